@@ -1,0 +1,34 @@
+"""Neurosim: event cameras, RGB, depth and IMU on agile multirotors, faster than real time.
+
+Everything is imported on first use: `import neurosim_core` starts no device and loads no heavy library.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neurosim_core.config import SimulationConfig, load_config
+    from neurosim_core.simulation import make_model, make_state, run, step
+
+__all__ = ["SimulationConfig", "load_config", "make_model", "make_state", "run", "step"]
+
+_HOME = {
+    "SimulationConfig": "neurosim_core.config",
+    "load_config": "neurosim_core.config",
+    "make_model": "neurosim_core.simulation",
+    "make_state": "neurosim_core.simulation",
+    "run": "neurosim_core.simulation",
+    "step": "neurosim_core.simulation",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'neurosim_core' has no attribute {name!r}, known: {__all__}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,61 @@
+"""Integer time: every stamp is a whole number of nanoseconds since the start of the episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+NS_PER_S = 1_000_000_000
+NS_PER_US = 1_000
+
+
+def to_ns(time_s: float) -> int:
+    """Return a time in seconds as the nearest nanosecond.
+
+    Raises:
+        ValueError: If `time_s` is not finite.
+    """
+    if not math.isfinite(time_s):
+        raise ValueError(f"time_s must be finite, got {time_s}")
+    return round(Fraction(time_s) * NS_PER_S)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A clock that ticks `rate_hz` times a second, for ever, without drift.
+
+    Tick k is at floor(k * 1e9 / rate_hz) ns, computed in exact rational arithmetic from the decimal form of
+    `rate_hz`: a rate that does not divide a second (30 Hz, 333 Hz, 29.97 Hz) has ticks that differ by 1 ns, and
+    no accumulated error.
+
+    Attributes:
+        rate_hz: Ticks per second [Hz], > 0 and at most 1e9.
+    """
+
+    rate_hz: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.rate_hz <= NS_PER_S):
+            raise ValueError(f"rate_hz must be in (0, 1e9], got {self.rate_hz}")
+
+    @property
+    def _period(self) -> Fraction:
+        return NS_PER_S / Fraction(str(self.rate_hz))
+
+    def stamp_ns(self, tick: int) -> int:
+        """Return the stamp of a tick [ns]."""
+        return math.floor(tick * self._period)
+
+    def first_tick(self, stamp_ns: int) -> int:
+        """Return the first tick at or after a stamp."""
+        # floor(k p) >= s  <=>  k p >= s  for integer s
+        return math.ceil(stamp_ns / self._period)
+
+    def stamps(self, start_ns: int, end_ns: int) -> Iterator[int]:
+        """Yield the stamps of all ticks in [start_ns, end_ns)."""
+        tick = self.first_tick(start_ns)
+        while (stamp := self.stamp_ns(tick)) < end_ns:
+            yield stamp
+            tick += 1

@@ -1,0 +1,74 @@
+"""Frames, once: W world (ENU, z up), B body (x forward, y left, z up), C camera optical (x right, y down, z forward).
+
+Quaternions are xyzw and `q_WB` takes body coordinates to world coordinates. Inner letters match:
+`R_WC = R_WB @ R_BC`, `p_WC = p_WB + R_WB @ p_BC`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.settings import Settings
+
+Vector3 = tuple[float, float, float]
+
+Q_FORWARD_OPTICAL = (-0.5, 0.5, -0.5, 0.5)
+"""Quaternion that takes optical coordinates to those of a forward, left, up frame that looks the same way."""
+
+
+class Mount(Settings):
+    """Where a sensor sits on the body: exactly T_BS, no hidden lift or lever arm."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    """Origin of the sensor in the body frame (x forward, y left, z up) [m]."""
+    rpy_rad: Vector3 = Field(default=(0.0, 0.0, 0.0))
+    """Roll, pitch, yaw of the sensor against the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); a camera with zeros
+    looks forward, positive pitch looks down."""
+
+    def rotation(self) -> Rotation:
+        """Return R_BS for a sensor with axes forward, left, up."""
+        return Rotation.from_euler("xyz", self.rpy_rad)
+
+    def optical_quaternion(self) -> NDArray[np.float64]:
+        """Return q_BC (xyzw, shape [4]) for a camera with optical axes right, down, forward."""
+        q_BC = self.rotation() * Rotation.from_quat(Q_FORWARD_OPTICAL)
+        return np.asarray(q_BC.as_quat(), dtype=np.float64)
+
+
+@wp.func
+def quaternion_exp(rotation: wp.vec3d) -> wp.quatd:
+    """Return the unit quaternion of a rotation vector [rad].
+
+    The series below 1e-4 rad is exact to rounding: its next term is 1e-4^6 / 46080.
+    """
+    half = wp.float64(0.5) * wp.length(rotation)
+    scale = wp.float64(0.5)
+    if half > wp.float64(5.0e-5):
+        scale = wp.sin(half) / (wp.float64(2.0) * half)
+    else:
+        half2 = half * half
+        scale = wp.float64(0.5) * (
+            wp.float64(1.0) - half2 / wp.float64(6.0) * (wp.float64(1.0) - half2 / wp.float64(20.0))
+        )
+    v = scale * rotation
+    return wp.quatd(v[0], v[1], v[2], wp.cos(half))
+
+
+def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.float64]:
+    """Return `value` as float64 [count, width], broadcasting one row to all.
+
+    Raises:
+        ValueError: If the shape does not fit or an element is not finite.
+    """
+    rows = np.asarray(value, dtype=np.float64)
+    if rows.shape not in ((width,), (1, width), (count, width)):
+        raise ValueError(f"{name} must have shape [{count}, {width}] or [{width}], got {list(rows.shape)}")
+    if not np.isfinite(rows).all():
+        raise ValueError(f"{name} must be finite, got {rows.tolist()}")
+    return np.ascontiguousarray(np.broadcast_to(rows, (count, width)))

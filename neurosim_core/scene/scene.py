@@ -1,0 +1,84 @@
+"""What a scene is once it is loaded or generated: triangles, materials and lights, in metres, z up, linear light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+LinearRgb = tuple[float, float, float]
+"""Linear-light red, green, blue (Rec. 709 primaries)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Texture:
+    """A picture that is wrapped around a surface."""
+
+    name: str
+    srgb: NDArray[np.uint8]
+    """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Material:
+    """A Lambertian surface that may also emit light."""
+
+    name: str
+    base_color: LinearRgb = (0.8, 0.8, 0.8)
+    """Albedo, linear, in [0, 1]; multiplies the texture."""
+    texture: Texture | None = None
+    emission: LinearRgb = (0.0, 0.0, 0.0)
+    """Emitted radiance, linear; seen by cameras, lights nothing (lamps come with a `Light`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """A point light: radiance reflected by a white surface at distance d facing it is intensity / d^2."""
+
+    position_m: tuple[float, float, float]
+    intensity: LinearRgb
+    """Reflected radiance at 1 m, linear."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ambient:
+    """Hemispheric light: a white surface facing up reflects `up`, one facing down reflects `down`."""
+
+    up: LinearRgb = (0.35, 0.35, 0.36)
+    down: LinearRgb = (0.22, 0.21, 0.20)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Triangles with materials and lights. World frame: metres, z up."""
+
+    name: str
+    vertices: NDArray[np.float32]
+    """Positions [m], shape [V, 3]. Vertices are split where uv or normals differ."""
+    faces: NDArray[np.int32]
+    """Vertex indices, shape [F, 3], counter-clockwise seen from the front. Surfaces are two-sided."""
+    normals: NDArray[np.float32]
+    """Unit shading normal of each vertex, shape [V, 3]."""
+    uv: NDArray[np.float32]
+    """Texture coordinates of each vertex, shape [V, 2]; v = 1 is the top row of the texture; wraps around."""
+    face_material: NDArray[np.int32]
+    """Index into `materials`, shape [F]."""
+    face_instance: NDArray[np.int32]
+    """Index into `instance_names`, shape [F]: which object a face belongs to."""
+    instance_names: tuple[str, ...]
+    materials: tuple[Material, ...]
+    lights: tuple[Light, ...] = ()
+    ambient: Ambient = field(default_factory=Ambient)
+    sky: LinearRgb = (0.55, 0.7, 0.95)
+    """Radiance of rays that hit nothing."""
+    notes: tuple[str, ...] = ()
+    """What was assumed, dropped or repaired while loading, one sentence each; shown to the user."""
+    inside_m: tuple[float, float, float] | None = None
+    """A point known to be in free space, if the source of the scene knows one [m]."""
+
+    @property
+    def bounds_m(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [m], shape [2, 3]."""
+        used = self.vertices[self.faces.reshape(-1)]
+        return np.stack([used.min(axis=0), used.max(axis=0)]).astype(np.float64)

@@ -1,0 +1,41 @@
+"""Fixtures that every test can use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+wp.config.quiet = True
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _devices() -> list[str]:
+    wp.init()
+    return ["cpu"] + (["cuda:0"] if wp.is_cuda_available() else [])
+
+
+@pytest.fixture(params=_devices())
+def device(request: pytest.FixtureRequest) -> str:
+    """Every device of this machine: kernels must be right on each."""
+    return str(request.param)
+
+
+@pytest.fixture(scope="session")
+def house() -> Path:
+    """The textured house that is kept beside the project."""
+    path = SHARED / "scenes" / "aws_small_house.glb"
+    if not path.exists():
+        pytest.skip(f"the house scene is not at {path}")
+    return path
+
+
+@pytest.fixture(scope="session")
+def test_assets() -> Path:
+    """Small glTF files that are kept beside the project."""
+    path = SHARED / "scenes" / "habitat_test_assets"
+    if not path.exists():
+        pytest.skip(f"the small glTF files are not at {path}")
+    return path
