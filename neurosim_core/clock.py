@@ -27,8 +27,8 @@ class Rate:
     """A clock that ticks `rate_hz` times a second, for ever, without drift.
 
     Tick k is at floor(k * 1e9 / rate_hz) ns, computed in exact rational arithmetic from the decimal form of
-    `rate_hz`: a rate that does not divide a second (30 Hz, 333 Hz, 29.97 Hz) has ticks that differ by 1 ns, and
-    no accumulated error.
+    `rate_hz`. Where the rate does not divide a second (30 Hz, 333 Hz, 29.97 Hz), intervals between ticks
+    differ by 1 ns, and no error accumulates.
 
     Attributes:
         rate_hz: Ticks per second [Hz], > 0 and at most 1e9.

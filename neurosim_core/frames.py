@@ -1,6 +1,8 @@
-"""Frames, once: W world (ENU, z up), B body (x forward, y left, z up), C camera optical (x right, y down, z forward).
+# mypy: disable-error-code="call-overload"
+"""Frames and rotations, once.
 
-Quaternions are xyzw and `q_WB` takes body coordinates to world coordinates. Inner letters match:
+W is the world (ENU, z up), B the body (x forward, y left, z up), C a camera (optical: x right, y down, z
+forward). Quaternions are xyzw and `q_WB` takes body coordinates to world coordinates. Inner letters match:
 `R_WC = R_WB @ R_BC`, `p_WC = p_WB + R_WB @ p_BC`.
 """
 
@@ -11,7 +13,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.settings import Settings
@@ -27,9 +28,9 @@ class Mount(Settings):
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
     """Origin of the sensor in the body frame (x forward, y left, z up) [m]."""
-    rpy_rad: Vector3 = Field(default=(0.0, 0.0, 0.0))
-    """Roll, pitch, yaw of the sensor against the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); a camera with zeros
-    looks forward, positive pitch looks down."""
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the sensor against the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll). A camera
+    with zeros looks forward; positive pitch looks down."""
 
     def rotation(self) -> Rotation:
         """Return R_BS for a sensor with axes forward, left, up."""

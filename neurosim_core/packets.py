@@ -38,8 +38,8 @@ class EventArrays(NamedTuple):
 class Events(Packet):
     """The events of one window of time, sorted by (t, y, x, polarity).
 
-    The window is the half-open interval (`start_ns`, `stamp_ns`]. Arrays have shape [n]; they are NumPy arrays on
-    a CPU device and Warp arrays on a CUDA device (`numpy()` gives NumPy arrays in both cases).
+    The window is the half-open interval (`start_ns`, `stamp_ns`]. Arrays have shape [n]: NumPy arrays
+    on a CPU device and Warp arrays on a CUDA device (`numpy()` gives NumPy arrays in both cases).
     """
 
     t: Any
@@ -76,7 +76,11 @@ ImageEncoding = Literal["rgb8", "mono8", "32FC1", "32FC2", "32SC1"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Image(Packet):
-    """One picture: rgb8 is uint8 [H, W, 3] in sRGB; 32FC1 is float32 [H, W] (depth: planar z [m], inf: nothing hit)."""
+    """One picture.
+
+    rgb8 is uint8 [H, W, 3] in sRGB. 32FC1 is float32 [H, W]; for depth it is planar z [m], inf where nothing
+    was hit.
+    """
 
     data: NDArray[Any]
     """Pixels, row-major, shape [H, W] or [H, W, C]."""
@@ -117,4 +121,4 @@ class Collision(Packet):
     position: NDArray[np.float64]
     """p_WB at the stamp [m], shape [3]."""
     clearance_m: float
-    """Distance from the centre of the vehicle to the nearest surface, minus the vehicle's radius [m]; <= 0."""
+    """Distance from the vehicle's centre to the nearest surface, minus its radius [m]; <= 0."""

@@ -9,8 +9,8 @@ class Settings(BaseModel):
     """A frozen group of settings.
 
     Unknown keys, non-finite numbers and values out of range are refused with a `ValueError` (pydantic's
-    `ValidationError`) that names the key, the value and what is allowed. Subclasses document each field with a
-    docstring on the following line; `neurosim run --print-config` prints these as comments.
+    `ValidationError`) that names the key, the value and what is allowed. Subclasses document each field with
+    a docstring on the line after it; `neurosim run --print-config` prints these as comments.
     """
 
     model_config = ConfigDict(

@@ -1,4 +1,7 @@
-"""What a scene is once it is loaded or generated: triangles, materials and lights, in metres, z up, linear light."""
+"""What a scene is once it is loaded or generated: triangles, materials and lights.
+
+Metres, z up, linear light.
+"""
 
 from __future__ import annotations
 
