@@ -1,0 +1,99 @@
+"""Who may import whom (the table of the design), no cycles, and an import that costs next to nothing."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = [p for p in ("neurosim_core", "cortex", "cortex_ros2_bridge") if (ROOT / p).is_dir()]
+FORBIDDEN = {
+    "neurosim_core": {"zmq", "rclpy", "cortex_ros2_bridge", "rotorpy"},
+    "cortex": {"neurosim_core", "cortex_ros2_bridge", "warp", "rclpy"},
+    "cortex_ros2_bridge": {"neurosim_core", "warp", "zmq"},
+}
+LAZY = set("torch rerun h5py hdf5plugin matplotlib pyrender OpenGL gymnasium cyclonedds rclpy".split())
+"""Heavy or optional: imported where they are used, never when a module is imported."""
+
+
+def modules(package: str) -> dict[str, ast.Module]:
+    found = {}
+    for path in sorted((ROOT / package).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+def imports(tree: ast.AST, *, top_level: bool) -> set[str]:
+    """Absolute names that a module imports; at top level only: not inside functions or `if TYPE_CHECKING`."""
+    names: set[str] = set()
+    queue: list[ast.AST] = [tree]
+    while queue:
+        node = queue.pop()
+        for child in ast.iter_child_nodes(node):
+            if top_level and isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+                continue
+            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+                continue
+            if isinstance(child, ast.Import):
+                names.update(alias.name for alias in child.names)
+            elif isinstance(child, ast.ImportFrom) and child.module:
+                names.add(child.module)
+                names.update(f"{child.module}.{alias.name}" for alias in child.names)
+            queue.append(child)
+    return names
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_imports_only_what_it_may(package):
+    for name, tree in modules(package).items():
+        used = {n.split(".")[0] for n in imports(tree, top_level=False)}
+        allowed = {"cortex"} if name.startswith("neurosim_core.nodes") else set()
+        forbidden = FORBIDDEN[package] | ({"cortex"} if package == "neurosim_core" else set())
+        assert not (used & forbidden) - allowed, name
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_heavy_libraries_are_imported_where_they_are_used(package):
+    for name, tree in modules(package).items():
+        assert not {n.split(".")[0] for n in imports(tree, top_level=True)} & LAZY, name
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_there_is_no_import_cycle(package):
+    trees = modules(package)
+    graph = {
+        name: {n for n in imports(tree, top_level=True) if n in trees and n != name}
+        for name, tree in trees.items()
+    }
+    done: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join([*trail, name])
+        if name not in done:
+            for other in graph[name]:
+                visit(other, (*trail, name))
+            done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+def test_importing_the_package_is_cheap():
+    """No device starts and no heavy library loads: modules are counted, as no slow machine can change that."""
+    code = "import sys, neurosim_core; print(' '.join(sys.modules))"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert not {"warp", "numpy", "scipy", "trimesh", "pydantic", "torch", "rerun"} & set(loaded)
+
+
+def test_every_file_has_one_subject():
+    banned = {"utils", "common", "helpers", "types"}
+    for package in PACKAGES:
+        assert not [name for name in modules(package) if name.rsplit(".", 1)[-1] in banned]

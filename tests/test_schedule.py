@@ -1,0 +1,61 @@
+"""The schedule of a run against a brute-force list of ticks."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neurosim_core.clock import Rate
+from neurosim_core.schedule import Schedule, batch_end_ns, boundaries, boundary_count_max
+
+hertz = st.sampled_from([20.0, 30.0, 100.0, 200.0, 333.0, 400.0, 500.0])
+schedules = st.builds(
+    Schedule,
+    control=hertz.map(Rate),
+    samplers=st.lists(hertz.map(Rate), max_size=2).map(tuple),
+    casts=st.lists(hertz.map(Rate), max_size=2).map(tuple),
+    packets=st.just(()),
+    instants_per_launch=st.integers(min_value=1, max_value=16),
+)
+
+
+def batches(schedule: Schedule, duration_ns: int) -> list[tuple[int, int]]:
+    cuts = [0]
+    while cuts[-1] < duration_ns:
+        cuts.append(batch_end_ns(schedule, cuts[-1], duration_ns))
+    return list(zip(cuts[:-1], cuts[1:], strict=True))
+
+
+@given(schedules)
+def test_batches_meet_every_tick_once(schedule):
+    duration_ns = 200_000_000
+    seen = [b for start, end in batches(schedule, duration_ns) for b in boundaries(schedule, start, end)]
+    for index, rate in enumerate(schedule.casts):
+        expected = list(rate.stamps(1, duration_ns + 1))
+        assert [b.stamp_ns for b in seen if index in b.casts] == expected
+    for index, rate in enumerate(schedule.samplers):
+        expected = list(rate.stamps(1, duration_ns + 1))
+        assert [b.stamp_ns for b in seen if index in b.samplers] == expected
+    assert [b.stamp_ns for b in seen if b.control] == list(schedule.control.stamps(1, duration_ns + 1))
+    stamps = [b.stamp_ns for b in seen]
+    assert stamps == sorted(set(stamps))
+    assert stamps[-1] == duration_ns
+
+
+@given(schedules)
+def test_no_batch_exceeds_its_buffers(schedule):
+    for start, end in batches(schedule, 200_000_000):
+        batch = boundaries(schedule, start, end)
+        assert len(batch) <= boundary_count_max(schedule)
+        for index in range(len(schedule.casts)):
+            assert sum(index in b.casts for b in batch) <= schedule.instants_per_launch
+
+
+def test_a_batch_ends_where_a_packet_of_events_ends():
+    schedule = Schedule(
+        control=Rate(200.0), samplers=(), casts=(Rate(500.0),), packets=(Rate(100.0),), instants_per_launch=16
+    )
+    assert batch_end_ns(schedule, 0, 10**9) == 10_000_000
+    assert batch_end_ns(schedule, 4_000_000, 10**9) == 10_000_000
+    assert batch_end_ns(schedule, 10_000_000, 10**9) == 20_000_000
+    assert batch_end_ns(schedule, 10_000_000, 15_000_000) == 15_000_000
