@@ -1,0 +1,310 @@
+# mypy: disable-error-code="index,attr-defined,misc"
+"""Paths: piecewise polynomials in position and yaw, evaluated by one Warp function at integer nanoseconds.
+
+A piece is a polynomial in its own normalised time u = (stamp - knot) / (next knot - knot) in [0, 1], and the difference
+of stamps is taken between integers: nothing accumulates, however long a path is. World frame, metres, radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from neurosim_core.clock import NS_PER_S
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class PathArrays:
+    """One path, or several behind each other, on a device; see `upload_paths`."""
+
+    first_knot: wp.array[wp.int32]
+    """Index of each path's first knot, shape [path + 1]; the last element is the number of knots."""
+    knots_ns: wp.array[wp.int64]
+    """Stamps at which pieces meet, strictly increasing within a path, shape [knot]."""
+    coefficients: wp.array2d[wp.vec4d]
+    """Coefficients of (x, y, z, yaw) in rising powers of u, shape [piece, degree + 1]."""
+
+
+@wp.struct
+class PathPoint:
+    """What a path asks for at one instant, in the world frame."""
+
+    position: wp.vec3d
+    """[m]."""
+    velocity: wp.vec3d
+    """[m/s]."""
+    acceleration: wp.vec3d
+    """[m/s^2]."""
+    jerk: wp.vec3d
+    """[m/s^3]."""
+    snap: wp.vec3d
+    """[m/s^4]."""
+    yaw: wp.float64
+    """Heading, continuous (it may pass pi) [rad]."""
+    yaw_rate: wp.float64
+    """[rad/s]."""
+    yaw_acceleration: wp.float64
+    """[rad/s^2]."""
+
+
+@wp.func
+def evaluate_path(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPoint:
+    """Return point of path `index` at a stamp; before its start and after its end it rests at its ends.
+
+    Position and four derivatives come out of one Horner scheme (repeated synthetic division). At a knot the piece that
+    starts there answers; at the last knot the last piece does.
+    """
+    first = path.first_knot[index]
+    last = path.first_knot[index + 1] - 1
+    low = first
+    high = last  # the piece starts at the last knot <= stamp
+    while high - low > 1:
+        middle = (low + high) // 2
+        if path.knots_ns[middle] <= stamp_ns:
+            low = middle
+        else:
+            high = middle
+    start_ns = path.knots_ns[low]
+    length_ns = path.knots_ns[low + 1] - start_ns
+    elapsed_ns = wp.clamp(stamp_ns - start_ns, wp.int64(0), length_ns)
+    u = wp.float64(elapsed_ns) / wp.float64(length_ns)
+
+    piece = low - index  # every path has one piece less than it has knots
+    d0 = wp.vec4d()
+    d1 = wp.vec4d()
+    d2 = wp.vec4d()
+    d3 = wp.vec4d()
+    d4 = wp.vec4d()
+    count = path.coefficients.shape[1]
+    for k in range(count):
+        d4 = d4 * u + d3
+        d3 = d3 * u + d2
+        d2 = d2 * u + d1
+        d1 = d1 * u + d0
+        d0 = d0 * u + path.coefficients[piece, count - 1 - k]
+
+    rate = wp.float64(1.0e9) / wp.float64(length_ns)
+    if stamp_ns < path.knots_ns[first] or stamp_ns > path.knots_ns[last]:
+        rate = wp.float64(0.0)
+    rate2 = rate * rate
+    d1 = d1 * rate
+    d2 = d2 * (wp.float64(2.0) * rate2)
+    d3 = d3 * (wp.float64(6.0) * rate2 * rate)
+    d4 = d4 * (wp.float64(24.0) * rate2 * rate2)
+
+    point = PathPoint()
+    point.position = wp.vec3d(d0[0], d0[1], d0[2])
+    point.velocity = wp.vec3d(d1[0], d1[1], d1[2])
+    point.acceleration = wp.vec3d(d2[0], d2[1], d2[2])
+    point.jerk = wp.vec3d(d3[0], d3[1], d3[2])
+    point.snap = wp.vec3d(d4[0], d4[1], d4[2])
+    point.yaw = d0[3]
+    point.yaw_rate = d1[3]
+    point.yaw_acceleration = d2[3]
+    return point
+
+
+@wp.kernel
+def _evaluate(
+    # Model:
+    path: PathArrays,
+    # In:
+    stamps_ns: wp.array[wp.int64],
+    # Out:
+    point_out: wp.array[PathPoint],
+) -> None:
+    sample = wp.tid()
+    point_out[sample] = evaluate_path(path, 0, stamps_ns[sample])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PathSamples:
+    """A path at n stamps, float64, world frame."""
+
+    stamps_ns: NDArray[np.int64]
+    """Shape [n]."""
+    position: NDArray[np.float64]
+    """[m], shape [n, 3]."""
+    velocity: NDArray[np.float64]
+    """[m/s], shape [n, 3]."""
+    acceleration: NDArray[np.float64]
+    """[m/s^2], shape [n, 3]."""
+    jerk: NDArray[np.float64]
+    """[m/s^3], shape [n, 3]."""
+    snap: NDArray[np.float64]
+    """[m/s^4], shape [n, 3]."""
+    yaw: NDArray[np.float64]
+    """[rad], shape [n]."""
+    yaw_rate: NDArray[np.float64]
+    """[rad/s], shape [n]."""
+    yaw_acceleration: NDArray[np.float64]
+    """[rad/s^2], shape [n]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """An immutable piecewise polynomial in (x, y, z, yaw), in the world frame.
+
+    Attributes:
+        knots_ns: Stamps at which pieces meet [ns], strictly increasing int64, shape [S + 1].
+        coefficients: Coefficients [m] and [rad] in rising powers of each piece's normalised time in [0, 1], float64,
+            shape [S, 4, degree + 1].
+
+    Raises:
+        ValueError: If shapes do not fit, knots do not increase or a coefficient is not finite.
+    """
+
+    knots_ns: NDArray[np.int64]
+    coefficients: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        knots_ns = np.array(self.knots_ns)
+        coefficients = np.array(self.coefficients, dtype=np.float64, order="C")
+        if not np.issubdtype(knots_ns.dtype, np.integer) or knots_ns.ndim != 1 or len(knots_ns) < 2:
+            raise ValueError(
+                f"knots_ns must be at least 2 integers, got {knots_ns.dtype} {list(knots_ns.shape)}"
+            )
+        knots_ns = knots_ns.astype(np.int64)
+        if not (np.diff(knots_ns) > 0).all():
+            raise ValueError(f"knots_ns must increase, got {knots_ns.tolist()}")
+        if coefficients.ndim != 3 or coefficients.shape[:2] != (len(knots_ns) - 1, 4):
+            raise ValueError(
+                f"coefficients must have shape [{len(knots_ns) - 1}, 4, degree + 1], got {list(coefficients.shape)}"
+            )
+        if not np.isfinite(coefficients).all():
+            raise ValueError("coefficients must be finite")
+        for name, array in (("knots_ns", knots_ns), ("coefficients", coefficients)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @property
+    def start_ns(self) -> int:
+        """First knot [ns]."""
+        return int(self.knots_ns[0])
+
+    @property
+    def end_ns(self) -> int:
+        """Last knot [ns]."""
+        return int(self.knots_ns[-1])
+
+    @property
+    def durations_s(self) -> NDArray[np.float64]:
+        """How long each piece takes [s], shape [S]."""
+        return np.diff(self.knots_ns) / NS_PER_S
+
+    @property
+    def length_m(self) -> float:
+        """Length of the way flown [m], to about 1e-3 (chords at 20 parts a piece)."""
+        u = np.linspace(0.0, 1.0, 21)
+        points = np.einsum("sak,uk->sua", self.coefficients[:, :3], u[:, None] ** np.arange(self.degree + 1))
+        return float(np.linalg.norm(np.diff(points, axis=1), axis=2).sum())
+
+    @property
+    def degree(self) -> int:
+        """Largest power of normalised time."""
+        return self.coefficients.shape[2] - 1
+
+    def evaluate(self, stamps_ns: ArrayLike, *, device: str = "cpu") -> PathSamples:
+        """Return position, yaw and their derivatives; before the start and after the end the path rests.
+
+        Args:
+            stamps_ns: Integer stamps [ns], shape [n] or a single one, in any order.
+            device: Where to compute.
+
+        Raises:
+            TypeError: If the stamps are not integers.
+        """
+        stamps = np.atleast_1d(np.asarray(stamps_ns))
+        if stamps.ndim != 1 or not np.issubdtype(stamps.dtype, np.integer):
+            raise TypeError(
+                f"stamps_ns must be integers of shape [n], got {stamps.dtype} {list(stamps.shape)}"
+            )
+        stamps = stamps.astype(np.int64)
+        points = wp.empty(len(stamps), dtype=PathPoint, device=device)
+        stamps_device = wp.array(stamps, dtype=wp.int64, device=device)
+        wp.launch(
+            _evaluate,
+            dim=len(stamps),
+            inputs=[upload_paths([self], device), stamps_device, points],
+            device=device,
+        )
+        rows = points.numpy()
+        return PathSamples(
+            stamps_ns=stamps, **{name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names}
+        )
+
+    def subdivided(self, parts: ArrayLike) -> Path:
+        """Return the same curve with piece i cut in `parts[i]` parts of equal length, to the nanosecond.
+
+        Args:
+            parts: How many parts each piece is cut into, integers >= 1, shape [S] or one for all.
+        """
+        counts = np.broadcast_to(np.asarray(parts, dtype=np.int64), (len(self.coefficients),))
+        knots: list[NDArray[np.int64]] = []
+        pieces: list[NDArray[np.float64]] = []
+        for start_ns, end_ns, count, piece in zip(
+            self.knots_ns[:-1], self.knots_ns[1:], counts, self.coefficients, strict=True
+        ):
+            inner = start_ns + (np.arange(count + 1) * (end_ns - start_ns)) // count
+            u = (inner - start_ns) / (end_ns - start_ns)
+            knots.append(inner[:-1])
+            pieces.append(np.einsum("pkj,aj->pak", _restriction(u, self.degree), piece))
+        return Path(np.concatenate([*knots, self.knots_ns[-1:]]), np.concatenate(pieces))
+
+    def with_yaw(self, coefficients: NDArray[np.float64]) -> Path:
+        """Return this path with another yaw on the same knots.
+
+        Args:
+            coefficients: Yaw in rising powers of normalised time [rad], shape [S, any degree + 1].
+        """
+        return Path(self.knots_ns, join_axes(self.coefficients[:, :3], coefficients[:, None, :]))
+
+
+def join_axes(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stack coefficients [S, a, j] and [S, b, k] of different degrees as [S, a + b, max(j, k)]."""
+    width = max(first.shape[2], second.shape[2])
+    padded = [np.pad(c, ((0, 0), (0, 0), (0, width - c.shape[2]))) for c in (first, second)]
+    return np.concatenate(padded, axis=1)
+
+
+def _restriction(u: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Matrices [part, power, power] that take a polynomial's coefficients to those on [u[i], u[i + 1]]."""
+    shift, scale = u[:-1], np.diff(u)
+    matrix = np.zeros((len(shift), degree + 1, degree + 1))
+    binomial = np.ones(1)
+    for power in range(degree + 1):  # (shift + scale v)^power
+        for k in range(power + 1):
+            matrix[:, k, power] = binomial[k] * shift ** (power - k) * scale**k
+        binomial = np.convolve(binomial, [1.0, 1.0])
+    return matrix
+
+
+def upload_paths(paths: Sequence[Path], device: Any) -> PathArrays:
+    """Put paths on a device, for `evaluate_path(arrays, index, stamp_ns)` inside a kernel.
+
+    Args:
+        paths: At least one; shorter degrees are padded with zeros.
+        device: Warp device.
+    """
+    width = max(path.degree for path in paths) + 1
+    rows = np.concatenate(
+        [np.pad(path.coefficients, ((0, 0), (0, 0), (0, width - path.degree - 1))) for path in paths]
+    )
+    arrays = PathArrays()
+    arrays.first_knot = wp.array(
+        np.cumsum([0] + [len(path.knots_ns) for path in paths]), dtype=wp.int32, device=device
+    )
+    arrays.knots_ns = wp.array(
+        np.concatenate([path.knots_ns for path in paths]), dtype=wp.int64, device=device
+    )
+    arrays.coefficients = wp.array(
+        np.ascontiguousarray(rows.transpose(0, 2, 1)), dtype=wp.vec4d, device=device
+    )
+    return arrays
