@@ -1,0 +1,66 @@
+"""States survive the buffer bit for bit; camera poses are T_WB T_BC."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.frames import Mount
+from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace
+
+
+def test_camera_pose_is_body_pose_times_mount(device):
+    rng = np.random.default_rng(0)
+    position = rng.normal(size=(1, 3))
+    orientation = Rotation.random(1, random_state=1).as_quat()
+    arrays = SimpleNamespace(
+        position=wp.array(position, dtype=wp.vec3d, device=device),
+        orientation=wp.array(orientation, dtype=wp.quatd, device=device),
+        velocity=wp.array(rng.normal(size=(1, 3)), dtype=wp.vec3d, device=device),
+        body_rate=wp.array(rng.normal(size=(1, 3)), dtype=wp.vec3d, device=device),
+        rotor_speed=wp.array(rng.normal(size=(1, 6)), dtype=wp.float64, device=device),
+    )
+    trace = Trace(capacity=3, vehicle_count=1, rotor_count=6, device=device)
+    trace.record(arrays, 2)
+    state = trace.numpy(3)[2, 0]
+    for part, array in (
+        (POSITION, arrays.position),
+        (ORIENTATION, arrays.orientation),
+        (VELOCITY, arrays.velocity),
+        (BODY_RATE, arrays.body_rate),
+        (ROTOR_SPEED, arrays.rotor_speed),
+    ):
+        np.testing.assert_array_equal(state[part], array.numpy()[0])
+
+    mount = Mount(position_m=(0.1, -0.2, 0.3), rpy_rad=(0.1, 0.2, 0.3))
+    p_WC = wp.zeros(1, dtype=wp.vec3, device=device)
+    q_WC = wp.zeros(1, dtype=wp.quat, device=device)
+    trace.camera_poses(
+        wp.array([2], dtype=int, device=device),
+        count=1,
+        p_BC=wp.vec3d(*mount.position_m),
+        q_BC=wp.quatd(*mount.optical_quaternion()),
+        p_WC=p_WC,
+        q_WC=q_WC,
+    )
+    R_WB = Rotation.from_quat(orientation[0])
+    R_WC = (
+        R_WB
+        * Rotation.from_euler("ZYX", [0.3, 0.2, 0.1])
+        * Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    )
+    np.testing.assert_allclose(
+        p_WC.numpy()[0], position[0] + R_WB.apply(mount.position_m), atol=1e-6
+    )  # float32
+    np.testing.assert_allclose(Rotation.from_quat(q_WC.numpy()[0]).as_matrix(), R_WC.as_matrix(), atol=1e-6)
+
+
+def test_optical_frame_looks_forward():
+    """Optical z is body x, optical x is body -y, optical y is body -z; positive pitch looks down."""
+    R_BC = Rotation.from_quat(Mount().optical_quaternion()).as_matrix()
+    np.testing.assert_allclose(R_BC, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-15)
+    down = Rotation.from_quat(Mount(rpy_rad=(0.0, 0.5, 0.0)).optical_quaternion()).apply([0, 0, 1])
+    np.testing.assert_allclose(down, [np.cos(0.5), 0.0, -np.sin(0.5)], atol=1e-15)
