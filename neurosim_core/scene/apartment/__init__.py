@@ -1,0 +1,5 @@
+"""The generated apartment: floor plan, building, surfaces and furniture."""
+
+from neurosim_core.scene.apartment.apartment import ApartmentConfig, make_apartment
+
+__all__ = ["ApartmentConfig", "make_apartment"]
