@@ -1,8 +1,9 @@
 # mypy: disable-error-code="index,attr-defined,misc"
 """Paths: piecewise polynomials in position and yaw, evaluated by one Warp function at integer nanoseconds.
 
-A piece is a polynomial in its own normalised time u = (stamp - knot) / (next knot - knot) in [0, 1], and the difference
-of stamps is taken between integers: nothing accumulates, however long a path is. World frame, metres, radians.
+A piece is a polynomial in its own normalised time u = (stamp - knot) / (next knot - knot) in [0, 1], and the
+difference of stamps is taken between integers: nothing accumulates, however long a path is. World frame,
+metres, radians.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ class PathPoint:
 def evaluate_path(path: PathArrays, index: int, stamp_ns: wp.int64) -> PathPoint:
     """Return point of path `index` at a stamp; before its start and after its end it rests at its ends.
 
-    Position and four derivatives come out of one Horner scheme (repeated synthetic division). At a knot the piece that
-    starts there answers; at the last knot the last piece does.
+    Position and four derivatives come out of one Horner scheme (repeated synthetic division). At a knot the
+    piece that starts there answers; at the last knot the last piece does.
     """
     first = path.first_knot[index]
     last = path.first_knot[index + 1] - 1
@@ -154,8 +155,8 @@ class Path:
 
     Attributes:
         knots_ns: Stamps at which pieces meet [ns], strictly increasing int64, shape [S + 1].
-        coefficients: Coefficients [m] and [rad] in rising powers of each piece's normalised time in [0, 1], float64,
-            shape [S, 4, degree + 1].
+        coefficients: Coefficients [m] and [rad] in rising powers of each piece's normalised time in [0, 1],
+            float64, shape [S, 4, degree + 1].
 
     Raises:
         ValueError: If shapes do not fit, knots do not increase or a coefficient is not finite.
@@ -176,7 +177,8 @@ class Path:
             raise ValueError(f"knots_ns must increase, got {knots_ns.tolist()}")
         if coefficients.ndim != 3 or coefficients.shape[:2] != (len(knots_ns) - 1, 4):
             raise ValueError(
-                f"coefficients must have shape [{len(knots_ns) - 1}, 4, degree + 1], got {list(coefficients.shape)}"
+                f"coefficients must have shape [{len(knots_ns) - 1}, 4, degree + 1], "
+                f"got {list(coefficients.shape)}"
             )
         if not np.isfinite(coefficients).all():
             raise ValueError("coefficients must be finite")
@@ -209,7 +211,7 @@ class Path:
     @property
     def degree(self) -> int:
         """Largest power of normalised time."""
-        return self.coefficients.shape[2] - 1
+        return int(self.coefficients.shape[2]) - 1
 
     def evaluate(self, stamps_ns: ArrayLike, *, device: str = "cpu") -> PathSamples:
         """Return position, yaw and their derivatives; before the start and after the end the path rests.
@@ -227,8 +229,8 @@ class Path:
                 f"stamps_ns must be integers of shape [n], got {stamps.dtype} {list(stamps.shape)}"
             )
         stamps = stamps.astype(np.int64)
-        points = wp.empty(len(stamps), dtype=PathPoint, device=device)
-        stamps_device = wp.array(stamps, dtype=wp.int64, device=device)
+        points: Any = wp.empty(len(stamps), dtype=PathPoint, device=device)
+        stamps_device: Any = wp.array(stamps, dtype=wp.int64, device=device)
         wp.launch(
             _evaluate,
             dim=len(stamps),
@@ -304,7 +306,6 @@ def upload_paths(paths: Sequence[Path], device: Any) -> PathArrays:
     arrays.knots_ns = wp.array(
         np.concatenate([path.knots_ns for path in paths]), dtype=wp.int64, device=device
     )
-    arrays.coefficients = wp.array(
-        np.ascontiguousarray(rows.transpose(0, 2, 1)), dtype=wp.vec4d, device=device
-    )
+    coefficients: Any = wp.array(np.ascontiguousarray(rows.transpose(0, 2, 1)), dtype=wp.vec4d, device=device)
+    arrays.coefficients = coefficients
     return arrays

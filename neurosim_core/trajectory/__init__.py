@@ -1,0 +1,1 @@
+"""Where the vehicle flies: paths, and what makes them."""
