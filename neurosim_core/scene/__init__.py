@@ -1,0 +1,1 @@
+"""Scenes: triangles with materials and lights, from a mesh file or generated."""

@@ -1,0 +1,512 @@
+"""glTF 2.0 (.gltf, .glb): geometry, node tree, materials, textures and lights of the default scene.
+
+Read here rather than with trimesh, whose reader rounds base colours to 8 bits and leaves out sparse and
+normalised accessors, second texture coordinate sets, texture transforms, skins and KHR_lights_punctual.
+Reference: Khronos glTF 2.0 specification; KHR_lights_punctual, KHR_texture_transform,
+KHR_materials_emissive_strength, KHR_materials_pbrSpecularGlossiness, KHR_mesh_quantization, EXT_texture_webp.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import struct
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.scene.scene import Material
+from neurosim_core.scene.source import (
+    Lamp,
+    Part,
+    SceneError,
+    Source,
+    TextureStore,
+    decode_picture,
+    rgb,
+    srgb_to_linear,
+    unique_name,
+)
+
+_COMPONENT = {
+    5120: np.int8,
+    5121: np.uint8,
+    5122: np.int16,
+    5123: np.uint16,
+    5125: np.uint32,
+    5126: np.float32,
+}
+_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_UNREADABLE = {
+    "KHR_draco_mesh_compression": "compressed geometry",
+    "EXT_meshopt_compression": "compressed geometry",
+    "KHR_texture_basisu": "compressed textures",
+}
+_MAX_DEPTH = 256
+
+
+def read_gltf(path: Path, *, textures_required: bool) -> Source:
+    """Read the default scene of a glTF file.
+
+    Args:
+        path: The .gltf or .glb file.
+        textures_required: Whether a texture file that is not there is an error, or noted and left out.
+
+    Raises:
+        SceneError: If the file is truncated, malformed, or needs an extension that is not read.
+    """
+    try:
+        return _Reader(path, textures_required=textures_required).read()
+    except (KeyError, IndexError, TypeError, AttributeError, struct.error, ValueError) as error:
+        if isinstance(error, SceneError):
+            raise
+        raise SceneError(
+            f"{path}: malformed glTF ({type(error).__name__}: {error}); a glTF 2.0 validator says where"
+        ) from error
+
+
+class _Reader:
+    def __init__(self, path: Path, *, textures_required: bool) -> None:
+        self.path = path
+        self.textures_required = textures_required
+        self.source = Source(unit_reason="glTF is in metres by specification", up_default="y")
+        self.tree, self.binary = self._split(path.read_bytes())
+        version = str(self.tree.get("asset", {}).get("version", "2.0"))
+        if not version.startswith("2"):
+            raise SceneError(f"{path}: glTF version {version}, only 2.x is read")
+        for name in self.tree.get("extensionsRequired", []):
+            if name in _UNREADABLE:
+                raise SceneError(
+                    f"{path}: needs {name} ({_UNREADABLE[name]}), which is not read; "
+                    "export it again without compression"
+                )
+
+    def _split(self, data: bytes) -> tuple[dict[str, Any], bytes]:
+        if data[:4] != b"glTF":
+            if self.path.suffix.lower() == ".glb":
+                raise SceneError(f"{self.path}: not a GLB file, it does not start with 'glTF'")
+            return self._parse(data), b""
+        if len(data) < 20:
+            raise SceneError(f"{self.path}: truncated, only {len(data)} bytes")
+        length = struct.unpack_from("<I", data, 8)[0]
+        if len(data) < length:
+            raise SceneError(f"{self.path}: truncated, {len(data)} of {length} bytes are there")
+        chunks: dict[int, bytes] = {}
+        at = 12
+        while at + 8 <= length:
+            size, kind = struct.unpack_from("<II", data, at)
+            if at + 8 + size > length:
+                raise SceneError(f"{self.path}: truncated, a chunk of {size} bytes ends after the file")
+            chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+            at += 8 + size
+        if 0x4E4F534A not in chunks:
+            raise SceneError(f"{self.path}: no JSON chunk, not a glTF 2.0 binary")
+        return self._parse(chunks[0x4E4F534A]), chunks.get(0x004E4942, b"")
+
+    def _parse(self, text: bytes) -> dict[str, Any]:
+        try:
+            tree = json.loads(text.decode("utf-8-sig"))
+        except (UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise SceneError(f"{self.path}: not glTF, or truncated: {error}") from error
+        if not isinstance(tree, dict) or "asset" not in tree:
+            raise SceneError(f"{self.path}: not glTF, there is no 'asset' in its JSON")
+        return tree
+
+    def _uri(self, uri: str) -> bytes | None:
+        """Return the bytes behind a URI, None if there is no such file."""
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.partition(",")[2], validate=False)
+            except binascii.Error as error:
+                raise SceneError(f"{self.path}: broken base64 in a data URI: {error}") from error
+        file = self.path.parent / unquote(uri)
+        return file.read_bytes() if file.is_file() else None
+
+    @cached_property
+    def _buffers(self) -> list[bytes]:
+        buffers = []
+        for index, buffer in enumerate(self.tree.get("buffers", [])):
+            data = self._uri(buffer["uri"]) if "uri" in buffer else self.binary
+            if data is None:
+                raise SceneError(f"{self.path}: buffer file {buffer['uri']!r} is missing beside it")
+            if len(data) < buffer["byteLength"]:
+                raise SceneError(
+                    f"{self.path}: truncated, buffer {index} has {len(data)} of {buffer['byteLength']} bytes"
+                )
+            buffers.append(data)
+        return buffers
+
+    def _view(self, index: int) -> tuple[memoryview, int | None]:
+        view = self.tree["bufferViews"][index]
+        start = view.get("byteOffset", 0)
+        data = memoryview(self._buffers[view["buffer"]])[start : start + view["byteLength"]]
+        if len(data) < view["byteLength"]:
+            raise SceneError(f"{self.path}: truncated, buffer view {index} ends after its buffer")
+        return data, view.get("byteStride")
+
+    def _elements(self, view: int, offset: int, component: int, width: int, count: int) -> NDArray[Any]:
+        data, stride = self._view(view)
+        dtype = np.dtype(_COMPONENT[component]).newbyteorder("<")
+        row = dtype.itemsize * width
+        stride = stride or row
+        if count and offset + (count - 1) * stride + row > len(data):
+            raise SceneError(f"{self.path}: truncated, an accessor ends after buffer view {view}")
+        values: NDArray[Any] = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
+        return values
+
+    def _accessor(self, index: int) -> NDArray[Any]:
+        """Return accessor `index`, shape [count, width]; normalised integers as floats."""
+        accessor = self.tree["accessors"][index]
+        component, width, count = accessor["componentType"], _WIDTH[accessor["type"]], accessor["count"]
+        if "bufferView" in accessor:
+            values = self._elements(
+                accessor["bufferView"], accessor.get("byteOffset", 0), component, width, count
+            )
+        else:
+            values = np.zeros((count, width), _COMPONENT[component])
+        if "sparse" in accessor:
+            sparse = accessor["sparse"]
+            where, what = sparse["indices"], sparse["values"]
+            values = values.copy()
+            rows = self._elements(
+                where["bufferView"], where.get("byteOffset", 0), where["componentType"], 1, sparse["count"]
+            )
+            values[rows[:, 0]] = self._elements(
+                what["bufferView"], what.get("byteOffset", 0), component, width, sparse["count"]
+            )
+        if accessor.get("normalized", False) and np.issubdtype(values.dtype, np.integer):
+            return np.asarray(np.maximum(values / np.float64(np.iinfo(values.dtype).max), -1.0))
+        return values
+
+    def _image_index(self, texture: dict[str, Any]) -> int:
+        """Return the index of the picture behind a texture reference, -1 if there is none."""
+        entry = self.tree["textures"][texture["index"]]
+        webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
+        return int(entry.get("source", webp.get("source", -1)))
+
+    def _pictures(self, wanted: set[int]) -> dict[int, NDArray[np.uint8]]:
+        """Decode images, several at once: Pillow releases the interpreter lock."""
+
+        def decode(index: int) -> NDArray[np.uint8] | None:
+            image = self.tree["images"][index]
+            name = image.get("name") or (
+                image["uri"] if "uri" in image and not image["uri"].startswith("data:") else f"image {index}"
+            )
+            data = (
+                bytes(self._view(image["bufferView"])[0])
+                if "bufferView" in image
+                else self._uri(image["uri"])
+            )
+            if data is None:
+                if self.textures_required:
+                    raise SceneError(
+                        f"{self.path}: texture file {image['uri']!r} is missing beside it; put it there, or "
+                        "set missing_texture to 'ignore' to use the base colour alone"
+                    )
+                return None
+            return decode_picture(data, file=str(self.path), name=name)
+
+        order = sorted(wanted)
+        with ThreadPoolExecutor(max_workers=4) as pool:
+            decoded = dict(zip(order, pool.map(decode, order), strict=True))
+        missing = sum(picture is None for picture in decoded.values())
+        if missing:
+            self.source.notes.append(f"{missing} texture files are missing; base colours are used alone.")
+        return {index: picture for index, picture in decoded.items() if picture is not None}
+
+    def _materials(self) -> list[dict[str, Any]]:
+        """Fill the materials; return for each how its texture coordinates are found."""
+        entries = [*self.tree.get("materials", []), {}]  # the last one: the specification's default material
+        bases, emissives = [], []
+        for entry in entries:
+            glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+            pbr = entry.get("pbrMetallicRoughness", {})
+            bases.append(
+                (glossy.get("diffuseFactor", [1, 1, 1, 1]), glossy.get("diffuseTexture"))
+                if glossy is not None
+                else (pbr.get("baseColorFactor", [1, 1, 1, 1]), pbr.get("baseColorTexture"))
+            )
+            emissives.append(entry.get("emissiveTexture"))
+        index_of = {
+            id(info): self._image_index(info) for info in [*(base[1] for base in bases), *emissives] if info
+        }
+        pictures = self._pictures({index for index in index_of.values() if index >= 0})
+        store = TextureStore()
+        names = {index: self.tree["images"][index].get("name") or f"image {index}" for index in pictures}
+        taken: set[str] = set()
+        coordinates = []
+        see_through = metallic = glowing = transformed = clamped = 0
+        for index, (entry, (factor, info), emissive) in enumerate(
+            zip(entries, bases, emissives, strict=True)
+        ):
+            picture = pictures.get(index_of.get(id(info), -1)) if info else None
+            texture = None
+            if picture is not None:
+                texture = store.add(picture, name=names[index_of[id(info)]])
+            glow = np.asarray(entry.get("emissiveFactor", [0, 0, 0]), dtype=np.float64)
+            glow = glow * entry.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get(
+                "emissiveStrength", 1.0
+            )
+            glow_picture = pictures.get(index_of.get(id(emissive), -1)) if emissive else None
+            if glow_picture is not None and glow.any():
+                table = srgb_to_linear(np.arange(256) / 255.0)
+                glow = glow * table[glow_picture].mean(axis=(0, 1))
+                glowing += 1
+            self.source.materials.append(
+                Material(
+                    name=unique_name(entry.get("name") or f"material {index}", taken),
+                    base_color=rgb(np.clip(np.asarray(factor, dtype=np.float64), 0.0, 1.0)),
+                    texture=texture,
+                    emission=rgb(np.maximum(glow, 0.0)),
+                )
+            )
+            see_through += entry.get("alphaMode", "OPAQUE") != "OPAQUE"
+            metallic += bool(entry) and self._is_metal(entry)
+            transform = (info or {}).get("extensions", {}).get("KHR_texture_transform", {})
+            transformed += bool(transform)
+            if info and "samplers" in self.tree and "sampler" in self.tree["textures"][info["index"]]:
+                sampler = self.tree["samplers"][self.tree["textures"][info["index"]]["sampler"]]
+                clamped += sampler.get("wrapS", 10497) != 10497 or sampler.get("wrapT", 10497) != 10497
+            coordinates.append(
+                {"set": transform.get("texCoord", (info or {}).get("texCoord", 0)), "transform": transform}
+            )
+        for count, text in (
+            (see_through, "materials with transparency are drawn opaque"),
+            (metallic, "metallic materials are drawn as Lambertian surfaces of their base colour"),
+            (glowing, "emissive textures are replaced by their mean"),
+            (transformed, "texture transforms are applied to the texture coordinates"),
+            (clamped, "textures that ask for clamping or mirroring wrap around instead"),
+        ):
+            if count:
+                self.source.notes.append(f"{count} {text}.")
+        return coordinates
+
+    @staticmethod
+    def _is_metal(entry: dict[str, Any]) -> bool:
+        pbr = entry.get("pbrMetallicRoughness")
+        return (
+            pbr is not None and "metallicRoughnessTexture" not in pbr and pbr.get("metallicFactor", 1.0) > 0.5
+        )
+
+    @staticmethod
+    def _local(node: dict[str, Any]) -> NDArray[np.float64]:
+        if "matrix" in node:
+            return np.asarray(np.asarray(node["matrix"], dtype=np.float64).reshape(4, 4).T)
+        matrix = np.eye(4)
+        rotation = np.asarray(node.get("rotation", [0, 0, 0, 1]), dtype=np.float64)
+        if np.linalg.norm(rotation) > 0.0:
+            matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix()
+        matrix[:3, :3] *= np.asarray(node.get("scale", [1, 1, 1]), dtype=np.float64)
+        matrix[:3, 3] = node.get("translation", [0, 0, 0])
+        return matrix
+
+    def _world(self) -> dict[int, NDArray[np.float64]]:
+        """Return the matrix of each node of the default scene, parents before children."""
+        nodes = self.tree.get("nodes", [])
+        if "scenes" in self.tree:
+            roots = self.tree["scenes"][self.tree.get("scene", 0)].get("nodes", [])
+        else:
+            children = {child for node in nodes for child in node.get("children", [])}
+            roots = [index for index in range(len(nodes)) if index not in children]
+        world: dict[int, NDArray[np.float64]] = {}
+        stack = [(root, np.eye(4), 0) for root in reversed(roots)]
+        while stack:
+            index, parent, depth = stack.pop()
+            if depth > _MAX_DEPTH or index in world:
+                raise SceneError(f"{self.path}: node {index} has two parents or is its own ancestor")
+            world[index] = parent @ self._local(nodes[index])
+            stack.extend(
+                (child, world[index], depth + 1) for child in reversed(nodes[index].get("children", []))
+            )
+        return world
+
+    def read(self) -> Source:
+        source = self.source
+        coordinates = self._materials()
+        world = self._world()
+        primitives: dict[int, list[dict[str, Any]]] = {}
+        taken: set[str] = set()
+        for index, matrix in world.items():
+            node = self.tree["nodes"][index]
+            if "light" in node.get("extensions", {}).get("KHR_lights_punctual", {}):
+                self._lamp(node["extensions"]["KHR_lights_punctual"]["light"], matrix)
+            if "mesh" not in node:
+                continue
+            mesh = self.tree["meshes"][node["mesh"]]
+            if node["mesh"] not in primitives:
+                primitives[node["mesh"]] = self._primitives(mesh, coordinates)
+            name = unique_name(node.get("name") or mesh.get("name") or f"node {index}", taken)
+            for primitive in primitives[node["mesh"]]:
+                arrays, place = dict(primitive), matrix
+                skin = arrays.pop("skin")
+                if "skin" in node and skin is not None:
+                    arrays = self._posed(arrays, skin, self.tree["skins"][node["skin"]], world)
+                    place = np.eye(4)
+                source.parts.append(
+                    Part(name=name, matrix=place, instance=len(source.instance_names), **arrays)
+                )
+            source.instance_names.append(name)
+        self._orientation()
+        return source
+
+    def _primitives(self, mesh: dict[str, Any], coordinates: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        parts = []
+        for primitive in mesh["primitives"]:
+            mode = primitive.get("mode", 4)
+            attributes = primitive["attributes"]
+            if mode not in (4, 5, 6) or "POSITION" not in attributes:
+                self.source.notes.append(f"Points and lines of {mesh.get('name', 'a mesh')!r} are left out.")
+                continue
+            for name in primitive.get("extensions", {}):
+                if name in _UNREADABLE:
+                    raise SceneError(
+                        f"{self.path}: uses {name}, which is not read; export it again without it"
+                    )
+            positions = self._accessor(attributes["POSITION"]).astype(np.float64)
+            if "indices" in primitive:
+                order = self._accessor(primitive["indices"])[:, 0].astype(np.int64)
+            else:
+                order = np.arange(len(positions), dtype=np.int64)
+            faces = _triangles(order, mode)
+            if faces.size and faces.max() >= len(positions):
+                raise SceneError(
+                    f"{self.path}: mesh {mesh.get('name', '')!r} uses vertex {faces.max()} of "
+                    f"{len(positions)}"
+                )
+            material = primitive.get("material", len(coordinates) - 1)
+            where = coordinates[material]
+            uv = None
+            if f"TEXCOORD_{where['set']}" in attributes:
+                uv = self._accessor(attributes[f"TEXCOORD_{where['set']}"]).astype(np.float64)
+                uv = _transformed(uv, where["transform"])
+                uv[:, 1] = 1.0 - uv[:, 1]  # glTF counts v from the top row down
+            colors = None
+            if "COLOR_0" in attributes:
+                colors = self._accessor(attributes["COLOR_0"])[:, :3].astype(np.float64)[faces]
+            skin = None
+            if "JOINTS_0" in attributes and "WEIGHTS_0" in attributes:
+                skin = (
+                    self._accessor(attributes["JOINTS_0"]).astype(np.int64),
+                    self._accessor(attributes["WEIGHTS_0"]).astype(np.float64),
+                )
+            normals = None
+            if "NORMAL" in attributes:
+                normals = self._accessor(attributes["NORMAL"]).astype(np.float64)
+            if "targets" in primitive and any(mesh.get("weights", [])):
+                for weight, target in zip(mesh["weights"], primitive["targets"], strict=False):
+                    if "POSITION" in target:
+                        positions = positions + weight * self._accessor(target["POSITION"])
+                normals = None
+            parts.append(
+                {
+                    "positions": positions,
+                    "faces": faces,
+                    "normals": normals,
+                    "uv": uv,
+                    "corner_color": colors,
+                    "material": material,
+                    "skin": skin,
+                }
+            )
+        return parts
+
+    def _posed(
+        self, arrays: dict[str, Any], skin: Any, entry: dict[str, Any], world: dict[int, NDArray[np.float64]]
+    ) -> dict[str, Any]:
+        """Skin vertices with the joints where the node tree has them; the mesh node's matrix is unused."""
+        joints, weights = skin
+        bind = np.tile(np.eye(4), (len(entry["joints"]), 1, 1))
+        if "inverseBindMatrices" in entry:
+            bind = self._accessor(entry["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+        pose = np.stack([world.get(joint, np.eye(4)) for joint in entry["joints"]]) @ bind
+        total = weights.sum(axis=1, keepdims=True)
+        blend = np.einsum("vk,vkij->vij", weights / np.where(total > 0.0, total, 1.0), pose[joints])
+        positions = np.einsum("vij,vj->vi", blend[:, :3, :3], arrays["positions"]) + blend[:, :3, 3]
+        note = "Skinned meshes stand in the pose of the file's node tree; animation is not played."
+        if note not in self.source.notes:
+            self.source.notes.append(note)
+        return {**arrays, "positions": positions, "normals": None}
+
+    def _lamp(self, index: int, matrix: NDArray[np.float64]) -> None:
+        light = self.tree["extensions"]["KHR_lights_punctual"]["lights"][index]
+        intensity = np.asarray(light.get("color", [1, 1, 1]), dtype=np.float64) * light.get("intensity", 1.0)
+        if not intensity.any():
+            return
+        directional = light["type"] == "directional"
+        if light["type"] == "spot":
+            self.source.notes.append(f"Spot light {light.get('name', index)!r} shines in all directions.")
+        self.source.lamps.append(
+            Lamp(
+                kind="directional" if directional else "point",
+                vector=-matrix[:3, 2] if directional else matrix[:3, 3],
+                intensity=rgb(intensity),
+            )
+        )
+
+    def _orientation(self) -> None:
+        """Find what the file says about up: extras, then a Habitat settings file, then its generator."""
+        source = self.source
+        scenes = self.tree.get("scenes") or [{}]
+        for holder in (self.tree.get("asset", {}), scenes[self.tree.get("scene", 0)]):
+            extras = holder.get("extras")
+            for key in ("up_axis", "upAxis", "up"):
+                value = extras.get(key) if isinstance(extras, dict) else None
+                if isinstance(value, str) and value.lower()[:1] in ("x", "y", "z"):
+                    source.up_axis = value.lower()[0]  # type: ignore[assignment]
+                    source.up_reason = f"the file's extras say {key} = {value!r}"
+                    return
+        for kind in ("stage", "object"):
+            beside = self.path.with_name(f"{self.path.stem}.{kind}_config.json")
+            if not beside.is_file():
+                continue
+            try:
+                up = json.loads(beside.read_text()).get("up")
+            except (OSError, ValueError, AttributeError) as error:
+                raise SceneError(
+                    f"{beside}: cannot be read ({error}); repair it or declare up_axis"
+                ) from error
+            axis = {(1, 0, 0): "x", (0, 1, 0): "y", (0, 0, 1): "z"}.get(tuple(up)) if up else None
+            if axis is not None:
+                source.up_axis = axis  # type: ignore[assignment]
+                source.up_reason = f"{beside.name} beside it says up = {up}"
+                return
+        generator = str(self.tree.get("asset", {}).get("generator", ""))
+        if "trimesh" in generator.lower():
+            source.up_reason = (
+                "glTF is y up by specification, but its writer, trimesh, stores any axes as they are"
+            )
+        else:
+            source.up_axis = "y"
+            source.up_reason = "glTF is y up by specification"
+
+
+def _triangles(order: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+    """Return faces [F, 3] of a triangle list (4), strip (5) or fan (6)."""
+    if mode == 4:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    count = max(len(order) - 2, 0)
+    k = np.arange(count)
+    if mode == 6:
+        return np.stack([np.repeat(order[:1], count), order[k + 1], order[k + 2]], axis=1)
+    odd = k % 2
+    return np.stack([order[k], order[k + 1 + odd], order[k + 2 - odd]], axis=1)
+
+
+def _transformed(uv: NDArray[np.float64], transform: dict[str, Any]) -> NDArray[np.float64]:
+    """Apply a KHR_texture_transform: scale, rotate counter-clockwise as seen on the picture, offset."""
+    if not transform:
+        return uv
+    angle = transform.get("rotation", 0.0)
+    scaled = uv * np.asarray(transform.get("scale", [1.0, 1.0]), dtype=np.float64)
+    turn = np.array(
+        [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]
+    )  # v points down
+    return np.asarray(scaled @ turn.T + np.asarray(transform.get("offset", [0.0, 0.0]), dtype=np.float64))

@@ -1,0 +1,163 @@
+"""Lights for a scene: those of its file brought to a sensible level, or lamps hung where there is room."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from neurosim_core.scene.scene import Light, LinearRgb
+
+LEVEL = 0.5
+"""Direct light that the median square metre would reflect if it were white, faced its lamps and saw them."""
+MAX_LAMPS = 6
+_SAMPLES = 4096
+_CELL_MAX = 300_000
+
+
+def surface_samples(triangles: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return points spread over triangles [F, 3, 3] in proportion to area, shape [count, 3].
+
+    A low-discrepancy sequence: the same triangles give the same points.
+    """
+    area = np.linalg.norm(
+        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
+    )
+    index = np.arange(count)
+    total = np.cumsum(area)
+    face = np.minimum(np.searchsorted(total, (index + 0.5) / count * total[-1]), len(area) - 1)
+    a = np.sqrt((index * 0.7548776662466927) % 1.0)  # Roberts' R2 sequence
+    b = (index * 0.5698402909980532) % 1.0
+    weights = np.stack([1.0 - a, a * (1.0 - b), a * b], axis=1)
+    return np.asarray(np.einsum("nk,nkx->nx", weights, triangles[face]))
+
+
+def _level(
+    positions: NDArray[np.float64], intensities: NDArray[np.float64], samples: NDArray[np.float64]
+) -> float:
+    """Return the median over `samples` of the brightest light's intensity / distance^2."""
+    squared = ((samples[:, None] - positions[None]) ** 2).sum(axis=2)
+    return float(np.median((intensities.mean(axis=1) / np.maximum(squared, 0.01)).max(axis=1)))
+
+
+def scaled_lights(
+    positions: Sequence[NDArray[np.float64]],
+    intensities: Sequence[LinearRgb],
+    triangles: NDArray[np.float64],
+    *,
+    factor: float | None,
+) -> tuple[tuple[Light, ...], float]:
+    """Return lights and the factor that was applied: `factor`, or the one that brings them to `LEVEL`."""
+    where, power = np.asarray(positions, dtype=np.float64), np.asarray(intensities, dtype=np.float64)
+    if factor is None:
+        factor = LEVEL / max(_level(where, power, surface_samples(triangles, _SAMPLES)), 1e-12)
+    lights = tuple(
+        Light(
+            position_m=(float(p[0]), float(p[1]), float(p[2])),
+            intensity=(float(i[0]), float(i[1]), float(i[2])),
+        )
+        for p, i in zip(where, power * factor, strict=True)
+    )
+    return lights, factor
+
+
+def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+    """Choose places for lamps: inside, one to each part of the rooms; around the scene if it is no room.
+
+    Surfaces are sampled into a grid. A lamp may hang in a cell with a surface 1.2 m or more below and a
+    ceiling 0.3 to 0.9 m above; where less than a third of the floor has one, the top of the scene counts as
+    ceiling. From the cell with most room on, each further lamp goes to a cell that is far by air, around
+    walls, from those that hang, until every cell is within 4 m of one.
+
+    Returns:
+        Positions [m], shape [n, 3], and the end of a sentence that says what was done.
+    """
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    size = high - low
+    if size[:2].min() < 2.0 or size[2] < 1.8 or size.max() > 500.0:
+        return _around(low, high), "placed above and around the scene, which is no room"
+    cell = max(0.2, float((np.prod(size + 0.5) / _CELL_MAX) ** (1.0 / 3.0)))
+    shape = np.ceil(size / cell).astype(int) + 2
+    area = np.linalg.norm(
+        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
+    )
+    count = int(min(2.0 * area.sum() / cell**2 + len(triangles), 1_000_000))
+    points = np.concatenate([surface_samples(triangles, count), triangles[:, 0]])
+    index = np.clip(((points - low) / cell).astype(int) + 1, 0, shape - 1)
+    full = np.zeros(shape, dtype=bool)
+    full[tuple(index.T)] = True
+    full[[0, -1]] = full[:, [0, -1]] = True  # nothing hangs outside
+    room = ndimage.distance_transform_edt(~full) * cell
+    width = ndimage.distance_transform_edt(~full, sampling=(1.0, 1.0, 4.0))  # counts walls, hardly the floor
+    floor = _gap(full) * cell
+    standing = np.isfinite(floor) & (floor >= 1.2)
+    how = "hung under the ceilings"
+    places = standing & _under(full, cell) & (room >= 0.25)
+    if places.any(axis=2).sum() < standing.any(axis=2).sum() / 3.0:
+        how = "hung inside at the height where a ceiling would be, for there is none"
+        full[:, :, -1] = True
+        places = standing & _under(full, cell) & (room >= 0.25)
+    air, _ = ndimage.label(room >= 1.5 * cell)
+    if not air[places].any():
+        return _around(low, high), "placed above and around the scene, which has no room for them inside"
+    free = air == np.bincount(air[places & (air > 0)]).argmax()
+    places &= free
+    lamps = [_widest(places, width)]
+    reach = _steps_by_air(free, lamps[0]) * cell
+    while len(lamps) < MAX_LAMPS:
+        far = float(reach[places].max())
+        if far <= 4.0:
+            break
+        # of the cells nearly as far off as the farthest, the one in most room: not the corner itself
+        lamps.append(_widest(places & (reach >= max(far - 2.0, 0.6 * far)), width))
+        reach = np.minimum(reach, _steps_by_air(free, lamps[-1]) * cell)
+    return low + (np.array(lamps) - 0.5) * cell, how
+
+
+def _under(full: NDArray[np.bool_], cell: float) -> NDArray[np.bool_]:
+    """Return the cells that have a ceiling at a lamp's distance above them."""
+    above = _gap(full[:, :, ::-1])[:, :, ::-1] * cell
+    return (above >= 0.3) & (above <= 0.9)
+
+
+def _widest(places: NDArray[np.bool_], width: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.array(np.unravel_index(np.argmax(np.where(places, width, -1.0)), width.shape))
+
+
+def _around(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    centre, reach = (low + high) / 2.0, float(np.linalg.norm(high - low))
+    angles = np.array([0.6, 0.6 + 2.0 * math.pi / 3.0, 0.6 + 4.0 * math.pi / 3.0])
+    directions = np.stack([np.cos(angles), np.sin(angles), np.full(3, 0.9)], axis=1)
+    return np.asarray(centre + 1.2 * reach * directions / np.linalg.norm(directions[0]))
+
+
+def _gap(full: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the distance in cells to the nearest full cell at a lower last index; inf: there is none."""
+    index = np.arange(full.shape[2], dtype=np.float64)
+    last = np.maximum.accumulate(np.where(full, index, -np.inf), axis=2)
+    return np.asarray(index - last)
+
+
+def _steps_by_air(free: NDArray[np.bool_], start: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the number of steps from `start` to each cell through free cells, inf where there is no way.
+
+    Steps go alternately to 6 and to 26 neighbours, whose balls are close to round.
+    """
+    reached = np.zeros(free.shape, dtype=bool)
+    reached[tuple(start)] = True
+    steps = np.full(free.shape, np.inf)
+    steps[tuple(start)] = 0.0
+    near, wide = ndimage.generate_binary_structure(3, 1), ndimage.generate_binary_structure(3, 3)
+    for step in range(1, sum(free.shape) * 2):
+        grown = ndimage.binary_dilation(reached, near if step % 2 else wide, mask=free)
+        front = grown & ~reached
+        if not front.any():
+            if step % 2 == 0:
+                break
+            continue
+        steps[front] = step
+        reached = grown
+    return steps

@@ -1,0 +1,546 @@
+"""Mesh files as scenes: glTF, GLB, OBJ, PLY, STL and whatever else trimesh reads."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydantic import Field
+from trimesh.exchange.load import mesh_formats
+
+from neurosim_core.scene.gltf import read_gltf
+from neurosim_core.scene.lamps import hang_lamps, scaled_lights
+from neurosim_core.scene.normals import smooth_normals
+from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture
+from neurosim_core.scene.source import (
+    Axis,
+    Part,
+    SceneError,
+    Source,
+    TextureStore,
+    decode_picture,
+    linear_to_srgb8,
+    rgb,
+    srgb_to_linear,
+    unique_name,
+)
+from neurosim_core.settings import Settings
+
+__all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
+
+_log = logging.getLogger(__name__)
+
+_EXTENT_MAX_M = 20_000.0
+_COLOR_WIDTH = 4096
+"""Widest texture that vertex colours are packed into [px]."""
+
+
+class MeshSceneConfig(Settings):
+    """A scene that is read from a mesh file."""
+
+    kind: Literal["mesh"] = "mesh"
+    """Kind of scene: a mesh file."""
+    file: Path
+    """glTF, GLB, OBJ, PLY, STL or another format that trimesh reads."""
+    unit_m: float | None = Field(default=None, gt=0.0)
+    """Length of one unit of the file [m], 0.001 for millimetres. None: what the file or its format says."""
+    up_axis: Axis | None = None
+    """Axis of the file that points up: x, y or z. None: what the file says, else what its geometry shows."""
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Added to every point, after units and axes [m]; brings far-off coordinates near the origin."""
+    inside_m: tuple[float, float, float] | None = None
+    """A point in free space of the loaded scene, where rooms are entered [m]. None: unknown."""
+    light_scale: float | None = Field(default=None, gt=0.0)
+    """Factor from candela in the file to radiance reflected at 1 m. None: such that rooms are well lit."""
+    missing_texture: Literal["error", "ignore"] = "error"
+    """What to do when a texture file is not there: stop, or go on with the base colour alone."""
+    ambient_up: LinearRgb = (0.35, 0.35, 0.36)
+    """Linear radiance that a white surface facing up reflects of the ambient light."""
+    ambient_down: LinearRgb = (0.22, 0.21, 0.20)
+    """Linear radiance that a white surface facing down reflects of the ambient light."""
+
+
+def load_mesh_scene(config: MeshSceneConfig) -> Scene:
+    """Read a mesh file: every instance in metres, z up, with materials, textures and lights.
+
+    Every assumption that was made is a sentence in the scene's `notes`. Transparent and metallic materials
+    become opaque Lambertian ones. Vertex and face colours become a texture in which each face has its own two
+    by two texels: bilinear lookup between three texel centres gives the linear blend of its corners.
+    Lights come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings.
+
+    Raises:
+        SceneError: If the file is missing, of an unknown format, truncated or malformed; if a texture is
+            missing or cannot be decoded; if a vertex in use is not finite; if no face is left; if the scene
+            reaches farther than 20 km from the origin.
+    """
+    path = config.file.expanduser()
+    source = _read(path, config)
+    notes = list(source.notes)
+    unit_m, sentence = _unit(config, source)
+    notes.insert(0, sentence)
+    if not any(len(part.faces) for part in source.parts):
+        raise SceneError(f"{path}: empty, there are no triangles in it")
+    parts = _placed(source.parts, path)
+    axis, sentence = _up_axis(config, source, parts)
+    notes.insert(1, sentence)
+    turn = unit_m * _TURN[axis]
+    for part in parts:
+        part["positions"] = part["positions"] @ turn.T + config.position_m
+        if part["normals"] is not None:
+            part["normals"] = part["normals"] @ _TURN[axis].T
+    _check_extent(parts, path)
+
+    arrays = _assembled(parts, source, notes, path)
+    triangles = arrays["vertices"][arrays["faces"]].astype(np.float64)
+    size = np.ptp(triangles, axis=(0, 1))
+    if config.unit_m is None and not 0.02 <= size.max() <= 500.0:
+        notes.append(
+            f"It is {size.max():.3g} m across; if that is wrong, declare unit_m (0.001 for millimetres)."
+        )
+    return Scene(
+        name=path.stem,
+        lights=_lights(config, source, turn, triangles, notes),
+        ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
+        instance_names=tuple(source.instance_names),
+        notes=tuple(notes),
+        inside_m=config.inside_m,
+        **arrays,
+    )
+
+
+def _read(path: Path, config: MeshSceneConfig) -> Source:
+    formats = sorted(mesh_formats() | {"gltf", "glb"})
+    if path.is_dir():
+        raise SceneError(f"{path}: a directory; name a mesh file in it ({', '.join(formats)})")
+    if not path.exists():
+        raise SceneError(f"{path}: no such file (looked from {Path.cwd()})")
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in formats:
+        raise SceneError(f"{path}: unknown format {path.suffix!r}, known: {', '.join(formats)}")
+    if path.stat().st_size == 0:
+        raise SceneError(f"{path}: empty, the file has no bytes")
+    required = config.missing_texture == "error"
+    if suffix in ("gltf", "glb"):
+        return read_gltf(path, textures_required=required)
+    return _read_with_trimesh(path, suffix, textures_required=required)
+
+
+class _Files(trimesh.resolvers.FilePathResolver):
+    """Finds files beside a mesh file, and remembers which it did not find."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(str(path))
+        self.missing: list[str] = []
+
+    def get(self, name: str) -> bytes:
+        name = name.strip().replace("\\", "/")
+        for candidate in (
+            name,
+            name.split()[-1] if name else name,
+        ):  # map_Kd may have options before the name
+            file = Path(self.parent) / candidate
+            if candidate and file.is_file():
+                return file.read_bytes()
+        self.missing.append(name)
+        raise FileNotFoundError(name)
+
+
+def _read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> Source:
+    files = _Files(path)
+    options: dict[str, Any] = {"split_objects": True} if suffix == "obj" else {}
+    try:
+        with path.open("rb") as stream:
+            loaded = trimesh.load_scene(stream, file_type=suffix, resolver=files, process=False, **options)
+    except Exception as error:  # trimesh's many readers raise whatever Python raises on their way
+        raise SceneError(
+            f"{path}: cannot be read as {suffix.upper()}, truncated or not one "
+            f"({type(error).__name__}: {error})"
+        ) from error
+    source = Source(up_default="y" if suffix == "obj" else "z")
+    source.up_reason = f"{suffix.upper()} files do not say which way is up"
+    if files.missing:
+        names = ", ".join(repr(name) for name in files.missing)
+        if textures_required:
+            raise SceneError(
+                f"{path}: file {names} is missing beside it; put it there, or set missing_texture to "
+                "'ignore' to go on without"
+            )
+        source.notes.append(f"Missing beside the file and left out: {names}.")
+    source.unit_reason = f"{suffix.upper()} files have no unit, metres are assumed"
+    if loaded.units is not None and suffix not in ("obj", "ply", "stl"):
+        source.unit_m = float(trimesh.units.unit_conversion(loaded.units, "meters"))
+        source.unit_reason = f"the file is in {loaded.units}"
+    store, materials, taken = TextureStore(), dict[int, int](), set[str]()
+    ignored = 0
+    for node in loaded.graph.nodes_geometry:
+        matrix, geometry = loaded.graph[node]
+        mesh = loaded.geometry[geometry]
+        if not isinstance(mesh, trimesh.Trimesh):
+            ignored += 1
+            continue
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
+            raise SceneError(f"{path}: {geometry!r} uses vertex {faces.max()} of {len(mesh.vertices)}")
+        material, uv, color = _appearance(mesh, source, materials, store, path)
+        normals = mesh._cache.cache.get(
+            "vertex_normals"
+        )  # only what the file had; the property would compute it
+        source.parts.append(
+            Part(
+                name=str(node),
+                positions=np.asarray(mesh.vertices, dtype=np.float64),
+                faces=faces,
+                matrix=np.asarray(matrix, dtype=np.float64),
+                normals=None if normals is None else np.asarray(normals, dtype=np.float64),
+                uv=uv,
+                corner_color=color,
+                material=material,
+                instance=len(source.instance_names),
+            )
+        )
+        source.instance_names.append(unique_name(str(node), taken))
+    if ignored:
+        source.notes.append(f"{ignored} objects of points and lines are left out.")
+    return source
+
+
+def _appearance(
+    mesh: Any, source: Source, known: dict[int, int], store: TextureStore, path: Path
+) -> tuple[int, NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """Return material index, texture coordinates and corner colours of a trimesh mesh."""
+    visual = mesh.visual
+    if isinstance(visual, trimesh.visual.ColorVisuals):
+        color = None
+        if visual.kind == "face":
+            color = np.repeat(srgb_to_linear(visual.face_colors[:, None, :3] / 255.0), 3, axis=1)
+        elif visual.kind == "vertex":
+            color = srgb_to_linear(visual.vertex_colors[:, :3] / 255.0)[np.asarray(mesh.faces)]
+        if -1 not in known:
+            known[-1] = len(source.materials)
+            source.materials.append(Material(name="plain", base_color=(0.8, 0.8, 0.8)))
+        if color is not None and -2 not in known:
+            known[-2] = len(source.materials)
+            source.materials.append(Material(name="colours of the file", base_color=(1.0, 1.0, 1.0)))
+        return known[-1 if color is None else -2], None, color
+    uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float64)
+    material = visual.material
+    if id(material) not in known:
+        known[id(material)] = len(source.materials)
+        source.materials.append(_material(material, store, path, len(source.materials)))
+    return known[id(material)], uv, None
+
+
+def _material(material: Any, store: TextureStore, path: Path, index: int) -> Material:
+    name = getattr(material, "name", None) or f"material {index}"
+    if isinstance(material, trimesh.visual.material.PBRMaterial):
+        base = material.baseColorFactor
+        color = (1.0, 1.0, 1.0) if base is None else rgb(np.asarray(base, dtype=np.float64) / 255.0)
+        picture, glow = material.baseColorTexture, material.emissiveFactor
+    else:
+        kd = material.kwargs.get("kd")  # as in the file; `diffuse` is rounded to 8 bits
+        base = np.asarray(material.diffuse[:3] / 255.0 if kd is None else kd, dtype=np.float64)
+        picture, glow = material.image, material.kwargs.get("ke")
+        # exporters write Kd 0 or any grey beside a texture; viewers then show the texture as it is
+        color = (1.0, 1.0, 1.0) if picture is not None else rgb(np.clip(np.resize(base, 3), 0.0, 1.0))
+    texture = None
+    if picture is not None:
+        pixels = decode_picture(picture, file=str(path), name=str(picture.info.get("file_path", name)))
+        texture = store.add(pixels, name=name)
+    emission = (0.0, 0.0, 0.0) if glow is None else rgb(np.resize(np.asarray(glow, dtype=np.float64), 3))
+    return Material(name=name, base_color=color, texture=texture, emission=emission)
+
+
+_TURN: dict[str, NDArray[np.float64]] = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+}
+"""Rotation that turns the axis up."""
+
+
+def _unit(config: MeshSceneConfig, source: Source) -> tuple[float, str]:
+    if config.unit_m is not None:
+        return config.unit_m, f"Unit: {config.unit_m:g} m, as declared."
+    return source.unit_m, f"Unit: {source.unit_m:g} m; {source.unit_reason}."
+
+
+def _up_axis(config: MeshSceneConfig, source: Source, parts: list[dict[str, Any]]) -> tuple[Axis, str]:
+    if config.up_axis is not None:
+        return config.up_axis, f"Up axis: {config.up_axis}, as declared."
+    looks = _looks_up(parts)
+    if source.up_axis is not None:
+        doubt = ""
+        if looks not in (None, source.up_axis):
+            doubt = f" Its geometry looks {looks} up; declare up_axis if it lies on its side."
+        return source.up_axis, f"Up axis: {source.up_axis}; {source.up_reason}.{doubt}"
+    if looks is not None:
+        return looks, (
+            f"Up axis: {looks}, from the geometry (flattest along {looks}, and most surfaces level in it); "
+            f"{source.up_reason}. Declare up_axis to be sure."
+        )
+    return source.up_default, (
+        f"Up axis: {source.up_default}, by custom; {source.up_reason} and the geometry does not tell. "
+        "Declare up_axis to be sure."
+    )
+
+
+def _looks_up(parts: list[dict[str, Any]]) -> Axis | None:
+    """Return the axis that a building would have up, None if it is not clear.
+
+    Clear means: flatter along it than 0.6 of both other extents, and more surface level in it (floors,
+    ceilings, table tops) than in any other.
+    """
+    triangles = np.concatenate([part["positions"][part["faces"]].reshape(-1, 3, 3) for part in parts])
+    extent = np.ptp(triangles, axis=(0, 1))
+    axis = int(np.argmin(extent))
+    if extent[axis] > 0.6 * np.delete(extent, axis).min():
+        return None
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    level = [float(area[np.abs(cross[:, a]) > 0.99 * area].sum()) for a in range(3)]
+    return None if int(np.argmax(level)) != axis or level[axis] <= 0.0 else ("x", "y", "z")[axis]
+
+
+def _check_extent(parts: list[dict[str, Any]], path: Path) -> None:
+    far = max(float(np.abs(part["positions"][part["faces"]]).max()) for part in parts if len(part["faces"]))
+    if far > _EXTENT_MAX_M:
+        raise SceneError(
+            f"{path}: reaches {far:.4g} m from the origin, allowed are {_EXTENT_MAX_M:g} m; declare unit_m "
+            "(0.001 for millimetres), or move it with position_m"
+        )
+
+
+def _placed(parts: list[Part], path: Path) -> list[dict[str, Any]]:
+    """Return parts with their transforms applied, in file units and axes."""
+    placed = []
+    for part in parts:
+        used = part.positions[part.faces.reshape(-1)]
+        bad = int((~np.isfinite(used).all(axis=1)).sum())
+        if bad or not np.isfinite(part.matrix).all():
+            what = f"{bad} corners of its faces" if bad else "its transform"
+            raise SceneError(
+                f"{path}: {part.name!r} has NaN or infinite numbers in {what}; finite ones are needed"
+            )
+        linear = part.matrix[:3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):  # vertices in no face may be anything
+            positions = part.positions @ linear.T + part.matrix[:3, 3]
+        determinant = np.linalg.det(linear)
+        faces = part.faces[:, ::-1] if determinant < 0.0 else part.faces
+        color = part.corner_color
+        if color is not None and determinant < 0.0:
+            color = color[:, ::-1]
+        normals = part.normals
+        if normals is not None:
+            # cofactors turn normals, also where the matrix is singular; a mirror would turn them inside out
+            cofactor = np.stack(
+                [
+                    np.cross(linear[1], linear[2]),
+                    np.cross(linear[2], linear[0]),
+                    np.cross(linear[0], linear[1]),
+                ]
+            )
+            normals = normals @ cofactor.T * (-1.0 if determinant < 0.0 else 1.0)
+        placed.append(
+            {
+                "positions": positions,
+                "faces": faces,
+                "thin": _is_thin(part.positions[part.faces]),
+                "normals": normals,
+                "uv": part.uv,
+                "color": color,
+                "material": part.material,
+                "instance": part.instance,
+            }
+        )
+    return placed
+
+
+def _is_thin(corner: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which triangles [F, 3, 3] are lower than 1e-7 of their longest edge: lines to float32."""
+    edge = np.roll(corner, -1, axis=1) - corner
+    longest_squared = np.einsum("fcx,fcx->fc", edge, edge).max(axis=1)
+    cross = np.cross(edge[:, 0], edge[:, 1])
+    return np.asarray(np.einsum("fx,fx->f", cross, cross) <= (1e-7 * longest_squared) ** 2)
+
+
+def _assembled(parts: list[dict[str, Any]], source: Source, notes: list[str], path: Path) -> dict[str, Any]:
+    """Join parts into the arrays of a scene, without degenerate faces and unused vertices."""
+    start = np.cumsum([0, *(len(part["positions"]) for part in parts)])
+    positions = np.concatenate([part["positions"] for part in parts]).astype(np.float32).astype(np.float64)
+    faces = np.concatenate([part["faces"] + first for part, first in zip(parts, start, strict=False)])
+    count = [len(part["faces"]) for part in parts]
+    material = np.repeat([part["material"] for part in parts], count)
+    instance = np.repeat([part["instance"] for part in parts], count)
+    owner = np.repeat(np.arange(len(parts)), np.diff(start))
+
+    # in the file's numbers, where a line is still exactly one, and as the scene stores them
+    thin = np.concatenate([part["thin"] for part in parts]) | _is_thin(positions[faces])
+    if thin.any():
+        notes.append(f"{int(thin.sum())} of {len(faces)} faces have no area and are dropped.")
+    if thin.all():
+        raise SceneError(f"{path}: empty, none of its {len(faces)} faces has an area")
+    keep = ~thin
+    faces, material, instance = faces[keep], material[keep], instance[keep]
+
+    uv = np.concatenate([np.zeros((len(p["positions"]), 2)) if p["uv"] is None else p["uv"] for p in parts])
+    used_uv = uv[faces.reshape(-1)]
+    if not np.isfinite(used_uv).all():
+        notes.append("Texture coordinates that are not finite are taken as 0.")
+        uv = np.where(np.isfinite(uv), uv, 0.0)
+    normals = np.concatenate(
+        [np.zeros((len(p["positions"]), 3)) if p["normals"] is None else p["normals"] for p in parts]
+    )
+    length = np.linalg.norm(normals, axis=1)
+    given = np.isfinite(length) & (length > 0.0)
+    normals = normals / np.where(given, length, 1.0)[:, None]
+
+    corner_vertex, corner_normal = faces.reshape(-1), np.full(faces.size, -1, dtype=np.int64)
+    lacking = ~given[faces].all(axis=1)
+    computed = np.zeros((0, 3))
+    if lacking.any():
+        computed, label = smooth_normals(positions, faces[lacking], owner)
+        corner_normal.reshape(-1, 3)[lacking] = label
+        if lacking.any():
+            notes.append(
+                f"{int(lacking.sum())} faces come without normals; they are computed, sharp at creases."
+            )
+
+    colors = [
+        np.ones((n, 3, 3)) if p["color"] is None else p["color"] for p, n in zip(parts, count, strict=True)
+    ]
+    tinted = np.repeat([p["color"] is not None for p in parts], count)[keep]
+    materials = list(source.materials)
+    color_uv: NDArray[np.float64] | None = None
+    if tinted.any():
+        material, color_uv, tinted = _tint(np.concatenate(colors)[keep], tinted, material, materials, notes)
+
+    # one vertex for each distinct pair of file vertex and normal; corners of tinted faces are never shared
+    pair = np.stack([corner_vertex, corner_normal], axis=1)
+    apart = np.repeat(tinted, 3)
+    order = np.lexsort((np.where(apart, np.arange(len(pair)), -1), pair[:, 1], pair[:, 0]))
+    new = np.ones(len(pair), dtype=bool)
+    new[1:] = (pair[order[1:]] != pair[order[:-1]]).any(axis=1) | apart[order[1:]] | apart[order[:-1]]
+    index = np.empty(len(pair), dtype=np.int64)
+    index[order] = np.cumsum(new) - 1
+    first = order[new]
+    vertex, normal = corner_vertex[first], corner_normal[first]
+    final_normals = normals[vertex]
+    final_normals[normal >= 0] = computed[normal[normal >= 0]]
+    final_uv = uv[vertex]
+    if color_uv is not None:
+        final_uv = np.where(apart[first][:, None], color_uv[first], final_uv)
+
+    used, face_material = np.unique(material, return_inverse=True)
+    return {
+        "vertices": positions[vertex].astype(np.float32),
+        "faces": index.reshape(-1, 3).astype(np.int32),
+        "normals": final_normals.astype(np.float32),
+        "uv": final_uv.astype(np.float32),
+        "face_material": face_material.astype(np.int32),
+        "face_instance": instance.astype(np.int32),
+        "materials": tuple(materials[i] for i in used),
+    }
+
+
+def _tint(
+    color: NDArray[np.float64],
+    tinted: NDArray[np.bool_],
+    material: NDArray[np.int64],
+    materials: list[Material],
+    notes: list[str],
+) -> tuple[NDArray[np.int64], NDArray[np.float64] | None, NDArray[np.bool_]]:
+    """Turn corner colours [F, 3, 3] into materials and texture coordinates.
+
+    Returns:
+        Material of each face, texture coordinates of each corner [3F, 2] (None: no texture), and which faces
+        use them.
+    """
+    material = material.copy()
+    textured = np.array([m.texture is not None for m in materials])[material]
+    plain = tinted & ~textured
+    if (tinted & textured).any():
+        notes.append("Vertex colours of textured faces are left out.")
+    color_uv = None
+    patched = np.zeros(len(color), dtype=bool)
+    for index in np.unique(material[plain]):
+        here = plain & (material == index)
+        base = materials[index]
+        shade = np.clip(color[here], 0.0, 1.0) * base.base_color
+        if np.ptp(shade, axis=(0, 1)).max() < 1e-3:
+            materials.append(
+                Material(name=base.name, base_color=rgb(shade.mean(axis=(0, 1))), emission=base.emission)
+            )
+        else:
+            texture, uv = _patches(shade, base.name)
+            materials.append(
+                Material(name=base.name, base_color=(1.0, 1.0, 1.0), texture=texture, emission=base.emission)
+            )
+            color_uv = np.zeros((len(color), 3, 2)) if color_uv is None else color_uv
+            color_uv[here] = uv
+            patched |= here
+        material[here] = len(materials) - 1
+    if patched.any():
+        notes.append(
+            f"Colours of {int(patched.sum())} faces are packed into textures, two by two texels to a face."
+        )
+    return material, None if color_uv is None else color_uv.reshape(-1, 2), patched
+
+
+def _patches(color: NDArray[np.float64], name: str) -> tuple[Texture, NDArray[np.float64]]:
+    """Pack corner colours [F, 3, 3] into a texture, two by two texels to a face, in the order of the faces.
+
+    Corners sit at three texel centres and the fourth texel continues the plane through them, so the bilinear
+    lookup is the linear blend of the corners, up to 8 bits and to clipping of the fourth.
+    """
+    side = 2 ** math.ceil(math.log2(2.0 * math.sqrt(len(color))))
+    width = min(side, _COLOR_WIDTH)
+    columns = width // 2
+    rows = -(-len(color) // columns)
+    height = 2 * rows
+    texels = np.zeros((rows * columns, 2, 2, 3))
+    texels[: len(color), 0, 0] = color[:, 0]
+    texels[: len(color), 0, 1] = color[:, 1]
+    texels[: len(color), 1, 0] = color[:, 2]
+    texels[: len(color), 1, 1] = color[:, 1] + color[:, 2] - color[:, 0]
+    texels[len(color) :] = color.mean(axis=(0, 1))
+    image = texels.reshape(rows, columns, 2, 2, 3).transpose(0, 2, 1, 3, 4).reshape(height, width, 3)
+    face = np.arange(len(color))
+    column, row = 2 * (face % columns), 2 * (face // columns)
+    at = np.stack([column, row], axis=1)[:, None] + np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
+    uv = at / [width, height]
+    uv[:, :, 1] = 1.0 - uv[:, :, 1]
+    return Texture(name=f"{name} (vertex colours)", srgb=linear_to_srgb8(image)), uv
+
+
+def _lights(
+    config: MeshSceneConfig,
+    source: Source,
+    turn: NDArray[np.float64],
+    triangles: NDArray[np.float64],
+    notes: list[str],
+) -> Any:
+    if not source.lamps:
+        places, sentence = hang_lamps(triangles)
+        notes.append(f"The file has no lights; {len(places)} are {sentence}.")
+        return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), triangles, factor=None)[0]
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    away = 20.0 * float(np.linalg.norm(high - low))
+    positions, intensities = [], []
+    for lamp in source.lamps:
+        vector = turn @ lamp.vector
+        if lamp.kind == "directional":  # a point light so far off that its rays are parallel
+            vector = vector / np.linalg.norm(vector)
+            positions.append((low + high) / 2.0 - away * vector)
+            intensities.append(rgb(np.asarray(lamp.intensity) * away**2))
+        else:
+            positions.append(vector + config.position_m)
+            intensities.append(lamp.intensity)
+    lights, factor = scaled_lights(positions, intensities, triangles, factor=config.light_scale)
+    how = "as declared" if config.light_scale is not None else "so that the median surface is well lit"
+    notes.append(f"{len(lights)} lights of the file, their intensities (cd, lx) times {factor:.3g}, {how}.")
+    return lights

@@ -1,0 +1,71 @@
+"""Shading normals of a mesh that has none: smooth over gentle edges, sharp over creases."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+CREASE_RAD = 0.7
+"""Edges whose faces differ by more than this stay sharp [rad]; 40 degrees."""
+
+
+def smooth_normals(
+    positions: NDArray[np.float64], faces: NDArray[np.int64], group: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the normal of each corner of each face, shared where the surface is smooth.
+
+    Corners that meet at one position are joined when a chain of faces leads from one to the other over edges
+    that are no creases; joined corners get the mean of their faces' normals, weighted by the corners' angles
+    (Thürmer and Wüthrich 1998), so the result does not depend on how a surface is cut into triangles.
+
+    Args:
+        positions: Of each vertex, shape [V, 3]. Vertices at equal positions are one, as at a texture seam.
+        faces: Vertex indices, shape [F, 3]; of no face is the area zero.
+        group: Which object each vertex belongs to, shape [V]; objects are not smoothed into each other.
+
+    Returns:
+        Unit normals, shape [N, 3], and for each corner the index of its normal, shape [F, 3].
+    """
+    if len(faces) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    key = np.empty((len(positions), 4), dtype=np.int64)
+    key[:, :3] = np.ascontiguousarray(positions + 0.0).view(np.int64)  # + 0.0 makes -0.0 equal to 0.0
+    key[:, 3] = group
+    order = np.lexsort(key.T)
+    new = np.ones(len(key), dtype=np.int64)
+    new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
+    point = np.empty(len(key), dtype=np.int64)
+    point[order] = np.cumsum(new) - 1
+
+    corner = positions[faces]
+    edge = np.roll(corner, -1, axis=1) - corner
+    face_normal = np.cross(edge[:, 0], edge[:, 1])
+    face_normal /= np.linalg.norm(face_normal, axis=1, keepdims=True)
+    direction = edge / np.linalg.norm(edge, axis=2, keepdims=True)
+    cosine = -np.einsum("fcx,fcx->fc", direction, np.roll(direction, 1, axis=1))
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+
+    # half-edges c -> c + 1 of each face; the two of one edge become neighbours when sorted by their ends
+    tail = np.arange(faces.size)
+    head = tail + 1 - 3 * (tail % 3 == 2)
+    ends = np.sort(point[faces].reshape(-1)[np.stack([tail, head], axis=1)], axis=1)
+    sorted_edges = np.lexsort((ends[:, 1], ends[:, 0]))
+    first, second = sorted_edges[:-1], sorted_edges[1:]
+    gentle = (ends[first] == ends[second]).all(axis=1)
+    gentle &= np.einsum("ex,ex->e", face_normal[first // 3], face_normal[second // 3]) > np.cos(CREASE_RAD)
+    first, second = first[gentle], second[gentle]
+    at = point[faces].reshape(-1)
+    same = at[first] == at[second]  # else the faces run along the edge in opposite senses, as they should
+    joined_a = np.concatenate([first, head[first]])
+    joined_b = np.concatenate([np.where(same, second, head[second]), np.where(same, head[second], second)])
+    links = coo_matrix((np.ones(len(joined_a), dtype=np.int8), (joined_a, joined_b)), shape=(faces.size,) * 2)
+    count, label = connected_components(links, directed=False)
+    weighted = (angle[:, :, None] * face_normal[:, None, :]).reshape(-1, 3)
+    total = np.empty((int(count), 3))
+    for axis in range(3):
+        total[:, axis] = np.bincount(label, weights=weighted[:, axis], minlength=int(count))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    total /= np.where(length > 0.0, length, 1.0)
+    return total, label.reshape(-1, 3).astype(np.int64)
