@@ -39,8 +39,7 @@ def hermite_matrix(order: int) -> Array:
 
     Returns:
         Shape [2 order, 2 order]: column k < order belongs to derivative k at 0, column order + k to
-        derivative k at
-        1, row j to power j.
+        derivative k at 1, row j to power j.
     """
     powers = np.arange(2 * order)
     values = np.zeros((2 * order, 2 * order))

@@ -257,7 +257,7 @@ class Path:
             inner = start_ns + (np.arange(count + 1) * (end_ns - start_ns)) // count
             u = (inner - start_ns) / (end_ns - start_ns)
             knots.append(inner[:-1])
-            pieces.append(np.einsum("pkj,aj->pak", _restriction(u, self.degree), piece))
+            pieces.append(np.einsum("pkj,aj->pak", restriction(u, self.degree), piece))
         return Path(np.concatenate([*knots, self.knots_ns[-1:]]), np.concatenate(pieces))
 
     def with_yaw(self, coefficients: NDArray[np.float64]) -> Path:
@@ -276,8 +276,16 @@ def join_axes(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArra
     return np.concatenate(padded, axis=1)
 
 
-def _restriction(u: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Matrices [part, power, power] that take a polynomial's coefficients to those on [u[i], u[i + 1]]."""
+def restriction(u: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Return matrices that take a polynomial's coefficients to those on its parts.
+
+    Args:
+        u: Where parts begin and end, in normalised time, shape [part + 1].
+        degree: Of the polynomial.
+
+    Returns:
+        Shape [part, degree + 1, degree + 1]; each part has its own normalised time in [0, 1].
+    """
     shift, scale = u[:-1], np.diff(u)
     matrix = np.zeros((len(shift), degree + 1, degree + 1))
     binomial = np.ones(1)

@@ -1,0 +1,82 @@
+"""Looking where one flies: a smooth heading whose rate is bounded by construction.
+
+The direction of travel, seen a little ahead, is unwrapped and replaced by the nearest function (in the
+largest difference) whose slope stays within the limit: the mean of its two Lipschitz envelopes. A Gaussian
+rounds it. The result gives the control points of a clamped quintic B-spline at its Greville abscissae; the
+spline's slope is a convex combination of slopes between neighbouring control points, so the limit holds
+everywhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, PPoly
+from scipy.ndimage import gaussian_filter1d
+
+from neurosim_core.clock import NS_PER_S
+from neurosim_core.trajectory.path import Path
+
+Array = NDArray[np.float64]
+
+_DEGREE = 5
+_KNOT_SPACING_S = 0.15
+_SAMPLE_NS = 10_000_000
+_SMOOTHING_S = 0.15
+"""Standard deviation of the Gaussian: at a yaw rate of 1 rad/s it cuts a corner by 0.1 rad."""
+_HORIZONTAL_MIN_M = 0.02
+"""Below this displacement over the lookahead there is no direction of travel, and it is interpolated."""
+
+
+def follow_travel(path: Path, *, lookahead_s: float, rate_max_rad_s: float) -> Path:
+    """Return a path with the same positions that looks where it flies.
+
+    The heading is four times continuously differentiable inside, and at rest at both ends. Pieces are cut so
+    that
+    none is longer than 0.15 s.
+
+    Args:
+        path: Positions; its yaw is replaced. A path without horizontal motion keeps yaw 0.
+        lookahead_s: The heading points to where the path will be after this time [s], > 0.
+        rate_max_rad_s: Largest yaw rate [rad/s], > 0; holds everywhere.
+    """
+    fine = path.subdivided(np.maximum(np.ceil(path.durations_s / _KNOT_SPACING_S), 1.0).astype(np.int64))
+    knots_s = (fine.knots_ns - fine.start_ns) / NS_PER_S
+    clamped = np.concatenate([np.full(_DEGREE, knots_s[0]), knots_s, np.full(_DEGREE, knots_s[-1])])
+    greville = np.lib.stride_tricks.sliding_window_view(clamped[1:-1], _DEGREE).mean(axis=1)
+    # three equal control points at each end: yaw rate and acceleration start and end at zero
+    asked_s = (
+        np.clip(greville, greville[2], greville[-3])
+        if len(greville) > 5
+        else np.full(len(greville), knots_s[0])
+    )
+
+    stamps_ns = np.arange(path.start_ns, path.end_ns + _SAMPLE_NS, _SAMPLE_NS, dtype=np.int64)
+    stamps_s = (stamps_ns - path.start_ns) / NS_PER_S
+    ahead_ns = stamps_ns + round(lookahead_s * NS_PER_S)
+    here_and_ahead = path.evaluate(np.concatenate([stamps_ns, ahead_ns])).position
+    way = here_and_ahead[len(stamps_ns) :, :2] - here_and_ahead[: len(stamps_ns), :2]
+    moving = np.linalg.norm(way, axis=1) >= _HORIZONTAL_MIN_M
+    if not moving.any():
+        return fine.with_yaw(np.zeros((len(fine.coefficients), 1)))
+    heading = np.unwrap(np.arctan2(way[moving, 1], way[moving, 0]))
+    target = np.interp(stamps_s, stamps_s[moving], heading)
+    limited = _nearest_with_slope(target, stamps_s, rate_max_rad_s)
+    smooth = gaussian_filter1d(limited, _SMOOTHING_S * NS_PER_S / _SAMPLE_NS, mode="nearest")
+
+    spline = BSpline(clamped, np.interp(asked_s, stamps_s, smooth), _DEGREE)
+    powers = np.asarray(PPoly.from_spline(spline.tck).c)[::-1]  # of seconds since the knot
+    pieces = powers[:, _DEGREE : _DEGREE + len(fine.coefficients)].T
+    return fine.with_yaw(pieces * np.diff(knots_s)[:, None] ** np.arange(_DEGREE + 1))
+
+
+def _nearest_with_slope(values: Array, times_s: Array, slope_max: float) -> Array:
+    """The function with at most this slope that is nearest to samples: mean of the two envelopes."""
+
+    def lower_envelope(v: Array) -> Array:  # largest function with the slope that is nowhere above v
+        ramp = slope_max * times_s
+        ahead = np.minimum.accumulate(v - ramp) + ramp
+        behind = np.minimum.accumulate((v + ramp)[::-1])[::-1] - ramp
+        return np.asarray(np.minimum(ahead, behind))
+
+    return np.asarray(0.5 * (lower_envelope(values) - lower_envelope(-values)))
