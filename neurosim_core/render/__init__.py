@@ -1,0 +1,1 @@
+"""Cameras: rays, light and pictures."""

@@ -1,0 +1,68 @@
+"""Launches of kernels that use all cores of a CPU.
+
+Warp runs a CPU kernel on the calling thread. The call lets go of the interpreter, so slices of one launch run on
+a pool of threads. A kernel that is launched this way takes the index of its first thread as its first parameter.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+_SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
+
+
+def core_count() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@cache
+def _pool(thread_count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
+
+
+def launch_split(
+    kernel: wp.Kernel,
+    *,
+    dim: int,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    device: str,
+    thread_count: int | None = None,
+) -> None:
+    """Launch a kernel of one dimension: on CUDA at once, on the CPU in slices on all cores.
+
+    Returns when a CPU has finished; does not wait for a CUDA device. Threads of the kernel must not depend on each
+    other. Slices begin at multiples of 64.
+
+    Args:
+        kernel: Its first parameter is the index of its first thread, an int.
+        dim: Number of threads.
+        inputs: Parameters after the first.
+        outputs: Parameters after the inputs.
+        device: Where to launch.
+        thread_count: Threads of the pool; all cores if None.
+    """
+    threads = thread_count or core_count()
+    slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64
+    if not wp.get_device(device).is_cpu or threads == 1 or slice_size >= dim:
+        wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=64)
+        return
+    wp.load_module(kernel.module, device=device)  # not in the pool: a kernel must be compiled once
+
+    def run(first: int) -> None:
+        size = min(slice_size, dim - first)
+        wp.launch(
+            kernel, dim=size, inputs=[first, *inputs], outputs=list(outputs), device=device, block_dim=64
+        )
+
+    for _ in _pool(threads).map(run, range(0, dim, slice_size)):
+        pass

@@ -1,0 +1,341 @@
+# mypy: disable-error-code="index,attr-defined,misc"
+"""Light: the one equation of how a surface looks, and its shadows, computed once per scene.
+
+Linear radiance of a Lambertian surface, seen from the side of its normal n (surfaces are two-sided: n points to the
+viewer):
+
+    radiance = albedo * (ambient(n) + sum_lights intensity * max(cos, 0) / d^2) + emission
+    ambient(n) = up * (1 + n_z) / 2 + down * (1 - n_z) / 2
+
+Scene and lights do not move, so the bracket, the light that a white surface reflects, does not depend on the view:
+`bake_light` computes it once, with shadows and ambient occlusion, and a renderer only interpolates.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.render.config import LightingConfig
+from neurosim_core.render.launch import launch_split
+from neurosim_core.scene.scene import Scene
+
+wp.set_module_options({"enable_backward": False})
+
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_OFFSET_M = wp.constant(1.0e-3)
+_INSET_MAX_M = wp.constant(0.03)
+
+
+@wp.func
+def ambient_light(normal: wp.vec3, up: wp.vec3, down: wp.vec3) -> wp.vec3:
+    """Return what a white surface reflects of the hemispheric ambient light."""
+    blend = 0.5 + 0.5 * normal[2]
+    return blend * up + (1.0 - blend) * down
+
+
+@wp.func
+def point_light(
+    point: wp.vec3, normal: wp.vec3, position: wp.vec3, intensity: wp.vec3, light_radius_m: float
+) -> wp.vec3:
+    """Return what a white surface reflects of an unshaded point light: intensity * max(cos, 0) / d^2."""
+    to_light = position - point
+    distance2 = wp.dot(to_light, to_light)
+    cosine = wp.dot(to_light, normal) / wp.sqrt(wp.max(distance2, 1.0e-12))
+    return (wp.max(cosine, 0.0) / wp.max(distance2, light_radius_m * light_radius_m)) * intensity
+
+
+@wp.func
+def reflect_light(albedo: wp.vec3, light: wp.vec3, emission: wp.vec3) -> wp.vec3:
+    """Return the radiance of a surface, given what a white one would reflect."""
+    return wp.cw_mul(albedo, light) + emission
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedMesh:
+    """Triangles of a scene after `refine`."""
+
+    vertices: NDArray[np.float32]
+    """Positions [m], shape [V, 3]; the first are those of the scene."""
+    normals: NDArray[np.float32]
+    """Unit shading normals, shape [V, 3]."""
+    uv: NDArray[np.float32]
+    """Texture coordinates, shape [V, 2]."""
+    faces: NDArray[np.int32]
+    """Vertex indices, shape [F, 3]."""
+    origin: NDArray[np.int32]
+    """Face of the scene that each face is a part of, shape [F]."""
+
+
+def refine(scene: Scene, edge_max_m: float | None) -> RefinedMesh:
+    """Split edges of triangles in halves until none is longer than `edge_max_m`; None: leave all as they are.
+
+    Whether an edge is split, and where, depends on nothing but its two ends, so faces that share an edge (also with
+    vertices of their own at the same places) split it alike: no cracks, no T-junctions. Area is preserved.
+    """
+    vertices, normals, uv = scene.vertices, scene.normals, scene.uv
+    faces = scene.faces
+    origin = np.arange(len(faces), dtype=np.int32)
+    while edge_max_m is not None:
+        tips = vertices[faces]
+        sides = tips[:, (1, 2, 0)] - tips  # side k goes from corner k to corner k + 1
+        long = np.einsum("fkc,fkc->fk", sides, sides) > np.float32(edge_max_m**2)
+        split = long.any(axis=1)
+        if not split.any():
+            break
+        chosen, chosen_long = faces[split], long[split]
+        ends = np.sort(np.stack([chosen, chosen[:, (1, 2, 0)]], axis=-1), axis=-1)[chosen_long].astype(
+            np.int64
+        )
+        keys, index = np.unique(ends[:, 0] * len(vertices) + ends[:, 1], return_inverse=True)
+        first, second = keys // len(vertices), keys % len(vertices)
+        middle = np.full(chosen.shape, -1, dtype=np.int32)
+        middle[chosen_long] = len(vertices) + index
+        halves = np.float32(0.5) * (normals[first] + normals[second])
+        length = np.linalg.norm(halves, axis=1, keepdims=True)
+        halves = np.where(length > 1e-3, halves / np.maximum(length, 1e-3), normals[first])
+        vertices = np.concatenate([vertices, np.float32(0.5) * (vertices[first] + vertices[second])])
+        normals = np.concatenate([normals, halves])
+        uv = np.concatenate([uv, np.float32(0.5) * (uv[first] + uv[second])])
+        parts, parents = _split_faces(vertices, chosen, middle)
+        faces = np.concatenate([faces[~split], parts])
+        origin = np.concatenate([origin[~split], origin[split][parents]])
+    order = np.argsort(origin, kind="stable")  # parts of a face stay together: neighbours in space and memory
+    return RefinedMesh(vertices=vertices, normals=normals, uv=uv, faces=faces[order], origin=origin[order])
+
+
+def _split_faces(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], middle: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Return the parts of faces [F, 3] and the row each comes from.
+
+    `middle` [F, 3] is the vertex in the middle of side k (from corner k to k + 1), -1 where it is not split.
+    """
+    parts: list[NDArray[np.int32]] = []
+    parents: list[NDArray[np.int64]] = []
+
+    def add(rows: NDArray[np.int64], *corners: NDArray[np.int32]) -> None:
+        parts.append(np.stack(corners, axis=1))
+        parents.append(rows)
+
+    count = (middle >= 0).sum(axis=1)
+    rows = np.flatnonzero(count == 3)
+    (a, b, c), (ab, bc, ca) = faces[rows].T, middle[rows].T
+    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
+        add(rows, *corners)
+    # Turned so that with one split side it is a-b, with two the whole side is c-a.
+    for turn in range(3):
+        turned, turned_middle = np.roll(faces, -turn, axis=1), np.roll(middle, -turn, axis=1)
+        rows = np.flatnonzero((count == 1) & (turned_middle[:, 0] >= 0))
+        (a, b, c), ab = turned[rows].T, turned_middle[rows, 0]
+        add(rows, a, ab, c)
+        add(rows, ab, b, c)
+        rows = np.flatnonzero((count == 2) & (turned_middle[:, 2] < 0))
+        (a, b, c), (ab, bc) = turned[rows].T, turned_middle[rows, :2].T
+        add(rows, ab, b, bc)
+        # The rest is a quadrangle a, ab, bc, c: cut along its shorter diagonal.
+        from_a = np.linalg.norm(vertices[a] - vertices[bc], axis=1) <= np.linalg.norm(
+            vertices[ab] - vertices[c], axis=1
+        )
+        add(rows[from_a], a[from_a], ab[from_a], bc[from_a])
+        add(rows[from_a], a[from_a], bc[from_a], c[from_a])
+        add(rows[~from_a], a[~from_a], ab[~from_a], c[~from_a])
+        add(rows[~from_a], ab[~from_a], bc[~from_a], c[~from_a])
+    return np.concatenate(parts), np.concatenate(parents)
+
+
+@wp.kernel
+def _bake(
+    first: int,
+    # Model:
+    occluders: wp.uint64,
+    ambient_up: wp.vec3,
+    ambient_down: wp.vec3,
+    light_position: wp.array[wp.vec3],
+    light_intensity: wp.array[wp.vec3],
+    light_radius_m: float,
+    ambient_radius_m: float,
+    interreflection: float,
+    hemisphere: wp.array[wp.vec3],
+    sphere: wp.array[wp.vec3],
+    # In:
+    vertices: wp.array[wp.vec3],
+    faces: wp.array[wp.vec3i],
+    group_normal: wp.array[wp.vec3],
+    group_first: wp.array[int],
+    group_corner: wp.array[int],
+    # Out:
+    light_out: wp.array[wp.vec3],
+) -> None:
+    index = first + wp.tid()
+    group = index // 2
+    side = 1.0 - 2.0 * float(index % 2)
+    normal = side * group_normal[group]
+    begin = group_first[group]
+    count = group_first[group + 1] - begin
+
+    handed = wp.where(normal[2] < 0.0, -1.0, 1.0)
+    a = -1.0 / (handed + normal[2])
+    b = normal[0] * normal[1] * a
+    tangent = wp.vec3(1.0 + handed * normal[0] * normal[0] * a, handed * b, -handed * normal[0])
+    bitangent = wp.vec3(b, handed + normal[1] * normal[1] * a, -normal[1])
+
+    point = wp.vec3(0.0)
+    openness = float(0.0)
+    for ray in range(hemisphere.shape[0]):
+        corner = group_corner[begin + ray % count]
+        origin, face_normal, point = _sample_point(vertices, faces, corner, normal)
+        local = hemisphere[ray]
+        direction = local[0] * tangent + local[1] * bitangent + local[2] * normal
+        below = wp.dot(direction, face_normal)
+        if below < 0.0:
+            direction = direction - 2.0 * below * face_normal
+        query = wp.mesh_query_ray(occluders, origin, direction, ambient_radius_m)
+        near = wp.where(query.result, query.t / ambient_radius_m, 1.0)
+        openness += near * (2.0 - near)
+    openness = openness / float(hemisphere.shape[0])
+    openness = openness / (1.0 - interreflection * (1.0 - openness))
+    light = openness * ambient_light(normal, ambient_up, ambient_down)
+
+    for lamp in range(light_position.shape[0]):
+        unshaded = point_light(point, normal, light_position[lamp], light_intensity[lamp], light_radius_m)
+        if wp.max(unshaded) > 0.0:
+            clear = int(0)
+            for ray in range(sphere.shape[0]):
+                corner = group_corner[begin + ray % count]
+                origin, face_normal, corner_point = _sample_point(vertices, faces, corner, normal)
+                to_light = light_position[lamp] + light_radius_m * sphere[ray] - origin
+                distance = wp.length(to_light)
+                if not wp.mesh_query_ray_anyhit(occluders, origin, to_light / distance, distance):
+                    clear += 1
+            light = light + (float(clear) / float(sphere.shape[0])) * unshaded
+    light_out[index] = light
+
+
+@wp.func
+def _sample_point(vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner: int, normal: wp.vec3):
+    # A little inside the corner, a little off the surface: not in the edge where two surfaces meet.
+    face = faces[corner // 3]
+    p0 = vertices[face[0]]
+    p1 = vertices[face[1]]
+    p2 = vertices[face[2]]
+    point = vertices[face[corner % 3]]
+    face_normal = wp.normalize(wp.cross(p1 - p0, p2 - p0))
+    if wp.dot(face_normal, normal) < 0.0:
+        face_normal = -face_normal
+    inwards = (p0 + p1 + p2) / 3.0 - point
+    inset = wp.min(0.25, _INSET_MAX_M / wp.max(wp.length(inwards), 1.0e-9))
+    return point + inset * inwards + _OFFSET_M * face_normal, face_normal, point
+
+
+def _hemisphere(count: int) -> NDArray[np.float32]:
+    """Return cosine-weighted directions about z, a Fibonacci spiral, shape [count, 3]."""
+    k = np.arange(count)
+    radius2 = (k + 0.5) / count
+    angle = k * _GOLDEN_ANGLE
+    radius = np.sqrt(radius2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - radius2)], 1).astype(
+        np.float32
+    )
+
+
+def _sphere(count: int) -> NDArray[np.float32]:
+    """Return evenly spread directions, a Fibonacci spiral, shape [count, 3]."""
+    k = np.arange(count)
+    z = 1.0 - (2.0 * k + 1.0) / count
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z], 1).astype(
+        np.float32
+    )
+
+
+def corner_normals(mesh: RefinedMesh) -> NDArray[np.float32]:
+    """Return the shading normal of each corner, turned to the front of its face, shape [F, 3, 3]."""
+    tips = mesh.vertices[mesh.faces]
+    front = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
+    normals = mesh.normals[mesh.faces]
+    sign = np.where(np.einsum("fkc,fc->fk", normals, front) < 0.0, np.float32(-1.0), np.float32(1.0))
+    return normals * sign[..., None]
+
+
+def _group_corners(
+    mesh: RefinedMesh, normals: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return a group number for each corner [3F] and one corner of each group: same place, same normal.
+
+    Places are told apart to 2^-20 of the scene's size, normals to 1/64.
+    """
+    low = mesh.vertices.min(axis=0)
+    quantum = max(float((mesh.vertices.max(axis=0) - low).max()) / (1 << 20), 1e-9)
+    place = np.rint((mesh.vertices - low) / quantum).astype(np.int64)
+    _, place_id = np.unique(place[:, 0] << 42 | place[:, 1] << 21 | place[:, 2], return_inverse=True)
+    facing = np.rint(normals.reshape(-1, 3) * 64.0).astype(np.int64) + 64
+    key = place_id[mesh.faces.reshape(-1)] << 24 | facing[:, 0] << 16 | facing[:, 1] << 8 | facing[:, 2]
+    _, example, group = np.unique(key, return_index=True, return_inverse=True)
+    return group, example
+
+
+def bake_light(
+    scene: Scene, mesh: RefinedMesh, config: LightingConfig, *, device: str
+) -> NDArray[np.float32]:
+    """Compute the light that a white surface reflects at each corner of each face, on both sides.
+
+    Corners in the same place with the same shading normal share one value: the rays are spread over all of them.
+    Point lights are dimmed by the share of shadow rays that reach them. Ambient light is dimmed by the mean over
+    cosine-weighted rays of (1 - t / R)^2 where something is hit at t < R; of what is taken, occluders
+    give back `interreflection`, and so on: open / (1 - interreflection (1 - open)). Emitting faces cast no shadow, so a
+    light may sit inside its lamp. Directions are fixed: the same scene gives the same light.
+
+    Args:
+        scene: Materials, lights and the triangles that cast shadows.
+        mesh: Where light is wanted: the scene, refined.
+        config: Numbers of rays, radii.
+        device: Where to compute.
+
+    Returns:
+        Linear light, shape [2, F, 3, 3]: front and back, face, corner, RGB.
+    """
+    normals = corner_normals(mesh)
+    group, example = _group_corners(mesh, normals)
+    order = np.argsort(group, kind="stable").astype(np.int32)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
+    dark = np.array([max(m.emission) <= 0.0 for m in scene.materials])[scene.face_material]
+    shading = scene.faces[dark] if dark.any() else np.zeros((1, 3), dtype=np.int32)  # a point hides nothing
+    occluders = wp.Mesh(
+        wp.array(scene.vertices, dtype=wp.vec3, device=device),
+        wp.array(shading.reshape(-1), dtype=int, device=device),
+        bvh_constructor="sah",
+        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
+    )
+    light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
+    lamps = np.array([lamp.position_m for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
+    power = np.array([lamp.intensity for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
+    launch_split(
+        _bake,
+        dim=2 * len(example),
+        inputs=[
+            occluders.id,
+            wp.vec3(*scene.ambient.up),
+            wp.vec3(*scene.ambient.down),
+            wp.array(lamps, dtype=wp.vec3, device=device),
+            wp.array(power, dtype=wp.vec3, device=device),
+            config.light_radius_m,
+            config.ambient_radius_m,
+            config.interreflection,
+            wp.array(_hemisphere(config.ambient_ray_count), dtype=wp.vec3, device=device),
+            wp.array(_sphere(config.shadow_ray_count), dtype=wp.vec3, device=device),
+            wp.array(mesh.vertices, dtype=wp.vec3, device=device),
+            wp.array(mesh.faces, dtype=wp.vec3i, device=device),
+            wp.array(normals.reshape(-1, 3)[example], dtype=wp.vec3, device=device),
+            wp.array(starts, dtype=int, device=device),
+            wp.array(order, dtype=int, device=device),
+        ],
+        outputs=[light],
+        device=device,
+    )
+    per_group = light.numpy().reshape(-1, 2, 3)
+    return np.ascontiguousarray(np.moveaxis(per_group[group], 1, 0)).reshape(2, -1, 3, 3)

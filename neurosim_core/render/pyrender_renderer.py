@@ -1,0 +1,214 @@
+"""The second renderer: rgb and depth through pyrender and OpenGL, to check the first one against.
+
+Geometry, visibility, perspective and texture filtering are OpenGL's; light is that of `lighting`, as colours of
+vertices. All that pyrender 0.1.45 needs on current libraries is in this module.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import warnings
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.config import RenderConfig
+from neurosim_core.render.lighting import bake_light, refine
+from neurosim_core.render.warp_renderer import auto_exposure
+from neurosim_core.scene.materials import mean_albedo, pack_textures
+from neurosim_core.scene.scene import Scene
+
+_NEAR_M = 0.02
+_OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+_GAMMA = 2.2  # of pyrender's shader
+_INSTALL_OPENGL = (
+    "OpenGL without a display needs EGL and a driver, for example: apt-get install libegl1 libgl1-mesa-dri; "
+    "or render with backend: warp, which needs neither"
+)
+
+
+class PyrenderError(RuntimeError):
+    """pyrender or OpenGL cannot be used on this machine; the message says what to install."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PyrenderScene:
+    """A scene as pyrender keeps it; shared by all cameras."""
+
+    scene: Scene
+    config: RenderConfig
+    nodes: Any
+    """pyrender.Scene."""
+    exposure: float
+
+
+def _import_pyrender() -> Any:
+    """Import pyrender on current NumPy, on the platform that needs no display."""
+    if "PYOPENGL_PLATFORM" not in os.environ:  # read once, when OpenGL is imported
+        if ctypes.util.find_library("EGL") is None:
+            raise PyrenderError(_INSTALL_OPENGL)
+        os.environ["PYOPENGL_PLATFORM"] = "egl"
+    if not hasattr(np, "infty"):
+        np.infty = np.inf  # removed in NumPy 2.0, used by pyrender 0.1.45
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of libraries that pyrender brings
+            import pyrender
+    except ImportError as error:
+        raise PyrenderError(f"pyrender cannot be used ({error}): pip install 'neurosim[render]'") from error
+    return pyrender
+
+
+def upload_pyrender_scene(scene: Scene, config: RenderConfig, *, device: str) -> PyrenderScene:
+    """Light a scene and hand it to pyrender.
+
+    Each side of a surface is a copy with its own light; OpenGL culls the one that is turned away. Faces that emit
+    show only their emission.
+
+    Args:
+        scene: What to render.
+        config: How to light it; mip levels and samples are OpenGL's own.
+        device: Where light is baked.
+
+    Raises:
+        PyrenderError: pyrender is not installed or there is no OpenGL.
+    """
+    pyrender = _import_pyrender()
+    mesh = refine(scene, config.lighting.edge_max_m)
+    light = bake_light(scene, mesh, config.lighting, device=device)
+    albedo = mean_albedo(scene.materials, pack_textures(scene.materials))
+    material_of = scene.face_material[mesh.origin]
+    exposure = config.exposure
+    if exposure == "auto":
+        exposure = auto_exposure(mesh, light, albedo[material_of])
+    nodes = pyrender.Scene(
+        bg_color=[*_to_display(exposure * np.array(scene.sky)), 1.0], ambient_light=[1.0] * 3
+    )
+    for index, material in enumerate(scene.materials):
+        chosen = np.flatnonzero(material_of == index)
+        if not chosen.size:
+            continue
+        emits = max(material.emission) > 0.0
+        look = pyrender.MetallicRoughnessMaterial(
+            baseColorFactor=[*((0.0,) * 3 if emits else material.base_color), 1.0],
+            baseColorTexture=None if material.texture is None else _texture(pyrender, material.texture.srgb),
+            emissiveFactor=np.sqrt(exposure * np.array(material.emission)),  # the shader squares it
+            metallicFactor=0.0,
+            doubleSided=False,
+        )
+        sides = []
+        for side, corners in enumerate(((0, 1, 2), (0, 2, 1))):
+            vertices = mesh.faces[chosen][:, corners].reshape(-1)
+            color = np.ones((vertices.size, 4), dtype=np.float32)
+            if not emits:
+                color[:, :3] = exposure * light[side, chosen][:, corners].reshape(-1, 3)
+            sides.append(
+                pyrender.Primitive(
+                    positions=mesh.vertices[vertices],
+                    normals=mesh.normals[vertices],
+                    texcoord_0=mesh.uv[vertices],
+                    color_0=color,
+                    material=look,
+                )
+            )
+        nodes.add(pyrender.Mesh(primitives=sides))
+    return PyrenderScene(scene=scene, config=config, nodes=nodes, exposure=exposure)
+
+
+def _to_display(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.clip(linear, 0.0, 1.0) ** (1.0 / _GAMMA))
+
+
+def _texture(pyrender: Any, srgb: NDArray[np.uint8]) -> Any:
+    return pyrender.Texture(source=srgb, source_channels="RGB")
+
+
+class PyrenderRenderer:
+    """Renders rgb and depth, one pose after another, through OpenGL.
+
+    Attributes:
+        rgb: uint8 on the host, shape [M, H, W, 3]; the display curve is a power of 1 / 2.2, not sRGB.
+        depth: float32 on the host, shape [M, H, W].
+        log_radiance: None; so are normal and instance.
+    """
+
+    def __init__(
+        self, scene: PyrenderScene, lens: PinholeConfig, *, outputs: Collection[str], image_count: int = 1
+    ) -> None:
+        """Allocate the outputs and open an OpenGL context.
+
+        Args:
+            scene: `upload_pyrender_scene`.
+            lens: The camera.
+            outputs: Some of "rgb", "depth".
+            image_count: M, number of image slots.
+
+        Raises:
+            ValueError: Another output is asked for.
+            PyrenderError: There is no OpenGL.
+        """
+        unknown = sorted(set(outputs) - {"rgb", "depth"})
+        if unknown or not outputs:
+            raise ValueError(
+                f"the pyrender backend renders ['rgb', 'depth'], asked for {sorted(outputs)}: "
+                "use backend: warp for event cameras and the rest"
+            )
+        pyrender = _import_pyrender()
+        self._scene = scene
+        self._width, self._height = lens.width, lens.height
+        fx, fy, cx, cy = lens.intrinsics()
+        far = 2.0 * float(np.linalg.norm(np.ptp(scene.scene.bounds_m, axis=0))) + 100.0
+        self._camera = pyrender.IntrinsicsCamera(fx, fy, cx, cy, znear=_NEAR_M, zfar=far)
+        self._context = _open_context(pyrender, lens.width, lens.height)
+        self.log_radiance = self.normal = self.instance = None
+        shape = (image_count, lens.height, lens.width)
+        self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device="cpu") if "rgb" in outputs else None
+        self.depth = wp.zeros(shape, dtype=float, device="cpu") if "depth" in outputs else None
+
+    def render(
+        self,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        *,
+        instant_count: int,
+    ) -> None:
+        """Render those of the first `instant_count` poses that have an image slot; see `Renderer.render`."""
+        rotations = Rotation.from_quat(q_WC.numpy()[:instant_count]).as_matrix()
+        positions, slots = p_WC.numpy(), image_slot.numpy()
+        for instant in range(instant_count):
+            if slots[instant] < 0:
+                continue
+            T_WC = np.eye(4)
+            T_WC[:3, :3] = rotations[instant]
+            T_WC[:3, 3] = positions[instant]
+            node = self._scene.nodes.add(self._camera, pose=T_WC @ _OPENGL_FROM_OPTICAL)
+            self._scene.nodes.main_camera_node = node
+            rgb, depth = self._context.render(self._scene.nodes)
+            self._scene.nodes.remove_node(node)
+            if self.rgb is not None:
+                self.rgb.numpy()[slots[instant]] = rgb
+            if self.depth is not None:
+                self.depth.numpy()[slots[instant]] = np.where(depth > 0.0, depth, np.inf)
+
+
+def _open_context(pyrender: Any, width: int, height: int) -> Any:
+    from OpenGL.error import Error
+
+    try:
+        return pyrender.OffscreenRenderer(width, height)
+    except (
+        AttributeError,
+        AssertionError,
+        ImportError,
+        ValueError,
+        Error,
+    ) as error:  # what a lack of OpenGL raises
+        raise PyrenderError(f"OpenGL cannot be used ({error}). {_INSTALL_OPENGL}") from error

@@ -1,0 +1,241 @@
+# mypy: disable-error-code="index,attr-defined,misc"
+"""The ray caster: one kernel factory, specialised on the outputs that are asked for and the terms that a scene has.
+
+One traversal per ray answers everything. A thread is a pixel of an instant; blocks of 64 threads are tiles of 8 x 8
+pixels, so that their rays walk the same nodes of the tree. What a specialisation does not need is not in its code.
+"""
+
+# Annotations are kept as objects (no `from __future__ import annotations`): Warp reads those of kernels in closures.
+
+from collections.abc import Collection
+from functools import cache
+from typing import NamedTuple
+
+import warp as wp
+
+from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
+from neurosim_core.scene.materials import sample_texture
+
+OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
+"""Everything that a cast can answer."""
+
+TILE = 8
+"""Width and height of the tile of a block [px]."""
+
+_COSINE_MIN = wp.constant(0.05)
+_FAR_M = wp.constant(1.0e9)
+
+
+class Terms(NamedTuple):
+    """What a scene and its settings need in the kernel."""
+
+    textured: bool
+    """Some material has a texture."""
+    emissive: bool
+    """Some material emits light."""
+    baked: bool
+    """Light is interpolated between corners instead of evaluated for each pixel."""
+    sample_count: int
+    """Rays per pixel."""
+
+
+@wp.struct
+class SceneData:
+    """The arrays of a scene that the kernel reads. Corner k of face f is at 3 f + k."""
+
+    mesh: wp.uint64
+    face_material: wp.array[int]
+    face_instance: wp.array[int]
+    face_lod: wp.array[float]
+    """log2 of texels per metre on each face."""
+    corner_uv: wp.array[wp.vec2]
+    corner_normal: wp.array[wp.vec3]
+    """Shading normals, on the front of the face; not filled if light is baked."""
+    corner_light: wp.array2d[wp.vec3]
+    """Baked light, shape [2, 3F]: front, back; not filled otherwise."""
+    base_color: wp.array[wp.vec3]
+    emission: wp.array[wp.vec3]
+    material_texture: wp.array[wp.vec2i]
+    levels: wp.array[wp.vec3i]
+    texels: wp.array[wp.uint32]
+    light_position: wp.array[wp.vec3]
+    light_intensity: wp.array[wp.vec3]
+    light_radius_m: float
+    ambient_up: wp.vec3
+    ambient_down: wp.vec3
+    sky: wp.vec3
+    mip_bias: float
+    dark_floor: float
+    exposure: float
+
+
+@wp.func
+def _to_srgb(linear: float) -> wp.uint8:
+    # IEC 61966-2-1
+    x = wp.clamp(linear, 0.0, 1.0)
+    code = wp.where(x <= 0.0031308, 12.92 * x, 1.055 * wp.pow(x, 1.0 / 2.4) - 0.055)
+    return wp.uint8(int(255.0 * code + 0.5))
+
+
+@cache
+def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
+    with_log = "log_radiance" in outputs
+    with_rgb = "rgb" in outputs
+    with_depth = "depth" in outputs
+    with_normal = "normal" in outputs
+    with_instance = "instance" in outputs
+    with_images = with_rgb or with_depth or with_normal or with_instance
+    with_radiance = with_log or with_rgb
+    textured = terms.textured
+    emissive = terms.emissive
+    baked = terms.baked
+    sample_count = terms.sample_count
+
+    @wp.func
+    def shade(
+        scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: wp.MeshQueryRay
+    ) -> wp.vec3:
+        corner = 3 * hit.face
+        u = hit.u
+        v = hit.v
+        w = 1.0 - u - v
+        facing = wp.dot(ray, hit.normal)
+        material = scene.face_material[hit.face]
+        albedo = scene.base_color[material]
+        if wp.static(textured):
+            texture = scene.material_texture[material]
+            if texture[1] > 0:
+                uv = (
+                    u * scene.corner_uv[corner]
+                    + v * scene.corner_uv[corner + 1]
+                    + w * scene.corner_uv[corner + 2]
+                )
+                footprint_m = spread_rad * hit.t / wp.max(wp.abs(facing), _COSINE_MIN)
+                lod = wp.log2(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
+                albedo = wp.cw_mul(albedo, sample_texture(scene.texels, scene.levels, texture, uv, lod))
+        if wp.static(baked):
+            side = wp.where(facing > 0.0, 1, 0)
+            light = (
+                u * scene.corner_light[side, corner]
+                + v * scene.corner_light[side, corner + 1]
+                + w * scene.corner_light[side, corner + 2]
+            )
+        else:
+            normal = wp.normalize(
+                u * scene.corner_normal[corner]
+                + v * scene.corner_normal[corner + 1]
+                + w * scene.corner_normal[corner + 2]
+            )
+            if facing > 0.0:
+                normal = -normal
+            point = origin + hit.t * ray
+            light = ambient_light(normal, scene.ambient_up, scene.ambient_down)
+            for lamp in range(scene.light_position.shape[0]):
+                light += point_light(
+                    point,
+                    normal,
+                    scene.light_position[lamp],
+                    scene.light_intensity[lamp],
+                    scene.light_radius_m,
+                )
+        emission = wp.vec3(0.0)
+        if wp.static(emissive):
+            emission = scene.emission[material]
+        return reflect_light(albedo, light, emission)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def raycast(
+        first: int,
+        # Model:
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        # In:
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        # Out:
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ) -> None:
+        index = first + wp.tid()
+        tile = index // 64
+        in_tile = index % 64
+        tile_columns = (width + 7) // 8
+        tiles = tile_columns * ((height + 7) // 8)
+        instant = tile // tiles
+        tile = tile % tiles
+        col = (tile % tile_columns) * 8 + in_tile % 8
+        row = (tile // tile_columns) * 8 + in_tile // 8
+        if col >= width or row >= height:
+            return
+        slot = int(-1)
+        if wp.static(with_images):
+            slot = image_slot[instant]
+            if wp.static(not with_log):
+                if slot < 0:
+                    return
+        origin = p_WC[instant]
+        q = q_WC[instant]
+        pixel = row * width + col
+        radiance = wp.vec3(0.0)
+        for sample in range(wp.static(sample_count)):
+            ray_C = rays[sample, pixel]
+            ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            hit = wp.mesh_query_ray(scene.mesh, origin, ray, _FAR_M)
+            if wp.static(with_radiance):
+                if hit.result:
+                    radiance += shade(scene, ray, origin, ray_C[3], hit)
+                else:
+                    radiance += scene.sky
+            if wp.static(with_depth or with_normal or with_instance):
+                if slot >= 0 and sample == 0:
+                    if wp.static(with_depth):
+                        depth_out[slot, row, col] = wp.where(hit.result, hit.t * ray_C[2], wp.inf)
+                    if wp.static(with_normal):
+                        normal = wp.vec3(0.0)
+                        if hit.result:
+                            normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
+                        normal_out[slot, row, col] = normal
+                    if wp.static(with_instance):
+                        name = int(-1)
+                        if hit.result:
+                            name = scene.face_instance[hit.face]
+                        instance_out[slot, row, col] = name
+        if wp.static(with_radiance):
+            radiance = radiance * wp.static(1.0 / sample_count)
+        if wp.static(with_log):
+            luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
+            log_radiance_out[instant, row, col] = wp.log(luma + scene.dark_floor)
+        if wp.static(with_rgb):
+            if slot >= 0:
+                rgb_out[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
+                rgb_out[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
+                rgb_out[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
+
+    return raycast
+
+
+def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
+    """Return the kernel that casts rays for `outputs` in a scene with `terms`; made once per combination.
+
+    Its outputs, all [.., H, W]: log_radiance, log(Rec. 709 luma + dark floor), of each instant; and of instants with
+    image_slot >= 0, in that slot: rgb, sRGB of exposure times radiance; depth, planar z [m], inf where nothing is
+    hit; normal, of the triangle, in W, towards the camera, zero where nothing is hit; instance, -1 where nothing is hit.
+
+    The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long side on the
+    surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much as along. The short side
+    or the geometric mean would keep more detail there, but alias along the surface, and aliasing
+    makes events that no sensor sees. |cos| counts as at least 0.05.
+
+    Raises:
+        ValueError: If an output is unknown or none is asked for.
+    """
+    unknown = sorted(set(outputs) - set(OUTPUTS))
+    if unknown or not outputs:
+        raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")
+    return _kernel(tuple(name for name in OUTPUTS if name in outputs), terms)

@@ -1,0 +1,93 @@
+"""What a renderer is, and which one renders."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, Protocol
+
+import warp as wp
+
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.config import LightingConfig, RenderConfig
+from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
+from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer
+from neurosim_core.render.warp_renderer import upload_scene as upload_warp_scene
+from neurosim_core.scene.scene import Scene
+
+__all__ = ["LightingConfig", "RenderConfig", "Renderer", "SceneOnDevice", "make_renderer", "upload_scene"]
+
+SceneOnDevice = SceneArrays | PyrenderScene
+"""A scene as one of the renderers keeps it, shared by all cameras."""
+
+
+class Renderer(Protocol):
+    """Renders up to K instants of one lens per call into arrays of its own; those not asked for are None."""
+
+    log_radiance: Any
+    """Logarithm of linear luma plus the dark floor, float32 [K, H, W]."""
+    rgb: Any
+    """8-bit sRGB, uint8 [M, H, W, 3]."""
+    depth: Any
+    """Planar z [m], inf where nothing is hit, float32 [M, H, W]."""
+    normal: Any
+    """Normal of the surface in W, towards the camera, zero where nothing is hit, vec3 [M, H, W]."""
+    instance: Any
+    """Index into `Scene.instance_names`, -1 where nothing is hit, int32 [M, H, W]."""
+
+    def render(
+        self,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        *,
+        instant_count: int,
+    ) -> None:
+        """Render the first `instant_count` poses.
+
+        Args:
+            p_WC: Position of the camera [m], shape [K].
+            q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
+            image_slot: Where the images of an instant go, shape [K]; -1: nowhere.
+            instant_count: How many of the K instants are rendered.
+        """
+
+
+def upload_scene(scene: Scene, config: RenderConfig, *, device: str) -> SceneOnDevice:
+    """Prepare a scene for the backend that `config` names.
+
+    Args:
+        scene: What to render.
+        config: Backend, light, exposure.
+        device: Where the Warp backend renders, and where light is baked.
+
+    Raises:
+        PyrenderError: The backend is pyrender and it cannot be used here.
+    """
+    if config.backend == "pyrender":
+        return upload_pyrender_scene(scene, config, device=device)
+    return upload_warp_scene(scene, config, device=device)
+
+
+def make_renderer(
+    scene: SceneOnDevice,
+    lens: PinholeConfig,
+    *,
+    outputs: Collection[str],
+    instant_count: int,
+    image_count: int = 1,
+) -> Renderer:
+    """Return a renderer for one lens.
+
+    Args:
+        scene: What `upload_scene` returned.
+        lens: The camera.
+        outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance".
+        instant_count: K, the most instants per call.
+        image_count: M, number of image slots.
+
+    Raises:
+        ValueError: An output is unknown, or the backend does not have it.
+    """
+    if isinstance(scene, PyrenderScene):
+        return PyrenderRenderer(scene, lens, outputs=outputs, image_count=image_count)
+    return WarpRenderer(scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count)

@@ -1,0 +1,248 @@
+# mypy: disable-error-code="attr-defined"
+"""The renderer of the simulator: ray casting in Warp, the same source on CPU and CUDA."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.render.camera import Lens
+from neurosim_core.render.config import RenderConfig
+from neurosim_core.render.launch import launch_split
+from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine
+from neurosim_core.render.raycast import TILE, SceneData, Terms, raycast_kernel
+from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
+from neurosim_core.scene.scene import Scene
+
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+_MIDDLE_GREY = 0.25
+_R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g, 1 / g^2 with g^3 = g + 1 (Roberts 2018)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneArrays:
+    """A scene on a device, ready to be cast at; shared by all cameras."""
+
+    scene: Scene
+    config: RenderConfig
+    device: str
+    mesh: wp.Mesh
+    """All triangles, refined if light is baked; for rays and for nearest-point queries."""
+    face_origin: wp.array[int]
+    """Face of the scene that each face of `mesh` is a part of, shape [F]."""
+    terms: Terms
+    data: SceneData
+    exposure: float
+    """Factor from linear radiance to the linear value 1.0 of an 8-bit picture."""
+    light_s: float
+    """Wall-clock time that baking took [s]."""
+
+    @property
+    def mesh_id(self) -> wp.uint64:
+        """Identifier of `mesh` for queries in kernels."""
+        return self.mesh.id
+
+
+def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays:
+    """Bring a scene to a device: refine and light it, pack its textures, build its tree.
+
+    Args:
+        scene: What to render.
+        config: How to light it.
+        device: "cpu", "cuda:0", …
+    """
+    baked = config.lighting.mode == "baked"
+    mesh = refine(scene, config.lighting.edge_max_m if baked else None)
+    packed = pack_textures(scene.materials)
+    material = scene.face_material[mesh.origin]
+    terms = Terms(
+        textured=bool((packed.material_texture[:, 1] > 0).any()),
+        emissive=any(max(m.emission) > 0.0 for m in scene.materials),
+        baked=baked,
+        sample_count=config.samples_per_pixel,
+    )
+    start = time.perf_counter()
+    if baked:
+        light = bake_light(scene, mesh, config.lighting, device=device)
+    else:
+        unlit = config.lighting
+        light = bake_light(scene, mesh, unlit, device=device) if config.exposure == "auto" else None
+    light_s = time.perf_counter() - start
+    exposure = config.exposure
+    if exposure == "auto":
+        assert light is not None
+        exposure = auto_exposure(mesh, light, mean_albedo(scene.materials, packed)[material])
+
+    points = wp.array(mesh.vertices, dtype=wp.vec3, device=device)
+    indices = wp.array(mesh.faces.reshape(-1), dtype=int, device=device)
+    tree = wp.Mesh(
+        points,
+        indices,
+        bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
+        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
+    )
+    data = SceneData()
+    data.mesh = tree.id
+    data.face_material = wp.array(material, dtype=int, device=device)
+    data.face_instance = wp.array(scene.face_instance[mesh.origin], dtype=int, device=device)
+    data.base_color = wp.array(_rows([m.base_color for m in scene.materials]), dtype=wp.vec3, device=device)
+    data.emission = wp.array(_rows([m.emission for m in scene.materials]), dtype=wp.vec3, device=device)
+    if terms.textured:
+        data.face_lod = wp.array(_texel_density(mesh, material, packed), dtype=float, device=device)
+        data.corner_uv = wp.array(mesh.uv[mesh.faces].reshape(-1, 2), dtype=wp.vec2, device=device)
+        data.material_texture = wp.array(packed.material_texture, dtype=wp.vec2i, device=device)
+        data.levels = wp.array(packed.levels, dtype=wp.vec3i, device=device)
+        data.texels = wp.array(packed.texels, dtype=wp.uint32, device=device)
+    if baked:
+        assert light is not None
+        data.corner_light = wp.array(light.reshape(2, -1, 3), dtype=wp.vec3, device=device)
+    else:
+        data.corner_normal = wp.array(corner_normals(mesh).reshape(-1, 3), dtype=wp.vec3, device=device)
+        positions, intensities = [x.position_m for x in scene.lights], [x.intensity for x in scene.lights]
+        data.light_position = wp.array(_rows(positions), dtype=wp.vec3, device=device)
+        data.light_intensity = wp.array(_rows(intensities), dtype=wp.vec3, device=device)
+    data.light_radius_m = config.lighting.light_radius_m
+    data.ambient_up = wp.vec3(*scene.ambient.up)
+    data.ambient_down = wp.vec3(*scene.ambient.down)
+    data.sky = wp.vec3(*scene.sky)
+    data.mip_bias = config.mip_bias
+    data.dark_floor = config.dark_floor
+    data.exposure = exposure
+    return SceneArrays(
+        scene=scene,
+        config=config,
+        device=device,
+        mesh=tree,
+        face_origin=wp.array(mesh.origin, dtype=int, device=device),
+        terms=terms,
+        data=data,
+        exposure=exposure,
+        light_s=light_s,
+    )
+
+
+def _rows(values: list[tuple[float, float, float]]) -> NDArray[np.float32]:
+    return np.array(values, dtype=np.float32).reshape(-1, 3)
+
+
+def _areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:
+    tips = mesh.vertices[mesh.faces].astype(np.float64)
+    normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0])
+    return 0.5 * np.asarray(np.linalg.norm(normal, axis=1))
+
+
+def _texel_density(
+    mesh: RefinedMesh, material: NDArray[np.int32], packed: PackedTextures
+) -> NDArray[np.float32]:
+    """Return log2 of texels of level 0 per metre on each face: half the log2 of texels per square metre."""
+    u, v = np.moveaxis(mesh.uv[mesh.faces].astype(np.float64), -1, 0)
+    uv_area = 0.5 * np.abs(
+        (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+    )
+    sizes = np.array([packed.size_px(k) for k in range(len(packed.material_texture))], dtype=np.float64)
+    texels = uv_area * sizes.prod(axis=1)[material]
+    return (0.5 * np.log2(np.maximum(texels, 1e-12) / np.maximum(_areas_m2(mesh), 1e-12))).astype(np.float32)
+
+
+def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray[np.float32]) -> float:
+    """Return the exposure that shows the mean surface as middle grey: the mean of log luma, weighted by area.
+
+    Each face counts with its brighter side: the other one is often the inside of a wall.
+    """
+    luma = (light.max(axis=0).mean(axis=1) * albedo) @ _LUMA
+    weight = _areas_m2(mesh)
+    return float(_MIDDLE_GREY / np.exp(np.average(np.log(np.maximum(luma, 1e-4)), weights=weight)))
+
+
+def _sample_offsets(count: int) -> list[tuple[float, float]]:
+    """Return where in a pixel rays go through [px]: the first through its centre, all well spread (R2 sequence)."""
+    return [((0.5 + k * _R2[0]) % 1.0, (0.5 + k * _R2[1]) % 1.0) for k in range(count)]
+
+
+class WarpRenderer:
+    """Renders K instants of one lens per launch. `render` neither allocates nor waits for a CUDA device.
+
+    Outputs that were not asked for are None. See `raycast.raycast_kernel` for what they are.
+
+    Attributes:
+        log_radiance: float32, shape [K, H, W].
+        rgb: uint8, shape [M, H, W, 3].
+        depth: float32, shape [M, H, W].
+        normal: vec3, shape [M, H, W].
+        instance: int32, shape [M, H, W].
+    """
+
+    def __init__(
+        self,
+        arrays: SceneArrays,
+        lens: Lens,
+        *,
+        outputs: Collection[str],
+        instant_count: int,
+        image_count: int = 1,
+        thread_count: int | None = None,
+    ) -> None:
+        """Allocate the outputs and choose the kernel.
+
+        Args:
+            arrays: The scene; `upload_scene`.
+            lens: Rays of the pixels.
+            outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance".
+            instant_count: K, the most instants per launch.
+            image_count: M, number of image slots.
+            thread_count: Threads on a CPU device; all cores if None.
+
+        Raises:
+            ValueError: If an output is unknown or none is asked for.
+        """
+        self._kernel = raycast_kernel(outputs, arrays.terms)
+        self._arrays = arrays
+        self._width, self._height = lens.width, lens.height
+        self._thread_count = thread_count
+        tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
+        self._instant_threads = tiles * TILE * TILE
+        count = arrays.terms.sample_count
+        spread = lens.ray_spread()[..., None] / np.float32(np.sqrt(count))
+        rays = [np.concatenate([lens.ray_table(at), spread], axis=-1) for at in _sample_offsets(count)]
+        device = arrays.device
+        self._rays = wp.array(np.stack(rays).reshape(count, -1, 4), dtype=wp.vec4, device=device)
+        images = (image_count, lens.height, lens.width)
+
+        def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
+            return wp.zeros(shape, dtype=dtype, device=device) if name in outputs else None
+
+        self.log_radiance = allocate("log_radiance", (instant_count, *images[1:]), float)
+        self.rgb = allocate("rgb", (*images, 3), wp.uint8)
+        self.depth = allocate("depth", images, float)
+        self.normal = allocate("normal", images, wp.vec3)
+        self.instance = allocate("instance", images, int)
+
+    def render(
+        self,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        *,
+        instant_count: int,
+    ) -> None:
+        """Render the first `instant_count` poses into the outputs.
+
+        Args:
+            p_WC: Position of the camera [m], shape [K].
+            q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
+            image_slot: Where the images of an instant go, shape [K]; -1: nowhere.
+            instant_count: How many of the K instants are rendered.
+        """
+        launch_split(
+            self._kernel,
+            dim=instant_count * self._instant_threads,
+            inputs=[self._arrays.data, self._rays, self._width, self._height, p_WC, q_WC, image_slot],
+            outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
+            device=self._arrays.device,
+            thread_count=self._thread_count,
+        )
