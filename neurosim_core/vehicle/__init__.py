@@ -1,0 +1,23 @@
+"""Multirotor dynamics: `Multirotor(preset("hummingbird"))` is a vehicle to fly."""
+
+from neurosim_core.vehicle.multirotor import (
+    TERMS,
+    Acceleration,
+    DynamicsError,
+    Multirotor,
+    MultirotorArrays,
+    MultirotorConfig,
+    MultirotorState,
+)
+from neurosim_core.vehicle.presets import preset
+
+__all__ = [
+    "TERMS",
+    "Acceleration",
+    "DynamicsError",
+    "Multirotor",
+    "MultirotorArrays",
+    "MultirotorConfig",
+    "MultirotorState",
+    "preset",
+]
