@@ -1,0 +1,414 @@
+# mypy: disable-error-code="attr-defined,misc,arg-type,call-overload,index"
+# mypy: disable-error-code="no-untyped-call,no-untyped-def,untyped-decorator"
+"""Command modes: what a setpoint is at each level, and the controller that turns it into rotor speeds.
+
+    mode          setpoint row (float64)                                   closes on
+    motor_speeds  R rotor speeds [rad/s]                                   nothing, only limits apply
+    rates         collective thrust [N], body rate in B [rad/s]            body rate
+    attitude      collective thrust [N], q_WB xyzw                         attitude
+    velocity      velocity in W [m/s], yaw rate [rad/s]                    velocity; the heading turns at the
+    rate position      position in W [m], yaw [rad]                             position and yaw
+    path          nothing: the path is evaluated at the vehicle's stamp    position and yaw, with all
+    derivatives
+
+Each level sets up the one below it (se3.py). Yaw is that of a Z-X-Y sequence: y_B is orthogonal to (cos yaw,
+sin yaw, 0). A mode is compiled when it is first used, and only then.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from neurosim_core.control.allocation import allocate, allocation_matrix, clip
+from neurosim_core.control.flatness import AttitudeReference
+from neurosim_core.control.se3 import (
+    Se3Config,
+    Se3Parameters,
+    VehicleState,
+    Wrench,
+    attitude_wrench,
+    make_parameters,
+    point_wrench,
+    present_heading,
+    rate_wrench,
+    shorten,
+    velocity_wrench,
+)
+from neurosim_core.frames import as_rows
+from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
+from neurosim_core.vehicle import MultirotorConfig
+
+wp.set_module_options({"enable_backward": False})
+
+CommandMode = Literal["motor_speeds", "rates", "attitude", "velocity", "position", "path"]
+"""Names of the command modes."""
+
+
+@wp.struct
+class Feedback:
+    """The arrays of a batch of vehicles that a controller reads, one element a vehicle."""
+
+    position: wp.array[wp.vec3d]
+    """p_WB [m]."""
+    velocity: wp.array[wp.vec3d]
+    """v_WB in W [m/s]."""
+    orientation: wp.array[wp.quatd]
+    """q_WB, xyzw."""
+    body_rate: wp.array[wp.vec3d]
+    """w_WB in B [rad/s]."""
+    rotor_speed: wp.array2d[wp.float64]
+    """[rad/s], shape [N, R]."""
+    stamp_ns: wp.array[wp.int64]
+    """Time since the start of the episode [ns]."""
+
+
+@wp.func
+def _vector3(rows: wp.array2d[wp.float64], row: int, first: int) -> wp.vec3d:
+    return wp.vec3d(rows[row, first], rows[row, first + 1], rows[row, first + 2])
+
+
+@wp.func
+def _rates(
+    parameters: Se3Parameters,
+    path: PathArrays,
+    setpoint: wp.array2d[wp.float64],
+    vehicle: int,
+    stamp_ns: wp.int64,
+    state: VehicleState,
+) -> Wrench:
+    rate = shorten(_vector3(setpoint, vehicle, 1), parameters.body_rate_max_rad_s)
+    return rate_wrench(parameters, state, setpoint[vehicle, 0], rate, wp.vec3d())
+
+
+@wp.func
+def _attitude(
+    parameters: Se3Parameters,
+    path: PathArrays,
+    setpoint: wp.array2d[wp.float64],
+    vehicle: int,
+    stamp_ns: wp.int64,
+    state: VehicleState,
+) -> Wrench:
+    imaginary = _vector3(setpoint, vehicle, 1)
+    reference = AttitudeReference()
+    reference.orientation = wp.normalize(
+        wp.quatd(imaginary[0], imaginary[1], imaginary[2], setpoint[vehicle, 4])
+    )
+    return attitude_wrench(parameters, state, setpoint[vehicle, 0], reference)
+
+
+@wp.func
+def _velocity(
+    parameters: Se3Parameters,
+    path: PathArrays,
+    setpoint: wp.array2d[wp.float64],
+    vehicle: int,
+    stamp_ns: wp.int64,
+    state: VehicleState,
+) -> Wrench:
+    heading = present_heading(state.orientation, setpoint[vehicle, 3])
+    velocity = _vector3(setpoint, vehicle, 0)
+    return velocity_wrench(parameters, state, velocity, wp.vec3d(), wp.vec3d(), wp.vec3d(), heading)
+
+
+@wp.func
+def _position(
+    parameters: Se3Parameters,
+    path: PathArrays,
+    setpoint: wp.array2d[wp.float64],
+    vehicle: int,
+    stamp_ns: wp.int64,
+    state: VehicleState,
+) -> Wrench:
+    point = PathPoint()
+    point.position = _vector3(setpoint, vehicle, 0)
+    point.yaw = setpoint[vehicle, 3]
+    return point_wrench(parameters, state, point)
+
+
+@wp.func
+def _path(
+    parameters: Se3Parameters,
+    path: PathArrays,
+    setpoint: wp.array2d[wp.float64],
+    vehicle: int,
+    stamp_ns: wp.int64,
+    state: VehicleState,
+) -> Wrench:
+    index = wp.min(vehicle, path.first_knot.shape[0] - 2)  # one path serves all
+    return point_wrench(parameters, state, evaluate_path(path, index, stamp_ns))
+
+
+def _make_wrench_kernel(name: str, wrench_of: Any) -> Any:
+    """Return the kernel that allocates the wrench of one mode."""
+
+    @wp.kernel(module=wp.get_module(f"{__name__}.{name}"), enable_backward=False)
+    def command(
+        # Model:
+        parameters: Se3Parameters,
+        matrix: wp.array2d[wp.float64],
+        path: PathArrays,
+        # In:
+        feedback: Feedback,
+        setpoint: wp.array2d[wp.float64],
+        # Out:
+        rotor_speed_command_out: wp.array2d[wp.float64],
+    ):
+        vehicle = wp.tid()
+        state = VehicleState()
+        state.position = feedback.position[vehicle]
+        state.velocity = feedback.velocity[vehicle]
+        state.orientation = feedback.orientation[vehicle]
+        state.body_rate = feedback.body_rate[vehicle]
+        wrench = wrench_of(parameters, path, setpoint, vehicle, feedback.stamp_ns[vehicle], state)
+        allocate(
+            matrix,
+            parameters.motors,
+            wrench.thrust_N,
+            wrench.torque,
+            vehicle,
+            feedback.rotor_speed,
+            rotor_speed_command_out,
+        )
+
+    return command
+
+
+def _make_motor_speeds_kernel() -> Any:
+    """Return the kernel that only applies the limits."""
+
+    @wp.kernel(module=wp.get_module(f"{__name__}.motor_speeds"), enable_backward=False)
+    def command(
+        # Model:
+        parameters: Se3Parameters,
+        matrix: wp.array2d[wp.float64],
+        path: PathArrays,
+        # In:
+        feedback: Feedback,
+        setpoint: wp.array2d[wp.float64],
+        # Out:
+        rotor_speed_command_out: wp.array2d[wp.float64],
+    ):
+        vehicle = wp.tid()
+        for rotor in range(matrix.shape[0]):
+            rotor_speed_command_out[vehicle, rotor] = clip(
+                setpoint[vehicle, rotor], parameters.motors.speed_min_rad_s, parameters.motors.speed_max_rad_s
+            )
+
+    return command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode:
+    """One row of the table of command modes."""
+
+    layout: tuple[str, ...]
+    """Name and unit of each element of a setpoint row; that of `motor_speeds` repeats for every rotor."""
+    make_kernel: Callable[[], Any]
+    """Makes the kernel from setpoint to rotor speed commands; all take the same arguments."""
+
+
+MODES: dict[str, Mode] = {
+    "motor_speeds": Mode(layout=("rotor_speed_rad_s",), make_kernel=_make_motor_speeds_kernel),
+    "rates": Mode(
+        layout=("thrust_N", "w_B_x_rad_s", "w_B_y_rad_s", "w_B_z_rad_s"),
+        make_kernel=functools.partial(_make_wrench_kernel, "rates", _rates),
+    ),
+    "attitude": Mode(
+        layout=("thrust_N", "q_WB_x", "q_WB_y", "q_WB_z", "q_WB_w"),
+        make_kernel=functools.partial(_make_wrench_kernel, "attitude", _attitude),
+    ),
+    "velocity": Mode(
+        layout=("v_W_x_m_s", "v_W_y_m_s", "v_W_z_m_s", "yaw_rate_rad_s"),
+        make_kernel=functools.partial(_make_wrench_kernel, "velocity", _velocity),
+    ),
+    "position": Mode(
+        layout=("p_W_x_m", "p_W_y_m", "p_W_z_m", "yaw_rad"),
+        make_kernel=functools.partial(_make_wrench_kernel, "position", _position),
+    ),
+    "path": Mode(layout=(), make_kernel=functools.partial(_make_wrench_kernel, "path", _path)),
+}
+"""The command modes by name."""
+
+
+@functools.cache
+def mode_kernel(mode: str) -> Any:
+    """Return the kernel of a mode, made once; `mode_kernel(mode).module` can be compiled ahead of time."""
+    return MODES[mode].make_kernel()
+
+
+class Controller:
+    """A controller for a batch of vehicles of one kind, in one command mode; see `make_controller`.
+
+    It has no memory: a command depends on the present state and setpoint only.
+
+    Attributes:
+        mode: Name of the command mode.
+        layout: Name and unit of each element of a setpoint row.
+        setpoint: The setpoints on the device, float64 [N, len(layout)]; written by whoever commands.
+    """
+
+    def __init__(
+        self,
+        *,
+        mode: str,
+        layout: tuple[str, ...],
+        parameters: Any,
+        matrix: NDArray[np.float64],
+        paths: Any,
+        count: int,
+        device: Any,
+    ) -> None:
+        self.mode = mode
+        self.layout = layout
+        self.count = count
+        self.rotor_count = len(matrix)
+        self.device = wp.get_device(device)
+        self.setpoint = wp.zeros((count, len(layout)), dtype=wp.float64, device=self.device)
+        self._parameters = parameters
+        self._matrix: Any = wp.array(matrix, dtype=wp.float64, device=self.device)
+        self._paths = paths
+        self._bound: tuple[Any, Any] = (None, None)
+
+    def update(self, arrays: Any) -> None:
+        """Write `arrays.rotor_speed_command` from the state in `arrays` and `setpoint`: one launch.
+
+        It neither allocates nor waits (after the first call with the same `arrays`), so it can be captured in
+        a graph. A setpoint that is not finite gives commands that are not, and the vehicle reports them.
+
+        Args:
+            arrays: The device arrays of a `Multirotor` (`vehicle.arrays`), or any object with the same
+                attributes.
+        """
+        if self._bound[0] is not arrays:
+            self._bound = (arrays, self._bind(arrays))
+        self._bound[1].launch()
+
+    def command(
+        self,
+        setpoint: ArrayLike | None = None,
+        *,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        orientation: ArrayLike,
+        body_rate: ArrayLike,
+        rotor_speed: ArrayLike,
+        stamp_ns: int = 0,
+    ) -> NDArray[np.float64]:
+        """Return the rotor speed commands [rad/s] for a state on the host, shape [N, R].
+
+        Args:
+            setpoint: Rows as in `layout`, shape [N, len(layout)] or one row for all; None keeps what
+                `setpoint` holds.
+            position: p_WB [m], shape [N, 3] or [3].
+            velocity: v_WB in W [m/s], shape [N, 3] or [3].
+            orientation: q_WB, xyzw, shape [N, 4] or [4].
+            body_rate: w_WB in B [rad/s], shape [N, 3] or [3].
+            rotor_speed: Measured speeds [rad/s], shape [N, R] or [R].
+            stamp_ns: Time at which a path is evaluated [ns].
+
+        Raises:
+            ValueError: If a shape does not fit or an element is not finite; the message names the mode and
+                its layout.
+        """
+        if setpoint is not None:
+            self.set(setpoint)
+        arrays = Feedback()
+        for name, value, width, dtype in (
+            ("position", position, 3, wp.vec3d),
+            ("velocity", velocity, 3, wp.vec3d),
+            ("orientation", orientation, 4, wp.quatd),
+            ("body_rate", body_rate, 3, wp.vec3d),
+            ("rotor_speed", rotor_speed, self.rotor_count, wp.float64),
+        ):
+            rows = as_rows(value, name=name, count=self.count, width=width)
+            setattr(arrays, name, wp.array(rows, dtype=dtype, device=self.device))
+        arrays.stamp_ns = wp.full(self.count, stamp_ns, dtype=wp.int64, device=self.device)
+        commands = wp.empty((self.count, self.rotor_count), dtype=wp.float64, device=self.device)
+        self._launch(arrays, commands)
+        return np.asarray(commands.numpy())
+
+    def set(self, setpoint: ArrayLike) -> None:
+        """Write all setpoints from the host.
+
+        Args:
+            setpoint: Rows as in `layout`, shape [N, len(layout)] or one row for all.
+
+        Raises:
+            ValueError: If the shape does not fit or an element is not finite.
+        """
+        try:
+            rows = as_rows(setpoint, name="setpoint", count=self.count, width=len(self.layout))
+        except ValueError as error:
+            raise ValueError(
+                f"mode {self.mode!r} takes rows of ({', '.join(self.layout)}): {error}"
+            ) from None
+        if self.mode == "attitude" and not (np.linalg.norm(rows[:, 1:], axis=1) > 1e-6).all():
+            raise ValueError(f"mode 'attitude' takes unit quaternions, got {rows[:, 1:].tolist()}")
+        self.setpoint.assign(rows)
+
+    def _bind(self, arrays: Any) -> Any:
+        feedback = Feedback()
+        for name in ("position", "velocity", "orientation", "body_rate", "rotor_speed", "stamp_ns"):
+            setattr(feedback, name, getattr(arrays, name))
+        return self._launch(feedback, arrays.rotor_speed_command, record=True)
+
+    def _launch(self, feedback: Any, commands: Any, *, record: bool = False) -> Any:
+        return wp.launch(
+            mode_kernel(self.mode),
+            dim=self.count,
+            inputs=[self._parameters, self._matrix, self._paths, feedback, self.setpoint],
+            outputs=[commands],
+            device=self.device,
+            record_cmd=record,
+        )
+
+
+def make_controller(
+    mode: CommandMode,
+    vehicle: MultirotorConfig,
+    config: Se3Config | None = None,
+    *,
+    count: int = 1,
+    device: Any = None,
+    paths: Path | Sequence[Path] | None = None,
+) -> Controller:
+    """Return a controller for `count` vehicles of one kind.
+
+    Args:
+        mode: What a setpoint is; see the table above.
+        vehicle: The vehicle's parameters; the controller knows mass, inertia, rotors and motors, not the air.
+        config: Gains and limits.
+        count: Vehicles in the batch.
+        device: Warp device.
+        paths: For mode `path`, and only there: one for all, or one for each vehicle.
+
+    Raises:
+        ValueError: If the mode is unknown, paths are missing, superfluous or of the wrong number, or the
+            rotors cannot produce every torque.
+    """
+    if mode not in MODES:
+        raise ValueError(f"unknown command mode {mode!r}, known: {sorted(MODES)}")
+    if count < 1:
+        raise ValueError(f"count must be >= 1, got {count}")
+    given = [] if paths is None else [paths] if isinstance(paths, Path) else list(paths)
+    if mode == "path" and len(given) not in (1, count):
+        raise ValueError(f"mode 'path' takes one path, or one for each of {count} vehicles, got {len(given)}")
+    if mode != "path" and given:
+        raise ValueError(f"mode {mode!r} takes setpoints ({', '.join(MODES[mode].layout)}), not paths")
+    matrix = allocation_matrix(vehicle)
+    layout = MODES[mode].layout
+    return Controller(
+        mode=mode,
+        layout=layout * vehicle.rotor_count if mode == "motor_speeds" else layout,
+        parameters=make_parameters(vehicle, config or Se3Config(), matrix),
+        matrix=matrix,
+        paths=upload_paths(given, wp.get_device(device)) if given else PathArrays(),
+        count=count,
+        device=device,
+    )
