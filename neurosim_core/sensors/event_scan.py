@@ -1,0 +1,447 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
+# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
+"""Kernels of the event camera: the pixels' scan over a stack of frames, and the 64-bit keys it writes.
+
+The law is in `walk`, once. A pixel holds the log radiance it was reset to (`base`), its last sample, and how
+many levels it crossed upwards and downwards since. The reference level is a function of these counts,
+
+    L_ref = base + up * threshold_on - down * threshold_off     (float64)
+
+so nothing accumulates: after any number of events it has the rounding of one evaluation.
+
+A sample is a float32, so a level counts as reached when the sample is as near to it as the input can tell:
+one ulp of the sample plus one ulp of the base, 2^-23 (|sample| + |base|). A step of k thresholds, rounded to
+float32, thus gives exactly k events from any base. A crossing found so is stamped at the sample.
+
+Crossing times are rounded to 2^-10 ns, then written as a key that sorts in the order of the packets:
+
+    time [us] | late | row | col | polarity | nanoseconds after the microsecond, rounded up (0 .. 1000)
+
+Rounded down to the microsecond, a crossing gets its time; rounded up to the nanosecond, it is compared
+exactly with the stamps of windows. `mark_late` sets `late` on events that share the microsecond of a window's
+end but come after it, so that windows are contiguous in the sorted keys.
+
+Where pixel noise enters later: low-pass and shot noise change `sample` where `walk` reads it, mismatch and
+leak change `_level`, refractory time suppresses `_emit` (never the crossing). Each becomes a `wp.static`
+branch at that place, with its state beside `up` and `down`.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+SUB_BITS = 11
+"""Bits of a key below the column: polarity and nanoseconds."""
+LOG_RADIANCE_MAX = 1.0e3
+"""Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
+
+_COUNT = wp.constant(0)
+_WRITE = wp.constant(1)
+_TABLE = wp.constant(2)
+
+_ULP = wp.constant(wp.float64(2.0**-23))
+_LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
+_TICKS_PER_NS = wp.constant(wp.float64(1024.0))
+_COLUMN_SHIFT = wp.constant(wp.int64(SUB_BITS))
+_US = wp.constant(wp.int64(1000))
+
+
+@wp.struct
+class Pixel:
+    """What a pixel remembers, and what one walk over a stack found."""
+
+    last: wp.float32
+    """Last sample."""
+    up: wp.int32
+    """Levels crossed upwards since the reset."""
+    down: wp.int32
+    """Levels crossed downwards since the reset."""
+    event_count: wp.int32
+    """Events that are kept."""
+    invalid_count: wp.int32
+    """Samples that are no log radiance; the sample before was held."""
+    invalid_first: wp.int32
+    """Frame of the first of them."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // one global atomic per block; every thread of the block must come here
+    __shared__ unsigned long long block_total;
+    __shared__ unsigned long long block_start;
+    if (threadIdx.x == 0) block_total = 0;
+    __syncthreads();
+    unsigned long long slot = 0;
+    if (count > 0) slot = atomicAdd(&block_total, (unsigned long long)count);
+    __syncthreads();
+    if (threadIdx.x == 0 && block_total > 0)
+        block_start = atomicAdd((unsigned long long*)counters.data, block_total);
+    __syncthreads();
+    return (int64_t)(block_start + slot);
+#else
+    const int64_t slot = counters.data[0];
+    counters.data[0] = slot + count;
+    return slot;
+#endif
+""")
+def _reserve(count: wp.int32, counters: wp.array[wp.int64]) -> wp.int64:
+    """Return the first of `count` consecutive slots."""
+    ...
+
+
+@wp.func
+def _level(
+    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
+) -> wp.float64:
+    return base + (wp.float64(up) * threshold_on - wp.float64(down) * threshold_off)
+
+
+@wp.func
+def _key(
+    level: wp.float64,
+    last: wp.float64,
+    sample: wp.float64,
+    start_ns: wp.int64,
+    end_ns: wp.int64,
+    place: wp.int64,
+    time_shift: wp.int32,
+    polarity: wp.int32,
+) -> wp.int64:
+    """Return the key of the crossing of a level on the line from (start_ns, last) to (end_ns, sample)."""
+    fraction = wp.min((level - last) / (sample - last), wp.float64(1.0))
+    ticks = wp.int64(wp.rint(wp.float64(end_ns - start_ns) * fraction * _TICKS_PER_NS))
+    ticks = wp.max(ticks, wp.int64(1))  # an interval does not hold its start: that is the window before
+    whole_ns = ticks >> wp.int64(10)
+    down_ns = start_ns + whole_ns
+    up_ns = down_ns
+    if ticks > (whole_ns << wp.int64(10)):
+        up_ns += wp.int64(1)
+    time_us = down_ns // _US
+    sub_ns = up_ns - time_us * _US
+    return (time_us << wp.int64(time_shift)) | place | wp.int64(polarity << 10) | sub_ns
+
+
+@wp.func
+def walk(
+    mode: wp.int32,
+    slot: wp.int64,
+    pixel: wp.int32,
+    row: wp.int32,
+    place: wp.int64,
+    base_32: wp.float32,
+    state: Pixel,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    time_shift: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    stamps: wp.array[wp.int64],
+    frame_count: wp.int32,
+    row_limit: wp.array[wp.int32],
+    table: wp.array2d[wp.int32],
+    keys: wp.array[wp.int64],
+) -> Pixel:
+    """Take one pixel over a stack of frames; count its events, write them, or enter them in the table."""
+    base = wp.float64(base_32)
+    base_slack = _ULP * wp.abs(base)
+    up = state.up
+    down = state.down
+    upper = _level(base, up + 1, down, threshold_on, threshold_off)
+    lower = _level(base, up, down + 1, threshold_on, threshold_off)
+    last = state.last
+    event_count = wp.int32(0)
+    invalid_count = wp.int32(0)
+    invalid_first = wp.int32(0)
+
+    for frame in range(frame_count):
+        sample = log_radiance[frame, pixel]
+        value = wp.float64(sample)
+        slack = _ULP * wp.abs(value) + base_slack
+        if value + slack < upper and value - slack > lower:
+            last = sample
+        elif wp.abs(sample) <= _LIMIT:
+            up_before = up
+            down_before = down
+            while value + slack >= upper:
+                up += 1
+                upper = _level(base, up + 1, down, threshold_on, threshold_off)
+            lower = _level(base, up, down + 1, threshold_on, threshold_off)
+            while value - slack <= lower:
+                down += 1
+                lower = _level(base, up, down + 1, threshold_on, threshold_off)
+            upper = _level(base, up + 1, down, threshold_on, threshold_off)
+            found = up - up_before + down - down_before
+            if mode == _TABLE:
+                wp.atomic_add(table, frame, row, found)
+            elif row < row_limit[frame]:
+                if mode == _WRITE:
+                    polarity = wp.where(up > up_before, 1, 0)
+                    for event in range(found):
+                        where = slot + wp.int64(event_count + event)
+                        if where < wp.int64(keys.shape[0]):
+                            step = event + 1
+                            level = _level(
+                                base,
+                                up_before + step * polarity,
+                                down_before + step * (1 - polarity),
+                                threshold_on,
+                                threshold_off,
+                            )
+                            keys[where] = _key(
+                                level,
+                                wp.float64(last),
+                                value,
+                                stamps[frame],
+                                stamps[frame + 1],
+                                place,
+                                time_shift,
+                                polarity,
+                            )
+                event_count += found
+            last = sample
+        else:
+            if invalid_count == 0:
+                invalid_first = frame
+            invalid_count += 1
+
+    state.last = last
+    state.up = up
+    state.down = down
+    state.event_count = event_count
+    state.invalid_count = invalid_count
+    state.invalid_first = invalid_first
+    return state
+
+
+@wp.kernel
+def scan(
+    # Model:
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    width: wp.int32,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    # In:
+    first_pixel: wp.int32,
+    end_pixel: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    stamps: wp.array[wp.int64],
+    frame_count: wp.int32,
+    row_limit: wp.array[wp.int32],
+    base: wp.array[wp.float32],
+    last: wp.array[wp.float32],
+    crossed: wp.array[wp.vec2i],
+    tabulate: wp.bool,
+    # Out:
+    last_out: wp.array[wp.float32],
+    crossed_out: wp.array[wp.vec2i],
+    keys_out: wp.array[wp.int64],
+    counters_out: wp.array[wp.int64],
+    table_out: wp.array2d[wp.int32],
+) -> None:
+    """Take the pixels [first_pixel, end_pixel) over `frame_count` frames.
+
+    Args:
+        threshold_on: Step of log radiance upwards.
+        threshold_off: Step of log radiance downwards.
+        width: Pixels per row.
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        first_pixel: Pixel of thread 0.
+        end_pixel: Threads at or past it (they fill the last CUDA block) do nothing.
+        log_radiance: Frames, shape [frame, pixel].
+        stamps: Stamp of the state, then of each frame, from the keys' time origin [ns], shape [frame + 1].
+        frame_count: Frames to scan.
+        row_limit: Rows whose events are kept, for each frame, shape [frame].
+        base: Log radiance of the reset, shape [pixel].
+        last: Last sample, shape [pixel].
+        crossed: Levels crossed upwards and downwards, shape [pixel].
+        tabulate: Only add the number of events to `table_out`, and change nothing else.
+        last_out: `last` after the scan.
+        crossed_out: `crossed` after the scan.
+        keys_out: Keys of the events, in no defined order; those past its end are not written.
+        counters_out: Zeros before. Events kept (written or not); invalid samples; and the flat index of the
+            first of these in the stack, as frame_count * pixel_count minus it.
+        table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
+    """
+    pixel = first_pixel + wp.tid()
+    state = Pixel()
+    place = wp.int64(0)
+    row = wp.int32(0)
+    if pixel < end_pixel:
+        row = pixel // width
+        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << _COLUMN_SHIFT)
+        before = crossed[pixel]
+        state.last = last[pixel]
+        state.up = before[0]
+        state.down = before[1]
+        mode = _COUNT
+        if tabulate:
+            mode = _TABLE
+        state = walk(
+            mode,
+            wp.int64(0),
+            pixel,
+            row,
+            place,
+            base[pixel],
+            state,
+            threshold_on,
+            threshold_off,
+            time_shift,
+            log_radiance,
+            stamps,
+            frame_count,
+            row_limit,
+            table_out,
+            keys_out,
+        )
+    if not tabulate:
+        slot = _reserve(state.event_count, counters_out)
+        if pixel < end_pixel:
+            if state.event_count > 0:
+                before = crossed[pixel]
+                again = Pixel()
+                again.last = last[pixel]
+                again.up = before[0]
+                again.down = before[1]
+                walk(
+                    _WRITE,
+                    slot,
+                    pixel,
+                    row,
+                    place,
+                    base[pixel],
+                    again,
+                    threshold_on,
+                    threshold_off,
+                    time_shift,
+                    log_radiance,
+                    stamps,
+                    frame_count,
+                    row_limit,
+                    table_out,
+                    keys_out,
+                )
+            last_out[pixel] = state.last
+            crossed_out[pixel] = wp.vec2i(state.up, state.down)
+            if state.invalid_count > 0:
+                pixel_count = base.shape[0]
+                flat = wp.int64(state.invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
+                wp.atomic_add(counters_out, 1, wp.int64(state.invalid_count))
+                wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+
+
+@wp.kernel
+def mark_late(
+    # In:
+    stamps: wp.array[wp.int64],
+    time_shift: wp.int32,
+    # In/out:
+    keys: wp.array[wp.int64],
+) -> None:
+    """Set `late` on the keys that come after a stamp within its microsecond.
+
+    Args:
+        stamps: Ends of windows from the keys' time origin [ns], at least 1 us apart, increasing.
+        time_shift: Bits of a key below its microseconds.
+        keys: Keys, in any order; overwritten.
+    """
+    event = wp.tid()
+    key = keys[event]
+    time_us = key >> wp.int64(time_shift)
+    low = wp.int32(0)
+    high = stamps.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if stamps[middle] // _US < time_us:
+            low = middle + 1
+        else:
+            high = middle
+    if low < stamps.shape[0]:
+        end_ns = stamps[low]
+        sub_ns = key & wp.int64(1023)
+        if end_ns // _US == time_us and sub_ns > end_ns - time_us * _US:
+            keys[event] = key | (wp.int64(1) << wp.int64(time_shift - 1))
+
+
+@wp.kernel
+def carry_over(
+    # In:
+    keys: wp.array[wp.int64],
+    origin_step_us: wp.int64,
+    time_shift: wp.int32,
+    # Out:
+    keys_out: wp.array[wp.int64],
+) -> None:
+    """Copy keys to a time origin that is later by `origin_step_us`, and clear `late`."""
+    event = wp.tid()
+    key = keys[event] & ~(wp.int64(1) << wp.int64(time_shift - 1))
+    keys_out[event] = key - (origin_step_us << wp.int64(time_shift))
+
+
+@wp.kernel
+def find_ends(
+    # In:
+    keys: wp.array[wp.int64],
+    key_count: wp.int32,
+    stamps: wp.array[wp.int64],
+    time_shift: wp.int32,
+    # Out:
+    end_out: wp.array[wp.int32],
+) -> None:
+    """Find where each window ends in the sorted keys.
+
+    Args:
+        keys: Keys after `mark_late`, sorted.
+        key_count: Number of keys.
+        stamps: Ends of windows from the keys' time origin [ns], shape [window].
+        time_shift: Bits of a key below its microseconds.
+        end_out: Index of the first key after each window, shape [window].
+    """
+    window = wp.tid()
+    bound = ((stamps[window] // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
+    low = wp.int32(0)
+    high = key_count
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < bound:
+            low = middle + 1
+        else:
+            high = middle
+    end_out[window] = low
+
+
+@wp.kernel
+def decode(
+    # In:
+    keys: wp.array[wp.int64],
+    time_origin_us: wp.int64,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    # Out:
+    t_out: wp.array[wp.int64],
+    x_out: wp.array[wp.uint16],
+    y_out: wp.array[wp.uint16],
+    polarity_out: wp.array[wp.uint8],
+) -> None:
+    """Take keys apart into time [us], column, row and polarity, arrays of shape [event].
+
+    Args:
+        keys: Keys.
+        time_origin_us: Origin of the keys' time [us].
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        t_out: Time [us].
+        x_out: Column.
+        y_out: Row.
+        polarity_out: 1: brighter, 0: darker.
+    """
+    event = wp.tid()
+    key = keys[event]
+    one = wp.int64(1)
+    row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
+    column_mask = (one << (wp.int64(row_shift) - _COLUMN_SHIFT)) - one
+    t_out[event] = time_origin_us + (key >> wp.int64(time_shift))
+    x_out[event] = wp.uint16((key >> _COLUMN_SHIFT) & column_mask)
+    y_out[event] = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
+    polarity_out[event] = wp.uint8((key >> wp.int64(10)) & one)
