@@ -1,0 +1,303 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+"""Inertial measurement unit: specific force and angular rate at its mount, and their errors.
+
+Without errors the reading is the exact kinematics of the state: with r the mount in B and w the body rate,
+
+    a_S = R_SB (R_BW (dv/dt - g) + dw/dt x r + w x (w x r)),    w_S = R_SB w,
+
+evaluated at the stamp, not interpolated. Errors are added per axis in this order: bias (a random walk, and
+bias instability), white noise, saturation, quantisation. Their parameters have Kalibr's units and meaning; a
+sample taken at rate f has white noise of standard deviation N sqrt(f), and the walk moves by K / sqrt(f) from
+one to the next.
+
+Reference: IEEE Std 952-1997, annex C, for the Allan variances: N^2 / T (white), K^2 T / 3 (walk), and 2 ln(2)
+/ pi B^2 (bias instability) over averaging times T.
+"""
+
+import functools
+import math
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from neurosim_core.frames import Mount
+from neurosim_core.random import normal2, random_bits, stream_id
+from neurosim_core.settings import Settings
+from neurosim_core.vehicle import Multirotor
+
+CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
+"""Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...
+1000."""
+
+_PROCESSES = len(CORRELATION_TIMES_S)
+_PROCESS_COUNT = wp.constant(_PROCESSES)
+_BLOCK_DIM = 32
+_SLOT_PARAMETER = 5  # position of `slot` among the kernel's parameters
+
+vec6d = wp.types.vector(length=6, dtype=wp.float64)
+vec_processes = wp.types.vector(length=_PROCESSES, dtype=wp.float64)
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+
+
+class ImuConfig(Settings):
+    """An inertial measurement unit: its place, its rate, and its errors, of which it has none by default."""
+
+    mount: Mount = Mount()
+    """Pose on the body."""
+    rate_hz: Annotated[float, Field(gt=0.0, le=1e6)] = 400.0
+    """Samples a second [Hz]."""
+    accelerometer_noise_density: NonNegative = 0.0
+    """White noise N of specific force [m/s^2/sqrt(Hz)]."""
+    accelerometer_random_walk: NonNegative = 0.0
+    """Random walk K of the bias of specific force [m/s^3/sqrt(Hz)]."""
+    accelerometer_bias_instability_m_s2: NonNegative = 0.0
+    """Bias instability B of specific force [m/s^2]: the Allan deviation has a floor of 0.664 B from 0.3 to
+    300 s."""
+    accelerometer_range_m_s2: Annotated[float, Field(gt=0.0)] | None = None
+    """Largest specific force that can be told along an axis, of either sign [m/s^2]; none: no limit."""
+    accelerometer_resolution_m_s2: NonNegative = 0.0
+    """Step between values of specific force [m/s^2]; 0: continuous."""
+    gyroscope_noise_density: NonNegative = 0.0
+    """White noise N of angular rate [rad/s/sqrt(Hz)]."""
+    gyroscope_random_walk: NonNegative = 0.0
+    """Random walk K of the bias of angular rate [rad/s^2/sqrt(Hz)]."""
+    gyroscope_bias_instability_rad_s: NonNegative = 0.0
+    """Bias instability B of angular rate [rad/s]: the Allan deviation has a floor of 0.664 B from 0.3 to 300
+    s."""
+    gyroscope_range_rad_s: Annotated[float, Field(gt=0.0)] | None = None
+    """Largest angular rate that can be told about an axis, of either sign [rad/s]; none: no limit."""
+    gyroscope_resolution_rad_s: NonNegative = 0.0
+    """Step between values of angular rate [rad/s]; 0: continuous."""
+
+
+class ImuReading(NamedTuple):
+    """One sample of every vehicle on the host, float64."""
+
+    specific_force: NDArray[np.float64]
+    """In S [m/s^2], [N, 3]."""
+    angular_rate: NDArray[np.float64]
+    """In S [rad/s], [N, 3]."""
+
+
+@wp.struct
+class _Model:
+    """Parameters as the kernel reads them; six-vectors hold specific force, then angular rate."""
+
+    position: wp.vec3d  # r in B
+    q_SB: wp.quatd
+    gravity: wp.float64
+    white: vec6d
+    walk: vec6d
+    instability: vec6d
+    process_decay: vec_processes
+    limit: vec6d
+    resolution: vec6d
+    seed: wp.uint64
+    white_stream: wp.uint32
+    walk_stream: wp.uint32
+    instability_stream: wp.uint32
+
+
+@wp.func
+def _normal6(seed: wp.uint64, stream: wp.uint32, step: wp.int64, element: wp.int32) -> vec6d:
+    a = normal2(random_bits(seed, stream, step, 3 * element))
+    b = normal2(random_bits(seed, stream, step, 3 * element + 1))
+    c = normal2(random_bits(seed, stream, step, 3 * element + 2))
+    return vec6d(a[0], a[1], b[0], b[1], c[0], c[1])
+
+
+@functools.cache
+def make_kernel(terms: frozenset[str]) -> Any:
+    """Return the kernel that computes only the given errors."""
+    white = "white" in terms
+    walk = "walk" in terms
+    instability = "instability" in terms
+    saturation = "saturation" in terms
+    quantisation = "quantisation" in terms
+
+    @wp.kernel(
+        module=wp.get_module("neurosim_core.sensors.imu." + ("_".join(sorted(terms)) or "exact")),
+        enable_backward=False,
+    )
+    def measure(
+        # Model:
+        model: _Model,
+        # In:
+        orientation: wp.array[wp.quatd],
+        body_rate: wp.array[wp.vec3d],
+        acceleration: wp.array[wp.vec3d],
+        angular_acceleration: wp.array[wp.vec3d],
+        slot: wp.int32,
+        # In/out:
+        sample: wp.array[wp.int64],
+        walk_bias: wp.array[vec6d],
+        processes: wp.array2d[vec6d],
+        # Out:
+        specific_force_out: wp.array2d[wp.vec3d],
+        angular_rate_out: wp.array2d[wp.vec3d],
+    ):
+        vehicle = wp.tid()
+        w = body_rate[vehicle]
+        up = wp.vec3d(wp.float64(0.0), wp.float64(0.0), model.gravity)
+        force = wp.quat_rotate_inv(orientation[vehicle], acceleration[vehicle] + up)
+        force += wp.cross(angular_acceleration[vehicle], model.position)
+        force += wp.cross(w, wp.cross(w, model.position))
+        force = wp.quat_rotate(model.q_SB, force)
+        rate = wp.quat_rotate(model.q_SB, w)
+        reading = vec6d(force[0], force[1], force[2], rate[0], rate[1], rate[2])
+
+        k = sample[vehicle]
+        if wp.static(walk):
+            if k > wp.int64(0):
+                walk_bias[vehicle] += wp.cw_mul(
+                    model.walk, _normal6(model.seed, model.walk_stream, k, vehicle)
+                )
+            reading += walk_bias[vehicle]
+        if wp.static(instability):
+            for process in range(_PROCESS_COUNT):
+                drive = wp.cw_mul(
+                    model.instability,
+                    _normal6(model.seed, model.instability_stream, k, vehicle * _PROCESS_COUNT + process),
+                )
+                value = drive  # stationary from the first sample on
+                if k > wp.int64(0):
+                    decay = model.process_decay[process]
+                    value = decay * processes[vehicle, process]
+                    value += wp.sqrt(wp.float64(1.0) - decay * decay) * drive
+                processes[vehicle, process] = value
+                reading += value
+        if wp.static(white):
+            reading += wp.cw_mul(model.white, _normal6(model.seed, model.white_stream, k, vehicle))
+        for axis in range(6):
+            if wp.static(saturation):
+                reading[axis] = wp.clamp(reading[axis], -model.limit[axis], model.limit[axis])
+            if wp.static(quantisation):
+                step = model.resolution[axis]
+                if step > wp.float64(0.0):
+                    reading[axis] = step * wp.rint(reading[axis] / step)
+
+        sample[vehicle] = k + wp.int64(1)
+        specific_force_out[slot, vehicle] = wp.vec3d(reading[0], reading[1], reading[2])
+        angular_rate_out[slot, vehicle] = wp.vec3d(reading[3], reading[4], reading[5])
+
+    return measure
+
+
+class Imu:
+    """The inertial measurement units of a batch of vehicles.
+
+    `measure` is the device form: two launches (accelerations of the vehicle, reading), without allocation or
+    waiting. Noise is addressed by seed, name, vehicle and number of the sample since the reset, so it does
+    not depend on the size of the batch or on what else is computed.
+
+    Args:
+        config: Parameters.
+        vehicle: Who carries it; its state is read at each sample.
+        seed: Seed of the run, 0 <= seed < 2^64.
+        name: Name of the sensor; two sensors of one run with different names have independent noise.
+        slot_count: Samples that the output arrays hold.
+
+    Attributes:
+        specific_force: Output in S [m/s^2], device array of vec3d, shape [slot, vehicle].
+        angular_rate: Output in S [rad/s], likewise.
+        terms: The errors that are compiled in.
+    """
+
+    def __init__(
+        self, config: ImuConfig, vehicle: Multirotor, *, seed: int = 0, name: str = "imu", slot_count: int = 1
+    ) -> None:
+        if slot_count < 1:
+            raise ValueError(f"slot_count must be >= 1, got {slot_count}")
+        self.config = config
+        self.terms = _terms(config)
+        device, count = vehicle.device, vehicle.count
+        self.specific_force = wp.zeros((slot_count, count), dtype=wp.vec3d, device=device)
+        self.angular_rate = wp.zeros((slot_count, count), dtype=wp.vec3d, device=device)
+        self._vehicle = vehicle
+        self._sample = wp.zeros(count, dtype=wp.int64, device=device)
+        # arrays of terms that are not computed are empty
+        self._walk_bias = wp.zeros(count if "walk" in self.terms else 0, dtype=vec6d, device=device)
+        self._processes = wp.zeros(
+            (count if "instability" in self.terms else 0, _PROCESSES), dtype=vec6d, device=device
+        )
+        arrays = vehicle.arrays
+        self._launch = wp.launch(
+            make_kernel(frozenset(self.terms)),
+            dim=count,
+            inputs=[
+                _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, seed=seed, name=name),
+                arrays.orientation,
+                arrays.body_rate,
+                arrays.acceleration,
+                arrays.angular_acceleration,
+                0,
+            ],
+            outputs=[self._sample, self._walk_bias, self._processes, self.specific_force, self.angular_rate],
+            device=device,
+            block_dim=_BLOCK_DIM,
+            record_cmd=True,
+        )
+
+    def reset(self) -> None:
+        """Start again at sample 0: the noise of the next samples is that of a new IMU."""
+        self._sample.zero_()
+        self._walk_bias.zero_()
+
+    def measure(self, slot: int = 0) -> None:
+        """Write the next sample of every vehicle, at its current state, into a slot of the output arrays."""
+        self._vehicle.accelerate()
+        self._launch.set_param_at_index(_SLOT_PARAMETER, slot)
+        self._launch.launch()
+
+    def sample(self) -> ImuReading:
+        """Take the next sample of every vehicle and wait for it; overwrites slot 0."""
+        self.measure(0)
+        return ImuReading(np.array(self.specific_force.numpy()[0]), np.array(self.angular_rate.numpy()[0]))
+
+
+def _terms(config: ImuConfig) -> tuple[str, ...]:
+    limited = config.accelerometer_range_m_s2 is not None or config.gyroscope_range_rad_s is not None
+    present = {
+        "white": config.accelerometer_noise_density or config.gyroscope_noise_density,
+        "walk": config.accelerometer_random_walk or config.gyroscope_random_walk,
+        "instability": config.accelerometer_bias_instability_m_s2 or config.gyroscope_bias_instability_rad_s,
+        "saturation": limited,
+        "quantisation": config.accelerometer_resolution_m_s2 or config.gyroscope_resolution_rad_s,
+    }
+    return tuple(term for term, needed in present.items() if needed)
+
+
+def _model(config: ImuConfig, *, gravity_m_s2: float, seed: int, name: str) -> Any:
+    def six(accelerometer: float, gyroscope: float, scale: float = 1.0) -> Any:
+        return vec6d(*(3 * [scale * accelerometer] + 3 * [scale * gyroscope]))
+
+    rate_hz = config.rate_hz
+    # Gauss-Markov processes with log-spaced times and equal variances s^2 have the spectrum s^2 / (2 f
+    # ln(ratio)) between their corners; flicker noise of instability B has B^2 / (2 pi f)
+    ratio = CORRELATION_TIMES_S[1] / CORRELATION_TIMES_S[0]
+    share = math.sqrt(math.log(ratio) / math.pi)
+    model = _Model()
+    model.position = wp.vec3d(*config.mount.position_m)
+    model.q_SB = wp.quatd(*config.mount.rotation().inv().as_quat())
+    model.gravity = gravity_m_s2
+    model.white = six(config.accelerometer_noise_density, config.gyroscope_noise_density, math.sqrt(rate_hz))
+    model.walk = six(config.accelerometer_random_walk, config.gyroscope_random_walk, 1.0 / math.sqrt(rate_hz))
+    model.instability = six(
+        config.accelerometer_bias_instability_m_s2, config.gyroscope_bias_instability_rad_s, share
+    )
+    model.process_decay = vec_processes(*(math.exp(-1.0 / (rate_hz * time)) for time in CORRELATION_TIMES_S))
+    model.limit = six(
+        math.inf if config.accelerometer_range_m_s2 is None else config.accelerometer_range_m_s2,
+        math.inf if config.gyroscope_range_rad_s is None else config.gyroscope_range_rad_s,
+    )
+    model.resolution = six(config.accelerometer_resolution_m_s2, config.gyroscope_resolution_rad_s)
+    model.seed = seed
+    model.white_stream = stream_id(f"{name}/imu/white")
+    model.walk_stream = stream_id(f"{name}/imu/walk")
+    model.instability_stream = stream_id(f"{name}/imu/instability")
+    return model
