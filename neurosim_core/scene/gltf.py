@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Material
 from neurosim_core.scene.source import (
     Lamp,
@@ -32,7 +33,6 @@ from neurosim_core.scene.source import (
     TextureStore,
     decode_picture,
     rgb,
-    srgb_to_linear,
     unique_name,
 )
 
@@ -257,8 +257,7 @@ class _Reader:
             )
             glow_picture = pictures.get(index_of.get(id(emissive), -1)) if emissive else None
             if glow_picture is not None and glow.any():
-                table = srgb_to_linear(np.arange(256) / 255.0)
-                glow = glow * table[glow_picture].mean(axis=(0, 1))
+                glow = glow * srgb_to_linear(glow_picture).mean(axis=(0, 1), dtype=np.float64)
                 glowing += 1
             self.source.materials.append(
                 Material(

@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from neurosim_core.scene.scene import Light, LinearRgb
 
-LEVEL = 0.5
-"""Direct light that the median square metre would reflect if it were white, faced its lamps and saw them."""
+LEVEL = 0.3
+"""What the median bit of surface would reflect if it were white and faced its brightest lamp, alone."""
 MAX_LAMPS = 6
 _SAMPLES = 4096
 _CELL_MAX = 300_000
@@ -95,11 +95,12 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
     floor = _gap(full) * cell
     standing = np.isfinite(floor) & (floor >= 1.2)
     how = "hung under the ceilings"
-    places = standing & _under(full, cell) & (room >= 0.25)
+    above = _gap(full[:, :, ::-1])[:, :, ::-1] * cell
+    places = standing & (above >= 0.3) & (above <= 0.9) & (room >= 0.25)
     if places.any(axis=2).sum() < standing.any(axis=2).sum() / 3.0:
         how = "hung inside at the height where a ceiling would be, for there is none"
-        full[:, :, -1] = True
-        places = standing & _under(full, cell) & (room >= 0.25)
+        top = (shape[2] - 1 - np.arange(shape[2])) * cell
+        places = standing & np.isinf(above) & (top >= 0.3) & (top <= 0.9) & (room >= 0.25)
     air, _ = ndimage.label(room >= 1.5 * cell)
     if not air[places].any():
         return _around(low, high), "placed above and around the scene, which has no room for them inside"
@@ -115,12 +116,6 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
         lamps.append(_widest(places & (reach >= max(far - 2.0, 0.6 * far)), width))
         reach = np.minimum(reach, _steps_by_air(free, lamps[-1]) * cell)
     return low + (np.array(lamps) - 0.5) * cell, how
-
-
-def _under(full: NDArray[np.bool_], cell: float) -> NDArray[np.bool_]:
-    """Return the cells that have a ceiling at a lamp's distance above them."""
-    above = _gap(full[:, :, ::-1])[:, :, ::-1] * cell
-    return (above >= 0.3) & (above <= 0.9)
 
 
 def _widest(places: NDArray[np.bool_], width: NDArray[np.float64]) -> NDArray[np.int64]:

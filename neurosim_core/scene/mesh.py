@@ -15,6 +15,7 @@ from trimesh.exchange.load import mesh_formats
 
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import hang_lamps, scaled_lights
+from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.normals import smooth_normals
 from neurosim_core.scene.scene import Ambient, LinearRgb, Material, Scene, Texture
 from neurosim_core.scene.source import (
@@ -26,7 +27,6 @@ from neurosim_core.scene.source import (
     decode_picture,
     linear_to_srgb8,
     rgb,
-    srgb_to_linear,
     unique_name,
 )
 from neurosim_core.settings import Settings
@@ -215,11 +215,11 @@ def _appearance(
     """Return material index, texture coordinates and corner colours of a trimesh mesh."""
     visual = mesh.visual
     if isinstance(visual, trimesh.visual.ColorVisuals):
-        color = None
+        color: NDArray[np.float64] | None = None
         if visual.kind == "face":
-            color = np.repeat(srgb_to_linear(visual.face_colors[:, None, :3] / 255.0), 3, axis=1)
+            color = np.repeat(srgb_to_linear(visual.face_colors[:, None, :3]), 3, axis=1).astype(np.float64)
         elif visual.kind == "vertex":
-            color = srgb_to_linear(visual.vertex_colors[:, :3] / 255.0)[np.asarray(mesh.faces)]
+            color = srgb_to_linear(visual.vertex_colors[:, :3])[np.asarray(mesh.faces)].astype(np.float64)
         if -1 not in known:
             known[-1] = len(source.materials)
             source.materials.append(Material(name="plain", base_color=(0.8, 0.8, 0.8)))

@@ -105,12 +105,6 @@ def decode_picture(data: bytes | Image.Image, *, file: str, name: str) -> NDArra
         ) from error
 
 
-def srgb_to_linear(srgb: Any) -> NDArray[np.float64]:
-    """Decode sRGB in [0, 1] to linear light. Reference: IEC 61966-2-1."""
-    value = np.asarray(srgb, dtype=np.float64)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
 def linear_to_srgb8(linear: Any) -> NDArray[np.uint8]:
     """Encode linear light in [0, 1] as 8-bit sRGB, rounded. Reference: IEC 61966-2-1."""
     value = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
