@@ -24,6 +24,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from neurosim_core.control.air import air_terms, make_air_model
 from neurosim_core.control.allocation import allocate, allocation_matrix, clip
 from neurosim_core.control.flatness import AttitudeReference
 from neurosim_core.control.se3 import (
@@ -41,7 +42,8 @@ from neurosim_core.control.se3 import (
 )
 from neurosim_core.frames import as_rows
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
-from neurosim_core.vehicle import MultirotorConfig
+from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.multirotor import MultirotorConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -144,13 +146,17 @@ def _path(
     return point_wrench(parameters, state, evaluate_path(path, index, stamp_ns))
 
 
-def _make_wrench_kernel(name: str, wrench_of: Any) -> Any:
-    """Return the kernel that allocates the wrench of one mode."""
+def _make_wrench_kernel(name: str, wrench_of: Any, terms: frozenset[str]) -> Any:
+    """Return the kernel that allocates the wrench of one mode, with compensation of the air's given terms."""
+    air_wrench = make_wrench(terms)
+    compensate = len(terms) > 0
 
-    @wp.kernel(module=wp.get_module(f"{__name__}.{name}"), enable_backward=False)
+    @wp.kernel(module=wp.get_module(".".join((__name__, name, *sorted(terms)))), enable_backward=False)
     def command(
         # Model:
         parameters: Se3Parameters,
+        airframe: Airframe,
+        linear_weight: wp.array[vec10d],
         matrix: wp.array2d[wp.float64],
         path: PathArrays,
         # In:
@@ -165,6 +171,14 @@ def _make_wrench_kernel(name: str, wrench_of: Any) -> Any:
         state.velocity = feedback.velocity[vehicle]
         state.orientation = feedback.orientation[vehicle]
         state.body_rate = feedback.body_rate[vehicle]
+        if wp.static(compensate):
+            linear = vec10d()
+            for rotor in range(matrix.shape[0]):
+                linear += feedback.rotor_speed[vehicle, rotor] * linear_weight[rotor]
+            air_B = wp.quat_rotate_inv(state.orientation, state.velocity)
+            force, torque = air_wrench(airframe, wp.vec4d(), linear, air_B, state.body_rate)
+            state.air_acceleration = wp.quat_rotate(state.orientation, force) / parameters.mass_kg
+            state.air_torque = torque
         wrench = wrench_of(parameters, path, setpoint, vehicle, feedback.stamp_ns[vehicle], state)
         allocate(
             matrix,
@@ -179,13 +193,15 @@ def _make_wrench_kernel(name: str, wrench_of: Any) -> Any:
     return command
 
 
-def _make_motor_speeds_kernel() -> Any:
-    """Return the kernel that only applies the limits."""
+def _make_motor_speeds_kernel(terms: frozenset[str]) -> Any:
+    """Return the kernel that only applies the limits, whatever the air does."""
 
     @wp.kernel(module=wp.get_module(f"{__name__}.motor_speeds"), enable_backward=False)
     def command(
         # Model:
         parameters: Se3Parameters,
+        airframe: Airframe,
+        linear_weight: wp.array[vec10d],
         matrix: wp.array2d[wp.float64],
         path: PathArrays,
         # In:
@@ -209,7 +225,7 @@ class Mode:
 
     layout: tuple[str, ...]
     """Name and unit of each element of a setpoint row; that of `motor_speeds` repeats for every rotor."""
-    make_kernel: Callable[[], Any]
+    make_kernel: Callable[[frozenset[str]], Any]
     """Makes the kernel from setpoint to rotor speed commands; all take the same arguments."""
 
 
@@ -237,9 +253,14 @@ MODES: dict[str, Mode] = {
 
 
 @functools.cache
-def mode_kernel(mode: str) -> Any:
-    """Return the kernel of a mode, made once; `mode_kernel(mode).module` can be compiled ahead of time."""
-    return MODES[mode].make_kernel()
+def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
+    """Return the kernel of a mode, made once; `mode_kernel(mode).module` can be compiled ahead of time.
+
+    Args:
+        mode: Name of the mode.
+        terms: Aerodynamic terms to compensate, of `vehicle.aerodynamics.AIR_TERMS`.
+    """
+    return MODES[mode].make_kernel(terms)
 
 
 class Controller:
@@ -258,21 +279,20 @@ class Controller:
         *,
         mode: str,
         layout: tuple[str, ...],
-        parameters: Any,
-        matrix: NDArray[np.float64],
-        paths: Any,
+        kernel: Any,
+        model: Sequence[Any],
         count: int,
+        rotor_count: int,
         device: Any,
     ) -> None:
         self.mode = mode
         self.layout = layout
         self.count = count
-        self.rotor_count = len(matrix)
-        self.device = wp.get_device(device)
-        self.setpoint = wp.zeros((count, len(layout)), dtype=wp.float64, device=self.device)
-        self._parameters = parameters
-        self._matrix: Any = wp.array(matrix, dtype=wp.float64, device=self.device)
-        self._paths = paths
+        self.rotor_count = rotor_count
+        self.device = device
+        self.setpoint = wp.zeros((count, len(layout)), dtype=wp.float64, device=device)
+        self._kernel = kernel
+        self._model = list(model)
         self._bound: tuple[Any, Any] = (None, None)
 
     def update(self, arrays: Any) -> None:
@@ -360,9 +380,9 @@ class Controller:
 
     def _launch(self, feedback: Any, commands: Any, *, record: bool = False) -> Any:
         return wp.launch(
-            mode_kernel(self.mode),
+            self._kernel,
             dim=self.count,
-            inputs=[self._parameters, self._matrix, self._paths, feedback, self.setpoint],
+            inputs=[*self._model, feedback, self.setpoint],
             outputs=[commands],
             device=self.device,
             record_cmd=record,
@@ -382,7 +402,7 @@ def make_controller(
 
     Args:
         mode: What a setpoint is; see the table above.
-        vehicle: The vehicle's parameters; the controller knows mass, inertia, rotors and motors, not the air.
+        vehicle: The vehicle's parameters; the controller knows all of them but the wind.
         config: Gains and limits.
         count: Vehicles in the batch.
         device: Warp device.
@@ -401,14 +421,21 @@ def make_controller(
         raise ValueError(f"mode 'path' takes one path, or one for each of {count} vehicles, got {len(given)}")
     if mode != "path" and given:
         raise ValueError(f"mode {mode!r} takes setpoints ({', '.join(MODES[mode].layout)}), not paths")
+    gains = config or Se3Config()
     matrix = allocation_matrix(vehicle)
     layout = MODES[mode].layout
+    place = wp.get_device(device)
     return Controller(
         mode=mode,
         layout=layout * vehicle.rotor_count if mode == "motor_speeds" else layout,
-        parameters=make_parameters(vehicle, config or Se3Config(), matrix),
-        matrix=matrix,
-        paths=upload_paths(given, wp.get_device(device)) if given else PathArrays(),
+        kernel=mode_kernel(mode, air_terms(vehicle) if gains.feed_forward_air else frozenset()),
+        model=[
+            make_parameters(vehicle, gains, matrix),
+            *make_air_model(vehicle, place),
+            wp.array(matrix, dtype=wp.float64, device=place),
+            upload_paths(given, place) if given else PathArrays(),
+        ],
         count=count,
-        device=device,
+        rotor_count=vehicle.rotor_count,
+        device=place,
     )

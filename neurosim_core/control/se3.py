@@ -70,6 +70,8 @@ class Se3Config(Settings):
     """Use jerk and yaw rate of a path: they give its body rate."""
     feed_forward_snap: bool = True
     """Use snap and yaw acceleration of a path: they give its angular acceleration."""
+    feed_forward_air: bool = True
+    """Cancel drag and lift as the vehicle's own model gives them in still air; wind remains a disturbance."""
 
 
 @wp.struct
@@ -112,7 +114,7 @@ def make_parameters(
     """Return what kernels need to know of a vehicle and its gains.
 
     Args:
-        vehicle: The vehicle; its aerodynamics are not known to the controller.
+        vehicle: The vehicle.
         config: Gains and limits.
         matrix: See `allocation_matrix`.
     """
@@ -153,6 +155,10 @@ class VehicleState:
     """q_WB, xyzw."""
     body_rate: wp.vec3d
     """w_WB in B [rad/s]."""
+    air_acceleration: wp.vec3d
+    """What the air is known to add to the acceleration, in W [m/s^2]; 0 where it is not compensated."""
+    air_torque: wp.vec3d
+    """What the air is known to add to the torque, in B [N m]; 0 where it is not compensated."""
 
 
 @wp.struct
@@ -234,9 +240,11 @@ def rate_wrench(
     w = state.body_rate
     wrench = Wrench()
     wrench.thrust_N = thrust_N
-    wrench.torque = parameters.inertia * (
-        wp.cw_mul(parameters.rate_gain, body_rate - w) + angular_acceleration
-    ) + wp.cross(w, parameters.inertia * w)
+    wrench.torque = (
+        parameters.inertia * (wp.cw_mul(parameters.rate_gain, body_rate - w) + angular_acceleration)
+        + wp.cross(w, parameters.inertia * w)
+        - state.air_torque
+    )
     return wrench
 
 
@@ -284,7 +292,8 @@ def thrust_wrench(
         heading: Where to look.
     """
     thrust = reachable_thrust(
-        acceleration + wp.vec3d(_ZERO, _ZERO, parameters.gravity_m_s2), parameters.thrust_max_m_s2
+        acceleration - state.air_acceleration + wp.vec3d(_ZERO, _ZERO, parameters.gravity_m_s2),
+        parameters.thrust_max_m_s2,
     )
     reference = attitude_reference(thrust, jerk, snap, heading, state.orientation)
     z_B = wp.quat_rotate(state.orientation, wp.vec3d(_ZERO, _ZERO, _ONE))
