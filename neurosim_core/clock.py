@@ -53,6 +53,10 @@ class Rate:
         # floor(k p) >= s  <=>  k p >= s  for integer s
         return math.ceil(stamp_ns / self._period)
 
+    def has_tick(self, stamp_ns: int) -> bool:
+        """Return whether a tick is at this stamp."""
+        return self.stamp_ns(self.first_tick(stamp_ns)) == stamp_ns
+
     def stamps(self, start_ns: int, end_ns: int) -> Iterator[int]:
         """Yield the stamps of all ticks in [start_ns, end_ns)."""
         tick = self.first_tick(start_ns)

@@ -17,8 +17,6 @@ class Schedule:
     """Clocks of the sensors that read the state of the vehicle (IMU, odometry)."""
     casts: tuple[Rate, ...]
     """Clocks of the casts."""
-    packets: tuple[Rate, ...]
-    """Clocks at which packets of events end; each tick is also a tick of a cast."""
     instants_per_launch: int
     """The most instants of one cast in one batch."""
 
@@ -39,14 +37,11 @@ class Boundary:
 def batch_end_ns(schedule: Schedule, start_ns: int, limit_ns: int) -> int:
     """Return where the batch that follows `start_ns` ends: at most at `limit_ns`.
 
-    A batch ends where a packet of events ends, and before any cast has more instants than one launch takes. A
-    rig without cameras counts commands instead.
+    It ends where the fastest cast has as many instants as one launch takes; a rig without cameras counts
+    commands instead.
     """
-    ends = [_tick_after(rate, start_ns, 1) for rate in schedule.packets]
-    ends += [_tick_after(rate, start_ns, schedule.instants_per_launch) for rate in schedule.casts]
-    if not ends:
-        ends = [_tick_after(schedule.control, start_ns, schedule.instants_per_launch)]
-    return min([*ends, limit_ns])
+    rates = schedule.casts or (schedule.control,)
+    return min([limit_ns, *(_tick_after(rate, start_ns, schedule.instants_per_launch) for rate in rates)])
 
 
 def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]:

@@ -46,6 +46,8 @@ def test_first_tick_is_the_first_at_or_after(rate_hz, stamp_ns):
     tick = rate.first_tick(stamp_ns)
     assert rate.stamp_ns(tick) >= stamp_ns
     assert tick == 0 or rate.stamp_ns(tick - 1) < stamp_ns
+    assert rate.has_tick(rate.stamp_ns(tick))
+    assert rate.has_tick(stamp_ns) == (rate.stamp_ns(tick) == stamp_ns)
 
 
 @given(rates, st.lists(st.integers(min_value=0, max_value=10**8), min_size=3, max_size=3))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +16,6 @@ schedules = st.builds(
     control=hertz.map(Rate),
     samplers=st.lists(hertz.map(Rate), max_size=2).map(tuple),
     casts=st.lists(hertz.map(Rate), max_size=2).map(tuple),
-    packets=st.just(()),
     instants_per_launch=st.integers(min_value=1, max_value=16),
 )
 
@@ -51,11 +52,11 @@ def test_no_batch_exceeds_its_buffers(schedule):
             assert sum(index in b.casts for b in batch) <= schedule.instants_per_launch
 
 
-def test_a_batch_ends_where_a_packet_of_events_ends():
+def test_a_batch_ends_with_the_last_instant_of_a_launch():
     schedule = Schedule(
-        control=Rate(200.0), samplers=(), casts=(Rate(500.0),), packets=(Rate(100.0),), instants_per_launch=16
+        control=Rate(200.0), samplers=(), casts=(Rate(500.0), Rate(30.0)), instants_per_launch=16
     )
-    assert batch_end_ns(schedule, 0, 10**9) == 10_000_000
-    assert batch_end_ns(schedule, 4_000_000, 10**9) == 10_000_000
-    assert batch_end_ns(schedule, 10_000_000, 10**9) == 20_000_000
-    assert batch_end_ns(schedule, 10_000_000, 15_000_000) == 15_000_000
+    assert batch_end_ns(schedule, 0, 10**9) == 32_000_000
+    assert batch_end_ns(schedule, 4_000_000, 10**9) == 36_000_000
+    assert batch_end_ns(schedule, 0, 15_000_000) == 15_000_000
+    assert batch_end_ns(replace(schedule, casts=()), 0, 10**9) == 80_000_000

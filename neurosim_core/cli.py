@@ -1,0 +1,110 @@
+"""The command `neurosim`: run | scene | view."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
+    arguments = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        return int(arguments.command(arguments))
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        print(f"neurosim: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("neurosim: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="neurosim",
+        description="Event cameras, RGB, depth and IMU on agile multirotors, faster than real time.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="fly, record, and draw a picture of it")
+    run.add_argument(
+        "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
+    )
+    run.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
+    run.add_argument("--seed", type=int, help="seed of the sensor noise")
+    run.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    run.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+                     help="any setting by its dotted key, such as scene.seed=3; may be repeated")  # fmt: skip
+    run.add_argument(
+        "--out", type=Path, metavar="DIR", help="where to leave the flight (default: ./flight, flight-2, ...)"
+    )
+    run.add_argument("--overwrite", action="store_true", help="replace a flight that is already in --out")
+    run.add_argument("--no-rrd", action="store_true", help="leave out flight.rrd")
+    run.add_argument(
+        "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
+    )
+    run.set_defaults(command=_run)
+
+    scene = commands.add_parser("scene", help="say what is in a scene file, and draw it")
+    scene.add_argument("file", type=Path, help="glTF, GLB, OBJ, PLY or STL")
+    scene.add_argument(
+        "--out", type=Path, metavar="PNG", help="where to leave the picture (default: NAME.png)"
+    )
+    scene.set_defaults(command=_scene)
+
+    view = commands.add_parser("view", help="look at a flight in Rerun")
+    view.add_argument("flight", type=Path, help="folder that `neurosim run` left, or a flight.h5")
+    view.add_argument(
+        "--save", type=Path, metavar="RRD", help="write the Rerun file instead of opening a window"
+    )
+    view.set_defaults(command=_view)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from neurosim_core.config import load_config, to_yaml
+
+    overrides: dict[str, Any] = {}
+    for setting in arguments.settings:
+        key, separator, text = setting.partition("=")
+        if not separator or not key:
+            raise ValueError(f"--set takes KEY=VALUE, got {setting!r}")
+        overrides[key] = yaml.safe_load(text)
+    for key, value in (
+        ("duration_s", arguments.duration),
+        ("seed", arguments.seed),
+        ("device", arguments.device),
+    ):
+        if value is not None:
+            overrides[key] = value
+    config = load_config(arguments.config, overrides=overrides)
+    if arguments.print_config:
+        print(to_yaml(config, comments=True), end="")
+        return 0
+
+    from neurosim_core.flight import fly, new_folder
+
+    folder = new_folder(arguments.out, overwrite=arguments.overwrite)
+    fly(config, folder, rerun=not arguments.no_rrd)
+    return 0
+
+
+def _scene(arguments: argparse.Namespace) -> int:
+    from neurosim_core.scene.report import report_scene
+
+    report_scene(arguments.file, arguments.out)
+    return 0
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from neurosim_core.flight import view
+
+    view(arguments.flight, save=arguments.save)
+    return 0

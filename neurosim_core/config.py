@@ -1,0 +1,282 @@
+"""Settings files: YAML -> one frozen `SimulationConfig`. The only reader of settings files."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+
+from neurosim_core.control import Se3Config
+from neurosim_core.render.renderer import RenderConfig
+from neurosim_core.scene.apartment import ApartmentConfig
+from neurosim_core.scene.freespace import FreeSpaceConfig
+from neurosim_core.scene.mesh import MeshSceneConfig
+from neurosim_core.sensors.rig import (
+    DepthSensorConfig,
+    EventSensorConfig,
+    ImuSensorConfig,
+    OdometrySensorConfig,
+    RgbSensorConfig,
+    SensorConfig,
+)
+from neurosim_core.settings import Settings
+from neurosim_core.trajectory import PathConfig, TourConfig
+from neurosim_core.vehicle import MultirotorConfig, preset
+
+
+class ConfigError(ValueError):
+    """A settings file or dict is wrong; the message names each key, its value and what is allowed."""
+
+
+class VehicleConfig(Settings):
+    """The multirotor that carries the sensors."""
+
+    preset: str = "hummingbird"
+    """Name of the airframe: crazyflie, hummingbird or racer."""
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    """Parameters of the airframe to change, by name (see `MultirotorConfig`), such as {mass_kg: 0.6}."""
+    max_step_s: Annotated[float, Field(gt=0.0, le=0.1)] = 0.001
+    """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
+    collision_radius_m: Annotated[float, Field(gt=0.0)] = 0.2
+    """Radius of the sphere around the vehicle that must not touch the scene [m]."""
+    on_collision: Literal["end", "report"] = "end"
+    """end: the run stops at the first touch; report: it flies on, through things, and yields Collision
+    packets."""
+
+    @model_validator(mode="after")
+    def _airframe_exists(self) -> VehicleConfig:
+        self.airframe()
+        return self
+
+    def airframe(self) -> MultirotorConfig:
+        """Return all parameters of the airframe."""
+        return preset(self.preset, **self.parameters)
+
+
+class ControlConfig(Settings):
+    """The controller that flies the path."""
+
+    rate_hz: Annotated[float, Field(gt=0.0, le=10_000.0)] = 200.0
+    """Commands a second [Hz]; each is held until the next."""
+    gains: Se3Config = Se3Config()
+    """Gains and limits of the geometric controller."""
+
+
+def _default_sensors() -> dict[str, SensorConfig]:
+    return {
+        "events": EventSensorConfig(),
+        "rgb": RgbSensorConfig(),
+        "depth": DepthSensorConfig(),
+        "imu": ImuSensorConfig(),
+        "odometry": OdometrySensorConfig(),
+    }
+
+
+SceneConfig = Annotated[ApartmentConfig | MeshSceneConfig, Field(discriminator="kind")]
+
+
+class SimulationConfig(Settings):
+    """Everything that decides the outcome of a run: same config, same device type, same bits."""
+
+    duration_s: Annotated[float, Field(gt=0.0, le=1e6)] = 4.0
+    """Simulated time [s]. Both ends are sampled: 4 s at 20 Hz give 81 pictures."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of all sensor noise."""
+    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
+    """Where to compute: auto (the first CUDA device, else the CPU), cpu, cuda:0, ..."""
+    instants_per_launch: Annotated[int, Field(ge=1, le=1024)] = 16
+    """How many instants of the fastest camera are rendered together; changes speed and memory, not the
+    result."""
+    scene: SceneConfig = ApartmentConfig()
+    """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
+    render: RenderConfig = RenderConfig()
+    """How the scene is lit and rendered."""
+    free_space: FreeSpaceConfig = FreeSpaceConfig()
+    """The map that the path is planned on."""
+    vehicle: VehicleConfig = VehicleConfig()
+    """The multirotor."""
+    path: PathConfig = TourConfig()
+    """Where it flies."""
+    control: ControlConfig = ControlConfig()
+    """What flies it."""
+    sensors: dict[Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], SensorConfig] = Field(
+        default_factory=_default_sensors
+    )
+    """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
+    exist."""
+
+    @field_validator("sensors")
+    @classmethod
+    def _no_reserved_name(cls, sensors: dict[str, SensorConfig]) -> dict[str, SensorConfig]:
+        if "collision" in sensors:
+            raise ValueError("the sensor name 'collision' is taken by collision reports")
+        return sensors
+
+
+def load_config(
+    source: str | Path | Mapping[str, Any] | None = None, *, overrides: Mapping[str, Any] | None = None
+) -> SimulationConfig:
+    """Read settings and check them.
+
+    Args:
+        source: A YAML file, a mapping with the same keys, or None for the defaults. A relative scene file is
+            looked up beside the YAML file.
+        overrides: Keys that win over the source. Nested mappings are merged; a key may be dotted
+            ("scene.seed").
+
+    Raises:
+        ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
+        out of
+            range. The message has one line for each mistake.
+    """
+    origin = str(source) if isinstance(source, str | Path) else "config"
+    raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
+    for key, value in (overrides or {}).items():
+        nested: Any = value
+        for part in reversed(key.split(".")):
+            nested = {part: nested}
+        raw = _merge(raw, nested)
+    if isinstance(source, str | Path):
+        raw = _beside(raw, Path(source).resolve().parent)
+    try:
+        return SimulationConfig.model_validate(raw)
+    except ValidationError as error:
+        lines = [f"  {line}" for line in _explain(error)]
+        raise ConfigError("\n".join([f"{origin} is not a valid configuration:", *lines])) from None
+
+
+def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
+    """Return a configuration as YAML that `load_config` reads back to an equal one.
+
+    Args:
+        config: The configuration.
+        comments: Put the documentation of each key above it.
+    """
+    return "\n".join(_yaml_lines(config, indent=0, comments=comments)) + "\n"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not YAML: {error}") from error
+    if raw is None:
+        return {}
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path} must hold a mapping of keys to values, got a {type(raw).__name__}")
+    return raw
+
+
+def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in patch.items():
+        old = merged.get(key)
+        merged[key] = _merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return merged
+
+
+def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Make a relative scene file absolute: it is meant relative to the settings file."""
+    scene = raw.get("scene")
+    file = scene.get("file") if isinstance(scene, Mapping) else None
+    if not isinstance(file, str) or Path(file).expanduser().is_absolute():
+        return raw
+    return _merge(raw, {"scene": {"file": str(folder / file)}})
+
+
+def _explain(error: ValidationError) -> Iterator[str]:
+    """One line for each mistake: path of the key, value, what is allowed."""
+    for item in error.errors():
+        path = [str(part) for part in item["loc"]]
+        model, keys = _model_at(SimulationConfig, item["loc"])
+        shown = ".".join(keys)
+        if item["type"] == "extra_forbidden":
+            known = sorted(model.model_fields) if model else []
+            close = difflib.get_close_matches(path[-1], known, n=1)
+            hint = f", did you mean {close[0]!r}?" if close else ""
+            yield f"{shown}: unknown key{hint} Known: {', '.join(known)}."
+        elif item["type"] in ("missing", "union_tag_not_found"):
+            yield f"{shown}: {item['msg']}"
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            got = "" if item["type"] == "value_error" and not keys else f", got {_shorten(item['input'])}"
+            yield f"{shown}: {message}{got}" if shown else message
+
+
+def _shorten(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _model_at(
+    model: type[BaseModel] | None, loc: tuple[int | str, ...]
+) -> tuple[type[BaseModel] | None, list[str]]:
+    """Follow an error location to the innermost model; return it and the keys as the user wrote them."""
+    keys: list[str] = []
+    annotation: Any = model
+    for index, part in enumerate(loc):
+        members = list(_models_in(annotation))
+        tagged = [m for m in members if _tag(m) == part]
+        if len(members) > 1 and tagged:  # the tag of a discriminated union: not a key
+            annotation = tagged[0]
+            continue
+        owner = members[0] if len(members) == 1 else None
+        if owner is not None and part in owner.model_fields:
+            annotation = owner.model_fields[str(part)].annotation
+        elif owner is not None and index < len(loc) - 1:
+            annotation = None
+        elif owner is None:
+            annotation = _value_type(annotation)
+        keys.append(str(part))
+    members = list(_models_in(annotation))
+    return (members[0] if len(members) == 1 else None), keys
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif getattr(annotation, "__origin__", None) is not dict:
+        for argument in get_args(annotation):
+            yield from _models_in(argument)
+
+
+def _value_type(annotation: Any) -> Any:
+    """Type of the values of a dict annotation."""
+    arguments = get_args(annotation)
+    return (
+        arguments[1]
+        if getattr(annotation, "__origin__", None) is dict and len(arguments) == 2
+        else annotation
+    )
+
+
+def _tag(model: type[BaseModel]) -> str | None:
+    kind = model.model_fields.get("kind")
+    return None if kind is None else kind.default
+
+
+def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:
+    pad = "  " * indent
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
+        if comments and field.description:
+            for line in field.description.split("\n"):
+                yield f"{pad}# {line.strip()}"
+        if isinstance(value, BaseModel):
+            yield f"{pad}{name}:"
+            yield from _yaml_lines(value, indent=indent + 1, comments=comments)
+        elif isinstance(value, dict) and value and all(isinstance(v, BaseModel) for v in value.values()):
+            yield f"{pad}{name}:"
+            for key, item in value.items():
+                yield f"{pad}  {key}:"
+                yield from _yaml_lines(item, indent=indent + 2, comments=comments)
+        else:
+            plain = model.model_dump(mode="json", include={name})[name]
+            text = yaml.safe_dump(plain, default_flow_style=True, width=10**6).splitlines()[0]
+            yield f"{pad}{name}: {text}"

@@ -1,0 +1,146 @@
+"""The sensors of a vehicle as the user names them, and how their cameras share the work of rendering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from neurosim_core.clock import Rate
+from neurosim_core.frames import Mount
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.sensors.events import EventCameraConfig
+from neurosim_core.sensors.imu import ImuConfig
+from neurosim_core.settings import Settings
+
+RateHz = Annotated[float, Field(gt=0.0, le=1e6)]
+
+
+class CameraConfig(Settings):
+    """What every camera has: a lens and a place on the body."""
+
+    lens: PinholeConfig = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
+    """Resolution and field of view."""
+    mount: Mount = Mount(position_m=(0.1, 0.0, 0.03))
+    """Pose of the camera on the body."""
+
+
+class EventSensorConfig(CameraConfig):
+    """An event camera."""
+
+    kind: Literal["event_camera"] = "event_camera"
+    pixel: EventCameraConfig = EventCameraConfig()
+    """The law of its pixels."""
+    sampling_rate_hz: RateHz = 500.0
+    """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
+    packet_rate_hz: RateHz = 100.0
+    """How many packets of events are sent a second [Hz]; the events in them are those of the whole window."""
+
+    @model_validator(mode="after")
+    def _packets_end_on_renders(self) -> EventSensorConfig:
+        if not _divides(self.packet_rate_hz, self.sampling_rate_hz):
+            raise ValueError(
+                f"packet_rate_hz must divide sampling_rate_hz = {self.sampling_rate_hz:g} without remainder, "
+                f"got {self.packet_rate_hz:g}"
+            )
+        return self
+
+
+class RgbSensorConfig(CameraConfig):
+    """A colour camera with an ideal global shutter; pictures are 8-bit sRGB."""
+
+    kind: Literal["rgb"] = "rgb"
+    rate_hz: RateHz = 20.0
+    """Pictures a second [Hz]."""
+
+
+class DepthSensorConfig(CameraConfig):
+    """A camera that measures planar depth z [m], without noise; inf where nothing is hit."""
+
+    kind: Literal["depth"] = "depth"
+    rate_hz: RateHz = 20.0
+    """Pictures a second [Hz]."""
+
+
+class ImuSensorConfig(ImuConfig):
+    """An inertial measurement unit."""
+
+    kind: Literal["imu"] = "imu"
+
+
+class OdometrySensorConfig(Settings):
+    """The true state of the vehicle, as a sensor."""
+
+    kind: Literal["odometry"] = "odometry"
+    rate_hz: RateHz = 200.0
+    """Samples a second [Hz]."""
+
+
+ImageSensorConfig = RgbSensorConfig | DepthSensorConfig
+SensorConfig = Annotated[
+    EventSensorConfig | RgbSensorConfig | DepthSensorConfig | ImuSensorConfig | OdometrySensorConfig,
+    Field(discriminator="kind"),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cast:
+    """Cameras that share a pose, a lens and a clock, so that one ray answers all of them."""
+
+    lens: PinholeConfig
+    mount: Mount
+    rate: Rate
+    """The instants at which rays are cast."""
+    event_cameras: tuple[str, ...]
+    """Names of the event cameras that see every instant."""
+    image_cameras: tuple[str, ...]
+    """Names of the cameras that take a picture at every n-th instant."""
+    outputs: frozenset[str]
+    """What a ray answers."""
+
+
+def plan_casts(sensors: dict[str, SensorConfig]) -> tuple[Cast, ...]:
+    """Group the cameras of a rig into as few casts as possible.
+
+    Event cameras with the same lens, mount and sampling rate share a cast. An image camera joins the first
+    cast with its lens and mount whose ticks contain all its own; so whether it exists does not change which
+    instants an event camera sees.
+    """
+    casts: list[tuple[PinholeConfig, Mount, float, list[str], list[str]]] = []
+
+    def join(camera: CameraConfig, rate_hz: float, name: str, *, event: bool) -> None:
+        for lens, mount, cast_rate_hz, event_names, image_names in casts:
+            fits = rate_hz == cast_rate_hz if event else _divides(rate_hz, cast_rate_hz)
+            if lens == camera.lens and mount == camera.mount and fits:
+                (event_names if event else image_names).append(name)
+                return
+        casts.append((camera.lens, camera.mount, rate_hz, [name] if event else [], [] if event else [name]))
+
+    images = {n: s for n, s in sensors.items() if isinstance(s, ImageSensorConfig)}
+    for name, sensor in sensors.items():
+        if isinstance(sensor, EventSensorConfig):
+            join(sensor, sensor.sampling_rate_hz, name, event=True)
+    for name, image in sorted(
+        images.items(), key=lambda item: -item[1].rate_hz
+    ):  # fastest first: others may join
+        join(image, image.rate_hz, name, event=False)
+    return tuple(
+        Cast(
+            lens=lens,
+            mount=mount,
+            rate=Rate(rate_hz),
+            event_cameras=tuple(event_names),
+            image_cameras=tuple(image_names),
+            outputs=frozenset(
+                (["log_radiance"] if event_names else []) + [images[n].kind for n in image_names]
+            ),
+        )
+        for lens, mount, rate_hz, event_names, image_names in casts
+    )
+
+
+def _divides(rate_hz: float, faster_hz: float) -> bool:
+    """Whether every tick of one rate is a tick of the other."""
+    return (Fraction(str(faster_hz)) / Fraction(str(rate_hz))).denominator == 1
