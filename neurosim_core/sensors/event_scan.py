@@ -10,8 +10,9 @@ many levels it crossed upwards and downwards since. The reference level is a fun
 so nothing accumulates: after any number of events it has the rounding of one evaluation.
 
 A sample is a float32, so a level counts as reached when the sample is as near to it as the input can tell:
-one ulp of the sample plus one ulp of the base, 2^-23 (|sample| + |base|). A step of k thresholds, rounded to
-float32, thus gives exactly k events from any base. A crossing found so is stamped at the sample.
+within one float32 ulp each of sample, base and threshold, 2^-23 (|sample| + |base| + threshold). A step of k
+thresholds, rounded to float32, thus gives exactly k events from any base, there and back. A crossing found so
+is stamped at the sample.
 
 Crossing times are rounded to 2^-10 ns, then written as a key that sorts in the order of the packets:
 
@@ -142,7 +143,7 @@ def walk(
 ) -> Pixel:
     """Take one pixel over a stack of frames; count its events, write them, or enter them in the table."""
     base = wp.float64(base_32)
-    base_slack = _ULP * wp.abs(base)
+    base_slack = _ULP * (wp.abs(base) + wp.max(threshold_on, threshold_off))
     up = state.up
     down = state.down
     upper = _level(base, up + 1, down, threshold_on, threshold_off)

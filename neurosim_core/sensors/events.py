@@ -144,8 +144,8 @@ class EventCamera:
 
         Raises:
             RuntimeError: If the camera was not reset, or `feed_device` was called without `collect`.
-            ValueError: If shape, dtype or stamps are wrong; also if a value is not finite or beyond +-1000, in
-                which case the camera must be reset.
+            ValueError: If shape, dtype or stamps are wrong; also if a value is not finite or beyond +-1000,
+                in which case the camera must be reset.
         """
         stamps = _as_stamps(stamps_ns)
         frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
@@ -166,22 +166,25 @@ class EventCamera:
 
         Raises:
             RuntimeError: If the camera was not reset, or the stack before was not collected.
-            ValueError: If shape or stamps are wrong, or the stamps too far from the last window collected.
+            ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
+                window collected.
         """
         now_ns = self._require_reset()
         if self._scanned is not None:
             raise RuntimeError("collect() must be called between two feed_device()")
         stamps = _as_stamps(stamps_ns)
         count = len(stamps)
-        shape = (self.height, self.width)
-        if (
-            log_radiance.ndim != 3
-            or log_radiance.shape[1:] != shape
-            or not 1 <= count <= log_radiance.shape[0]
-        ):
+        fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == (self.height, self.width)
+        if not (fits and 1 <= count <= log_radiance.shape[0] and log_radiance.is_contiguous):
             raise ValueError(
-                f"log_radiance must have shape [>= {count}, {self.height}, {self.width}] for {count} stamps,"
-                f" got {list(log_radiance.shape)}"
+                f"log_radiance must be contiguous of shape [>= {count}, {self.height}, {self.width}]"
+                f" for {count} >= 1 stamps, got {list(log_radiance.shape)}"
+                f" with strides {list(log_radiance.strides)}"
+            )
+        if log_radiance.dtype != wp.float32 or log_radiance.device != self.device:
+            raise ValueError(
+                f"log_radiance must be float32 on {self.device},"
+                f" got {log_radiance.dtype.__name__} on {log_radiance.device}"
             )
         if stamps[0] <= now_ns:
             raise ValueError(f"stamps_ns must be later than {now_ns}, got {stamps[0]}")
@@ -285,7 +288,8 @@ class EventCamera:
             if value.device != self.device:
                 raise ValueError(f"log_radiance must be on {self.device}, got {value.device}")
             return value.contiguous()
-        return wp.array(np.ascontiguousarray(value), dtype=wp.float32, device=self.device, copy=False)
+        flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
+        return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
 
     def _launch(self, *, tabulate: bool) -> None:
         """Scan the stack from the state before it; the state after it goes to the second buffers."""
