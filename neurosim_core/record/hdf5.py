@@ -24,9 +24,9 @@ and shuffle are used, which are part of HDF5 itself.
                                     of DSEC files work; they take the group of any other camera just as well
 
 A killed run leaves a readable file. Packets are held in memory and written together at every flush; what
-was flushed is never touched again: space in the file is not reused, and a row counts only once
-`packet_count`, which is written after everything else, says so. What is lost is what came after the last
-flush.
+was flushed is never touched again: space in the file is not reused, HDF5's bookkeeping is replaced in one go
+after the data, and a row counts only once `packet_count`, which is written last, says so. What is lost is
+what came after the last flush.
 
 Reference: DSEC, Gehrig et al. (2021), https://dsec.ifi.uzh.ch/data-format, for events, ms_to_idx, t_offset.
 """
@@ -37,6 +37,7 @@ import contextlib
 import dataclasses
 import heapq
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -113,7 +114,7 @@ class FlightWriter:
         self._file = h5py.File(self._disk, "w", libver=("earliest", "v110"), fs_strategy="none")
         self._described = _write_header(self._file, header)
         self._file.flush()
-        self._disk.check()
+        self._disk.seal()
         cameras = [s.name for s in header.sensors if s.kind == "event_camera"]
         self._root_camera = cameras[0] if cameras else None
 
@@ -146,11 +147,11 @@ class FlightWriter:
         for stream in self._streams.values():
             stream.write_rows()
         self._file.flush()
-        self._disk.check()
+        self._disk.seal()
         for stream in self._streams.values():
             stream.commit()
         self._file.flush()
-        self._disk.check()
+        self._disk.seal()
         self._pending_bytes = 0
         self._flushed_s = time.monotonic()
 
@@ -169,7 +170,7 @@ class FlightWriter:
                 self.flush()
                 self._file.attrs["clean"] = True
                 self._file.flush()
-                self._disk.check()
+                self._disk.seal()
         finally:
             self._file.close()
             self._disk.close()
@@ -205,48 +206,78 @@ class FlightWriter:
 
 
 class _Disk:
-    """The file below HDF5. After a failed write it only pretends to write.
+    """The file below HDF5, which changes what is on disk only at `seal`.
 
-    HDF5 would try again when it closes an object, and crashes when that fails. So nothing on disk changes any
-    more, and what was flushed before stays readable.
+    What HDF5 appends goes to disk at once; what it writes over the part that was sealed before (a few kB of
+    its own bookkeeping) is held back until everything that it refers to is on disk. So a process that is
+    killed leaves the state of the last seal, unless that hits the millisecond in which this part is written.
+
+    After a failed write it only pretends to write: HDF5 would try again when it closes an object, and crash.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
         self._error: OSError | None = None
+        self._offset = 0
+        self._sealed_size = 0
+        self._held: dict[tuple[int, int], bytes] = {}
 
     @property
     def failed(self) -> bool:
         return self._error is not None
 
-    def check(self) -> None:
-        """Raise OSError if a write has failed."""
+    def seal(self) -> None:
+        """Bring what was held back to disk.
+
+        Raises:
+            OSError: A write has failed.
+        """
+        for (offset, _), data in sorted(self._held.items(), key=lambda item: item[0][0] > 0):
+            self._write(offset, memoryview(data))  # first the superblock, which says how long the file is
+        self._held.clear()
         if self._error is not None:
             raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
+        self._sealed_size = os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
         self._file.close()
 
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(offset, whence)
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        begin = {
+            os.SEEK_SET: 0,
+            os.SEEK_CUR: self._offset,
+            os.SEEK_END: os.fstat(self._file.fileno()).st_size,
+        }
+        self._offset = begin[whence] + offset
+        return self._offset
 
     def tell(self) -> int:
-        return self._file.tell()
+        return self._offset
+
+    def read(self, size: int) -> bytes:
+        """Read without `readinto`; by this method h5py knows a file."""
+        buffer = bytearray(size)
+        return bytes(buffer[: self.readinto(memoryview(buffer))])
 
     def readinto(self, buffer: memoryview) -> int:
-        return self._file.readinto(buffer)
-
-    def read(self, size: int = -1) -> bytes:
-        return self._file.read(size)
+        self._file.seek(self._offset)
+        found = self._file.readinto(buffer)
+        for (offset, size), data in self._held.items():
+            low, high = max(offset, self._offset), min(offset + size, self._offset + len(buffer))
+            if low < high:
+                buffer[low - self._offset : high - self._offset] = data[low - offset : high - offset]
+        self._offset += found
+        return found
 
     def write(self, data: memoryview) -> int:
-        rest = memoryview(data)
-        while self._error is None and len(rest):
-            try:
-                rest = rest[self._file.write(rest) :]
-            except OSError as error:
-                self._error = error
+        held = min(max(self._sealed_size - self._offset, 0), len(data))
+        if held:
+            key = (self._offset, held)
+            self._held.pop(key, None)  # later writes win where they overlap
+            self._held[key] = bytes(data[:held])
+        self._write(self._offset + held, data[held:])
+        self._offset += len(data)
         return len(data)
 
     def truncate(self, size: int) -> int:
@@ -258,7 +289,16 @@ class _Disk:
         return size
 
     def flush(self) -> None:
-        """Do nothing: nothing is buffered."""
+        """Do nothing: HDF5 asks before everything is consistent; `seal` says when it is."""
+
+    def _write(self, offset: int, data: memoryview) -> None:
+        while self._error is None and len(data):
+            try:
+                self._file.seek(offset)
+                written = self._file.write(data)
+                offset, data = offset + written, data[written:]
+            except OSError as error:
+                self._error = error
 
 
 class _Column:
