@@ -1,1 +1,132 @@
 """Where the vehicle flies: paths, and what makes them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from neurosim_core.scene.freespace import FreeSpace
+from neurosim_core.trajectory.certify import ClearanceProof, prove_clearance
+from neurosim_core.trajectory.feasibility import FlightBounds, FlightLimits, flight_bounds
+from neurosim_core.trajectory.minsnap import minimum_snap
+from neurosim_core.trajectory.path import (
+    Path,
+    PathArrays,
+    PathPoint,
+    PathSamples,
+    evaluate_path,
+    upload_paths,
+)
+from neurosim_core.trajectory.planner import (
+    CollisionFreeConfig,
+    PlanningError,
+    TourConfig,
+    WaypointsConfig,
+    plan_tour,
+    plan_waypoints,
+)
+from neurosim_core.trajectory.shapes import (
+    CircleConfig,
+    FigureEightConfig,
+    HoverConfig,
+    LineConfig,
+    LissajousConfig,
+    circle,
+    figure_eight,
+    hover,
+    line,
+    lissajous,
+)
+from neurosim_core.vehicle import MultirotorConfig
+
+PathConfig = Annotated[
+    TourConfig
+    | WaypointsConfig
+    | HoverConfig
+    | LineConfig
+    | CircleConfig
+    | FigureEightConfig
+    | LissajousConfig,
+    Field(discriminator="kind"),
+]
+"""Where to fly, as a user says it."""
+
+__all__ = [
+    "CircleConfig",
+    "ClearanceProof",
+    "CollisionFreeConfig",
+    "FigureEightConfig",
+    "FlightBounds",
+    "FlightLimits",
+    "HoverConfig",
+    "LineConfig",
+    "LissajousConfig",
+    "Path",
+    "PathArrays",
+    "PathConfig",
+    "PathPoint",
+    "PathSamples",
+    "PlanningError",
+    "TourConfig",
+    "WaypointsConfig",
+    "circle",
+    "evaluate_path",
+    "figure_eight",
+    "flight_bounds",
+    "hover",
+    "line",
+    "lissajous",
+    "make_path",
+    "minimum_snap",
+    "plan_tour",
+    "plan_waypoints",
+    "prove_clearance",
+    "upload_paths",
+]
+
+
+def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, *, duration_s: float) -> Path:
+    """Plan the path that a configuration asks for.
+
+    Tours and waypoints are proven to keep their clearance. Closed forms are flown as they are, through walls
+    if so asked: collisions in flight are detected by the simulation.
+
+    Args:
+        config: What to fly.
+        space: Where.
+        airframe: What flies; it must be able to give the thrust that the limits allow.
+        duration_s: How long the run is [s].
+
+    Raises:
+        PlanningError: There is no path, or the limits allow more thrust than the vehicle has.
+    """
+    if isinstance(config, CollisionFreeConfig):
+        _check_thrust(config.limits, airframe)
+    match config:
+        case TourConfig():
+            return plan_tour(space, config, duration_s=duration_s)
+        case WaypointsConfig():
+            return plan_waypoints(space, config)
+        case HoverConfig():
+            return hover(config, position=space.seed_m)
+        case LineConfig():
+            return line(config)
+        case CircleConfig():
+            return circle(config, center=space.seed_m)
+        case FigureEightConfig():
+            return figure_eight(config, center=space.seed_m)
+        case LissajousConfig():
+            return lissajous(config, center=space.seed_m)
+
+
+def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
+    thrust = (
+        len(airframe.rotor_position_m) * airframe.thrust_coefficient_n_s2 * airframe.rotor_speed_max_rad_s**2
+    )
+    weight = airframe.mass_kg * airframe.gravity_m_s2
+    if limits.thrust_to_weight_max * weight > thrust:
+        raise PlanningError(
+            f"limits.thrust_to_weight_max = {limits.thrust_to_weight_max:g} is more than the vehicle has: "
+            f"its rotors give {thrust:.3g} N at full speed, {thrust / weight:.3g} times its weight"
+        )

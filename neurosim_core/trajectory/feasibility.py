@@ -165,9 +165,15 @@ def _bounds(velocity: Array, acceleration: Array, jerk: Array, *, factor: float)
 
 
 @functools.lru_cache
+def bernstein_matrix(degree: int) -> Array:
+    """Return the matrix [point, power] from coefficients to Bernstein control points on [0, 1]."""
+    orders = range(degree + 1)
+    return np.array([[math.comb(i, j) / math.comb(degree, j) for j in orders] for i in orders])
+
+
+@functools.lru_cache
 def _bernstein_matrices(degree: int, parts: int) -> Array:
     """Matrices [part, point, power] from coefficients to control points on equal parts of [0, 1]."""
-    convert = np.array(
-        [[math.comb(i, j) / math.comb(degree, j) for j in range(degree + 1)] for i in range(degree + 1)]
+    return bernstein_matrix(degree) @ restriction(
+        np.arange(parts) / parts, np.full(parts, 1.0 / parts), degree
     )
-    return np.asarray(convert @ restriction(np.linspace(0.0, 1.0, parts + 1), degree))

@@ -257,7 +257,7 @@ class Path:
             inner = start_ns + (np.arange(count + 1) * (end_ns - start_ns)) // count
             u = (inner - start_ns) / (end_ns - start_ns)
             knots.append(inner[:-1])
-            pieces.append(np.einsum("pkj,aj->pak", restriction(u, self.degree), piece))
+            pieces.append(np.einsum("pkj,aj->pak", restriction(u[:-1], np.diff(u), self.degree), piece))
         return Path(np.concatenate([*knots, self.knots_ns[-1:]]), np.concatenate(pieces))
 
     def with_yaw(self, coefficients: NDArray[np.float64]) -> Path:
@@ -276,22 +276,22 @@ def join_axes(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArra
     return np.concatenate(padded, axis=1)
 
 
-def restriction(u: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """Return matrices that take a polynomial's coefficients to those on its parts.
+def restriction(start: NDArray[np.float64], length: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Return matrices that take a polynomial's coefficients to those on parts of its interval.
 
     Args:
-        u: Where parts begin and end, in normalised time, shape [part + 1].
+        start: Where each part begins, in normalised time, shape [part].
+        length: How long it is, shape [part].
         degree: Of the polynomial.
 
     Returns:
         Shape [part, degree + 1, degree + 1]; each part has its own normalised time in [0, 1].
     """
-    shift, scale = u[:-1], np.diff(u)
-    matrix = np.zeros((len(shift), degree + 1, degree + 1))
+    matrix = np.zeros((len(start), degree + 1, degree + 1))
     binomial = np.ones(1)
-    for power in range(degree + 1):  # (shift + scale v)^power
+    for power in range(degree + 1):  # (start + length v)^power
         for k in range(power + 1):
-            matrix[:, k, power] = binomial[k] * shift ** (power - k) * scale**k
+            matrix[:, k, power] = binomial[k] * start ** (power - k) * length**k
         binomial = np.convolve(binomial, [1.0, 1.0])
     return matrix
 
