@@ -54,7 +54,8 @@ class PinholeConfig(Settings):
     height: int = Field(gt=0, le=16384)
     """Height of the picture [px]."""
     horizontal_fov_rad: float | None = Field(default=None, gt=0.0, lt=math.pi)
-    """Angle between the left and the right border of the picture [rad]; pixels are square, the axis is in the centre."""
+    """Angle between the left and the right border of the picture [rad]; pixels are square, and the optical
+    axis goes through the centre."""
     fx: float | None = Field(default=None, gt=0.0)
     """Focal length along a row [px]."""
     fy: float | None = Field(default=None, gt=0.0)

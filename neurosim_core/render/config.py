@@ -13,14 +13,15 @@ class LightingConfig(Settings):
     """How surfaces are lit: Lambert, hemispheric ambient, the lights of the scene."""
 
     mode: Literal["baked", "unshadowed"] = "baked"
-    """`baked`: shadows and ambient occlusion, computed once when the scene is loaded. `unshadowed`: evaluated for
-    each pixel, exact, without shadows."""
-    edge_max_m: float = Field(default=0.25, ge=0.01)
+    """`baked`: shadows and ambient occlusion, computed once when the scene is loaded. `unshadowed`: evaluated
+    for each pixel, exact, without shadows."""
+    edge_max_m: float = Field(default=0.35, ge=0.01)
     """`baked`: edges of triangles are split until none is longer [m]; light is linear between their ends."""
-    ambient_ray_count: int = Field(default=24, ge=1, le=1024)
+    ambient_ray_count: int = Field(default=16, ge=1, le=1024)
     """`baked`: rays per point and side that look for occluders of the ambient light."""
     ambient_radius_m: float = Field(default=1.0, gt=0.0)
-    """`baked`: an occluder further away than this takes no ambient light [m]; nearer ones take more and more."""
+    """`baked`: an occluder further away than this takes no ambient light [m]; nearer ones take more and
+    more."""
     interreflection: float = Field(default=0.5, ge=0.0, lt=1.0)
     """`baked`: mean albedo of occluders; they give back that share of the ambient light that they take."""
     shadow_ray_count: int = Field(default=4, ge=1, le=256)
@@ -33,15 +34,18 @@ class RenderConfig(Settings):
     """How pictures are computed, the same for all cameras of a run."""
 
     backend: Literal["warp", "pyrender"] = "warp"
-    """`warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only, for comparison."""
+    """`warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only, for
+    comparison."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
-    """Factor from linear radiance to the linear value 1.0 of an 8-bit picture. `auto`: chosen once from the scene.
-    Event cameras do not use it."""
+    """Factor from linear radiance to the linear value 1.0 of an 8-bit picture. `auto`: chosen once from the
+    scene. Event cameras do not use it."""
     dark_floor: float = Field(default=1.0e-3, gt=0.0)
     """Radiance added before the logarithm that event cameras see: what a black surface gives."""
     samples_per_pixel: int = Field(default=1, ge=1, le=64)
-    """Rays per pixel. Geometry (depth, normal, instance) is always that of the ray through the pixel's centre."""
+    """Rays per pixel. Geometry (depth, normal, instance) is always that of the ray through the pixel's
+    centre."""
     mip_bias: float = Field(default=0.0, ge=-4.0, le=4.0)
-    """Added to the level of the texture that the footprint of a ray asks for; negative is sharper and aliases."""
+    """Added to the level of the texture that the footprint of a ray asks for; negative is sharper and
+    aliases."""

@@ -1,7 +1,8 @@
 """Launches of kernels that use all cores of a CPU.
 
-Warp runs a CPU kernel on the calling thread. The call lets go of the interpreter, so slices of one launch run on
-a pool of threads. A kernel that is launched this way takes the index of its first thread as its first parameter.
+Warp runs a CPU kernel on the calling thread. The call lets go of the interpreter, so slices of one launch
+run on a pool of threads. A kernel that is launched this way takes the index of its first thread as its first
+parameter.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ def launch_split(
 ) -> None:
     """Launch a kernel of one dimension: on CUDA at once, on the CPU in slices on all cores.
 
-    Returns when a CPU has finished; does not wait for a CUDA device. Threads of the kernel must not depend on each
-    other. Slices begin at multiples of 64.
+    Returns when a CPU has finished; does not wait for a CUDA device. Threads of the kernel must not depend
+    on each other. Slices begin at multiples of 64.
 
     Args:
         kernel: Its first parameter is the index of its first thread, an int.

@@ -1,14 +1,15 @@
-# mypy: disable-error-code="index,attr-defined,misc"
+# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,no-any-return,operator,no-untyped-def"
+# ruff: noqa: UP018, RUF046  (typed literals are variables in kernels)
 """Light: the one equation of how a surface looks, and its shadows, computed once per scene.
 
-Linear radiance of a Lambertian surface, seen from the side of its normal n (surfaces are two-sided: n points to the
-viewer):
+Linear radiance of a Lambertian surface, seen from the side of its normal n (surfaces are two-sided: n points
+to the viewer):
 
     radiance = albedo * (ambient(n) + sum_lights intensity * max(cos, 0) / d^2) + emission
     ambient(n) = up * (1 + n_z) / 2 + down * (1 - n_z) / 2
 
-Scene and lights do not move, so the bracket, the light that a white surface reflects, does not depend on the view:
-`bake_light` computes it once, with shadows and ambient occlusion, and a renderer only interpolates.
+Scene and lights do not move, so the bracket, the light that a white surface reflects, does not depend on the
+view: `bake_light` computes it once, with shadows and ambient occlusion, and a renderer only interpolates.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from neurosim_core.scene.scene import Scene
 wp.set_module_options({"enable_backward": False})
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+_BURIED = 0.1  # occluders at 5 % of the ambient radius all around
 _OFFSET_M = wp.constant(1.0e-3)
 _INSET_MAX_M = wp.constant(0.03)
 
@@ -74,8 +76,9 @@ class RefinedMesh:
 def refine(scene: Scene, edge_max_m: float | None) -> RefinedMesh:
     """Split edges of triangles in halves until none is longer than `edge_max_m`; None: leave all as they are.
 
-    Whether an edge is split, and where, depends on nothing but its two ends, so faces that share an edge (also with
-    vertices of their own at the same places) split it alike: no cracks, no T-junctions. Area is preserved.
+    Whether an edge is split, and where, depends on nothing but its two ends, so faces that share an edge
+    (also with vertices of their own at the same places) split it alike: no cracks, no T-junctions. Area is
+    preserved.
     """
     vertices, normals, uv = scene.vertices, scene.normals, scene.uv
     faces = scene.faces
@@ -138,9 +141,8 @@ def _split_faces(
         (a, b, c), (ab, bc) = turned[rows].T, turned_middle[rows, :2].T
         add(rows, ab, b, bc)
         # The rest is a quadrangle a, ab, bc, c: cut along its shorter diagonal.
-        from_a = np.linalg.norm(vertices[a] - vertices[bc], axis=1) <= np.linalg.norm(
-            vertices[ab] - vertices[c], axis=1
-        )
+        first, second = vertices[a] - vertices[bc], vertices[ab] - vertices[c]
+        from_a = np.linalg.norm(first, axis=1) <= np.linalg.norm(second, axis=1)
         add(rows[from_a], a[from_a], ab[from_a], bc[from_a])
         add(rows[from_a], a[from_a], bc[from_a], c[from_a])
         add(rows[~from_a], a[~from_a], ab[~from_a], c[~from_a])
@@ -170,6 +172,7 @@ def _bake(
     group_corner: wp.array[int],
     # Out:
     light_out: wp.array[wp.vec3],
+    openness_out: wp.array[float],
 ) -> None:
     index = first + wp.tid()
     group = index // 2
@@ -186,7 +189,9 @@ def _bake(
 
     point = wp.vec3(0.0)
     openness = float(0.0)
-    for ray in range(hemisphere.shape[0]):
+    ray_count = hemisphere.shape[0]
+    ray = int(0)
+    while ray < ray_count:
         corner = group_corner[begin + ray % count]
         origin, face_normal, point = _sample_point(vertices, faces, corner, normal)
         local = hemisphere[ray]
@@ -197,7 +202,11 @@ def _bake(
         query = wp.mesh_query_ray(occluders, origin, direction, ambient_radius_m)
         near = wp.where(query.result, query.t / ambient_radius_m, 1.0)
         openness += near * (2.0 - near)
-    openness = openness / float(hemisphere.shape[0])
+        ray += 1
+        if 4 * ray >= ray_count and (openness == float(ray) or openness < 0.25 * float(ray)):
+            ray_count = ray  # a quarter of the directions, which are well spread: all open, or a dark corner
+    openness = openness / float(ray_count)
+    openness_out[index] = openness
     openness = openness / (1.0 - interreflection * (1.0 - openness))
     light = openness * ambient_light(normal, ambient_up, ambient_down)
 
@@ -205,14 +214,19 @@ def _bake(
         unshaded = point_light(point, normal, light_position[lamp], light_intensity[lamp], light_radius_m)
         if wp.max(unshaded) > 0.0:
             clear = int(0)
-            for ray in range(sphere.shape[0]):
-                corner = group_corner[begin + ray % count]
-                origin, face_normal, corner_point = _sample_point(vertices, faces, corner, normal)
-                to_light = light_position[lamp] + light_radius_m * sphere[ray] - origin
+            shadow_ray_count = sphere.shape[0]
+            shadow_ray = int(0)
+            while shadow_ray < shadow_ray_count:
+                corner = group_corner[begin + shadow_ray % count]
+                origin, _face_normal, _corner_point = _sample_point(vertices, faces, corner, normal)
+                to_light = light_position[lamp] + light_radius_m * sphere[shadow_ray] - origin
                 distance = wp.length(to_light)
                 if not wp.mesh_query_ray_anyhit(occluders, origin, to_light / distance, distance):
                     clear += 1
-            light = light + (float(clear) / float(sphere.shape[0])) * unshaded
+                shadow_ray += 1
+                if 2 * shadow_ray >= shadow_ray_count and (clear == 0 or clear == shadow_ray):
+                    shadow_ray_count = shadow_ray  # half of them agree: full light or full shadow
+            light = light + (float(clear) / float(shadow_ray_count)) * unshaded
     light_out[index] = light
 
 
@@ -232,9 +246,17 @@ def _sample_point(vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner
     return point + inset * inwards + _OFFSET_M * face_normal, face_normal, point
 
 
+def _spread_order(count: int) -> NDArray[np.int64]:
+    """Return an order of `count` items in which every part of the order is spread evenly over them."""
+    stride = round(count * (math.sqrt(5.0) - 1.0) / 2.0)
+    while math.gcd(stride, count) != 1:
+        stride += 1
+    return np.arange(count) * stride % count
+
+
 def _hemisphere(count: int) -> NDArray[np.float32]:
     """Return cosine-weighted directions about z, a Fibonacci spiral, shape [count, 3]."""
-    k = np.arange(count)
+    k = _spread_order(count)
     radius2 = (k + 0.5) / count
     angle = k * _GOLDEN_ANGLE
     radius = np.sqrt(radius2)
@@ -245,7 +267,7 @@ def _hemisphere(count: int) -> NDArray[np.float32]:
 
 def _sphere(count: int) -> NDArray[np.float32]:
     """Return evenly spread directions, a Fibonacci spiral, shape [count, 3]."""
-    k = np.arange(count)
+    k = _spread_order(count)
     z = 1.0 - (2.0 * k + 1.0) / count
     radius = np.sqrt(1.0 - z * z)
     return np.stack([radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z], 1).astype(
@@ -276,7 +298,32 @@ def _group_corners(
     facing = np.rint(normals.reshape(-1, 3) * 64.0).astype(np.int64) + 64
     key = place_id[mesh.faces.reshape(-1)] << 24 | facing[:, 0] << 16 | facing[:, 1] << 8 | facing[:, 2]
     _, example, group = np.unique(key, return_index=True, return_inverse=True)
-    return group, example
+    order = np.argsort(example)  # in the order of faces: neighbours in space run after each other
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return rank[group], example[order]
+
+
+def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: NDArray[np.int64]) -> None:
+    """Give buried points (a floor under a carpet) the mean light of the neighbours that are not, in place.
+
+    They are not seen, but faces reach from them into the open, and would be dark there.
+
+    Args:
+        light: Light of each group on each side, shape [G, 2, 3]; overwritten.
+        openness: Share of the ambient light, shape [G, 2].
+        faces: Groups of the corners of each face, shape [F, 3].
+    """
+    ends = np.concatenate([faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]])
+    ends = np.concatenate([ends, ends[:, ::-1]])
+    for side in range(2):
+        buried = openness[:, side] < _BURIED
+        from_open = ends[buried[ends[:, 0]] & ~buried[ends[:, 1]]]
+        count = np.bincount(from_open[:, 0], minlength=len(light))
+        touched = count > 0
+        for channel in range(3):
+            total = np.bincount(from_open[:, 0], light[from_open[:, 1], side, channel], minlength=len(light))
+            light[touched, side, channel] = total[touched] / count[touched]
 
 
 def bake_light(
@@ -284,11 +331,12 @@ def bake_light(
 ) -> NDArray[np.float32]:
     """Compute the light that a white surface reflects at each corner of each face, on both sides.
 
-    Corners in the same place with the same shading normal share one value: the rays are spread over all of them.
-    Point lights are dimmed by the share of shadow rays that reach them. Ambient light is dimmed by the mean over
-    cosine-weighted rays of (1 - t / R)^2 where something is hit at t < R; of what is taken, occluders
-    give back `interreflection`, and so on: open / (1 - interreflection (1 - open)). Emitting faces cast no shadow, so a
-    light may sit inside its lamp. Directions are fixed: the same scene gives the same light.
+    Corners in the same place with the same shading normal share one value: the rays are spread over them.
+    Point lights are dimmed by the share of shadow rays that reach them. Ambient light is dimmed by the mean
+    over cosine-weighted rays of (1 - t / R)^2 where something is hit at t < R; of what is taken, occluders
+    give back `interreflection`, and so on: open / (1 - interreflection (1 - open)). Emitting faces cast no
+    shadow, so a light may sit inside its lamp. Buried points take the light of their neighbours. Directions
+    are fixed: the same scene gives the same light. Rays stop early where a well spread part of them agrees.
 
     Args:
         scene: Materials, lights and the triangles that cast shadows.
@@ -312,6 +360,7 @@ def bake_light(
         bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
     )
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
+    openness = wp.empty(2 * len(example), dtype=float, device=device)
     lamps = np.array([lamp.position_m for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
     power = np.array([lamp.intensity for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
     launch_split(
@@ -334,8 +383,9 @@ def bake_light(
             wp.array(starts, dtype=int, device=device),
             wp.array(order, dtype=int, device=device),
         ],
-        outputs=[light],
+        outputs=[light, openness],
         device=device,
     )
     per_group = light.numpy().reshape(-1, 2, 3)
+    _unbury(per_group, openness.numpy().reshape(-1, 2), group.reshape(-1, 3))
     return np.ascontiguousarray(np.moveaxis(per_group[group], 1, 0)).reshape(2, -1, 3, 3)

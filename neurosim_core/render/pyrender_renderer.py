@@ -1,7 +1,8 @@
+# mypy: disable-error-code="no-untyped-call"
 """The second renderer: rgb and depth through pyrender and OpenGL, to check the first one against.
 
-Geometry, visibility, perspective and texture filtering are OpenGL's; light is that of `lighting`, as colours of
-vertices. All that pyrender 0.1.45 needs on current libraries is in this module.
+Geometry, visibility, perspective and texture filtering are OpenGL's; light is that of `lighting`, as colours
+of vertices. All that pyrender 0.1.45 needs on current libraries is in this module.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def _import_pyrender() -> Any:
             raise PyrenderError(_INSTALL_OPENGL)
         os.environ["PYOPENGL_PLATFORM"] = "egl"
     if not hasattr(np, "infty"):
-        np.infty = np.inf  # removed in NumPy 2.0, used by pyrender 0.1.45
+        np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201  removed in NumPy 2.0, used by pyrender 0.1.45
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of libraries that pyrender brings
@@ -69,8 +70,8 @@ def _import_pyrender() -> Any:
 def upload_pyrender_scene(scene: Scene, config: RenderConfig, *, device: str) -> PyrenderScene:
     """Light a scene and hand it to pyrender.
 
-    Each side of a surface is a copy with its own light; OpenGL culls the one that is turned away. Faces that emit
-    show only their emission.
+    Each side of a surface is a copy with its own light; OpenGL culls the one that is turned away. Faces that
+    emit show only their emission.
 
     Args:
         scene: What to render.
@@ -167,6 +168,9 @@ class PyrenderRenderer:
         far = 2.0 * float(np.linalg.norm(np.ptp(scene.scene.bounds_m, axis=0))) + 100.0
         self._camera = pyrender.IntrinsicsCamera(fx, fy, cx, cy, znear=_NEAR_M, zfar=far)
         self._context = _open_context(pyrender, lens.width, lens.height)
+        # The pass for segmentation is the one without multisampling: its depth is that of the pixel's centre.
+        self._segment = pyrender.RenderFlags.SEG
+        self._ids = dict.fromkeys(scene.nodes.mesh_nodes, (255, 255, 255))
         self.log_radiance = self.normal = self.instance = None
         shape = (image_count, lens.height, lens.width)
         self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device="cpu") if "rgb" in outputs else None
@@ -191,12 +195,15 @@ class PyrenderRenderer:
             T_WC[:3, 3] = positions[instant]
             node = self._scene.nodes.add(self._camera, pose=T_WC @ _OPENGL_FROM_OPTICAL)
             self._scene.nodes.main_camera_node = node
-            rgb, depth = self._context.render(self._scene.nodes)
-            self._scene.nodes.remove_node(node)
             if self.rgb is not None:
+                rgb, _ = self._context.render(self._scene.nodes)
                 self.rgb.numpy()[slots[instant]] = rgb
             if self.depth is not None:
+                _, depth = self._context.render(
+                    self._scene.nodes, flags=self._segment, seg_node_map=self._ids
+                )
                 self.depth.numpy()[slots[instant]] = np.where(depth > 0.0, depth, np.inf)
+            self._scene.nodes.remove_node(node)
 
 
 def _open_context(pyrender: Any, width: int, height: int) -> Any:

@@ -1,11 +1,13 @@
-# mypy: disable-error-code="index,attr-defined,misc"
-"""The ray caster: one kernel factory, specialised on the outputs that are asked for and the terms that a scene has.
+# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,no-any-return,operator,arg-type,untyped-decorator"
+# ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches and typed literals have a meaning in kernels)
+"""The ray caster: one kernel factory, specialised on the outputs that are asked for and the terms of the scene.
 
-One traversal per ray answers everything. A thread is a pixel of an instant; blocks of 64 threads are tiles of 8 x 8
-pixels, so that their rays walk the same nodes of the tree. What a specialisation does not need is not in its code.
+One traversal per ray answers everything. A thread is a pixel of an instant; blocks of 64 threads are tiles of
+8 x 8 pixels, so that their rays walk the same nodes of the tree. What a specialisation does not need is not
+in its code.
 """
 
-# Annotations are kept as objects (no `from __future__ import annotations`): Warp reads those of kernels in closures.
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
 from collections.abc import Collection
 from functools import cache
@@ -223,14 +225,16 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
 def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     """Return the kernel that casts rays for `outputs` in a scene with `terms`; made once per combination.
 
-    Its outputs, all [.., H, W]: log_radiance, log(Rec. 709 luma + dark floor), of each instant; and of instants with
-    image_slot >= 0, in that slot: rgb, sRGB of exposure times radiance; depth, planar z [m], inf where nothing is
-    hit; normal, of the triangle, in W, towards the camera, zero where nothing is hit; instance, -1 where nothing is hit.
+    Its outputs, all [.., H, W]: log_radiance, log(Rec. 709 luma + dark floor), of each instant; and of
+    instants
+    with image_slot >= 0, in that slot: rgb, sRGB of exposure times radiance; depth, planar z [m], inf where
+    nothing is hit; normal, of the triangle, in W, towards the camera, zero where nothing is hit; instance, -1
+    where nothing is hit.
 
-    The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long side on the
-    surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much as along. The short side
-    or the geometric mean would keep more detail there, but alias along the surface, and aliasing
-    makes events that no sensor sees. |cos| counts as at least 0.05.
+    The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
+    side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much
+    as along. The short side or the geometric mean would keep more detail there, but alias along the surface,
+    and aliasing makes events that no sensor sees. |cos| counts as at least 0.05.
 
     Raises:
         ValueError: If an output is unknown or none is asked for.

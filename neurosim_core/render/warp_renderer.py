@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined"
+# mypy: disable-error-code="attr-defined,var-annotated,type-arg,call-overload,assignment,no-any-return"
 """The renderer of the simulator: ray casting in Warp, the same source on CPU and CUDA."""
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_text
 from neurosim_core.scene.scene import Scene
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
-_MIDDLE_GREY = 0.25
+_MIDDLE_GREY = 0.2
+_BRIGHT = 0.6
 _R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g, 1 / g^2 with g^3 = g + 1 (Roberts 2018)
 
 
@@ -67,11 +68,9 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         sample_count=config.samples_per_pixel,
     )
     start = time.perf_counter()
-    if baked:
+    light: NDArray[np.float32] | None = None
+    if baked or config.exposure == "auto":
         light = bake_light(scene, mesh, config.lighting, device=device)
-    else:
-        unlit = config.lighting
-        light = bake_light(scene, mesh, unlit, device=device) if config.exposure == "auto" else None
     light_s = time.perf_counter() - start
     exposure = config.exposure
     if exposure == "auto":
@@ -150,17 +149,21 @@ def _texel_density(
 
 
 def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray[np.float32]) -> float:
-    """Return the exposure that shows the mean surface as middle grey: the mean of log luma, weighted by area.
+    """Return an exposure that shows the mean surface as middle grey and nine tenths of all surfaces below white.
 
-    Each face counts with its brighter side: the other one is often the inside of a wall.
+    The mean is that of log luma; faces count by area and with their brighter side: the other one is
+    often the inside of a wall.
     """
-    luma = (light.max(axis=0).mean(axis=1) * albedo) @ _LUMA
-    weight = _areas_m2(mesh)
-    return float(_MIDDLE_GREY / np.exp(np.average(np.log(np.maximum(luma, 1e-4)), weights=weight)))
+    luma = np.maximum((light.max(axis=0).mean(axis=1) * albedo) @ _LUMA, 1e-4)
+    area = _areas_m2(mesh)
+    order = np.argsort(luma)
+    share = np.cumsum(area[order]) / area.sum()
+    bright = luma[order[np.searchsorted(share, 0.9)]]
+    return float(min(_MIDDLE_GREY / np.exp(np.average(np.log(luma), weights=area)), _BRIGHT / bright))
 
 
 def _sample_offsets(count: int) -> list[tuple[float, float]]:
-    """Return where in a pixel rays go through [px]: the first through its centre, all well spread (R2 sequence)."""
+    """Return where in a pixel rays go through [px]: the first in its centre, all well spread (R2 sequence)."""
     return [((0.5 + k * _R2[0]) % 1.0, (0.5 + k * _R2[1]) % 1.0) for k in range(count)]
 
 

@@ -1,9 +1,9 @@
-# mypy: disable-error-code="index,attr-defined,misc"
+# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,return-value,assignment,operator"
 """Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled in the kernel.
 
-A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the codes
-like sRGB does, but is decoded with one multiplication and no table, and with 8 times (blue: 4 times) the
-levels of an 8-bit file, so the error is far below that of the file itself.
+A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the
+codes like sRGB does, but is decoded with one multiplication and no table, and with 8 times (blue: 4 times)
+the levels of an 8-bit file, so the error is far below that of the file itself.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def encode_texels(linear: NDArray[np.float32]) -> NDArray[np.uint32]:
     red = np.rint(root[..., 0] * _LEVELS_RG).astype(np.uint32)
     green = np.rint(root[..., 1] * _LEVELS_RG).astype(np.uint32)
     blue = np.rint(root[..., 2] * _LEVELS_B).astype(np.uint32)
-    return red | (green << np.uint32(11)) | (blue << np.uint32(22))
+    return np.asarray(red | (green << np.uint32(11)) | (blue << np.uint32(22)), dtype=np.uint32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,7 +90,8 @@ class PackedTextures:
 
 
 def pack_textures(materials: Sequence[Material]) -> PackedTextures:
-    """Decode the textures of materials, build their mip chains and pack them; shared textures are packed once."""
+    """Decode textures, build their mip chains and pack them; a texture that materials share is packed
+    once."""
     chunks: list[NDArray[np.uint32]] = []
     levels: list[tuple[int, int, int]] = []
     rows: dict[int, tuple[int, int]] = {}
@@ -120,7 +121,7 @@ def mean_albedo(materials: Sequence[Material], packed: PackedTextures) -> NDArra
     albedo = np.array([m.base_color for m in materials], dtype=np.float32).reshape(-1, 3)
     for index, (first, count) in enumerate(packed.material_texture):
         if count:
-            code = packed.texels[packed.levels[first + count - 1, 0]]
+            code = int(packed.texels[packed.levels[first + count - 1, 0]])
             root = np.array([code & 2047, (code >> 11) & 2047, code >> 22]) / (
                 _LEVELS_RG,
                 _LEVELS_RG,
