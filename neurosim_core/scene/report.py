@@ -1,0 +1,380 @@
+"""What is in a scene: figures, a table of them, and a picture with the plan of its free space."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.config import LightingConfig, RenderConfig
+from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
+from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
+from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
+from neurosim_core.scene.scene import Scene
+
+CLEARANCE_M = 0.3
+"""Room around its centre that a small multirotor asks for, in the figures and the plan [m]."""
+
+_SIZE = (1600, 900)
+_VIEW = (1010, 900)
+_PLAN = (550, 520)
+_INK, _FAINT, _PAPER = (29, 37, 48), (107, 118, 130), (255, 255, 255)
+_FREE = np.array([34.0, 160.0, 110.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeSpaceReport:
+    """The room that there is to fly in."""
+
+    volume_m3: float
+    """What can be reached at `CLEARANCE_M` [m^3], to the voxel."""
+    floor_m2: float
+    """Its extent seen from above [m^2]."""
+    widest_m: float
+    """Largest distance to any surface in it [m]."""
+    height_m: float
+    """The height at which most of it lies: a good one to fly at [m]."""
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneReport:
+    """The figures of a scene."""
+
+    name: str
+    bounds_m: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """Lowest and highest corner [m]."""
+    triangle_count: int
+    vertex_count: int
+    area_m2: float
+    """Of all triangles, one side each [m^2]."""
+    edge_median_m: float
+    """Median length of the triangles' longest edges [m]."""
+    instance_count: int
+    material_count: int
+    emissive_count: int
+    """Materials that glow."""
+    texture_count: int
+    """Distinct textures."""
+    texel_count: int
+    """Texels of all distinct textures."""
+    untextured_share: float
+    """Share of the area that has no texture, in [0, 1]."""
+    light_count: int
+    notes: tuple[str, ...]
+    """What was assumed, dropped or repaired."""
+    free_space: FreeSpaceReport | None = None
+
+    @property
+    def size_m(self) -> tuple[float, float, float]:
+        """Extent along x, y, z [m]."""
+        low, high = self.bounds_m
+        return high[0] - low[0], high[1] - low[1], high[2] - low[2]
+
+
+def describe(scene: Scene, free_space: FreeSpace | None = None) -> SceneReport:
+    """Count and measure what is in a scene, and in its free space if that is given."""
+    triangles = scene.vertices[scene.faces].astype(np.float64)
+    edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    plain = np.array([material.texture is None for material in scene.materials])[scene.face_material]
+    textures = {id(m.texture): m.texture for m in scene.materials if m.texture is not None}
+    low, high = scene.bounds_m.tolist()
+    return SceneReport(
+        name=scene.name,
+        bounds_m=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+        triangle_count=len(scene.faces),
+        vertex_count=len(scene.vertices),
+        area_m2=float(area.sum()),
+        edge_median_m=float(np.median(edges.max(axis=1))),
+        instance_count=len(np.unique(scene.face_instance)),
+        material_count=len(scene.materials),
+        emissive_count=sum(max(material.emission) > 0.0 for material in scene.materials),
+        texture_count=len(textures),
+        texel_count=sum(t.srgb.shape[0] * t.srgb.shape[1] for t in textures.values()),
+        untextured_share=float(area[plain].sum() / area.sum()),
+        light_count=len(scene.lights),
+        notes=scene.notes,
+        free_space=None if free_space is None else _describe_free(free_space),
+    )
+
+
+def _describe_free(space: FreeSpace) -> FreeSpaceReport:
+    reachable = space.reachable(CLEARANCE_M)
+    layers = reachable.sum(axis=(0, 1))
+    # the middle of the layers that are about as wide as the widest
+    wide = np.flatnonzero(layers >= 0.95 * layers.max())
+    return FreeSpaceReport(
+        volume_m3=float(reachable.sum() * space.voxel_m**3),
+        floor_m2=float(reachable.any(axis=2).sum() * space.voxel_m**2),
+        widest_m=float(space.distance[reachable].max()) if reachable.any() else 0.0,
+        height_m=float(space.origin_m[2] + space.voxel_m * wide[len(wide) // 2]),
+        notes=space.notes,
+    )
+
+
+def rows(report: SceneReport) -> list[tuple[str, str]]:
+    """Return the figures as text, a name and a value each."""
+    low, high = report.bounds_m
+    size = " x ".join(f"{length:.2f}" for length in report.size_m)
+    corners = " to ".join("(" + ", ".join(f"{c:.2f}" for c in corner) + ")" for corner in (low, high))
+    textures = f"{report.texture_count}, {report.texel_count / 1e6:.1f} million texels"
+    if report.untextured_share > 0.0:
+        textures += f"; {100.0 * report.untextured_share:.0f} % of the area has none"
+    table = [
+        ("size", f"{size} m"),
+        ("corners", f"{corners} m"),
+        ("triangles", f"{report.triangle_count:,}, median edge {100.0 * report.edge_median_m:.1f} cm"),
+        ("vertices", f"{report.vertex_count:,}"),
+        ("area", f"{report.area_m2:.1f} m²"),
+        ("objects", str(report.instance_count)),
+        ("materials", f"{report.material_count}, {report.emissive_count} glow"),
+        ("textures", textures),
+        ("lights", str(report.light_count)),
+    ]
+    free = report.free_space
+    if free is not None and free.volume_m3 == 0.0:
+        table.append(("free space", f"none with {CLEARANCE_M:g} m clear"))
+    elif free is not None:
+        table += [
+            ("free space", f"{free.volume_m3:.1f} m³ over {free.floor_m2:.1f} m², {CLEARANCE_M:g} m clear"),
+            ("widest place", f"{free.widest_m:.2f} m to the nearest surface"),
+            ("fly at", f"z = {free.height_m:.2f} m"),
+        ]
+    return table
+
+
+def print_report(report: SceneReport, console: Console) -> None:
+    """Print the figures as a table, and the notes under it."""
+    table = Table(title=report.name, title_justify="left", box=box.SIMPLE, show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for name, value in rows(report):
+        table.add_row(name, value)
+    console.print(table)
+    for note in (*report.notes, *(report.free_space.notes if report.free_space else ())):
+        console.print(f"- {note}", markup=False, highlight=False)
+
+
+def report_scene(
+    file: Path | MeshSceneConfig | Scene,
+    out: Path | None = None,
+    *,
+    device: str = "cpu",
+    console: Console | None = None,
+) -> SceneReport:
+    """Say what is in a scene, and draw it.
+
+    Args:
+        file: A mesh file, how to load one, or a scene that is loaded already.
+        out: Where the picture goes; None: the scene's name with .png, in the working directory.
+        device: Where free space is mapped and the picture is rendered.
+        console: Where the table is printed; None: standard output.
+
+    Raises:
+        SceneError: The file cannot be used.
+        OSError: The picture cannot be written.
+    """
+    console = console or Console()
+    start = time.perf_counter()
+    if isinstance(file, Scene):
+        scene = file
+    else:
+        scene = load_mesh_scene(file if isinstance(file, MeshSceneConfig) else MeshSceneConfig(file=file))
+    loaded_s = time.perf_counter() - start
+    space = make_free_space(scene, FreeSpaceConfig(), device=device)
+    report = describe(scene, space)
+    print_report(report, console)
+    if not isinstance(file, Scene):
+        console.print(f"- Loaded in {loaded_s:.2f} s.", highlight=False)
+    out = Path(f"{scene.name}.png") if out is None else out
+    out.parent.mkdir(parents=True, exist_ok=True)
+    scene_picture(scene, space, report, device=device).save(out)
+    console.print(f"- Picture: {out}", markup=False, highlight=False, soft_wrap=True)
+    return report
+
+
+def scene_picture(scene: Scene, space: FreeSpace, report: SceneReport, *, device: str = "cpu") -> Image.Image:
+    """Draw a scene, cut open at about eye height, from above, with the plan of its free space.
+
+    Returns:
+        An RGB picture of 1600 x 900 px.
+    """
+    config = RenderConfig(
+        samples_per_pixel=4,
+        lighting=LightingConfig(edge_max_m=max(0.3, max(report.size_m) / 60.0), ambient_ray_count=12),
+    )
+    opened = cut_open(scene, _cut_height(report))
+    arrays = upload_scene(opened, config, device)
+    arrays.data.sky = wp.vec3(1.0 / arrays.exposure)  # white paper
+    picture = Image.new("RGB", _SIZE, _PAPER)
+    corners = opened.bounds_m
+    picture.paste(Image.fromarray(_look(arrays, *_view_from_above(corners), _VIEW)), (0, 0))
+
+    plan, scale, origin = _draw_plan(arrays, space, report, corners)
+    left, top = _VIEW[0] + 20, 70
+    picture.paste(plan, (left, top))
+    draw = ImageDraw.Draw(picture)
+    large, normal = ImageFont.load_default(size=30), ImageFont.load_default(size=17)
+    draw.text((left, 22), report.name, font=large, fill=_INK)
+    bottom = top + plan.height
+    for light in scene.lights:
+        x = left + (light.position_m[0] - origin[0]) * scale
+        y = bottom - (light.position_m[1] - origin[1]) * scale
+        if left < x < left + plan.width and top < y < bottom:
+            draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=(255, 210, 60), outline=_INK)
+    bar_m = float(10.0 ** np.floor(np.log10(150.0 / scale)))
+    bar_m *= next(k for k in (5.0, 2.0, 1.0) if k * bar_m * scale <= 160.0)
+    draw.line((left, bottom + 14, left + bar_m * scale, bottom + 14), fill=_INK, width=3)
+    caption = f"{bar_m:g} m"
+    if report.free_space is not None and report.free_space.volume_m3 > 0.0:
+        caption += f"      green: free at z = {_flight_height(report):.1f} m, {CLEARANCE_M:g} m clear"
+    draw.text((left, bottom + 20), caption, font=normal, fill=_FAINT)
+    for index, (name, value) in enumerate(entry for entry in rows(report) if entry[0] != "corners"):
+        y = bottom + 58 + 24 * index
+        if y > _SIZE[1] - 24:
+            break
+        draw.text((left, y), name, font=normal, fill=_FAINT)
+        # the font that Pillow brings has no superscripts
+        draw.text((left + 120, y), value.replace("²", "^2").replace("³", "^3"), font=normal, fill=_INK)
+    return picture
+
+
+def cut_open(scene: Scene, height_m: float) -> Scene:
+    """Return the scene without what is above a height; triangles that cross it are cut.
+
+    Args:
+        scene: Triangles.
+        height_m: Where to cut, z [m].
+
+    Raises:
+        ValueError: If nothing is below the height.
+    """
+    over = scene.vertices[scene.faces][:, :, 2] > height_m
+    count = over.sum(axis=1)
+    if (count == 3).all():
+        raise ValueError(f"nothing of scene {scene.name!r} is below {height_m} m")
+    values = np.concatenate([scene.vertices, scene.normals, scene.uv], axis=1).astype(np.float64)
+    pieces, origin = [values[scene.faces[count == 0]]], [np.flatnonzero(count == 0)]
+    for above in (1, 2):
+        faces = np.flatnonzero(count == above)
+        odd = np.argmax(over[faces] == (above == 1), axis=1)  # the corner that is alone on its side
+        turned = (odd[:, None] + np.arange(3)) % 3
+        lone, right, left = np.moveaxis(values[np.take_along_axis(scene.faces[faces], turned, axis=1)], 1, 0)
+        on_right, on_left = (
+            lone + ((height_m - lone[:, 2]) / (other[:, 2] - lone[:, 2]))[:, None] * (other - lone)
+            for other in (right, left)
+        )
+        if above == 2:
+            pieces.append(np.stack([lone, on_right, on_left], axis=1))
+            origin.append(faces)
+        else:
+            pieces += [np.stack([on_right, right, left], axis=1), np.stack([on_right, left, on_left], axis=1)]
+            origin += [faces, faces]
+    corner, face = np.concatenate(pieces), np.concatenate(origin)
+    edge = np.roll(corner[:, :, :3], -1, axis=1) - corner[:, :, :3]
+    kept = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1) > 1e-9  # cuts through corners leave lines
+    flat = corner[kept].reshape(-1, 8)
+    length = np.linalg.norm(flat[:, 3:6], axis=1, keepdims=True)
+    return dataclasses.replace(
+        scene,
+        vertices=flat[:, :3].astype(np.float32),
+        normals=(flat[:, 3:6] / np.where(length > 0.0, length, 1.0)).astype(np.float32),
+        uv=flat[:, 6:].astype(np.float32),
+        faces=np.arange(len(flat), dtype=np.int32).reshape(-1, 3),
+        face_material=scene.face_material[face[kept]],
+        face_instance=scene.face_instance[face[kept]],
+    )
+
+
+def _flight_height(report: SceneReport) -> float:
+    return report.bounds_m[1][2] if report.free_space is None else report.free_space.height_m
+
+
+def _cut_height(report: SceneReport) -> float:
+    """Under the ceiling of the storey that one flies in, over most furniture; for things, above them."""
+    low, high = report.bounds_m[0][2], report.bounds_m[1][2]
+    if high - low < 1.8:
+        return high
+    return min(max(_flight_height(report) + 0.5, low + 0.5 * (high - low)), high - 0.15 * (high - low))
+
+
+def _pose(eye: NDArray[np.float64], forward: NDArray[np.float64], up: NDArray[np.float64]) -> Any:
+    """Return p_WC and q_WC of a camera that looks along `forward`."""
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    R_WC = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return eye, Rotation.from_matrix(R_WC).as_quat()
+
+
+def _view_from_above(bounds: NDArray[np.float64]) -> tuple[Any, float]:
+    """Return the pose and the horizontal field of view [rad] of a camera that sees all of the scene."""
+    fov_rad = 0.7
+    forward = np.array([0.28, 0.55, -0.79])
+    forward /= np.linalg.norm(forward)
+    _, q_WC = _pose(np.zeros(3), forward, np.array([0.0, 0.0, 1.0]))
+    corners = np.array(list(itertools.product(*bounds.T)))
+    in_C = Rotation.from_quat(q_WC).inv().apply(corners - corners.mean(axis=0))
+    half = np.tan(0.5 * fov_rad) * np.array([1.0, _VIEW[1] / _VIEW[0]]) * 0.94
+    # |p + shift| <= half (z + distance) for all corners: least distance, axis by axis
+    high = np.array([np.max(in_C[:, a] - half[a] * in_C[:, 2]) for a in (0, 1)])
+    low = np.array([np.max(-in_C[:, a] - half[a] * in_C[:, 2]) for a in (0, 1)])
+    distance = float(np.max((high + low) / (2.0 * half)))
+    shift = np.array([*(0.5 * (low - high)), distance])
+    eye = corners.mean(axis=0) - Rotation.from_quat(q_WC).apply(shift)
+    return (eye, q_WC), fov_rad
+
+
+def _look(arrays: SceneArrays, pose: Any, fov_rad: float, size: tuple[int, int]) -> NDArray[np.uint8]:
+    lens = PinholeConfig(width=size[0], height=size[1], horizontal_fov_rad=fov_rad)
+    renderer = WarpRenderer(arrays, lens, outputs={"rgb"}, instant_count=1)
+    renderer.render(
+        wp.array(pose[0][None].astype(np.float32), dtype=wp.vec3, device=arrays.device),
+        wp.array(pose[1][None].astype(np.float32), dtype=wp.quat, device=arrays.device),
+        wp.zeros(1, dtype=int, device=arrays.device),
+        instant_count=1,
+    )
+    rgb: Any = renderer.rgb
+    return np.asarray(rgb.numpy()[0], dtype=np.uint8)
+
+
+def _draw_plan(
+    arrays: SceneArrays, space: FreeSpace, report: SceneReport, bounds: NDArray[np.float64]
+) -> tuple[Image.Image, float, NDArray[np.float64]]:
+    """Return the scene from above with free space in green, its pixels per metre and its lower left [m]."""
+    extent = bounds[1, :2] - bounds[0, :2]
+    scale = float(min(_PLAN[0] / max(extent[0], 1e-3), _PLAN[1] / max(extent[1], 1e-3)))
+    width, height = (max(int(length * scale), 2) for length in extent)
+    centre = bounds.mean(axis=0)
+    distance = 60.0 * float(max(extent.max(), bounds[1, 2] - bounds[0, 2]))  # far off: nearly parallel rays
+    eye = np.array([centre[0], centre[1], centre[2] + distance])
+    pose = _pose(eye, np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]))
+    fov_rad = 2.0 * float(np.arctan(0.5 * width / scale / distance))
+    picture = _look(arrays, pose, fov_rad, (width, height)).astype(np.float64)
+
+    layer = space.voxel_of([*space.seed_m[:2], _flight_height(report)])[2]
+    free = space.reachable(CLEARANCE_M)[:, :, layer]
+    lower_left = centre[:2] - 0.5 * np.array([width, height]) / scale
+    x = lower_left[0] + (np.arange(width) + 0.5) / scale
+    y = lower_left[1] + (height - np.arange(height) - 0.5) / scale
+    column = np.rint((x - space.origin_m[0]) / space.voxel_m).astype(int)
+    row = np.rint((y - space.origin_m[1]) / space.voxel_m).astype(int)
+    inside = ((column >= 0) & (column < free.shape[0]))[None] & ((row >= 0) & (row < free.shape[1]))[:, None]
+    at = np.clip(column, 0, free.shape[0] - 1)[None], np.clip(row, 0, free.shape[1] - 1)[:, None]
+    reached = inside & free[at]
+    picture[reached] = 0.55 * picture[reached] + 0.45 * _FREE
+    return Image.fromarray(picture.astype(np.uint8)), scale, lower_left
