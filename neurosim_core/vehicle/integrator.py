@@ -85,6 +85,9 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
     wind = air_terms and "wind" in terms
     full_inertia = "full_inertia" in terms
     wrench = make_wrench(terms)
+    rotor_wrench = make_wrench(
+        terms & {"rotor_drag", "flapping"}
+    )  # what is linear in the sums over the rotors
     module = wp.get_module("neurosim_core.vehicle.integrator." + ("_".join(sorted(terms)) or "rigid"))
 
     @wp.func
@@ -232,14 +235,19 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
             w_next = w + sixth * (w_1 + two * (w_2 + w_3) + w_4)
             u = sixth * (w + two * (u_rate_2 + u_rate_3) + u_rate_4)
 
-            # guard: the embedded estimate, less what the lag alone puts into it (the lag is integrated
-            # exactly)
+            # guard: the embedded estimate, less what the lag alone puts into it, as that is integrated exactly
             a_error = a_1 - a_2 - a_3 + a_4
             w_error = w_1 - w_2 - w_3 + w_4
             if wp.static(motor_lag):
-                lag = quadratic_1 - two * quadratic_2 + quadratic_4
-                a_error -= wp.vec3d(wp.float64(0.0), wp.float64(0.0), airframe.mass_inverse * lag[0])
-                w_error -= solve_inertia(airframe, wp.vec3d(lag[1], lag[2], lag[3]))
+                lag_force, lag_torque = rotor_wrench(
+                    airframe,
+                    quadratic_1 - two * quadratic_2 + quadratic_4,
+                    linear_1 - two * linear_2 + linear_4,
+                    air_0,
+                    w,
+                )
+                a_error -= airframe.mass_inverse * lag_force
+                w_error -= solve_inertia(airframe, lag_torque)
             # written so that a NaN trips it
             if not (sixth * sixth * wp.length_sq(a_error) <= absolute2 + relative2 * wp.length_sq(v_next)):
                 failure = STATUS_VELOCITY
