@@ -1,0 +1,103 @@
+"""The plan of a scene: what an architect draws, cut at one height and seen from above."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurosim_core.scene.materials import srgb_to_linear
+from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.source import linear_to_srgb8
+
+_STEPS = (0.1, 0.3, 0.5, 0.7)
+_SAMPLES = np.array([[a, b, 1.0 - a - b] for a in _STEPS for b in _STEPS if a + b < 1.0])
+"""Barycentric coordinates at which a face's texture is averaged."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """A scene cut by the plane z = height_m. Coordinates are those of the world."""
+
+    height_m: float
+    outlines: NDArray[np.float64]
+    """Where the plane cuts surfaces [m], shape [n, 2, 2]: segments of two points (x, y)."""
+    low_outlines: NDArray[np.float64]
+    """The same, cut at 0.3 of the height above the lowest point of the scene: tables, beds, sofas."""
+    triangles: NDArray[np.float64]
+    """What is seen from above below the plane [m], shape [n, 3, 2], lowest first."""
+    colors: NDArray[np.float64]
+    """sRGB colour of each triangle in [0, 1], shape [n, 3]."""
+    bounds: NDArray[np.float64]
+    """Lowest and highest (x, y) of what is shown [m], shape [2, 2]."""
+
+
+def cut_plan(scene: Scene, *, height_m: float) -> Plan:
+    """Cut a scene at a height.
+
+    What lies above the cut is left out. Triangles below it are ordered by their highest point, so that
+    drawing them one after the other shows what is on top (exact where objects do not interlock).
+    """
+    corners = scene.vertices[scene.faces].astype(np.float64)
+    floor_m = float(corners[:, :, 2].min())
+    outlines = slice_triangles(corners, height_m=height_m)
+    normal_z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
+    below = (corners[:, :, 2].max(axis=1) < height_m) & (np.abs(normal_z) > 1e-9)
+    faces = np.flatnonzero(below)
+    faces = faces[np.argsort(corners[faces, :, 2].max(axis=1), kind="stable")]
+    triangles = corners[faces, :, :2]
+    shown = np.concatenate([outlines.reshape(-1, 2), triangles.reshape(-1, 2)])
+    if not len(shown):
+        shown = scene.bounds_m[:, :2]
+    return Plan(
+        height_m=height_m,
+        outlines=outlines,
+        low_outlines=slice_triangles(corners, height_m=floor_m + 0.3 * (height_m - floor_m)),
+        triangles=triangles,
+        colors=face_colors(scene, faces),
+        bounds=np.stack([shown.min(axis=0), shown.max(axis=0)]),
+    )
+
+
+def slice_triangles(corners: NDArray[np.float64], *, height_m: float) -> NDArray[np.float64]:
+    """Intersect triangles with the plane z = height_m.
+
+    Args:
+        corners: Triangles [m], shape [F, 3, 3].
+        height_m: Height of the plane [m]; a corner exactly on it counts as above.
+
+    Returns:
+        One segment for each triangle that has corners on both sides, shape [n, 2, 2].
+    """
+    z = corners[:, :, 2] - height_m
+    above = z >= 0.0
+    cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
+    corners, z, above = corners[cut], z[cut], above[cut]
+    # The corner that is alone on its side is an end of both edges that are cut.
+    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    row = np.arange(len(cut))
+    tip, tip_z = corners[row, alone, :2], z[row, alone]
+    ends = []
+    for step in (1, 2):
+        other = (alone + step) % 3
+        share = tip_z / (tip_z - z[row, other])
+        ends.append(tip + share[:, None] * (corners[row, other, :2] - tip))
+    return np.stack(ends, axis=1)
+
+
+def face_colors(scene: Scene, faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the mean albedo of faces as sRGB in [0, 1], shape [n, 3]."""
+    linear = np.empty((len(faces), 3))
+    for index, material in enumerate(scene.materials):
+        mine = np.flatnonzero(scene.face_material[faces] == index)
+        linear[mine] = np.array(material.base_color) + np.array(material.emission)
+        if material.texture is None or not len(mine):
+            continue
+        texels = material.texture.srgb
+        height, width = texels.shape[:2]
+        uv = np.einsum("sk,fkc->fsc", _SAMPLES, scene.uv[scene.faces[faces[mine]]])
+        column = np.floor(uv[..., 0] * width).astype(np.int64) % width
+        row = np.floor((1.0 - uv[..., 1]) * height).astype(np.int64) % height
+        linear[mine] *= srgb_to_linear(texels[row, column]).mean(axis=1)
+    return linear_to_srgb8(np.clip(linear, 0.0, 1.0)) / 255.0
