@@ -128,10 +128,11 @@ def load_config(
         overrides: Keys that win over the source. Nested mappings are merged; a key may be dotted
             ("scene.seed").
 
+    A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
+
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
-        out of
-            range. The message has one line for each mistake.
+            out of range. The message has one line for each mistake.
     """
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
@@ -142,6 +143,7 @@ def load_config(
         raw = _merge(raw, nested)
     if isinstance(source, str | Path):
         raw = _beside(raw, Path(source).resolve().parent)
+    raw = _with_default_kinds(raw)
     try:
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
@@ -190,6 +192,15 @@ def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     return _merge(raw, {"scene": {"file": str(folder / file)}})
 
 
+def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
+    """Add the default kind to top-level groups that come in several and do not say which they are."""
+    for key, item in SimulationConfig.model_fields.items():
+        group = raw.get(key)
+        if isinstance(group, Mapping) and "kind" not in group and hasattr(item.default, "kind"):
+            raw = {**raw, key: {"kind": item.default.kind, **group}}
+    return raw
+
+
 def _explain(error: ValidationError) -> Iterator[str]:
     """One line for each mistake: path of the key, value, what is allowed."""
     for item in error.errors():
@@ -201,8 +212,13 @@ def _explain(error: ValidationError) -> Iterator[str]:
             close = difflib.get_close_matches(path[-1], known, n=1)
             hint = f", did you mean {close[0]!r}?" if close else ""
             yield f"{shown}: unknown key{hint} Known: {', '.join(known)}."
-        elif item["type"] in ("missing", "union_tag_not_found"):
-            yield f"{shown}: {item['msg']}"
+        elif item["type"] == "missing":
+            yield f"{shown}: required, and not given"
+        elif item["type"] == "union_tag_not_found":
+            yield f"{shown}.kind: required, and not given"
+        elif item["type"] == "union_tag_invalid":
+            context = item["ctx"]
+            yield f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}"
         else:
             message = item["msg"].removeprefix("Value error, ")
             got = "" if item["type"] == "value_error" and not keys else f", got {_shorten(item['input'])}"

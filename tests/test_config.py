@@ -1,0 +1,154 @@
+"""Settings: every mistake is named with its path, its value and what is allowed; YAML round-trips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
+from neurosim_core.settings import Settings
+
+
+def test_defaults_are_what_the_manual_says():
+    config = load_config()
+    assert config.duration_s == 4.0
+    lens = config.sensors["events"].lens
+    assert (lens.width, lens.height) == (346, 260)
+    assert config.sensors["rgb"].rate_hz == config.sensors["depth"].rate_hz == 20.0
+    assert config.sensors["imu"].rate_hz == 400.0
+    assert config.scene.kind == "apartment"
+
+
+@pytest.mark.parametrize("comments", [False, True])
+def test_yaml_round_trip(comments):
+    config = load_config({"scene": {"seed": 3}, "sensors": {"cam": {"kind": "rgb", "rate_hz": 30}}})
+    assert load_config(yaml.safe_load(to_yaml(config, comments=comments))) == config
+
+
+def test_every_key_is_documented():
+    def undocumented(model: type[BaseModel], path: str) -> Iterator[str]:
+        for name, item in model.model_fields.items():
+            if not item.description:
+                yield f"{path}.{name}"
+
+    def subclasses(cls: type) -> Iterator[type]:
+        for sub in cls.__subclasses__():
+            yield sub
+            yield from subclasses(sub)
+
+    models = [m for m in subclasses(Settings) if m.__module__.startswith("neurosim_core")]
+    assert len(models) > 10
+    tagged = {"kind"}  # says of itself what it is
+    missing = [p for m in models for p in undocumented(m, m.__name__) if p.rsplit(".", 1)[-1] not in tagged]
+    assert not missing
+
+
+WRONG = [
+    ({"duration_s": -1.0}, ["duration_s", "greater than 0", "-1.0"]),
+    ({"duration_ms": 4000}, ["duration_ms", "unknown key", "duration_s"]),
+    ({"duration_s": "4 s"}, ["duration_s", "valid number", "'4 s'"]),
+    ({"duration_s": float("nan")}, ["duration_s", "finite"]),
+    ({"device": "gpu"}, ["device", "gpu"]),
+    ({"scene": {"kind": "castle"}}, ["scene.kind", "castle", "apartment", "mesh"]),
+    ({"scene": {"kind": "mesh"}}, ["scene.file", "required"]),
+    ({"sensors": {"x": {"rate_hz": 3}}}, ["sensors.x.kind", "required"]),
+    ({"scene": {"kind": "apartment", "romms": 4}}, ["scene.romms", "unknown key", "'rooms'"]),
+    ({"vehicle": {"preset": "zeppelin"}}, ["zeppelin", "crazyflie", "hummingbird", "racer"]),
+    ({"vehicle": {"parameters": {"mass_kg": 0.0}}}, ["mass_kg", "0"]),
+    ({"control": {"gains": {"position_gain_per_s2": -1}}}, ["control.gains.position_gain_per_s2", "-1"]),
+    (
+        {"sensors": {"dvs": {"kind": "event_camera", "pixel": {"threshold_on": 0.0}}}},
+        ["sensors.dvs.pixel.threshold_on", "0.0"],
+    ),
+    (
+        {"sensors": {"dvs": {"kind": "event_camera", "treshold": 0.2}}},
+        ["sensors.dvs.treshold", "unknown key", "pixel"],
+    ),
+    (
+        {"sensors": {"dvs": {"kind": "event_camera", "sampling_rate_hz": 500, "packet_rate_hz": 30}}},
+        ["sensors.dvs", "packet_rate_hz must divide", "500", "30"],
+    ),
+    ({"sensors": {"a b": {"kind": "rgb"}}}, ["sensors", "a b"]),
+    ({"sensors": {"collision": {"kind": "rgb"}}}, ["sensors", "collision", "taken"]),
+    ({"sensors": {"x": {"kind": "sonar"}}}, ["sensors.x.kind", "sonar", "event_camera"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"), WRONG, ids=[f"{next(iter(w[0]))}-{i}" for i, w in enumerate(WRONG)]
+)
+def test_mistakes_are_named(settings: dict[str, Any], named: list[str]):
+    with pytest.raises(ConfigError) as error:
+        load_config(settings)
+    for text in named:
+        assert text in str(error.value)
+
+
+def test_all_mistakes_are_told_at_once():
+    with pytest.raises(ConfigError) as error:
+        load_config({"duration_s": 0, "seed": -1, "cat": 1})
+    assert len(str(error.value).splitlines()) == 4
+
+
+def test_overrides_win_and_may_be_dotted(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text("duration_s: 3\nscene: {kind: apartment, seed: 1}\n")
+    config = load_config(file, overrides={"scene.seed": 5, "duration_s": 2.0})
+    assert (config.duration_s, config.scene.seed) == (2.0, 5)
+
+
+def test_scene_file_is_relative_to_the_settings_file(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text("scene: {kind: mesh, file: house.glb}\n")
+    assert load_config(file).scene.file == tmp_path / "house.glb"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"), [("[1, 2]", "mapping"), ("a: [", "not YAML"), ("a: 'x\n b: {", "not YAML")]
+)
+def test_files_that_are_no_settings(tmp_path, text, named):
+    file = tmp_path / "scene.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=named):
+        load_config(file)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing\.yaml"):
+        load_config(tmp_path / "nothing.yaml")
+
+
+def test_empty_file_is_the_default(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text("# nothing\n")
+    assert load_config(file) == SimulationConfig()
+
+
+def test_config_is_frozen():
+    with pytest.raises(ValueError, match="frozen"):
+        load_config().duration_s = 1.0  # type: ignore[misc]
+
+
+json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda children: (
+        st.lists(children, max_size=3) | st.dictionaries(st.text(max_size=5), children, max_size=3)
+    ),
+    max_leaves=5,
+)
+
+
+@given(st.sampled_from(sorted(SimulationConfig.model_fields)), json)
+def test_any_value_is_taken_or_refused_by_name(key, value):
+    message = ""
+    try:
+        config = load_config({key: value})
+    except ConfigError as error:
+        message = str(error)
+    assert key in message or isinstance(config, SimulationConfig)
