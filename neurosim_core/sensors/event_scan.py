@@ -33,6 +33,8 @@ wp.set_module_options({"enable_backward": False})
 
 SUB_BITS = 11
 """Bits of a key below the column: polarity and nanoseconds."""
+TILE_SIZE = wp.constant(256)
+"""Pixels that a thread of `screen` takes."""
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
 
@@ -98,6 +100,22 @@ def _level(
 
 
 @wp.func
+def _base_slack(base: wp.float64, threshold_on: wp.float64, threshold_off: wp.float64) -> wp.float64:
+    return _ULP * (wp.abs(base) + wp.max(threshold_on, threshold_off))
+
+
+@wp.func
+def _quiet_range(lower: wp.float64, upper: wp.float64, base_slack: wp.float64) -> wp.vec2:
+    """Return a float32 range inside which, ends excluded, a sample is sure to reach neither level.
+
+    It is narrower by the largest slack that a sample between the levels can have, and by the rounding of the
+    range itself; what falls outside is decided in float64. This test alone meets nearly all samples.
+    """
+    margin = wp.float64(2.0) * _ULP * wp.max(wp.abs(lower), wp.abs(upper)) + base_slack
+    return wp.vec2(wp.float32(lower + margin), wp.float32(upper - margin))
+
+
+@wp.func
 def _key(
     level: wp.float64,
     last: wp.float64,
@@ -122,6 +140,40 @@ def _key(
     return (time_us << wp.int64(time_shift)) | place | wp.int64(polarity << 10) | sub_ns
 
 
+@wp.func_native("""
+    // frame by frame, so that memory is read in order and the inner loop becomes vector instructions
+    constexpr int SIZE = 256;
+    const int count = end - begin < SIZE ? end - begin : SIZE;
+    int alive[SIZE];
+    int lead[SIZE];
+    for (int i = 0; i < count; ++i) { alive[i] = 1; lead[i] = 0; }
+    const float* __restrict__ low = low_32.data + begin;
+    const float* __restrict__ high = high_32.data + begin;
+    for (int frame = 0; frame < frame_count; ++frame) {
+        const float* __restrict__ sample = log_radiance.data + (size_t)frame * log_radiance.shape[1] + begin;
+        int any = 0;
+        for (int i = 0; i < count; ++i) {
+            alive[i] &= (sample[i] > low[i]) & (sample[i] < high[i]);
+            lead[i] += alive[i];
+            any |= alive[i];
+        }
+        if (!any) break;
+    }
+    for (int i = 0; i < count; ++i) lead_out.data[begin + i] = lead[i];
+""")
+def _count_lead(
+    begin: wp.int32,
+    end: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    frame_count: wp.int32,
+    low_32: wp.array[wp.float32],
+    high_32: wp.array[wp.float32],
+    lead_out: wp.array[wp.int32],
+) -> None:
+    """Count for at most 256 pixels the frames before the first that leaves (low, high)."""
+    ...
+
+
 @wp.func
 def walk(
     mode: wp.int32,
@@ -137,29 +189,36 @@ def walk(
     log_radiance: wp.array2d[wp.float32],
     stamps: wp.array[wp.int64],
     frame_count: wp.int32,
+    lead: wp.int32,
     row_limit: wp.array[wp.int32],
     table: wp.array2d[wp.int32],
     keys: wp.array[wp.int64],
 ) -> Pixel:
-    """Take one pixel over a stack of frames; count its events, write them, or enter them in the table."""
+    """Take one pixel over a stack of frames; count its events, write them, or enter them in the table.
+
+    The first `lead` frames are known to be quiet.
+    """
     base = wp.float64(base_32)
-    base_slack = _ULP * (wp.abs(base) + wp.max(threshold_on, threshold_off))
+    base_slack = _base_slack(base, threshold_on, threshold_off)
     up = state.up
     down = state.down
     upper = _level(base, up + 1, down, threshold_on, threshold_off)
     lower = _level(base, up, down + 1, threshold_on, threshold_off)
+    quiet = _quiet_range(lower, upper, base_slack)
     last = state.last
+    if lead > 0:
+        last = log_radiance[lead - 1, pixel]
     event_count = wp.int32(0)
     invalid_count = wp.int32(0)
     invalid_first = wp.int32(0)
 
-    for frame in range(frame_count):
+    for frame in range(lead, frame_count):
         sample = log_radiance[frame, pixel]
-        value = wp.float64(sample)
-        slack = _ULP * wp.abs(value) + base_slack
-        if value + slack < upper and value - slack > lower:
+        if sample > quiet[0] and sample < quiet[1]:
             last = sample
         elif wp.abs(sample) <= _LIMIT:
+            value = wp.float64(sample)
+            slack = _ULP * wp.abs(value) + base_slack
             up_before = up
             down_before = down
             while value + slack >= upper:
@@ -170,6 +229,7 @@ def walk(
                 down += 1
                 lower = _level(base, up, down + 1, threshold_on, threshold_off)
             upper = _level(base, up + 1, down, threshold_on, threshold_off)
+            quiet = _quiet_range(lower, upper, base_slack)
             found = up - up_before + down - down_before
             if mode == _TABLE:
                 wp.atomic_add(table, frame, row, found)
@@ -214,6 +274,56 @@ def walk(
 
 
 @wp.kernel
+def screen(
+    # Model:
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    # In:
+    first_pixel: wp.int32,
+    end_pixel: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    frame_count: wp.int32,
+    base: wp.array[wp.float32],
+    crossed: wp.array[wp.vec2i],
+    # Out:
+    low_out: wp.array[wp.float32],
+    high_out: wp.array[wp.float32],
+    lead_out: wp.array[wp.int32],
+) -> None:
+    """Count the frames of each pixel before the first that may fire; one thread takes TILE_SIZE pixels.
+
+    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
+    event.
+
+    Args:
+        threshold_on: Step of log radiance upwards.
+        threshold_off: Step of log radiance downwards.
+        first_pixel: First pixel of thread 0.
+        end_pixel: End of the last thread's pixels.
+        log_radiance: Frames, shape [frame, pixel], contiguous.
+        frame_count: Frames to look at.
+        base: Log radiance of the reset, shape [pixel].
+        crossed: Levels crossed upwards and downwards, shape [pixel].
+        low_out: Lower end of the quiet range, shape [pixel].
+        high_out: Upper end of the quiet range, shape [pixel].
+        lead_out: Quiet frames, shape [pixel].
+    """
+    begin = first_pixel + wp.tid() * TILE_SIZE
+    end = wp.min(begin + TILE_SIZE, end_pixel)
+    for pixel in range(begin, end):
+        before = crossed[pixel]
+        value = wp.float64(base[pixel])
+        quiet = _quiet_range(
+            _level(value, before[0], before[1] + 1, threshold_on, threshold_off),
+            _level(value, before[0] + 1, before[1], threshold_on, threshold_off),
+            _base_slack(value, threshold_on, threshold_off),
+        )
+        low_out[pixel] = quiet[0]
+        high_out[pixel] = quiet[1]
+    _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)
+
+
+@wp.kernel
 def scan(
     # Model:
     threshold_on: wp.float64,
@@ -227,6 +337,7 @@ def scan(
     log_radiance: wp.array2d[wp.float32],
     stamps: wp.array[wp.int64],
     frame_count: wp.int32,
+    lead: wp.array[wp.int32],
     row_limit: wp.array[wp.int32],
     base: wp.array[wp.float32],
     last: wp.array[wp.float32],
@@ -252,6 +363,7 @@ def scan(
         log_radiance: Frames, shape [frame, pixel].
         stamps: Stamp of the state, then of each frame, from the keys' time origin [ns], shape [frame + 1].
         frame_count: Frames to scan.
+        lead: Frames at the start that `screen` found quiet, or 0, shape [pixel].
         row_limit: Rows whose events are kept, for each frame, shape [frame].
         base: Log radiance of the reset, shape [pixel].
         last: Last sample, shape [pixel].
@@ -269,33 +381,37 @@ def scan(
     place = wp.int64(0)
     row = wp.int32(0)
     if pixel < end_pixel:
-        row = pixel // width
-        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << _COLUMN_SHIFT)
         before = crossed[pixel]
-        state.last = last[pixel]
         state.up = before[0]
         state.down = before[1]
-        mode = _COUNT
-        if tabulate:
-            mode = _TABLE
-        state = walk(
-            mode,
-            wp.int64(0),
-            pixel,
-            row,
-            place,
-            base[pixel],
-            state,
-            threshold_on,
-            threshold_off,
-            time_shift,
-            log_radiance,
-            stamps,
-            frame_count,
-            row_limit,
-            table_out,
-            keys_out,
-        )
+        if lead[pixel] == frame_count:
+            state.last = log_radiance[frame_count - 1, pixel]
+        else:
+            state.last = last[pixel]
+            row = pixel // width
+            place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << _COLUMN_SHIFT)
+            mode = _COUNT
+            if tabulate:
+                mode = _TABLE
+            state = walk(
+                mode,
+                wp.int64(0),
+                pixel,
+                row,
+                place,
+                base[pixel],
+                state,
+                threshold_on,
+                threshold_off,
+                time_shift,
+                log_radiance,
+                stamps,
+                frame_count,
+                lead[pixel],
+                row_limit,
+                table_out,
+                keys_out,
+            )
     if not tabulate:
         slot = _reserve(state.event_count, counters_out)
         if pixel < end_pixel:
@@ -319,6 +435,7 @@ def scan(
                     log_radiance,
                     stamps,
                     frame_count,
+                    lead[pixel],
                     row_limit,
                     table_out,
                     keys_out,

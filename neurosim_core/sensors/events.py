@@ -24,7 +24,7 @@ from pydantic import Field
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
 from neurosim_core.sensors import event_scan
-from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX, SUB_BITS
+from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
 from neurosim_core.settings import Settings
 
 _log = logging.getLogger(__name__)
@@ -96,6 +96,9 @@ class EventCamera:
         self._base = self._empty(pixel_count, wp.float32)
         self._last = [self._empty(pixel_count, wp.float32) for _ in range(2)]
         self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in range(2)]
+        self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
+        scratch = pixel_count if self.device.is_cpu else 0
+        self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._chunks = [
             _Chunk(first, end, self._empty(2 * (end - first), wp.int64), self._empty(3, wp.int64))
             for first, end in self._chunk_bounds()
@@ -298,6 +301,16 @@ class EventCamera:
 
         def launch(chunk: _Chunk) -> None:
             chunk.counters.zero_()
+            thresholds = [self.config.threshold_on, self.config.threshold_off]
+            extent = [chunk.first_pixel, chunk.end_pixel, frames]
+            if self.device.is_cpu:
+                wp.launch(
+                    event_scan.screen,
+                    dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),
+                    inputs=[*thresholds, *extent, len(stamps), self._base, self._crossed[0]],
+                    outputs=[*self._quiet_range, self._lead],
+                    device=self.device,
+                )
             block = _BLOCK_SIZE if self.device.is_cuda else 1
             blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
             wp.launch(
@@ -305,16 +318,14 @@ class EventCamera:
                 dim=blocks * block,  # whole blocks: their threads reserve slots together
                 block_dim=_BLOCK_SIZE,
                 inputs=[
-                    self.config.threshold_on,
-                    self.config.threshold_off,
+                    *thresholds,
                     self.width,
                     self._row_shift,
                     self._time_shift,
-                    chunk.first_pixel,
-                    chunk.end_pixel,
-                    frames,
+                    *extent,
                     self._stamps,
                     len(stamps),
+                    self._lead,
                     self._row_limit,
                     self._base,
                     self._last[0],
