@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.scene.apartment.assembly import Assembly, Lamp, Piece, Surface
-from neurosim_core.scene.apartment.floorplan import FloorPlan, make_floor_plan, stream
-from neurosim_core.scene.apartment.geometry import cylinder, rounded_box
-from neurosim_core.scene.apartment.shell import RoomFinish, add_shell
-from neurosim_core.scene.apartment.surfaces import TEXTURES, quantize
+from neurosim_core.scene.apartment.assembly import Assembly
+from neurosim_core.scene.apartment.floorplan import FloorPlan, make_floor_plan
+from neurosim_core.scene.apartment.looks import Palette
+from neurosim_core.scene.apartment.rooms import furnish
+from neurosim_core.scene.apartment.shell import add_shell
 from neurosim_core.scene.scene import Ambient, Scene
 from neurosim_core.settings import Settings
 
@@ -49,34 +47,31 @@ def make_apartment(config: ApartmentConfig) -> Scene:
         ceiling_m=config.ceiling_m,
     )
 
-    def paint(key: str) -> NDArray[np.uint8]:
-        return quantize(TEXTURES[key](stream(config.seed, "texture", key)))
-
-    assembly = Assembly(paint)
-    wall = Surface(name="wall", texture="plaster", color=(0.8, 0.75, 0.68), tile_m=(1.6, 1.6))
-    white = Surface(name="white paint", texture="plaster", color=(0.85, 0.85, 0.83), tile_m=(1.6, 1.6))
-    floor = Surface(name="oak floor", texture="oak planks", tile_m=(1.8, 1.8), exact=True)
-    view = Surface(name="sky", emission=(0.6, 0.75, 0.95), color=(0.0, 0.0, 0.0))
-    finish = RoomFinish(
-        floor=floor, wall=wall, accent=wall, accent_wall=-1, ceiling=white, trim=white, sill=floor, view=view
-    )
-    add_shell(assembly, plan, {room.name: finish for room in plan.rooms}, ceiling_m=config.ceiling_m)
-    for room in plan.rooms:
-        x, y = room.rect.center
-        table = Piece("table")
-        table.add(floor, rounded_box((1.2, 0.7, 0.4), 0.02, center=(0.0, 0.0, 0.202)))
-        assembly.place(table.moved((x, y, 0.0)))
-        lamp = Piece("pendant", lamps=[Lamp(position=(x, y, 2.1), intensity=(0.9, 0.85, 0.75))])
-        lamp.add(
-            Surface(name="lamp", emission=(2.0, 1.8, 1.5)),
-            cylinder(0.2, 2.15, config.ceiling_m - 0.05, x=x, y=y, edge_m=0.03),
+    palette = Palette(config.seed)
+    assembly = Assembly(palette.paint)
+    finishes = {
+        room.name: palette.finish(room.name, room.role, index) for index, room in enumerate(plan.rooms)
+    }
+    add_shell(assembly, plan, finishes, ceiling_m=config.ceiling_m)
+    for index, room in enumerate(plan.rooms):
+        furnish(
+            room,
+            index,
+            assembly,
+            palette,
+            finishes[room.name],
+            seed=config.seed,
+            density=config.furniture,
+            ceiling_m=config.ceiling_m,
         )
-        assembly.place(lamp)
     return assembly.finish(
-        f"apartment {config.seed} with {config.rooms} rooms", ambient=Ambient(), inside_m=_inside(plan)
+        f"apartment with {config.rooms} rooms, seed {config.seed}",
+        ambient=Ambient(up=(0.26, 0.26, 0.27), down=(0.2, 0.19, 0.18)),
+        inside_m=_inside(plan),
     )
 
 
 def _inside(plan: FloorPlan) -> tuple[float, float, float]:
+    """A point in front of a door, which is always free; in the middle of a flat that has none."""
     x, y = plan.rooms[0].rect.center
     return x, y, 1.4

@@ -6,6 +6,8 @@ metres, so that one material has one texel density wherever it is used.
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -109,42 +111,78 @@ def grid_surface(points: Array, uv: Array, *, normals: Array | None = None, clos
             np.stack([corner, corner + columns + 1, corner + columns], axis=1),
         ]
     )
-    return _without_slivers(
-        Part(
-            vertices=points.reshape(-1, 3),
-            normals=normals.reshape(-1, 3),
-            uv=uv.reshape(-1, 2),
-            faces=faces,
-        )
+    return Part(
+        vertices=points.reshape(-1, 3), normals=normals.reshape(-1, 3), uv=uv.reshape(-1, 2), faces=faces
     )
 
 
-def _without_slivers(part: Part) -> Part:
+def without_slivers(part: Part) -> Part:
     """Drop the faces that a pole or a repeated point folds to nothing."""
     a, b, c = (part.vertices[part.faces[:, corner]] for corner in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return replace(part, faces=part.faces[area > 1e-10])
 
 
-_FACES = tuple((axis, sign) for axis in range(3) for sign in (-1.0, 1.0))
+@dataclass(frozen=True, eq=False)
+class _Cube:
+    """The surface of a cube as a grid that can be stretched into boxes."""
+
+    corner: Array
+    """Signs of the corner that each vertex belongs to, shape [V, 3]."""
+    normals: Array
+    """Unit normals of the rounded edge there, shape [V, 3]."""
+    points: Array
+    """Positions on the cube from -1 to 1, evenly spaced as seen from its middle, shape [V, 3]."""
+    side: NDArray[np.int64]
+    """Axis of the side that each vertex belongs to, shape [V]."""
+    faces: NDArray[np.int64]
 
 
-def _cube_faces(coordinates: Sequence[Array], grain: int) -> list[tuple[Array, Array]]:
-    """Points [M, N, 3] on the six sides of a box, and their uv; `coordinates` are the grid lines of each axis."""
-    sides = []
-    for axis, sign in _FACES:
-        right, up = (axis + 1) % 3, (axis + 2) % 3
-        if sign < 0.0:
-            right, up = up, right
-        columns, rows = np.meshgrid(coordinates[right], coordinates[up])
-        points = np.empty((*rows.shape, 3))
-        points[..., right], points[..., up] = columns, rows
-        points[..., axis] = sign * abs(coordinates[axis][0])
-        across = up if right == grain else right
-        along = right + up - across if axis != grain else right
-        across = right + up - along
-        sides.append((points, np.stack([points[..., along], points[..., across]], axis=-1)))
-    return sides
+@functools.cache
+def _cube(lines: int, *, sharp: bool = False) -> _Cube:
+    """A cube of `lines` grid lines along each edge; half of them round each corner, unless it is `sharp`."""
+    half = lines // 2
+    spread = np.linspace(-1.0, 1.0, lines)
+    # In a rounded corner the first line is where the flat part ends, the last one is the middle of the edge.
+    bend = np.tan(0.25 * np.pi * np.arange(half) / max(1, half - 1))
+    offset = np.concatenate([-bend[::-1], bend]) if 2 * half == lines else np.zeros(lines)
+    rows, columns = (
+        grid.reshape(-1) for grid in np.meshgrid(np.arange(lines), np.arange(lines), indexing="ij")
+    )
+    cell = (np.arange(lines - 1)[:, None] * lines + np.arange(lines - 1)[None, :]).reshape(-1)
+    quads = np.stack(
+        [cell, cell + 1, cell + lines + 1, cell, cell + lines + 1, cell + lines], axis=1
+    ).reshape(-1, 3)
+    corner, normals, points, side, faces = [], [], [], [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            right, up = (axis + 1) % 3, (axis + 2) % 3
+            if sign < 0.0:
+                right, up = up, right
+            at, bent, spot = (
+                np.empty((lines * lines, 3)),
+                np.empty((lines * lines, 3)),
+                np.empty((lines * lines, 3)),
+            )
+            at[:, right], at[:, up], at[:, axis] = np.sign(spread[columns]), np.sign(spread[rows]), sign
+            bent[:, right], bent[:, up], bent[:, axis] = offset[columns], offset[rows], sign
+            if sharp:
+                bent[:, [right, up]] = 0.0
+            tangent = np.tan(0.25 * np.pi * spread)
+            spot[:, right], spot[:, up], spot[:, axis] = tangent[columns], tangent[rows], sign
+            faces.append(quads + len(faces) * lines * lines)
+            corner.append(at)
+            normals.append(bent / np.linalg.norm(bent, axis=1, keepdims=True))
+            points.append(spot)
+            side.append(np.full(lines * lines, axis))
+    return _Cube(*(np.concatenate(values) for values in (corner, normals, points, side, faces)))
+
+
+def _planar_uv(positions: Array, side: NDArray[np.int64], grain: int) -> Array:
+    """Project each vertex along the axis of its side; u follows the grain where that lies in the side."""
+    along = np.where(side == grain, (side + 1) % 3, grain)
+    index = np.arange(len(positions))
+    return np.stack([positions[index, along], positions[index, 3 - side - along]], axis=1)
 
 
 def box(size: ArrayLike, *, center: ArrayLike = (0.0, 0.0, 0.0), grain: int = 0) -> Part:
@@ -155,15 +193,10 @@ def box(size: ArrayLike, *, center: ArrayLike = (0.0, 0.0, 0.0), grain: int = 0)
         center: Where its middle is [m].
         grain: Axis that u follows.
     """
-    half = 0.5 * np.asarray(size, float)
-    parts = []
-    for (axis, sign), (points, uv) in zip(
-        _FACES, _cube_faces([np.array([-h, h]) for h in half], grain), strict=True
-    ):
-        normals = np.zeros_like(points)
-        normals[..., axis] = sign
-        parts.append(grid_surface(points, uv, normals=normals))
-    return merge(parts).shifted(center)
+    cube = _cube(2, sharp=True)
+    vertices = cube.corner * (0.5 * np.asarray(size, float))
+    uv = _planar_uv(vertices, cube.side, grain)
+    return Part(vertices=vertices + np.asarray(center, float), normals=cube.normals, uv=uv, faces=cube.faces)
 
 
 def rounded_box(
@@ -178,22 +211,17 @@ def rounded_box(
 
     Args:
         size: Outer edge lengths [m].
-        radius_m: Radius of the edges [m]; less than half the shortest edge.
+        radius_m: Radius of the edges [m]; at most nearly half the shortest edge is used.
         center: Where its middle is [m].
         grain: Axis that u follows.
-        segments: Facets per half edge; 1 makes 108 triangles.
+        segments: Facets per half edge; 1 makes 108 triangles, 2 make 300.
     """
+    cube = _cube(2 * (segments + 1))
     half = 0.5 * np.asarray(size, float)
-    radius = min(radius_m, 0.49 * 2.0 * float(half.min()))
-    bend = radius * np.tan(0.25 * np.pi * np.arange(segments + 1) / segments)
-    lines = [np.concatenate([-(h - radius) - bend[::-1], (h - radius) + bend]) for h in half]
-    parts = []
-    for points, uv in _cube_faces(lines, grain):
-        core = np.clip(points, radius - half, half - radius)
-        normals = points - core
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        parts.append(grid_surface(core + radius * normals, uv, normals=normals))
-    return merge(parts).shifted(center)
+    radius = min(radius_m, 0.98 * float(half.min()))
+    vertices = cube.corner * (half - radius) + radius * cube.normals
+    uv = _planar_uv(vertices, cube.side, grain)
+    return Part(vertices=vertices + np.asarray(center, float), normals=cube.normals, uv=uv, faces=cube.faces)
 
 
 def cushion(
@@ -215,24 +243,16 @@ def cushion(
     """
     half = 0.5 * np.asarray(size, float)
     exponent = np.asarray(power, float)
-    line = np.tan(0.25 * np.pi * np.linspace(-1.0, 1.0, segments + 1))
-    parts = []
-    for points, uv in _cube_faces([line] * 3, grain):
-        scale = np.ones(points.shape[:2])
-        for _ in range(24):  # Newton on sum |s x|^p = 1, convex and increasing in s: converges from above
-            value = np.abs(points * scale[..., None]) ** exponent
-            scale -= (value.sum(-1) - 1.0) * scale / (exponent * value).sum(-1)
-        surface = points * scale[..., None]
-        normals = np.sign(surface) * exponent * np.abs(surface) ** (exponent - 1.0) / half
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        parts.append(grid_surface(surface * half, uv * _flat_size(half, grain), normals=normals))
-    return merge(parts).shifted(center)
-
-
-def _flat_size(half: Array, grain: int) -> Array:
-    """Metres per unit of uv on a cushion, close enough for cloth: its length along and across the grain."""
-    across = np.delete(half, grain)
-    return np.array([half[grain], across.max()])
+    cube = _cube(segments + 1)
+    scale = np.ones(len(cube.points))
+    for _ in range(10):  # Newton on sum |s x|^p = 1, convex and rising in s: converges from above
+        value = np.abs(cube.points * scale[:, None]) ** exponent
+        scale -= (value.sum(axis=1) - 1.0) * scale / (exponent * value).sum(axis=1)
+    surface = cube.points * scale[:, None]
+    normals = np.sign(surface) * exponent * np.abs(surface) ** (exponent - 1.0) / half
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    uv = _planar_uv(cube.points * half, cube.side, grain)
+    return Part(vertices=surface * half + np.asarray(center, float), normals=normals, uv=uv, faces=cube.faces)
 
 
 def lathe(
@@ -259,7 +279,7 @@ def lathe(
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(segment, axis=1))])
     girth = 2.0 * np.pi * float(outline[:, 0].max())
     parts = []
-    for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+    for first, last in itertools.pairwise(cuts):
         run = outline[first : last + 1]
         tangent = np.gradient(run, axis=0) if len(run) > 2 else np.tile(run[1] - run[0], (2, 1))
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -277,7 +297,7 @@ def lathe(
                 np.broadcast_arrays((angle / (2.0 * np.pi) * girth)[None], length[first : last + 1, None]), -1
             )
         parts.append(grid_surface(points, uv, normals=normals))
-    return merge(parts).shifted(center)
+    return without_slivers(merge(parts)).shifted(center)
 
 
 def cylinder(
@@ -352,7 +372,7 @@ def strip(profile: ArrayLike, length_m: float) -> Part:
     outline = np.asarray(profile, float)
     run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
     parts = []
-    for index, ((y0, z0), (y1, z1)) in enumerate(zip(outline[:-1], outline[1:], strict=True)):
+    for index, ((y0, z0), (y1, z1)) in enumerate(itertools.pairwise(outline)):
         part = quad((0.0, y0, z0), (length_m, 0.0, 0.0), (0.0, y1 - y0, z1 - z0))
         uv = np.array(
             [[0.0, run[index]], [length_m, run[index]], [length_m, run[index + 1]], [0.0, run[index + 1]]]
@@ -373,7 +393,7 @@ def panel_with_holes(
     """
     x_lines = sorted({0.0, width_m, *(x for hole in holes for x in (hole[0], hole[2]))})
     parts = []
-    for x0, x1 in zip(x_lines[:-1], x_lines[1:], strict=True):
+    for x0, x1 in itertools.pairwise(x_lines):
         over = sorted((z0, z1) for a, z0, b, z1 in holes if a < 0.5 * (x0 + x1) < b)
         ends = [0.0, *(z for span in over for z in span), height_m]
         for z0, z1 in zip(ends[0::2], ends[1::2], strict=True):

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from neurosim_core.scene.apartment.assembly import Assembly, Surface
 from neurosim_core.scene.apartment.floorplan import OUTER_WALL_M, WALL_M, FloorPlan, Opening, Room, Wall
-from neurosim_core.scene.apartment.geometry import Part, box, panel_with_holes, quad, rounded_box, strip
+from neurosim_core.scene.apartment.geometry import (
+    Part,
+    box,
+    panel_with_holes,
+    picture_quad,
+    quad,
+    rounded_box,
+    strip,
+)
 
 _SINK_M = 0.004
 """How deep mouldings reach into walls and floors, so that no two faces lie in one plane."""
@@ -33,8 +42,8 @@ class RoomFinish:
     ceiling: Surface
     trim: Surface
     sill: Surface
-    view: Surface
-    """What is seen through the windows; emits light."""
+    view: Callable[[float, float], Surface]
+    """What is seen through a window of a width and a height [m]; emits light."""
 
 
 def add_shell(
@@ -96,8 +105,8 @@ def _add_casing(assembly: Assembly, instance: int, wall: Wall, opening: Opening,
     depth = proud + _SINK_M
     middle = 0.5 * (_SINK_M - proud)
     for x in (opening.x0 - lip - 0.5 * _CASING_M, opening.x1 + lip + 0.5 * _CASING_M):
-        size = (_CASING_M, depth, height + _SINK_M)
-        upright = rounded_box(size, 0.006, center=(x, middle, 0.5 * (height - _SINK_M)), grain=2)
+        size = (_CASING_M, depth, height - 0.001)
+        upright = rounded_box(size, 0.006, center=(x, middle, 0.5 * (height + 0.001)), grain=2)
         assembly.add(instance, surface, _to_world(upright, wall))
     width = opening.x1 - opening.x0 + 2.0 * lip + 2.0 * _CASING_M + 0.03
     head = rounded_box(
@@ -143,7 +152,7 @@ def _add_window(assembly: Assembly, wall: Wall, opening: Opening, finish: RoomFi
         quad((x0, deep, z1), (width, 0.0, 0.0), (0.0, -deep, 0.0)),
         quad((x0, 0.0, z0), (width, 0.0, 0.0), (0.0, deep, 0.0)),
     ]
-    view = quad((x0, deep, z0), (width, 0.0, 0.0), (0.0, 0.0, height))
+    view = picture_quad((x0, deep, z0), (width, 0.0, 0.0), (0.0, 0.0, height))
     board = rounded_box((width + 0.12, 0.16 + 0.06, 0.03), 0.008, center=(0.5 * (x0 + x1), 0.05, z0 + 0.011))
     bar, thick = 0.055, 0.05
     at = deep - 0.06
@@ -165,7 +174,7 @@ def _add_window(assembly: Assembly, wall: Wall, opening: Opening, finish: RoomFi
         bars.append(box((width, thick - 0.016, slim), center=(0.5 * (x0 + x1), at, z0 + 0.7 * height)))
     assembly.add(instance, finish.trim, *(_to_world(part, wall) for part in (*reveal, *bars)))
     assembly.add(instance, finish.sill, _to_world(board, wall))
-    assembly.add(assembly.instance("view"), finish.view, _to_world(view, wall))
+    assembly.add(assembly.instance("view"), finish.view(width, height), _to_world(view, wall))
     lip, proud = 0.004, 0.016
     for x, z, w, h in (
         (x0 - lip - 0.03, 0.5 * (z0 + z1) + 0.03, 0.06, height),
@@ -189,8 +198,8 @@ def _add_outside(assembly: Assembly, plan: FloorPlan, finish: RoomFinish, ceilin
     xs = sorted({outer.x0, outer.x1, *(x for room in plan.rooms for x in (room.rect.x0, room.rect.x1))})
     ys = sorted({outer.y0, outer.y1, *(y for room in plan.rooms for y in (room.rect.y0, room.rect.y1))})
     tops = assembly.instance("wall_top")
-    for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
-        for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
+    for x0, x1 in itertools.pairwise(xs):
+        for y0, y1 in itertools.pairwise(ys):
             x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
             inside = any(r.rect.x0 < x < r.rect.x1 and r.rect.y0 < y < r.rect.y1 for r in plan.rooms)
             if not inside:
