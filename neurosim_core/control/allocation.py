@@ -2,9 +2,9 @@
 # mypy: disable-error-code="no-untyped-call,no-any-return"
 """Control allocation: collective thrust and torque -> rotor speeds within the motors' limits.
 
-What the rotors cannot give is given up in a fixed order, because a multirotor that keeps its attitude can
-still be flown and one that keeps its yaw cannot: first yaw torque, then collective thrust, last roll and
-pitch torque (shortened, its direction kept).
+A wrench within limits is given exactly. Of any other, a multirotor gives up in a fixed order what it can best
+do without: first yaw torque; then, without any, collective thrust; last roll and pitch torque, which are
+shortened together so that their direction stays.
 """
 
 import numpy as np
@@ -76,6 +76,41 @@ def clip(value: wp.float64, low: wp.float64, high: wp.float64) -> wp.float64:
 
 
 @wp.func
+def yaw_share(
+    matrix: wp.array2d[wp.float64],
+    low: wp.float64,
+    high: wp.float64,
+    thrust_N: wp.float64,
+    torque: wp.vec3d,
+) -> wp.float64:
+    """Return the largest share of yaw torque, in [0, 1], that goes with the rest; -1 if none does.
+
+    Args:
+        matrix: See `allocation_matrix`.
+        low: Least squared rotor speed [rad^2/s^2].
+        high: Largest squared rotor speed [rad^2/s^2].
+        thrust_N: Collective thrust [N].
+        torque: Torque in B [N m].
+    """
+    least = _ZERO
+    most = _ONE
+    for rotor in range(matrix.shape[0]):
+        level = matrix[rotor, 0] * thrust_N + matrix[rotor, 1] * torque[0] + matrix[rotor, 2] * torque[1]
+        turn = matrix[rotor, 3] * torque[2]
+        if turn > _ZERO:
+            least = wp.max(least, (low - level) / turn)
+            most = wp.min(most, (high - level) / turn)
+        elif turn < _ZERO:
+            least = wp.max(least, (high - level) / turn)
+            most = wp.min(most, (low - level) / turn)
+        elif level < low or level > high:
+            return -_ONE
+    if least > most:
+        return -_ONE
+    return most
+
+
+@wp.func
 def allocate(
     matrix: wp.array2d[wp.float64],
     motors: Motors,
@@ -99,47 +134,36 @@ def allocate(
     rotors = matrix.shape[0]
     low = motors.speed_min_rad_s * motors.speed_min_rad_s
     high = motors.speed_max_rad_s * motors.speed_max_rad_s
-
-    # Roll and pitch: the largest share for which some collective thrust keeps all rotors within limits.
-    share = _ONE
-    for above in range(rotors):
-        for below in range(rotors):
-            # above needs thrust <= (high - r) / b, below needs thrust >= (low - r) / b
-            gap = high / matrix[above, 0] - low / matrix[below, 0]
-            need = (matrix[above, 1] * torque[0] + matrix[above, 2] * torque[1]) / matrix[above, 0] - (
-                matrix[below, 1] * torque[0] + matrix[below, 2] * torque[1]
-            ) / matrix[below, 0]
-            if share * need > gap:
-                share = wp.max(gap / need, _ZERO)
-    torque_x = share * torque[0]
-    torque_y = share * torque[1]
-
-    # Collective thrust: as near to what is asked as roll and pitch allow.
-    thrust_low = wp.float64(-1.0e300)
-    thrust_high = wp.float64(1.0e300)
-    for rotor in range(rotors):
-        tilt = matrix[rotor, 1] * torque_x + matrix[rotor, 2] * torque_y
-        thrust_low = wp.max(thrust_low, (low - tilt) / matrix[rotor, 0])
-        thrust_high = wp.min(thrust_high, (high - tilt) / matrix[rotor, 0])
-    thrust = clip(thrust_N, thrust_low, thrust_high)
-
-    # Yaw: the share that is left.
-    share = _ONE
-    for rotor in range(rotors):
-        level = matrix[rotor, 0] * thrust + matrix[rotor, 1] * torque_x + matrix[rotor, 2] * torque_y
-        turn = matrix[rotor, 3] * torque[2]
-        if level + share * turn > high:
-            share = wp.max((high - level) / turn, _ZERO)
-        if level + share * turn < low:
-            share = wp.max((low - level) / turn, _ZERO)
-    torque_z = share * torque[2]
+    thrust = thrust_N
+    tilt = _ONE
+    yaw = yaw_share(matrix, low, high, thrust, torque)
+    if yaw < _ZERO:
+        # the largest share of roll and pitch for which there is a thrust that keeps all rotors within limits:
+        # a rotor at the top needs thrust <= (high - r) / b, one at the bottom thrust >= (low - r) / b
+        for top in range(rotors):
+            for bottom in range(rotors):
+                room = high / matrix[top, 0] - low / matrix[bottom, 0]
+                need = (matrix[top, 1] * torque[0] + matrix[top, 2] * torque[1]) / matrix[top, 0] - (
+                    matrix[bottom, 1] * torque[0] + matrix[bottom, 2] * torque[1]
+                ) / matrix[bottom, 0]
+                if tilt * need > room:
+                    tilt = wp.max(room / need, _ZERO)
+        # of these thrusts, the one nearest to what is asked
+        thrust_low = wp.float64(-1.0e300)
+        thrust_high = wp.float64(1.0e300)
+        for rotor in range(rotors):
+            level = tilt * (matrix[rotor, 1] * torque[0] + matrix[rotor, 2] * torque[1])
+            thrust_low = wp.max(thrust_low, (low - level) / matrix[rotor, 0])
+            thrust_high = wp.min(thrust_high, (high - level) / matrix[rotor, 0])
+        thrust = clip(thrust_N, thrust_low, thrust_high)
+        rest = wp.vec3d(tilt * torque[0], tilt * torque[1], torque[2])
+        yaw = wp.max(yaw_share(matrix, low, high, thrust, rest), _ZERO)  # -1: a limit is met up to rounding
 
     for rotor in range(rotors):
         square = (
             matrix[rotor, 0] * thrust
-            + matrix[rotor, 1] * torque_x
-            + matrix[rotor, 2] * torque_y
-            + matrix[rotor, 3] * torque_z
+            + tilt * (matrix[rotor, 1] * torque[0] + matrix[rotor, 2] * torque[1])
+            + yaw * matrix[rotor, 3] * torque[2]
         )
         speed = wp.sqrt(clip(square, low, high))
         present = rotor_speed[vehicle, rotor]

@@ -96,11 +96,10 @@ def _attitude(
     stamp_ns: wp.int64,
     state: VehicleState,
 ) -> Wrench:
-    imaginary = _vector3(setpoint, vehicle, 1)
+    v = _vector3(setpoint, vehicle, 1)
+    q = wp.quatd(v[0], v[1], v[2], setpoint[vehicle, 4])
     reference = AttitudeReference()
-    reference.orientation = wp.normalize(
-        wp.quatd(imaginary[0], imaginary[1], imaginary[2], setpoint[vehicle, 4])
-    )
+    reference.orientation = q / wp.length(q)  # `wp.normalize` would make the identity of nan
     return attitude_wrench(parameters, state, setpoint[vehicle, 0], reference)
 
 

@@ -1,0 +1,227 @@
+"""Command modes: one answer whatever the level that is asked, and clear errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.control import MODES, Se3Config, make_controller, mode_kernel
+from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
+from neurosim_core.vehicle import DynamicsError, Multirotor, preset
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS
+
+HUMMINGBIRD = preset("hummingbird")
+WEIGHT = HUMMINGBIRD.mass_kg * HUMMINGBIRD.gravity_m_s2
+REST = {
+    "position": [1.0, 2.0, 3.0],
+    "velocity": [0.0, 0.0, 0.0],
+    "orientation": [0.0, 0.0, 0.0, 1.0],
+    "body_rate": [0.0, 0.0, 0.0],
+    "rotor_speed": np.sqrt(WEIGHT / 4.0 / HUMMINGBIRD.thrust_coefficient_n_s2) * np.ones(4),
+}
+SETPOINTS = {
+    "motor_speeds": [100.0, 200.0, 300.0, 400.0],
+    "rates": [5.0, 0.1, -0.2, 0.3],
+    "attitude": [5.0, 0.1, 0.05, 0.2, 0.97],
+    "velocity": [1.0, -0.5, 0.2, 0.4],
+    "position": [1.2, 1.8, 3.1, 0.3],
+}
+
+
+def random_states(count, config=HUMMINGBIRD, seed=0):
+    random = np.random.default_rng(seed)
+    return {
+        "position": random.normal(size=(count, 3)),
+        "velocity": random.normal(size=(count, 3)),
+        "orientation": Rotation.random(count, rng=random).as_quat(),
+        "body_rate": random.normal(size=(count, 3)),
+        "rotor_speed": random.uniform(200.0, 1200.0, size=(count, config.rotor_count)),
+    }
+
+
+def a_path(yaw="travel"):
+    return figure_eight(FigureEightConfig(yaw=yaw), center=np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("mode", "setpoint"),
+    [
+        ("rates", [WEIGHT, 0.0, 0.0, 0.0]),
+        ("attitude", [WEIGHT, 0.0, 0.0, 0.0, 1.0]),
+        ("velocity", [0.0, 0.0, 0.0, 0.0]),
+        ("position", [1.0, 2.0, 3.0, 0.0]),
+    ],
+)
+def test_no_error_is_hover(device, mode, setpoint):
+    """Every mode, asked for the state it is in, carries the weight and no more."""
+    controller = make_controller(mode, HUMMINGBIRD, device=device)
+    speeds = controller.command(setpoint, **REST)
+    np.testing.assert_allclose(speeds, [REST["rotor_speed"]], rtol=1e-14)
+
+
+def test_attitude_at_its_attitude_is_rates():
+    """Attitude without attitude error is the rate mode asked for no rate."""
+    state = random_states(20)
+    thrust = np.full((20, 1), 6.0)
+    attitude = make_controller("attitude", HUMMINGBIRD, count=20)
+    rates = make_controller("rates", HUMMINGBIRD, count=20)
+    np.testing.assert_allclose(
+        attitude.command(np.hstack([thrust, state["orientation"]]), **state),
+        rates.command(np.hstack([thrust, np.zeros((20, 3))]), **state),
+        rtol=1e-12,
+    )
+
+
+def test_position_is_velocity_asked_for_the_correction():
+    """Below its limits, position asks the velocity level for gain / gain times the error."""
+    state = random_states(20) | {"orientation": [0.0, 0.0, 0.0, 1.0], "body_rate": [0.0, 0.0, 0.0]}
+    target = state["position"] + 0.1
+    gains = Se3Config(position_gain_per_s2=12.0, velocity_gain_per_s=6.0)
+    position = make_controller("position", HUMMINGBIRD, gains, count=20)
+    velocity = make_controller("velocity", HUMMINGBIRD, gains, count=20)
+    np.testing.assert_allclose(
+        position.command(np.hstack([target, np.zeros((20, 1))]), **state),
+        velocity.command(np.hstack([2.0 * (target - state["position"]), np.zeros((20, 1))]), **state),
+        rtol=1e-12,
+    )
+
+
+def test_path_at_rest_is_position():
+    """Behind its end a path rests: the same as the position mode there."""
+    path, state = a_path(), random_states(8)
+    end = path.evaluate(path.end_ns)
+    setpoint = [*end.position[0], end.yaw[0]]
+    np.testing.assert_allclose(
+        make_controller("path", HUMMINGBIRD, count=8, paths=path).command(
+            **state, stamp_ns=path.end_ns + 10**9
+        ),
+        make_controller("position", HUMMINGBIRD, count=8).command(setpoint, **state),
+        rtol=1e-9,
+    )
+
+
+def test_quaternion_sign_does_not_matter():
+    """Minus q is q: of the body and of the setpoint, within rounding."""
+    state = random_states(30)
+    setpoint = np.hstack([np.full((30, 1), 5.0), Rotation.random(30, rng=1).as_quat()])
+    controller = make_controller("attitude", HUMMINGBIRD, count=30)
+    one = controller.command(setpoint, **state)
+    np.testing.assert_allclose(
+        controller.command(setpoint, **state | {"orientation": -state["orientation"]}), one
+    )
+    np.testing.assert_allclose(controller.command(setpoint * [1, -1, -1, -1, -1], **state), one)
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [*(("hummingbird", mode) for mode in SETPOINTS), ("crazyflie", "position"), ("racer", "position")],
+)
+def test_commands_stay_within_limits(name, mode, device):
+    """Wild states and setpoints: every command is a number within the motors' range."""
+    config = preset(name)
+    state = random_states(200, config, seed=5)
+    state["velocity"] = 50.0 * state["velocity"]
+    state["body_rate"] = 50.0 * state["body_rate"]
+    controller = make_controller(mode, config, count=200, device=device)
+    setpoint = 100.0 * np.random.default_rng(6).normal(size=(200, len(controller.layout)))
+    speeds = controller.command(setpoint, **state)
+    assert speeds.min() >= config.rotor_speed_min_rad_s
+    assert speeds.max() <= config.rotor_speed_max_rad_s
+
+
+@pytest.mark.parametrize("mode", [*SETPOINTS, "path"])
+def test_batch_is_its_singles(mode, device):
+    """A batch gives bit for bit what its vehicles give alone."""
+    count = 7
+    state, stamp_ns = random_states(count), 1_234_567_890
+    paths = [a_path(yaw) for yaw in (0.1, 0.2, 0.3, 0.4, 0.5, "travel", 0.7)] if mode == "path" else None
+    setpoint = None
+    if paths is None:
+        setpoint = np.array(SETPOINTS[mode]) + 0.1 * np.arange(count)[:, None]
+    batch = make_controller(mode, HUMMINGBIRD, count=count, device=device, paths=paths)
+    together = batch.command(setpoint, **state, stamp_ns=stamp_ns)
+    for vehicle in range(count):
+        single = make_controller(mode, HUMMINGBIRD, device=device, paths=paths and paths[vehicle])
+        alone = single.command(
+            None if setpoint is None else setpoint[vehicle],
+            **{name: rows[vehicle] for name, rows in state.items()},
+            stamp_ns=stamp_ns,
+        )
+        np.testing.assert_array_equal(alone[0], together[vehicle])
+
+
+@pytest.mark.parametrize("mode", [*SETPOINTS, "path"])
+def test_device_form_is_host_form(mode, device):
+    """`update` on a vehicle's arrays writes what `command` returns for its state."""
+    vehicle = Multirotor(HUMMINGBIRD, count=3, device=device)
+    vehicle.reset(**random_states(3))
+    vehicle.advance(50_000_000)
+    path = a_path() if mode == "path" else None
+    controller = make_controller(mode, HUMMINGBIRD, count=3, device=device, paths=path)
+    if mode != "path":
+        controller.set(SETPOINTS[mode])
+    controller.update(vehicle.arrays)
+    expected = controller.command(**vehicle.state._asdict(), stamp_ns=50_000_000)
+    np.testing.assert_array_equal(vehicle.arrays.rotor_speed_command.numpy(), expected)
+
+
+@pytest.mark.parametrize(
+    ("mode", "element"), [(mode, element) for mode in SETPOINTS for element in range(len(SETPOINTS[mode]))]
+)
+def test_not_a_number_reaches_the_vehicle(mode, element, device):
+    """On the device nothing checks a setpoint, so nothing may hide it: the vehicle reports the command."""
+    vehicle = Multirotor(HUMMINGBIRD, device=device)
+    controller = make_controller(mode, HUMMINGBIRD, device=device)
+    row = np.array([SETPOINTS[mode]])
+    row[0, element] = np.nan
+    controller.setpoint.assign(row)
+    controller.update(vehicle.arrays)
+    vehicle.advance(1_000_000)
+    with pytest.raises(DynamicsError, match="rotor_speed_command"):
+        vehicle.check()
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [[0.0] * 4] * 2])
+def test_bad_setpoint_names_mode_and_layout(bad):
+    controller = make_controller("velocity", HUMMINGBIRD)
+    with pytest.raises(ValueError, match=r"mode 'velocity' takes rows of \(v_W_x_m_s, .*yaw_rate_rad_s\)"):
+        controller.set(bad)
+
+
+def test_other_errors_are_clear():
+    with pytest.raises(ValueError, match=r"unknown command mode 'fly', known: .*'attitude'"):
+        make_controller("fly", HUMMINGBIRD)
+    with pytest.raises(ValueError, match="takes one path, or one for each of 3 vehicles, got 2"):
+        make_controller("path", HUMMINGBIRD, count=3, paths=[a_path(), a_path()])
+    with pytest.raises(ValueError, match="not paths"):
+        make_controller("position", HUMMINGBIRD, paths=a_path())
+    with pytest.raises(ValueError, match="unit quaternions"):
+        make_controller("attitude", HUMMINGBIRD).set([5.0, 0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="orientation must have shape"):
+        make_controller("rates", HUMMINGBIRD).command([1.0, 0.0, 0.0, 0.0], **REST | {"orientation": [1.0]})
+    with pytest.raises(ValidationError, match="velocity_gain_per_s"):
+        Se3Config(velocity_gain_per_s=0.0)
+
+
+def test_layouts_have_units():
+    assert {mode: len(make_controller(mode, HUMMINGBIRD).layout) for mode in SETPOINTS} == {
+        mode: len(row) for mode, row in SETPOINTS.items()
+    }
+
+
+@pytest.mark.parametrize("mode", [*SETPOINTS, "path"])
+def test_builds_for_cuda(mode, tmp_path: Path):
+    """Compiled ahead of time for sm_90, which needs no GPU."""
+    terms = frozenset(AIR_TERMS if mode == "path" else ())
+    module = mode_kernel(mode, terms).module
+    wp.compile_aot_module(module, module_dir=str(tmp_path), arch=90)
+    assert list(tmp_path.glob("*.ptx")) + list(tmp_path.glob("*.cubin"))
+
+
+def test_every_mode_is_tested():
+    assert set(MODES) == {*SETPOINTS, "path"}
