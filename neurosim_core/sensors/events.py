@@ -97,7 +97,8 @@ class EventCamera:
         self._last = [self._empty(pixel_count, wp.float32) for _ in range(2)]
         self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in range(2)]
         self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
-        scratch = pixel_count if self.device.is_cpu else 0
+        self._screened = self.device.is_cpu
+        scratch = pixel_count if self._screened else 0
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._chunks = [
             _Chunk(first, end, self._empty(2 * (end - first), wp.int64), self._empty(3, wp.int64))
@@ -303,7 +304,7 @@ class EventCamera:
             chunk.counters.zero_()
             thresholds = [self.config.threshold_on, self.config.threshold_off]
             extent = [chunk.first_pixel, chunk.end_pixel, frames]
-            if self.device.is_cpu:
+            if self._screened:
                 wp.launch(
                     event_scan.screen,
                     dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),

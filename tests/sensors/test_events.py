@@ -442,6 +442,21 @@ def test_large_image_is_scanned_in_parts(device):
     assert_same(events, run(frames, stamps, device))
 
 
+def test_screen_changes_nothing():
+    """On a CPU quiet frames are skipped first, on CUDA they are not: the same events without."""
+    rng = np.random.default_rng(6)
+    frames = rng.normal(scale=0.05, size=(33, 40, 50)).cumsum(axis=0).astype(np.float32)
+    packets = []
+    for screened in (True, False):
+        camera = make_camera(50, 40, "cpu")
+        camera._screened = screened
+        camera.reset(frames[0])
+        packets.append([camera.feed(frames[k : k + 8], np.arange(k, k + 8) * MS) for k in (1, 9, 17, 25)])
+    for a, b in zip(*packets, strict=True):
+        assert len(a) > 400
+        assert_same(a, b)
+
+
 def test_reset_means_reset(device):
     """The first packet after a reset is that of a fresh camera, also in the middle of everything."""
     rng = np.random.default_rng(3)
