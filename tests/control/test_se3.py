@@ -54,7 +54,7 @@ def path_error(config, path, *, rate_hz, gains=None, device="cpu", duration_ns=N
 
 
 def test_tracking_is_exact_in_the_limit(device):
-    """Ideal motors, no air, no initial error: the error is that of holding commands, and falls as their period."""
+    """Ideal motors, no air, no initial error: what is left is that of held commands, of first order."""
     config = preset("hummingbird", **IDEAL)
     path = eight(4.0, 4.0, yaw="travel")
     rates_hz = (250.0, 500.0, 1000.0)
