@@ -463,14 +463,14 @@ class EventCamera:
                 device=self.device,
             )
             cuts = found.numpy().tolist()
-        if self.device.is_cpu:
-            columns = [column.numpy() for column in columns]
 
         packets = []
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
             dropped = sum(lost for stamp_ns, lost in self._dropped if stamp_ns <= end_ns)
             self._dropped = [(stamp_ns, lost) for stamp_ns, lost in self._dropped if stamp_ns > end_ns]
-            t, x, y, polarity = (column[start:cut] for column in columns)
+            # Warp refuses an empty slice
+            parts = [c[start:cut] if cut > start else self._empty(0, c.dtype) for c in columns]
+            t, x, y, polarity = (p.numpy() for p in parts) if self.device.is_cpu else parts
             packets.append(
                 Events(
                     stamp_ns=end_ns,
