@@ -34,7 +34,6 @@ CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7
 1000."""
 
 _PROCESSES = len(CORRELATION_TIMES_S)
-_PROCESS_COUNT = wp.constant(_PROCESSES)
 _BLOCK_DIM = 32
 _SLOT_PARAMETER = 5  # position of `slot` among the kernel's parameters
 
@@ -159,10 +158,11 @@ def make_kernel(terms: frozenset[str]) -> Any:
                 )
             reading += walk_bias[vehicle]
         if wp.static(instability):
-            for process in range(_PROCESS_COUNT):
+            process_count = processes.shape[1]  # no constant: unrolled, it compiles four times as long
+            for process in range(process_count):
                 drive = wp.cw_mul(
                     model.instability,
-                    _normal6(model.seed, model.instability_stream, k, vehicle * _PROCESS_COUNT + process),
+                    _normal6(model.seed, model.instability_stream, k, vehicle * process_count + process),
                 )
                 value = drive  # stationary from the first sample on
                 if k > wp.int64(0):

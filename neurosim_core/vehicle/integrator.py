@@ -235,7 +235,7 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
             w_next = w + sixth * (w_1 + two * (w_2 + w_3) + w_4)
             u = sixth * (w + two * (u_rate_2 + u_rate_3) + u_rate_4)
 
-            # guard: the embedded estimate, less what the lag alone puts into it, as that is integrated exactly
+            # guard: the embedded estimate, less what the lag alone puts into it (it is integrated exactly)
             a_error = a_1 - a_2 - a_3 + a_4
             w_error = w_1 - w_2 - w_3 + w_4
             if wp.static(motor_lag):
