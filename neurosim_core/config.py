@@ -125,8 +125,8 @@ def load_config(
     Args:
         source: A YAML file, a mapping with the same keys, or None for the defaults. A relative scene file is
             looked up beside the YAML file.
-        overrides: Keys that win over the source. Nested mappings are merged; a key may be dotted
-            ("scene.seed").
+        overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
+            another kind; a key may be dotted ("scene.seed").
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
 
@@ -176,6 +176,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with the keys of `patch`; a group of another kind replaces the one it meets."""
+    if "kind" in patch and patch["kind"] != base.get("kind"):
+        return dict(patch)
     merged = dict(base)
     for key, value in patch.items():
         old = merged.get(key)
@@ -210,8 +213,8 @@ def _explain(error: ValidationError) -> Iterator[str]:
         if item["type"] == "extra_forbidden":
             known = sorted(model.model_fields) if model else []
             close = difflib.get_close_matches(path[-1], known, n=1)
-            hint = f", did you mean {close[0]!r}?" if close else ""
-            yield f"{shown}: unknown key{hint} Known: {', '.join(known)}."
+            hint = f"did you mean {close[0]!r}? " if close else ""
+            yield f"{shown}: unknown key; {hint}known: {', '.join(known)}"
         elif item["type"] == "missing":
             yield f"{shown}: required, and not given"
         elif item["type"] == "union_tag_not_found":

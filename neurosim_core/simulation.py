@@ -270,7 +270,7 @@ def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True
 
 def finish(state: State) -> list[Packet]:
     """Return the packets whose windows have begun and not ended; for the end of a run."""
-    return [packet for cast in state.casts for packet in flush_events(cast)]
+    return [packet for cast in state.casts for packet in flush_events(cast, until_ns=state.stamp_ns)]
 
 
 def _pass(model: Model, state: State, boundary: Boundary, *, slot: int, closed_loop: bool) -> None:
@@ -293,24 +293,25 @@ def _observe(model: Model, state: State, batch: Sequence[Boundary]) -> list[Pack
                 render_instants(cast, state.trace, slots, [batch[slot].stamp_ns for slot in slots])
                 seeing.append(cast)
                 state.counts["renders"] += len(slots)
-    packets: list[Packet] = []
     with timed(state.wall_s, "events"):
         for cast in seeing:
             scan_events(cast)
+    with timed(state.wall_s, "read-back"):
+        states = state.trace.numpy(len(batch))[:, 0]
+        try:
+            state.vehicle.check()
+        except DynamicsError as error:
+            state.failure = error
+            state.stamp_ns = min(state.stamp_ns, error.stamp_ns)
+    with timed(state.wall_s, "collision check"):
+        packets = _collide(model, state, batch, states)  # may end the run before the end of the batch
+    with timed(state.wall_s, "events"):
         for cast in seeing:
-            packets += read_events(cast)
+            packets += read_events(cast, until_ns=state.stamp_ns)
     with timed(state.wall_s, "read-back"):
         for cast in seeing:
             packets += read_images(cast)
-        states = state.trace.numpy(len(batch))[:, 0]
         packets += _read_samplers(model, state, batch, states)
-    with timed(state.wall_s, "collision check"):
-        packets += _collide(model, state, batch, states)
-    try:
-        state.vehicle.check()
-    except DynamicsError as error:
-        state.failure = error
-        state.stamp_ns = min(state.stamp_ns, error.stamp_ns)
     state.counts["boundaries"] += len(batch)
     rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
     kept = [packet for packet in packets if packet.stamp_ns <= state.stamp_ns]

@@ -101,6 +101,7 @@ def test_overrides_win_and_may_be_dotted(tmp_path):
     file.write_text("duration_s: 3\nscene: {kind: apartment, seed: 1}\n")
     config = load_config(file, overrides={"scene.seed": 5, "duration_s": 2.0})
     assert (config.duration_s, config.scene.seed) == (2.0, 5)
+    assert load_config(file, overrides={"scene": {"kind": "mesh", "file": "/a.glb"}}).scene.kind == "mesh"
 
 
 def test_scene_file_is_relative_to_the_settings_file(tmp_path):

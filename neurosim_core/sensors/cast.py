@@ -44,6 +44,7 @@ class CastState:
     """The device buffers of one cast, for batches of at most `capacity` instants."""
 
     capacity: int
+    rate: Rate
     renderer: Renderer
     events: dict[str, EventChannel]
     images: dict[str, ImageChannel]
@@ -86,15 +87,17 @@ def make_cast_state(
         sensor = sensors[name]
         assert isinstance(sensor, ImageSensorConfig)
         images[name] = ImageChannel(output=sensor.kind, rate=Rate(sensor.rate_hz))
-    fastest_hz = max((image.rate.rate_hz for image in images.values()), default=0.0)
+    # of n consecutive ticks of the cast, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
+    picture_count = sum(int(capacity * i.rate.rate_hz / cast.rate.rate_hz) + 1 for i in images.values())
     return CastState(
         capacity=capacity,
+        rate=cast.rate,
         renderer=make_renderer(
             scene,
             cast.lens,
             outputs=cast.outputs,
             instant_count=capacity,
-            image_count=min(capacity, int(capacity * fastest_hz / cast.rate.rate_hz) + 1),
+            image_count=max(1, min(capacity, picture_count)),
         ),
         events=events,
         images=images,
@@ -144,19 +147,24 @@ def scan_events(cast: CastState) -> None:
             channel.camera.feed_device(log_radiance, cast.stamps_ns)
 
 
-def read_events(cast: CastState) -> list[Events]:
-    """Return the packets of events whose windows ended in the batch."""
+def read_events(cast: CastState, *, until_ns: int) -> list[Events]:
+    """Return the packets of events whose windows ended in the batch, at most at a stamp."""
     packets: list[Events] = []
     for channel in cast.events.values():
-        ends = [int(stamp) for stamp in cast.stamps_ns if stamp > 0 and channel.packets.has_tick(int(stamp))]
-        packets += channel.camera.collect_windows(ends)
+        stamps = (int(stamp) for stamp in cast.stamps_ns if 0 < stamp <= until_ns)
+        packets += channel.camera.collect_windows([s for s in stamps if channel.packets.has_tick(s)])
     return packets
 
 
-def flush_events(cast: CastState) -> list[Events]:
-    """Return the packets of events whose windows have begun and not ended, cut short at the last instant."""
-    packets = (channel.camera.collect() for channel in cast.events.values())
-    return [packet for packet in packets if packet.stamp_ns > packet.start_ns]
+def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
+    """Return the packets whose windows have begun and not ended, cut at the last instant until a stamp."""
+    end_ns = cast.rate.stamp_ns(cast.rate.first_tick(until_ns + 1) - 1)
+    packets: list[Events] = []
+    for channel in cast.events.values():
+        begun_ns = channel.packets.stamp_ns(channel.packets.first_tick(end_ns) - 1)
+        if 0 <= begun_ns < end_ns and not channel.packets.has_tick(end_ns):
+            packets += channel.camera.collect_windows([end_ns])
+    return packets
 
 
 def read_images(cast: CastState) -> list[Packet]:

@@ -1,0 +1,237 @@
+"""A run as a whole: order, determinism, independence of how it is cut, collisions, failures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import neurosim_core as ns
+from neurosim_core import simulation
+from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.vehicle import DynamicsError
+
+LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
+SENSORS = {
+    "events": {"kind": "event_camera", "lens": LENS, "sampling_rate_hz": 500, "packet_rate_hz": 100},
+    "rgb": {"kind": "rgb", "lens": LENS, "rate_hz": 20},
+    "depth": {"kind": "depth", "lens": LENS, "rate_hz": 50},
+    "imu": {
+        "kind": "imu",
+        "rate_hz": 333,
+        "gyroscope_noise_density": 1e-3,
+        "accelerometer_noise_density": 1e-2,
+    },
+    "odometry": {"kind": "odometry", "rate_hz": 200},
+}
+THROUGH_THE_WALL = {
+    "kind": "line",
+    "start_m": [0.0, 0.0, 1.5],
+    "end_m": [0.0, 4.0, 1.5],
+    "speed_max_m_s": 6.0,
+}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """A room of 6 x 4 x 3 m with a few coloured boxes on the floor, z up, its middle at (0, 0, 1.5)."""
+    scene = trimesh.Scene()
+    walls = trimesh.creation.box(extents=[6.0, 4.0, 3.0])
+    walls.invert()
+    walls.apply_translation([0.0, 0.0, 1.5])
+    scene.add_geometry(walls, node_name="walls")
+    rng = np.random.default_rng(0)
+    for index in range(12):
+        box = trimesh.creation.box(extents=rng.uniform(0.2, 0.6, size=3))
+        angle = 0.5 * index
+        box.apply_translation([2.6 * np.cos(angle), 1.7 * np.sin(angle), 0.5 + 0.2 * index % 2.0])
+        color = [*rng.uniform(0.0, 1.0, size=3), 1.0]
+        box.visual = trimesh.visual.TextureVisuals(
+            material=trimesh.visual.material.PBRMaterial(baseColorFactor=color)
+        )
+        scene.add_geometry(box, node_name=f"box_{index}")
+    path = tmp_path_factory.mktemp("scene") / "room.glb"
+    scene.export(path)
+    return path
+
+
+@pytest.fixture
+def settings(room: Path) -> dict[str, Any]:
+    return {
+        "duration_s": 0.2,
+        "device": "cpu",
+        "scene": {
+            "kind": "mesh",
+            "file": str(room),
+            "up_axis": "z",
+            "unit_m": 1.0,
+            "inside_m": [0.0, 0.0, 1.5],
+        },
+        "render": {"lighting": {"mode": "unshadowed"}},
+        "path": {"kind": "line", "start_m": [-1.0, 0.0, 1.5], "end_m": [1.0, 0.3, 1.4]},
+        "sensors": SENSORS,
+    }
+
+
+def fly(settings: dict[str, Any], **overrides: Any) -> list[Packet]:
+    return list(ns.run({**settings, **overrides}))
+
+
+def of(packets: list[Packet], sensor: str) -> list[Any]:
+    return [packet for packet in packets if packet.sensor == sensor]
+
+
+def content(packets: list[Packet]) -> list[tuple[Any, ...]]:
+    """All bytes of the packets, to compare runs."""
+
+    def plain(value: Any) -> Any:
+        return (value.dtype.str, value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
+
+    return [(type(p).__name__, *((k, plain(v)) for k, v in sorted(vars(p).items()))) for p in packets]
+
+
+def test_packets_come_in_order_and_none_is_missing(settings):
+    packets = fly(settings)
+    order = [(p.stamp_ns, list(SENSORS).index(p.sensor)) for p in packets]
+    assert order == sorted(order)
+    for name, count in (("rgb", 5), ("depth", 11), ("odometry", 41), ("imu", 67), ("events", 20)):
+        assert [p.sequence for p in of(packets, name)] == list(range(count))
+    assert [p.stamp_ns for p in of(packets, "imu")][:3] == [0, 3_003_003, 6_006_006]
+    assert [p.stamp_ns for p in of(packets, "rgb")] == [k * 50_000_000 for k in range(5)]
+
+
+def test_two_runs_give_the_same_bytes(settings):
+    assert content(fly(settings)) == content(fly(settings))
+
+
+@pytest.mark.parametrize("instants", [1, 3, 64])
+def test_packets_do_not_depend_on_the_size_of_a_launch(settings, instants):
+    assert content(fly(settings, instants_per_launch=instants)) == content(fly(settings))
+
+
+def test_a_sensor_does_not_change_the_others(settings):
+    """Whether pictures, IMU or odometry exist changes no event, although they share casts and boundaries."""
+    alone = fly({**settings, "sensors": {"events": SENSORS["events"]}})
+    together = of(fly(settings), "events")
+    events = of(alone, "events")
+    # the integration is cut at other stamps: positions differ by rounding and truncation, not by a pixel
+    assert sum(len(e) for e in events) == pytest.approx(sum(len(e) for e in together), rel=1e-3)
+
+
+def test_another_seed_changes_noise_and_nothing_else(settings):
+    one, two = fly(settings), fly(settings, seed=1)
+    assert content(of(one, "odometry")) == content(of(two, "odometry"))
+    assert content(of(one, "events")) == content(of(two, "events"))
+    assert content(of(one, "imu")) != content(of(two, "imu"))
+
+
+def test_hovering_gives_no_event_and_reads_gravity(settings):
+    packets = fly(
+        settings,
+        path={"kind": "hover", "position_m": [0.0, 0.0, 1.5]},
+        sensors={"imu": {"kind": "imu", "rate_hz": 400}, "events": SENSORS["events"]},
+    )
+    assert sum(len(p) for p in of(packets, "events")) == 0
+    for packet in of(packets, "imu"):
+        assert isinstance(packet, ImuSample)
+        np.testing.assert_allclose(packet.specific_force, [0.0, 0.0, 9.81], atol=1e-6)
+        np.testing.assert_allclose(packet.angular_rate, 0.0, atol=1e-6)
+
+
+def test_the_vehicle_follows_the_path(settings):
+    config = ns.load_config({**settings, "duration_s": 1.0, "sensors": {"odometry": SENSORS["odometry"]}})
+    model = simulation.make_model(config)
+    state = simulation.make_state(model)
+    for packet in simulation.run_model(model, state):
+        assert isinstance(packet, Odometry)
+        wanted = model.path.evaluate([packet.stamp_ns]).position[0]
+        assert np.linalg.norm(packet.position - wanted) < 0.02
+    assert state.stamp_ns == model.duration_ns
+    assert model.scene_on_device is None  # nobody looks: nothing is rendered
+
+
+def test_depth_is_what_the_room_says(settings):
+    """From its middle, looking along x, the wall is 3 m away and the camera 0.1 m ahead of the body."""
+    depth = {"kind": "depth", "lens": LENS, "mount": {"position_m": [0.1, 0.0, 0.0]}, "rate_hz": 10}
+    packets = fly(settings, path={"kind": "hover", "position_m": [0.0, 0.0, 1.5]}, sensors={"depth": depth})
+    image = packets[0]
+    assert isinstance(image, Image)
+    assert (image.encoding, image.data.dtype, image.data.shape) == ("32FC1", np.float32, (36, 48))
+    assert np.median(image.data[12:18, 22:26]) == pytest.approx(2.9, abs=0.5)  # boxes stand before the wall
+    assert image.data.max() == pytest.approx(2.9, abs=1e-4)
+
+
+def test_a_collision_ends_the_run_or_is_reported(settings):
+    settings = {
+        **settings,
+        "path": THROUGH_THE_WALL,
+        "duration_s": 1.5,
+        "sensors": {"odometry": SENSORS["odometry"]},
+    }
+    ended = fly(settings)
+    hit = ended[-1]
+    assert isinstance(hit, Collision)
+    assert -0.05 < hit.clearance_m <= 0.0  # 5 ms between checks at up to 6 m/s
+    assert hit.position[1] == pytest.approx(2.0 - 0.2, abs=0.06)
+    assert max(p.stamp_ns for p in ended) == hit.stamp_ns
+
+    reported = fly(settings, vehicle={"on_collision": "report"})
+    assert of(reported, "collision")[0].stamp_ns == hit.stamp_ns
+    assert reported[-1].stamp_ns == 1_500_000_000
+    assert content([p for p in reported if p.stamp_ns <= hit.stamp_ns]) == content(ended)
+
+
+def test_where_a_collision_ends_does_not_depend_on_the_size_of_a_launch(settings):
+    settings = {**settings, "path": THROUGH_THE_WALL, "duration_s": 1.5}
+    assert content(fly(settings, instants_per_launch=5)) == content(fly(settings))
+
+
+def test_an_outside_controller_flies_the_same(settings):
+    """`step` with the commands of the path controller gives the packets of `run`, byte for byte."""
+    config = ns.load_config(settings)
+    expected = fly(settings)
+    model = simulation.make_model(config)
+    inside, outside = simulation.make_state(model), simulation.make_state(model)
+    inside.controller.update(inside.vehicle.arrays)
+    packets: list[Packet] = []
+    while outside.stamp_ns < model.duration_ns:
+        outside_now = outside.vehicle.arrays
+        inside.controller.update(outside_now)
+        packets += ns.step(model, outside, outside_now.rotor_speed_command.numpy()[0])
+    packets += simulation.finish(outside)
+    assert content(packets) == content(expected)
+
+
+def test_a_vehicle_that_cannot_be_integrated_is_an_error(settings):
+    """The packets before it are not lost."""
+    config = ns.load_config({**settings, "sensors": {"odometry": SENSORS["odometry"]}})
+    model = simulation.make_model(config)
+    state = simulation.make_state(model)
+    packets = simulation.start(model, state)
+    state.vehicle.arrays.body_rate.assign([[1e9, 1e9, 1e9]])
+    packets += simulation.advance(model, state, 80_000_000)
+    assert isinstance(state.failure, DynamicsError)
+    assert max(p.stamp_ns for p in packets) <= state.failure.stamp_ns == state.stamp_ns
+
+
+def test_the_last_packet_of_events_ends_with_the_run(settings):
+    """A window that the run does not complete is cut at the last instant in it."""
+    events = of(fly({**settings, "duration_s": 0.1155}), "events")
+    assert [e.stamp_ns for e in events[-2:]] == [110_000_000, 114_000_000]
+    assert events[-1].start_ns == 110_000_000
+
+
+def test_events_of_a_run_are_sorted_within_their_windows(settings):
+    for packet in of(fly(settings), "events"):
+        assert isinstance(packet, Events)
+        t = packet.numpy().t
+        assert (np.diff(t) >= 0).all()
+        assert ((t * 1000 > packet.start_ns - 1000) & (t * 1000 <= packet.stamp_ns)).all()
+
+
+def test_an_unknown_device_is_named(settings):
+    with pytest.raises(ValueError, match="cuda:77"):
+        fly(settings, device="cuda:77")
