@@ -64,8 +64,8 @@ class Track:
 class FlightSummary:
     """Collects from the packets of a flight what its overview shows, in bounded memory.
 
-    The moment shown is the one at which the contrast of the picture times the number of pixels that saw
-    events is greatest: not the blank wall.
+    The moment shown is the one at which the contrast of the picture, times the number of pixels that saw
+    events, times the spread of depth (its logarithm) is greatest: a view into a room, not the blank wall.
     """
 
     def __init__(
@@ -174,6 +174,9 @@ class FlightSummary:
         if snapshot.events is not None:
             pixels = snapshot.events.y.astype(np.int64) * snapshot.event_width + snapshot.events.x
             interest *= 1.0 + len(np.unique(pixels))
+        if snapshot.depth is not None:
+            seen = snapshot.depth.data[np.isfinite(snapshot.depth.data) & (snapshot.depth.data > 0.0)]
+            interest *= 0.1 + (float(np.log(seen).std()) if seen.size else 0.0)
         if self._best is None or interest > self._best[0]:
             self._best = (interest, snapshot)
 
@@ -316,7 +319,7 @@ def _draw_snapshot(figure: Any, snapshot: Snapshot | None) -> None:
     seen = depth[np.isfinite(depth)]
     far = float(np.percentile(seen, 99.5)) if seen.size else 1.0
     _heading(figure, x, y, "Depth", "metres", width=_PANEL_W)
-    picture = _show(axes, np.where(np.isfinite(depth), depth, np.nan), cmap="turbo_r", vmin=0.0, vmax=far)
+    picture = _show(axes, np.where(np.isfinite(depth), depth, np.nan), cmap="turbo", vmin=0.0, vmax=far)
     bar = axes.inset_axes((0.0, -0.065, 1.0, 0.035))
     figure.colorbar(picture, cax=bar, orientation="horizontal").outline.set_visible(False)
     bar.tick_params(length=3, labelsize=9.5, pad=2)

@@ -11,8 +11,7 @@ from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.source import linear_to_srgb8
 
-_STEPS = (0.1, 0.3, 0.5, 0.7)
-_SAMPLES = np.array([[a, b, 1.0 - a - b] for a in _STEPS for b in _STEPS if a + b < 1.0])
+_SAMPLES = np.array([[i + 1 / 3, j + 1 / 3, 3 - i - j + 1 / 3] for i in range(4) for j in range(4 - i)]) / 4
 """Barycentric coordinates at which a face's texture is averaged."""
 
 

@@ -38,8 +38,8 @@ _TEXTURE_MAX_PX = 256
 _BATCH_NS = 50_000_000
 _BATCH_ROWS = 1024
 _XYZ_COLORS = ((224, 49, 49), (47, 158, 68), (28, 126, 214))
-_TRAIL_COLOR = (255, 146, 43)
-_PATH_COLOR = (116, 192, 252)
+_TRAIL_COLOR = (253, 126, 20)
+_PATH_COLOR = (51, 154, 240)
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -54,7 +54,7 @@ def open_recording(path: str | Path | None = None) -> rr.RecordingStream:
         ImportError: Rerun is not installed.
     """
     rr = _import_rerun()
-    recording: rr.RecordingStream = rr.RecordingStream("neurosim")
+    recording = rr.RecordingStream("neurosim")
     recording.set_log_time_enabled(False)  # wall-clock time has no place in a simulation's recording
     recording.set_log_tick_enabled(False)
     if path is not None:
@@ -63,7 +63,7 @@ def open_recording(path: str | Path | None = None) -> rr.RecordingStream:
             recording.save(path)
         except (OSError, RuntimeError) as error:
             raise OSError(f"cannot write {path}: {error}") from error
-    return recording
+    return recording  # type: ignore[no-any-return]
 
 
 class RerunLogger:
@@ -116,7 +116,9 @@ class RerunLogger:
             for entity, mesh in scene_meshes(scene):
                 recording.log(entity, mesh, static=True)
         if len(path_position) > 1:
-            path = self._rr.LineStrips3D([path_position], colors=[_PATH_COLOR], radii=[0.008])
+            path = self._rr.LineStrips3D(
+                [path_position], colors=[_PATH_COLOR], radii=self._rr.Radius.ui_points(1.5)
+            )
             recording.log("world/path", path, static=True)
         recording.log("world/vehicle", self._rr.TransformAxes3D(0.25), static=True)
         for sensor in sensors:
@@ -229,7 +231,8 @@ class RerunLogger:
         stroke = np.concatenate([start, translation])
         self._trail_end = translation[-1:]
         self._set_time(int(stamp_ns[-1]))
-        self._recording.log("world/trail", rr.LineStrips3D([stroke], colors=[_TRAIL_COLOR], radii=[0.015]))
+        line = rr.LineStrips3D([stroke], colors=[_TRAIL_COLOR], radii=rr.Radius.ui_points(3.0))
+        self._recording.log("world/trail", line)
 
     def _log_image(self, packet: Image) -> None:
         last_ns = self._image_stamp_ns.get(packet.sensor)
@@ -283,7 +286,7 @@ class _Table:
 def encode_image(image: Image) -> Any:
     """Return a picture as Rerun shows it.
 
-    rgb8 and mono8 become JPEG; 32FC1 becomes a depth image in millimetres, cut at 65 m, 0 where nothing is hit.
+    rgb8 and mono8 become JPEG; 32FC1 becomes a depth image in millimetres up to 65 m, 0 where nothing is hit.
 
     Raises:
         ValueError: If another encoding is given.
@@ -376,7 +379,7 @@ def make_blueprint(sensors: tuple[SensorDescription, ...], scene: Scene | None =
     if scene is not None:
         low, high = scene.bounds_m
         center, size = 0.5 * (low + high), high - low
-        away = np.array([-0.35 * size[0], -0.75 * size[1], 0.8 * max(size)])
+        away = np.array([-0.3 * size[0], -0.7 * max(size), 0.85 * max(size)])
         eye = rrb.EyeControls3D(position=center + away, look_target=center, eye_up=(0.0, 0.0, 1.0))
     space = rrb.Spatial3DView(
         origin="world",
