@@ -293,6 +293,7 @@ class Controller:
         self._kernel = kernel
         self._model = list(model)
         self._bound: tuple[Any, Any] = (None, None)
+        self._host: tuple[_HostArrays, Any] | None = None
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays` and `setpoint`: one launch.
@@ -303,9 +304,12 @@ class Controller:
         Args:
             arrays: The device arrays of a `Multirotor` (`vehicle.arrays`), or any object with the same
                 attributes.
+
+        Raises:
+            ValueError: If the arrays are of another number of vehicles or rotors, or on another device.
         """
         if self._bound[0] is not arrays:
-            self._bound = (arrays, self._bind(arrays))
+            self._bound = (arrays, self._record(arrays))
         self._bound[1].launch()
 
     def command(
@@ -337,20 +341,21 @@ class Controller:
         """
         if setpoint is not None:
             self.set(setpoint)
-        arrays = Feedback()
-        for name, value, width, dtype in (
-            ("position", position, 3, wp.vec3d),
-            ("velocity", velocity, 3, wp.vec3d),
-            ("orientation", orientation, 4, wp.quatd),
-            ("body_rate", body_rate, 3, wp.vec3d),
-            ("rotor_speed", rotor_speed, self.rotor_count, wp.float64),
+        if self._host is None:
+            arrays = _HostArrays(self.count, self.rotor_count, self.device)
+            self._host = (arrays, self._record(arrays))
+        arrays, launch = self._host
+        for array, name, value, width in (
+            (arrays.position, "position", position, 3),
+            (arrays.velocity, "velocity", velocity, 3),
+            (arrays.orientation, "orientation", orientation, 4),
+            (arrays.body_rate, "body_rate", body_rate, 3),
+            (arrays.rotor_speed, "rotor_speed", rotor_speed, self.rotor_count),
         ):
-            rows = as_rows(value, name=name, count=self.count, width=width)
-            setattr(arrays, name, wp.array(rows, dtype=dtype, device=self.device))
-        arrays.stamp_ns = wp.full(self.count, stamp_ns, dtype=wp.int64, device=self.device)
-        commands = wp.empty((self.count, self.rotor_count), dtype=wp.float64, device=self.device)
-        self._launch(arrays, commands)
-        return np.asarray(commands.numpy())
+            array.assign(as_rows(value, name=name, count=self.count, width=width))
+        arrays.stamp_ns.fill_(stamp_ns)
+        launch.launch()
+        return np.array(arrays.rotor_speed_command.numpy())
 
     def set(self, setpoint: ArrayLike) -> None:
         """Write all setpoints from the host.
@@ -371,21 +376,38 @@ class Controller:
             raise ValueError(f"mode 'attitude' takes unit quaternions, got {rows[:, 1:].tolist()}")
         self.setpoint.assign(rows)
 
-    def _bind(self, arrays: Any) -> Any:
+    def _record(self, arrays: Any) -> Any:
+        """Prepare the launch on some arrays."""
+        shape = (self.count, self.rotor_count)
+        if arrays.rotor_speed.shape != shape or arrays.rotor_speed.device != self.device:
+            raise ValueError(
+                f"the controller is for {shape[0]} vehicles of {shape[1]} rotors on {self.device}, got "
+                f"arrays of {arrays.rotor_speed.shape} on {arrays.rotor_speed.device}"
+            )
         feedback = Feedback()
         for name in ("position", "velocity", "orientation", "body_rate", "rotor_speed", "stamp_ns"):
             setattr(feedback, name, getattr(arrays, name))
-        return self._launch(feedback, arrays.rotor_speed_command, record=True)
-
-    def _launch(self, feedback: Any, commands: Any, *, record: bool = False) -> Any:
         return wp.launch(
             self._kernel,
             dim=self.count,
             inputs=[*self._model, feedback, self.setpoint],
-            outputs=[commands],
+            outputs=[arrays.rotor_speed_command],
             device=self.device,
-            record_cmd=record,
+            record_cmd=True,
         )
+
+
+class _HostArrays:
+    """Arrays for states that come from the host."""
+
+    def __init__(self, count: int, rotor_count: int, device: Any) -> None:
+        self.position: Any = wp.zeros(count, dtype=wp.vec3d, device=device)
+        self.velocity: Any = wp.zeros(count, dtype=wp.vec3d, device=device)
+        self.orientation: Any = wp.zeros(count, dtype=wp.quatd, device=device)
+        self.body_rate: Any = wp.zeros(count, dtype=wp.vec3d, device=device)
+        self.rotor_speed: Any = wp.zeros((count, rotor_count), dtype=wp.float64, device=device)
+        self.stamp_ns: Any = wp.zeros(count, dtype=wp.int64, device=device)
+        self.rotor_speed_command: Any = wp.zeros((count, rotor_count), dtype=wp.float64, device=device)
 
 
 def make_controller(

@@ -208,6 +208,12 @@ def test_other_errors_are_clear():
         Se3Config(velocity_gain_per_s=0.0)
 
 
+def test_arrays_of_another_batch_are_refused(device):
+    controller = make_controller("rates", HUMMINGBIRD, count=2, device=device)
+    with pytest.raises(ValueError, match="for 2 vehicles of 4 rotors"):
+        controller.update(Multirotor(HUMMINGBIRD, count=3, device=device).arrays)
+
+
 def test_layouts_have_units():
     assert {mode: len(make_controller(mode, HUMMINGBIRD).layout) for mode in SETPOINTS} == {
         mode: len(row) for mode, row in SETPOINTS.items()
