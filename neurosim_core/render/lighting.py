@@ -246,7 +246,7 @@ def _sample_point(vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner
     return point + inset * inwards + _OFFSET_M * face_normal, face_normal, point
 
 
-def _spread_order(count: int) -> NDArray[np.int64]:
+def spread_order(count: int) -> NDArray[np.int64]:
     """Return an order of `count` items in which every part of the order is spread evenly over them."""
     stride = round(count * (math.sqrt(5.0) - 1.0) / 2.0)
     while math.gcd(stride, count) != 1:
@@ -256,7 +256,7 @@ def _spread_order(count: int) -> NDArray[np.int64]:
 
 def _hemisphere(count: int) -> NDArray[np.float32]:
     """Return cosine-weighted directions about z, a Fibonacci spiral, shape [count, 3]."""
-    k = _spread_order(count)
+    k = spread_order(count)
     radius2 = (k + 0.5) / count
     angle = k * _GOLDEN_ANGLE
     radius = np.sqrt(radius2)
@@ -267,7 +267,7 @@ def _hemisphere(count: int) -> NDArray[np.float32]:
 
 def _sphere(count: int) -> NDArray[np.float32]:
     """Return evenly spread directions, a Fibonacci spiral, shape [count, 3]."""
-    k = _spread_order(count)
+    k = spread_order(count)
     z = 1.0 - (2.0 * k + 1.0) / count
     radius = np.sqrt(1.0 - z * z)
     return np.stack([radius * np.cos(k * _GOLDEN_ANGLE), radius * np.sin(k * _GOLDEN_ANGLE), z], 1).astype(

@@ -1,6 +1,7 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,no-any-return,operator,arg-type,untyped-decorator"
+# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type"
+# mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches and typed literals have a meaning in kernels)
-"""The ray caster: one kernel factory, specialised on the outputs that are asked for and the terms of the scene.
+"""The ray caster: one kernel factory, specialised on the outputs asked for and the terms of the scene.
 
 One traversal per ray answers everything. A thread is a pixel of an instant; blocks of 64 threads are tiles of
 8 x 8 pixels, so that their rays walk the same nodes of the tree. What a specialisation does not need is not
@@ -37,8 +38,8 @@ class Terms(NamedTuple):
     """Some material emits light."""
     baked: bool
     """Light is interpolated between corners instead of evaluated for each pixel."""
-    sample_count: int
-    """Rays per pixel."""
+    supersampled: bool
+    """Radiance is the mean over several rays per pixel."""
 
 
 @wp.struct
@@ -86,12 +87,13 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     with_depth = "depth" in outputs
     with_normal = "normal" in outputs
     with_instance = "instance" in outputs
-    with_images = with_rgb or with_depth or with_normal or with_instance
     with_radiance = with_log or with_rgb
     textured = terms.textured
     emissive = terms.emissive
+    with_images = len(outputs) > int(with_log)
     baked = terms.baked
-    sample_count = terms.sample_count
+    supersampled = terms.supersampled
+    with_geometry = with_depth or with_normal or with_instance
 
     @wp.func
     def shade(
@@ -185,17 +187,22 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         q = q_WC[instant]
         pixel = row * width + col
         radiance = wp.vec3(0.0)
-        for sample in range(wp.static(sample_count)):
-            ray_C = rays[sample, pixel]
+        for layer in range(rays.shape[0]):
+            ray_C = rays[layer, pixel]
             ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            if wp.static(supersampled):
+                # Layer 0 goes through the centre and is for geometry, the others are for radiance.
+                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
+                    continue
             hit = wp.mesh_query_ray(scene.mesh, origin, ray, _FAR_M)
             if wp.static(with_radiance):
-                if hit.result:
-                    radiance += shade(scene, ray, origin, ray_C[3], hit)
-                else:
-                    radiance += scene.sky
-            if wp.static(with_depth or with_normal or with_instance):
-                if slot >= 0 and sample == 0:
+                if wp.static(not supersampled) or layer > 0:
+                    if hit.result:
+                        radiance += shade(scene, ray, origin, ray_C[3], hit)
+                    else:
+                        radiance += scene.sky
+            if wp.static(with_geometry):
+                if slot >= 0 and layer == 0:
                     if wp.static(with_depth):
                         depth_out[slot, row, col] = wp.where(hit.result, hit.t * ray_C[2], wp.inf)
                     if wp.static(with_normal):
@@ -208,8 +215,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                         if hit.result:
                             name = scene.face_instance[hit.face]
                         instance_out[slot, row, col] = name
-        if wp.static(with_radiance):
-            radiance = radiance * wp.static(1.0 / sample_count)
+        if wp.static(supersampled):
+            radiance = (1.0 / float(rays.shape[0] - 1)) * radiance
         if wp.static(with_log):
             luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
             log_radiance_out[instant, row, col] = wp.log(luma + scene.dark_floor)
@@ -230,6 +237,9 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     with image_slot >= 0, in that slot: rgb, sRGB of exposure times radiance; depth, planar z [m], inf where
     nothing is hit; normal, of the triangle, in W, towards the camera, zero where nothing is hit; instance, -1
     where nothing is hit.
+
+    Rays are [layer, H * W]: direction in C and spread [rad]. One layer, or the layer of the centres and then
+    the samples whose mean is the radiance.
 
     The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
     side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much

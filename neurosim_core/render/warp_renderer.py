@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine
+from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine, spread_order
 from neurosim_core.render.raycast import TILE, SceneData, Terms, raycast_kernel
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
@@ -22,7 +22,6 @@ from neurosim_core.scene.scene import Scene
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _MIDDLE_GREY = 0.2
 _BRIGHT = 0.6
-_R2 = (0.7548776662466927, 0.5698402909980532)  # 1 / g, 1 / g^2 with g^3 = g + 1 (Roberts 2018)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,7 +64,7 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         textured=bool((packed.material_texture[:, 1] > 0).any()),
         emissive=any(max(m.emission) > 0.0 for m in scene.materials),
         baked=baked,
-        sample_count=config.samples_per_pixel,
+        supersampled=config.samples_per_pixel > 1,
     )
     start = time.perf_counter()
     light: NDArray[np.float32] | None = None
@@ -149,7 +148,7 @@ def _texel_density(
 
 
 def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray[np.float32]) -> float:
-    """Return an exposure that shows the mean surface as middle grey and nine tenths of all surfaces below white.
+    """Return an exposure that shows the mean surface as middle grey and nine tenths of all below white.
 
     The mean is that of log luma; faces count by area and with their brighter side: the other one is
     often the inside of a wall.
@@ -162,9 +161,21 @@ def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray
     return float(min(_MIDDLE_GREY / np.exp(np.average(np.log(luma), weights=area)), _BRIGHT / bright))
 
 
-def _sample_offsets(count: int) -> list[tuple[float, float]]:
-    """Return where in a pixel rays go through [px]: the first in its centre, all well spread (R2 sequence)."""
-    return [((0.5 + k * _R2[0]) % 1.0, (0.5 + k * _R2[1]) % 1.0) for k in range(count)]
+def _ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
+    """Return rays through the centres of pixels and, for several samples, through points spread over them.
+
+    The points are a lattice: along rows and along columns each n-th of a pixel has one of the n.
+
+    Returns:
+        Direction in C and spread [rad], shape [1 or 1 + n, H * W, 4].
+    """
+    spread = lens.ray_spread()[..., None] / np.float32(np.sqrt(sample_count))
+    offsets = [(0.5, 0.5)]
+    if sample_count > 1:
+        columns, rows = np.arange(sample_count), spread_order(sample_count)
+        offsets += list(zip((columns + 0.5) / sample_count, (rows + 0.5) / sample_count, strict=True))
+    layers = [np.concatenate([lens.ray_table(offset), spread], axis=-1).reshape(-1, 4) for offset in offsets]
+    return np.stack(layers)
 
 
 class WarpRenderer:
@@ -209,11 +220,9 @@ class WarpRenderer:
         self._thread_count = thread_count
         tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
         self._instant_threads = tiles * TILE * TILE
-        count = arrays.terms.sample_count
-        spread = lens.ray_spread()[..., None] / np.float32(np.sqrt(count))
-        rays = [np.concatenate([lens.ray_table(at), spread], axis=-1) for at in _sample_offsets(count)]
+        rays = _ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
-        self._rays = wp.array(np.stack(rays).reshape(count, -1, 4), dtype=wp.vec4, device=device)
+        self._rays = wp.array(rays, dtype=wp.vec4, device=device)
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,return-value,assignment,operator"
-"""Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled in the kernel.
+"""Textures for the ray caster: decoded to linear light, averaged into mip levels, packed, sampled.
 
 A texel is 32 bits: the square roots of linear red, green and blue in 11, 11 and 10 bits. The root spreads the
 codes like sRGB does, but is decoded with one multiplication and no table, and with 8 times (blue: 4 times)
@@ -90,8 +90,7 @@ class PackedTextures:
 
 
 def pack_textures(materials: Sequence[Material]) -> PackedTextures:
-    """Decode textures, build their mip chains and pack them; a texture that materials share is packed
-    once."""
+    """Decode textures, build their mip chains and pack them; one that materials share is packed once."""
     chunks: list[NDArray[np.uint32]] = []
     levels: list[tuple[int, int, int]] = []
     rows: dict[int, tuple[int, int]] = {}
