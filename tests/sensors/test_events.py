@@ -340,6 +340,17 @@ def test_windows_are_cut_by_nanoseconds(device):
     assert rows(camera.collect()) == [(5, 0, 0, 1)]
 
 
+def test_crossing_right_after_a_frame_belongs_to_the_window_after(device):
+    """1e-7 under the level at 2000 ns, crossed 1e-7 ns later: that window had closed, in any split."""
+    camera = make_camera(1, 1, device)
+    camera.reset(np.zeros((1, 1), np.float32))
+    frames = np.array([0.2 - 1e-7, 100.0], np.float32).reshape(2, 1, 1)
+    camera.feed_device(wp.array(frames, device=device), [2000, 2100])
+    first, second = camera.collect_windows([2000])[0], camera.collect()
+    assert len(first) == 0
+    assert rows(second) == [(2, 0, 0, 1)] * 500
+
+
 def test_device_form_reads_only_its_frames(device):
     """A buffer longer than the stack: the frames behind are not read, though they hold nonsense."""
     frames = np.full((16, 3, 4), np.nan, np.float32)
