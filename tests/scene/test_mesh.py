@@ -201,6 +201,13 @@ def test_trimesh_files_are_judged_by_geometry(tmp_path, axis):
     assert scene.notes[1].startswith(f"Up axis: {axis}, from the geometry")
 
 
+def test_a_tall_room_is_not_judged(tmp_path):
+    """6 x 5 x 4 m: flattest along z, but not by much."""
+    trimesh.creation.box([6.0, 5.0, 4.0]).export(tmp_path / "room.glb")
+    scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / "room.glb"))
+    assert scene.notes[1].startswith("Up axis: y, by custom")
+
+
 @pytest.mark.parametrize(("suffix", "axis"), [("glb", "y"), ("obj", "y"), ("ply", "z"), ("stl", "z")])
 def test_a_cube_is_oriented_by_custom(tmp_path, suffix, axis):
     trimesh.creation.box([1, 1, 1]).export(tmp_path / f"cube.{suffix}")
@@ -517,7 +524,7 @@ def test_degenerate_faces_are_dropped_and_counted(tmp_path):
     seed=st.integers(0, 2**31),
     count=st.integers(1, 30),
     repeated=st.integers(0, 5),
-    scale=st.floats(1e-3, 1e3),
+    scale=st.floats(1e-3, 1.5),  # larger ones would be rooms, where placing lamps takes a while
 )
 def test_area_is_kept(tmp_path_factory, seed, count, repeated, scale):
     """Random triangles, randomly turned: area times unit^2, and exactly the degenerate ones are gone."""
@@ -598,14 +605,19 @@ def test_light_of_the_file(tmp_path):
 
 
 def test_sun_is_a_far_light(tmp_path):
-    """It shines along the node's -z (here the file's -z, so the world's +y), with little spread."""
-    scene = load(tmp_path / "a.glb", lit("directional", intensity=5.0).glb())
+    """It shines along the node's -z (here the file's -z, so the world's +y), 5 lx times 0.1 strong."""
+    scene = load(tmp_path / "a.glb", lit("directional", intensity=5.0).glb(), light_scale=0.1)
     offset = np.array(scene.lights[0].position_m) - scene.vertices.mean(axis=0)
-    assert offset / np.linalg.norm(offset) == pytest.approx((0, -1, 0), abs=0.02)
+    distance = np.linalg.norm(offset)
+    assert offset / distance == pytest.approx((0, -1, 0), abs=0.02)  # 20 diagonals away, from the middle
+    assert scene.lights[0].intensity == pytest.approx(np.full(3, 0.5 * distance**2), rel=0.02)
+
+
+CUPBOARD = (0.2, 2.2, 2.8, 4.8, 0.1, 2.9)
 
 
 def room(*, ceiling: bool) -> trimesh.Trimesh:
-    """Two rooms of 5 x 5 x 3 m with a door between them."""
+    """Two rooms of 5 x 5 x 3 m with a door between them, and a closed cupboard as large as a lift."""
 
     def slab(x0, x1, y0, y1, z0, z1):
         return trimesh.creation.box(bounds=[[x0, y0, z0], [x1, y1, z1]])
@@ -613,6 +625,7 @@ def room(*, ceiling: bool) -> trimesh.Trimesh:
     walls = [slab(0, 10, 0, 5, -0.1, 0), slab(0, 10, -0.1, 0, 0, 3), slab(0, 10, 5, 5.1, 0, 3)]
     walls += [slab(-0.1, 0, 0, 5, 0, 3), slab(10, 10.1, 0, 5, 0, 3)]
     walls += [slab(4.95, 5.05, 0, 2, 0, 3), slab(4.95, 5.05, 3, 5, 0, 3), slab(4.95, 5.05, 2, 3, 2.1, 3)]
+    walls.append(slab(*CUPBOARD))
     if ceiling:
         walls.append(slab(0, 10, 0, 5, 3, 3.1))
     return trimesh.util.concatenate(walls)
@@ -629,6 +642,7 @@ def test_lamps_hang_in_every_room(tmp_path, ceiling):
     assert (places[:, 0] > 5.1).any()
     assert ((places[:, 2] > 1.9) & (places[:, 2] < 2.8)).all()
     assert ((places > (0, 0, 0)) & (places < (10, 5, 3))).all()
+    assert not ((places[:, 0] < CUPBOARD[1]) & (places[:, 1] > CUPBOARD[2])).any()
 
 
 def test_things_are_lit_from_outside(tmp_path):
