@@ -9,9 +9,9 @@ K = diag(k_d, k_d, k_z):
     translational lift  k_h (u_ix^2 + u_iy^2) z            parasitic drag       -|v_a| diag(c) v_a
     reaction torque     k_m d_i Omega_i^2 z                flapping torque      -k_flap Omega_i u_i x z
 
-All but the last two of each column act at the hub r_i. Everything is linear in Omega_i, in Omega_i^2, or free
-of both, with coefficients that depend on geometry alone; so a few sums over the rotors replace the rotors,
-and no right-hand side loops over them.
+Parasitic drag acts at the centre of mass, all other forces at the hub r_i. Everything is linear in Omega_i,
+in Omega_i^2, or free of both, with coefficients that depend on geometry alone; so a few sums over the rotors
+replace the rotors, and no right-hand side loops over them.
 
 Reference: Svacha, Mohta, Kumar (2017), Improving quadrotor trajectory tracking by compensating for
 aerodynamic effects; the same equations as in RotorPy 3.0 (Folk, Paulos, Kumar 2023).

@@ -11,6 +11,7 @@ Reference: Munthe-Kaas (1998), Runge-Kutta methods on Lie groups.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -32,6 +33,12 @@ GUARD_RELATIVE = 1e-2
 """Guard: largest embedded error estimate of one step as a share of speed and body rate."""
 
 
+_vec7d = wp.types.vector(length=7, dtype=wp.float64)
+# Taylor coefficients in t^2, the highest first; what is left out is below 1e-16 for t < 1/2
+_SINE_SERIES = wp.constant(_vec7d(*((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6, -1, -1))))
+_COSINE_SERIES = wp.constant(_vec7d(*((-1.0) ** k / math.factorial(2 * k + 2) for k in range(6, -1, -1))))
+
+
 class Kernels(NamedTuple):
     """The kernels of one set of terms."""
 
@@ -50,30 +57,16 @@ def _chart_rate(u: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
 @wp.func
 def _rotation_series(u: wp.vec3d) -> wp.vec2d:
     """Return a = sin(t) / t and b = (1 - cos(t)) / t^2, t = |u|: exp(u) x = x + a u x x + b u x (u x x)."""
-    one = wp.float64(1.0)
     t2 = wp.dot(u, u)
-    # fourteenth-degree Taylor polynomials: relative error below 1e-16 for t < 1/2
-    a = one - t2 / wp.float64(6.0) * (
-        one
-        - t2
-        / wp.float64(20.0)
-        * (one - t2 / wp.float64(42.0) * (one - t2 / wp.float64(72.0) * (one - t2 / wp.float64(110.0))))
-    )
-    b = wp.float64(0.5) * (
-        one
-        - t2
-        / wp.float64(12.0)
-        * (
-            one
-            - t2
-            / wp.float64(30.0)
-            * (one - t2 / wp.float64(56.0) * (one - t2 / wp.float64(90.0) * (one - t2 / wp.float64(132.0))))
-        )
-    )
+    a = wp.float64(0.0)
+    b = wp.float64(0.0)
+    for term in range(7):
+        a = a * t2 + _SINE_SERIES[term]
+        b = b * t2 + _COSINE_SERIES[term]
     if t2 > wp.float64(0.25):
         t = wp.sqrt(t2)
         a = wp.sin(t) / t
-        b = (one - wp.cos(t)) / t2
+        b = (wp.float64(1.0) - wp.cos(t)) / t2
     return wp.vec2d(a, b)
 
 
@@ -85,9 +78,7 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
     wind = air_terms and "wind" in terms
     full_inertia = "full_inertia" in terms
     wrench = make_wrench(terms)
-    rotor_wrench = make_wrench(
-        terms & {"rotor_drag", "flapping"}
-    )  # what is linear in the sums over the rotors
+    rotor_wrench = make_wrench(terms & {"rotor_drag", "flapping"})  # linear in the sums over the rotors
     module = wp.get_module("neurosim_core.vehicle.integrator." + ("_".join(sorted(terms)) or "rigid"))
 
     @wp.func

@@ -69,8 +69,7 @@ RACER = MultirotorConfig(
     rotor_speed_min_rad_s=150.0,  # Agilicious
     rotor_speed_max_rad_s=2300.0,  # at which four rotors give NeuroBEM's 33 N
 )
-"""A racing quadrotor with 5-inch propellers. Neither source has drag coefficients of this model's form: it
-has none."""
+"""A racing quadrotor with 5-inch propellers; no drag, as neither source has coefficients of this form."""
 
 _PRESETS = {"crazyflie": CRAZYFLIE, "hummingbird": HUMMINGBIRD, "racer": RACER}
 
