@@ -65,7 +65,7 @@ class FlightSummary:
     """Collects from the packets of a flight what its overview shows, in bounded memory.
 
     The moment shown is the one at which the contrast of the picture, times the number of pixels that saw
-    events, times the spread of depth (its logarithm) is greatest: a view into a room, not the blank wall.
+    events, times the median depth (at most 3 m) is greatest: a view into a room, not the wall in front.
     """
 
     def __init__(
@@ -175,8 +175,7 @@ class FlightSummary:
             pixels = snapshot.events.y.astype(np.int64) * snapshot.event_width + snapshot.events.x
             interest *= 1.0 + len(np.unique(pixels))
         if snapshot.depth is not None:
-            seen = snapshot.depth.data[np.isfinite(snapshot.depth.data) & (snapshot.depth.data > 0.0)]
-            interest *= 0.1 + (float(np.log(seen).std()) if seen.size else 0.0)
+            interest *= 0.1 + min(float(np.median(snapshot.depth.data)), 3.0)
         if self._best is None or interest > self._best[0]:
             self._best = (interest, snapshot)
 

@@ -1,0 +1,218 @@
+"""The overview: what it collects, against brute force; and that its picture has something where it should."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+from test_plan import make_scene
+
+from neurosim_core.packets import Events, Image, Odometry
+from neurosim_core.record import SensorDescription
+from neurosim_core.view.overview import FlightSummary, Snapshot, Track, save_overview
+
+MS = 1_000_000
+WIDTH, HEIGHT = 40, 30
+
+
+def odometry(k: int, *, period_ns: int = 5 * MS) -> Odometry:
+    angle = 0.01 * k
+    return Odometry(
+        stamp_ns=k * period_ns,
+        sequence=k,
+        sensor="truth",
+        position=np.array([np.cos(angle), np.sin(angle), 1.2]),
+        orientation=np.array([0.0, 0.0, np.sin(0.5 * angle), np.cos(0.5 * angle)]),
+        velocity=np.array([-np.sin(angle), np.cos(angle), 0.0]),
+        body_rate=np.zeros(3),
+        rotor_speed=np.zeros(4),
+    )
+
+
+def events(rng, k: int, count: int, *, sensor: str = "dvs") -> Events:
+    """Events of the window from 10 k ms to 10 (k + 1) ms."""
+    return Events(
+        stamp_ns=(k + 1) * 10 * MS,
+        start_ns=k * 10 * MS,
+        sequence=k,
+        sensor=sensor,
+        t=np.sort(rng.integers(k * 10_000 + 1, (k + 1) * 10_000 + 1, count)),
+        x=rng.integers(0, WIDTH, count).astype(np.uint16),
+        y=rng.integers(0, HEIGHT, count).astype(np.uint16),
+        polarity=rng.integers(0, 2, count).astype(np.uint8),
+        width=WIDTH,
+        height=HEIGHT,
+    )
+
+
+def picture(stamp_ns: int, contrast: int, *, sensor: str = "rgb") -> Image:
+    data = np.full((HEIGHT, WIDTH, 3), 100, dtype=np.uint8)
+    data[:, ::2] += np.uint8(contrast)
+    return Image(stamp_ns=stamp_ns, sensor=sensor, data=data, encoding="rgb8")
+
+
+def test_snapshot_holds_exactly_the_window_before_the_picture():
+    """Also when the packets of the picture's own stamp come after it."""
+    rng = np.random.default_rng(0)
+    summary = FlightSummary()
+    packets = [events(rng, k, 100) for k in range(8)]
+    for k, packet in enumerate(packets):
+        if k in (3, 6):  # pictures at 40 and 70 ms, before the events of the same stamp
+            summary.log(picture(packet.stamp_ns, 90 if k == 3 else 10))
+        summary.log(packet)
+    snapshot = summary.snapshot()
+    assert snapshot is not None
+    assert snapshot.stamp_ns == 40 * MS  # the one with the greater contrast
+    t = np.concatenate([p.t for p in packets])
+    assert snapshot.events is not None
+    assert snapshot.events.t.tolist() == t[(t > 20_000) & (t <= 40_000)].tolist()
+    assert (snapshot.event_width, snapshot.event_height) == (WIDTH, HEIGHT)
+    assert summary.event_count == 800
+
+
+def test_moment_with_more_events_and_wider_view_is_chosen():
+    rng = np.random.default_rng(0)
+    near = np.full((HEIGHT, WIDTH), 0.5, dtype=np.float32)
+    far = np.geomspace(1.0, 10.0, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
+    far[0] = np.inf
+    for counts, depths, wanted_ns in (
+        ((10, 500), (near, near), 20 * MS),
+        ((100, 100), (far, near), 10 * MS),
+    ):
+        summary = FlightSummary(event_window_ns=10 * MS)
+        for k, (count, depth) in enumerate(zip(counts, depths, strict=True)):
+            stamp_ns = (k + 1) * 10 * MS
+            summary.log(events(rng, k, count))
+            summary.log(picture(stamp_ns, 50))
+            summary.log(Image(stamp_ns=stamp_ns, sensor="z", data=depth, encoding="32FC1"))
+        snapshot = summary.snapshot()
+        assert snapshot is not None
+        assert snapshot.stamp_ns == wanted_ns
+
+
+def test_only_the_first_camera_of_a_kind_is_shown():
+    rng = np.random.default_rng(0)
+    described = SensorDescription(
+        name="right",
+        kind="event_camera",
+        rate_hz=1.0,
+        position=np.zeros(3),
+        orientation=np.array([0, 0, 0, 1.0]),
+    )
+    summary = FlightSummary((described,))
+    summary.log(events(rng, 0, 7, sensor="left"))
+    summary.log(events(rng, 0, 5, sensor="right"))
+    summary.log(picture(10 * MS, 10, sensor="a"))
+    summary.log(picture(10 * MS, 90, sensor="b"))
+    snapshot = summary.snapshot()
+    assert snapshot is not None
+    assert snapshot.events is not None
+    assert len(snapshot.events.t) == 5
+    assert snapshot.rgb is not None
+    assert snapshot.rgb.sensor == "a"
+
+
+def test_memory_is_bounded(monkeypatch):
+    """Events: those of one window. Odometry: at most so many rows, evenly spread over the whole flight."""
+    monkeypatch.setattr("neurosim_core.view.overview._TRACK_ROWS", 200)
+    rng = np.random.default_rng(0)
+    summary = FlightSummary()
+    for k in range(100):
+        summary.log(events(rng, k, 10))
+        assert len(summary._recent) <= 2
+    for k in range(450):
+        summary.log(odometry(k, period_ns=MS))
+    track = summary.track()
+    assert 100 < len(track.stamp_ns) <= 200
+    assert np.unique(np.diff(track.stamp_ns)).tolist() == [4 * MS]
+    assert track.stamp_ns[-1] >= 446 * MS
+
+
+def test_track_is_the_state():
+    """Heading of a level camera is its yaw."""
+    summary = FlightSummary()
+    for k in range(100):
+        summary.log(odometry(k))
+    track = summary.track()
+    angle = 0.01 * np.arange(100)
+    assert track.stamp_ns.tolist() == [k * 5 * MS for k in range(100)]
+    assert track.position[:, 2].tolist() == [1.2] * 100
+    heading = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert track.heading == pytest.approx(heading, abs=1e-12)  # rounding
+
+
+def room() -> trimesh.Trimesh:
+    return trimesh.util.concatenate(
+        [trimesh.creation.box(extents=(6, 4, 2.5)), trimesh.creation.box(extents=(1, 1, 1))]
+    )
+
+
+def draw(path, summary: FlightSummary, **options) -> np.ndarray:
+    save_overview(
+        path, scene=make_scene(room()), track=summary.track(), snapshot=summary.snapshot(), **options
+    )
+    with PIL.Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def test_picture_has_its_size_and_its_parts(tmp_path):
+    """1600 x 900, and each panel shows more than paper. Places are those of the layout, in pixels."""
+    rng = np.random.default_rng(0)
+    summary = FlightSummary()
+    for k in range(101):
+        summary.log(odometry(k))
+    for k in range(4):
+        summary.log(events(rng, k, 500))
+        summary.log(picture((k + 1) * 10 * MS, 90))
+        depth = np.geomspace(1.0, 10.0, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
+        summary.log(Image(stamp_ns=(k + 1) * 10 * MS, sensor="z", data=depth, encoding="32FC1"))
+    found = draw(tmp_path / "o.png", summary, event_count=2000, real_time_factor=0.5)
+    assert found.shape == (900, 1600, 3)
+    panels = {
+        "title": (slice(20, 90), slice(40, 500)),
+        "rgb": (slice(124, 436), slice(40, 456)),
+        "events": (slice(124, 436), slice(520, 936)),
+        "depth": (slice(508, 820), slice(40, 456)),
+        "profile": (slice(508, 820), slice(520, 936)),
+        "plan": (slice(124, 816), slice(996, 1560)),
+    }
+    for name, place in panels.items():
+        assert (found[place] != 255).any(axis=-1).mean() > 0.02, name
+        assert found[place].reshape(-1, 3).std() > 10.0, name
+    border = np.ones((900, 1600), dtype=bool)
+    border[12:-12, 12:-12] = False
+    assert (found[border] == 255).all()  # nothing is cut off
+    gutter = found[130:430, 470:510]
+    assert (gutter == 255).all()  # panels do not run into each other
+    events_panel = found[panels["events"]].astype(int)
+    red = (events_panel[..., 0] > events_panel[..., 2] + 60).mean()
+    blue = (events_panel[..., 2] > events_panel[..., 0] + 60).mean()
+    assert 0.1 < red < 0.9
+    assert 0.1 < blue < 0.9
+
+
+def test_flight_without_cameras_or_motion_is_drawn(tmp_path):
+    """What is missing is said, not drawn; nothing fails."""
+    assert draw(tmp_path / "a.png", FlightSummary()).shape == (900, 1600, 3)
+    summary = FlightSummary()
+    summary.log(odometry(0))
+    assert draw(tmp_path / "b.png", summary).shape == (900, 1600, 3)
+    for _ in range(3):
+        summary.log(odometry(0))
+    empty = Snapshot(stamp_ns=0, depth=Image(data=np.full((4, 4), np.inf, np.float32), encoding="32FC1"))
+    save_overview(tmp_path / "c.png", scene=make_scene(room()), track=summary.track(), snapshot=empty)
+
+
+def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    none = Track(
+        stamp_ns=np.zeros(0, np.int64),
+        position=np.zeros((0, 3)),
+        velocity=np.zeros((0, 3)),
+        heading=np.zeros((0, 2)),
+    )
+    with pytest.raises(ImportError, match=r"pip install 'neurosim\[view\]'"):
+        save_overview(tmp_path / "o.png", scene=make_scene(room()), track=none, snapshot=None)

@@ -1,0 +1,272 @@
+"""Rerun recordings, read back from the file."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+import rerun as rr
+import rerun.chunk
+import trimesh
+from test_plan import make_scene
+
+from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.record import Intrinsics, SensorDescription
+from neurosim_core.scene.scene import Material, Texture
+from neurosim_core.view.event_picture import event_picture
+from neurosim_core.view.rerun_log import (
+    RerunLogger,
+    encode_events,
+    encode_image,
+    open_recording,
+    scene_meshes,
+)
+
+MS = 1_000_000
+LENS = Intrinsics(width=32, height=24, fx=30.0, fy=31.0, cx=16.0, cy=12.0)
+
+
+def describe(name: str, kind: str, *, lens: Intrinsics | None = None) -> SensorDescription:
+    return SensorDescription(
+        name=name,
+        kind=kind,
+        rate_hz=100.0,
+        position=np.array([0.1, 0.0, 0.03]),
+        orientation=np.array([-0.5, 0.5, -0.5, 0.5]),
+        intrinsics=lens,
+    )
+
+
+SENSORS = (
+    describe("dvs", "event_camera", lens=LENS),
+    describe("rgb", "rgb", lens=LENS),
+    describe("z", "depth", lens=LENS),
+    describe("imu", "imu"),
+    describe("truth", "odometry"),
+)
+
+
+def make_events(k: int, count: int = 50) -> Events:
+    rng = np.random.default_rng(k)
+    return Events(
+        stamp_ns=(k + 1) * 10 * MS,
+        start_ns=k * 10 * MS,
+        sensor="dvs",
+        t=np.sort(rng.integers(k * 10_000 + 1, (k + 1) * 10_000 + 1, count)),
+        x=rng.integers(0, 32, count).astype(np.uint16),
+        y=rng.integers(0, 24, count).astype(np.uint16),
+        polarity=rng.integers(0, 2, count).astype(np.uint8),
+        width=32,
+        height=24,
+    )
+
+
+def make_odometry(k: int) -> Odometry:
+    return Odometry(
+        stamp_ns=k * 5 * MS + 1,
+        sensor="truth",
+        position=np.array([0.1 * k, 1.0, 2.0]),
+        orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+        velocity=np.array([3.0, 4.0, 0.0]),
+        body_rate=np.zeros(3),
+        rotor_speed=np.arange(4.0) + k,
+    )
+
+
+def make_imu(k: int) -> ImuSample:
+    return ImuSample(
+        stamp_ns=k * 2 * MS + 1,
+        sensor="imu",
+        specific_force=np.array([k, 0.0, 9.81]),
+        angular_rate=np.arange(3.0),
+    )
+
+
+def make_image(stamp_ns: int, sensor: str = "rgb") -> Image:
+    return Image(stamp_ns=stamp_ns, sensor=sensor, data=np.full((24, 32, 3), 90, np.uint8), encoding="rgb8")
+
+
+def read(path: Path) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
+    """Rows of each entity: (time [ns] or None if static, values by name of the component)."""
+    rows: dict[str, list[tuple[int | None, dict[str, Any]]]] = defaultdict(list)
+    for chunk in rerun.chunk.RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        names = batch.schema.names
+        times = batch.column(names.index("sim_time")) if "sim_time" in names else None
+        for row in range(batch.num_rows):
+            values = {
+                name.rsplit(":", 1)[-1]: batch.column(index)[row].as_py()
+                for index, name in enumerate(names)
+                if ":" in name
+            }
+            stamp_ns = None if times is None else int(times[row].value)
+            rows[chunk.entity_path].append((stamp_ns, values))
+    return {entity: sorted(found, key=lambda item: item[0] or 0) for entity, found in rows.items()}
+
+
+def record(
+    path: Path, packets: list[Packet], **options: Any
+) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
+    with RerunLogger(open_recording(path), sensors=SENSORS, **options) as logger:
+        for packet in packets:
+            logger.log(packet)
+    return read(path)
+
+
+def test_scalars_and_poses_are_read_back(tmp_path):
+    """Every sample, at its nanosecond."""
+    packets: list[Packet] = [*(make_odometry(k) for k in range(50)), *(make_imu(k) for k in range(130))]
+    rows = record(tmp_path / "f.rrd", sorted(packets, key=lambda p: p.stamp_ns))
+    force = [(t, v["scalars"]) for t, v in rows["/plots/imu/specific_force"] if t is not None]
+    assert force == [(k * 2 * MS + 1, [k, 0.0, 9.81]) for k in range(130)]
+    speed = [(t, v["scalars"]) for t, v in rows["/plots/truth/speed"] if t is not None]
+    assert speed == [(k * 5 * MS + 1, [5.0]) for k in range(50)]
+    rotors = [v["scalars"] for t, v in rows["/plots/truth/rotor_speed"] if t is not None]
+    assert rotors == [[k, k + 1.0, k + 2.0, k + 3.0] for k in range(50)]
+    poses = [(t, v["translation"]) for t, v in rows["/world/vehicle"] if t is not None]
+    assert [t for t, _ in poses] == [k * 5 * MS + 1 for k in range(50)]
+    assert np.array([p[0] for _, p in poses])[:, 0] == pytest.approx(0.1 * np.arange(50), rel=1e-6)  # float32
+    strokes = [v["strips"][0] for _, v in rows["/world/trail"]]
+    trail = np.concatenate([stroke[1:] for stroke in strokes])  # each begins where the one before ended
+    assert trail[:, 0] == pytest.approx(0.1 * np.arange(50), rel=1e-6)
+    assert 4 <= len(strokes) <= 6  # one per 50 ms
+
+
+def test_events_become_one_picture_per_window(tmp_path):
+    """Two packets of 10 ms make a window of 20 ms; its picture is the one of event_picture, without loss."""
+    packets = [make_events(k) for k in range(6)]
+    rows = record(tmp_path / "f.rrd", list(packets))["/world/vehicle/dvs/image"]
+    assert [t for t, _ in rows] == [20 * MS, 40 * MS, 60 * MS]
+    for k, (_, values) in enumerate(rows):
+        joined = EventArrays(
+            *(
+                np.concatenate(columns)
+                for columns in zip(*(p.numpy() for p in packets[2 * k : 2 * k + 2]), strict=True)
+            )
+        )
+        with PIL.Image.open(io.BytesIO(bytes(values["blob"][0]))) as found:
+            assert (np.asarray(found.convert("RGB")) == event_picture(joined, width=32, height=24)).all()
+
+
+def test_cameras_are_described(tmp_path):
+    rows = record(tmp_path / "f.rrd", [])
+    for name in ("dvs", "rgb", "z"):
+        values: dict[str, Any] = {}
+        for stamp_ns, part in rows[f"/world/vehicle/{name}"]:
+            assert stamp_ns is None
+            values |= {key: value for key, value in part.items() if value is not None}
+        assert values["resolution"] == [[32.0, 24.0]]
+        assert values["image_from_camera"] == [
+            [30.0, 0.0, 0.0, 0.0, 31.0, 0.0, 16.0, 12.0, 1.0]
+        ]  # column by column
+        assert values["quaternion"] == [[-0.5, 0.5, -0.5, 0.5]]
+        assert values["translation"][0] == pytest.approx([0.1, 0.0, 0.03], rel=1e-6)  # float32
+    assert len(rerun.chunk.RrdReader(tmp_path / "f.rrd").blueprints()) == 1
+
+
+def test_image_rate_is_limited_per_sensor(tmp_path):
+    packets = [make_image(k * 10 * MS, sensor) for k in range(21) for sensor in ("rgb", "other")]
+    packets.append(make_image(0))  # after a reset time starts again, and the first picture is shown
+    rows = record(tmp_path / "f.rrd", list(packets), image_rate_max_hz=20.0)
+    assert [t for t, _ in rows["/world/vehicle/rgb/image"]] == [0, 0, 50 * MS, 100 * MS, 150 * MS, 200 * MS]
+    assert [t for t, _ in rows["/world/vehicle/other/image"]] == [0, 50 * MS, 100 * MS, 150 * MS, 200 * MS]
+
+
+def test_collisions_clearance_and_path(tmp_path):
+    path = np.arange(9.0).reshape(3, 3)
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), path_position=path) as logger:
+        logger.log(
+            Collision(stamp_ns=7, sensor="collision", position=np.array([1.0, 2.0, 3.0]), clearance_m=-0.1)
+        )
+        logger.log_scalar("clearance", 5, 0.25)
+    rows = read(tmp_path / "f.rrd")
+    assert [(t, v["positions"]) for t, v in rows["/world/collisions"]] == [(7, [[1.0, 2.0, 3.0]])]
+    assert [(t, v["scalars"]) for t, v in rows["/plots/clearance"]] == [(5, [0.25])]
+    assert rows["/world/path"][0][1]["strips"] == [path.tolist()]
+
+
+def test_depth_is_in_millimetres_and_zero_is_nothing():
+    depth = np.array([[0.5, 1.2345], [np.inf, 100.0]], dtype=np.float32)
+    encoded = encode_image(Image(data=depth, encoding="32FC1"))
+    assert encoded.meter.as_arrow_array().to_pylist() == [1000.0]
+    blob = encoded.blob.as_arrow_array()[0].as_py()
+    with PIL.Image.open(io.BytesIO(bytes(blob))) as found:
+        assert np.asarray(found).tolist() == [[500, 1235], [0, 65535]]
+
+
+def test_scene_is_split_by_material_and_ceiling():
+    """Triangles are the scene's, vertices only those in use, v counts from the top, textures are small."""
+    floor = trimesh.creation.box(extents=(4, 4, 0.2))
+    ceiling = trimesh.creation.box(extents=(4, 4, 0.2)).apply_translation((0, 0, 2.5))
+    mesh = trimesh.util.concatenate([floor, ceiling])
+    texture = Texture(name="t", srgb=np.zeros((512, 1024, 3), np.uint8))
+    scene = make_scene(
+        mesh,
+        uv=np.tile(np.float32([0.25, 0.75]), (16, 1)),
+        materials=(Material(name="a", base_color=(1.0, 0.0, 0.0), texture=texture), Material(name="b")),
+        face_material=np.repeat([0, 1], 12).astype(np.int32),
+    )
+    meshes = dict(scene_meshes(scene))
+    assert sorted(meshes) == ["world/scene/ceiling/1", "world/scene/room/0"]
+    for part, first in (("world/scene/room/0", 0), ("world/scene/ceiling/1", 12)):
+        vertices = np.array(meshes[part].vertex_positions.as_arrow_array().to_pylist())
+        triangles = np.array(meshes[part].triangle_indices.as_arrow_array().to_pylist())
+        assert len(vertices) == 8
+        assert (vertices[triangles] == mesh.triangles[first : first + 12].astype(np.float32)).all()
+    room = meshes["world/scene/room/0"]
+    assert room.vertex_texcoords.as_arrow_array().to_pylist() == [[0.25, 0.25]] * 8
+    assert room.albedo_texture_format.as_arrow_array().to_pylist()[0]["width"] == 256
+    assert room.albedo_factor.as_arrow_array().to_pylist() == [0xFF0000FF]
+
+
+def test_memory_is_bounded(tmp_path):
+    """Rows wait for at most 50 ms or 1024 rows."""
+    with RerunLogger(open_recording(tmp_path / "f.rrd")) as logger:
+        for k in range(3000):
+            sample = make_imu(k)
+            logger.log(
+                ImuSample(
+                    stamp_ns=k,
+                    sensor="imu",
+                    specific_force=sample.specific_force,
+                    angular_rate=sample.angular_rate,
+                )
+            )
+            assert all(len(table._stamp_ns) < 1024 for table in logger._tables.values())
+    rows = read(tmp_path / "f.rrd")["/plots/imu/specific_force"]
+    assert [t for t, _ in rows if t is not None] == list(range(3000))
+
+
+def test_wrong_input_is_refused(tmp_path):
+    with (
+        RerunLogger(open_recording(tmp_path / "f.rrd")) as logger,
+        pytest.raises(ValueError, match="type 'Packet'"),
+    ):
+        logger.log(Packet())
+    with pytest.raises(ValueError, match="encoding '32SC1', known"):
+        encode_image(Image(data=np.zeros((2, 2), np.int32), encoding="32SC1"))
+    with pytest.raises(OSError, match=r"cannot write .*nowhere"):
+        open_recording(tmp_path / "nowhere" / "f.rrd")
+
+
+def test_missing_rerun_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    for call in (open_recording, lambda: encode_events(make_events(0).numpy(), width=32, height=24)):
+        with pytest.raises(ImportError, match=r"pip install 'neurosim\[view\]'"):
+            call()
+
+
+def test_no_wall_clock_is_recorded(tmp_path):
+    """Files of equal flights differ in nothing but identifiers."""
+    record(tmp_path / "f.rrd", [make_imu(0), make_image(0)])
+    names = set()
+    for chunk in rerun.chunk.RrdReader(tmp_path / "f.rrd").stream():
+        names |= set(chunk.timeline_names)
+    assert names == {"sim_time"}
+    assert rr.get_global_data_recording() is None  # nothing was made the default of the process
