@@ -34,6 +34,8 @@ wp.set_module_options({"enable_backward": False})
 
 Array = NDArray[np.float64]
 
+_ROOM_MIN_M3 = 12.0
+"""Smaller regions with walls around them are taken for the insides of things."""
 _CPU_CHUNKS = 8
 """Launches that the columns of a grid are divided into on the CPU, for two or more threads to share."""
 
@@ -296,9 +298,10 @@ def make_free_space(
 
     The seed is, in this order: `config.seed_m`; the point that the scene knows (`scene.inside_m`); or the
     widest place of the largest connected region, counting only voxels that have a surface below them and in
-    each of the four horizontal directions. The inside of a closed solid is such a region too, but a small
-    one; outside a building some direction is open. Scenes without walls (nothing counts by that rule) take
-    the largest region that has a surface below, and else the largest.
+    each of the four horizontal directions. The inside of a closed solid is such a region too, but a smaller
+    one; outside a building some direction is open. Where no such region has 12 m^3 (a terrain with rocks),
+    the largest region that has a surface below is taken, and else the largest. A large closed solid in the
+    open, such as a block that stands for a building, is taken for a room: say `seed_m` then.
 
     Args:
         scene: Triangles.
@@ -350,7 +353,7 @@ def make_free_space(
         device=device,
     )
     seed = _find_seed(unseeded) if known is None else known
-    if known is not None and (room := float(unseeded.clearance(known.point)[0])) <= 0.5 * voxel:
+    if known is not None and (room := float(unseeded.clearance(known.point)[0])) <= voxel:
         if config.seed_m is not None:
             raise ValueError(
                 f"seed_m must be in free space, got {config.seed_m}, where the nearest surface or bound "
@@ -424,14 +427,15 @@ def _find_seed(space: FreeSpace) -> _Seed:
     walls = seen(0, up=False) & seen(0, up=True) & seen(1, up=False) & seen(1, up=True)
     widest = "the widest place of the largest region"
     rules = (
-        (below & walls, f"{widest} with a floor below and walls on four sides"),
-        (below, f"{widest} with a surface below, as nothing has walls on four sides"),
-        (np.ones_like(below), f"{widest}, as nothing has a surface below"),
+        (below & walls, _ROOM_MIN_M3, f"{widest} with a floor below and walls on four sides"),
+        (below, 0.0, f"{widest} with a surface below, as no room has walls on four sides"),
+        (np.ones_like(below), 0.0, f"{widest}, as nothing has a surface below"),
     )
-    for counts, rule in rules:
+    for counts, size_min_m3, rule in rules:
         inside = counts & ~occupied
-        if inside.any():
-            region = int(np.bincount(labels[inside], minlength=count + 1).argmax())
+        sizes = np.bincount(labels[inside], minlength=count + 1)
+        region = int(sizes.argmax())
+        if sizes[region] * space.voxel_m**3 > size_min_m3:
             width = np.where(inside & (labels == region), space.grid_clearance, -np.inf)
             voxel = np.array(np.unravel_index(int(width.argmax()), width.shape))
             return _Seed(space.centers(voxel), rule)

@@ -46,6 +46,8 @@ _SPLITS_MAX = 3
 """How often a piece may be split before it gets stops."""
 _SPARE_M = 1e-6
 """More clearance than asked for while planning, so that the proof survives rounding to nanoseconds."""
+_RING = (0.75, 1.25)
+"""Goals are at a distance between these multiples of the leg's length."""
 _CANDIDATES = 24
 """Random places of which the next goal is the one farthest from where the tour has been."""
 
@@ -124,7 +126,7 @@ def plan_tour(space: FreeSpace, config: TourConfig, *, duration_s: float) -> Pat
     # nothing is faster than the limit, so a way of this length takes at least as long as asked
     length_min = duration_s * config.limits.speed_max_m_s
     while len(legs) < config.goal_count if config.goal_count is not None else length < length_min:
-        found = search(terrain.slowness, space.voxel_m, here)
+        found = search(terrain.slowness, space.voxel_m, here, cost_max_m=_RING[1] * config.leg_length_m)
         goal = _next_goal(found.cost, places, visited, config.leg_length_m, rng)
         if goal is None:
             raise PlanningError(
@@ -195,13 +197,13 @@ def _next_goal(
 ) -> Voxel | None:
     """A random place about a leg's length away, the farthest of a few from where the tour has been."""
     way = cost[places[:, 0], places[:, 1], places[:, 2]]
-    far = float(way.max())
+    far = float(way.max(initial=0.0, where=np.isfinite(way)))
     if not far > 0.0:
         return None
-    length = min(leg_length_m, 0.9 * far)
-    ring = np.flatnonzero(np.abs(way - length) <= 0.25 * length)
-    if len(ring) == 0:
-        ring = np.array([int(np.argmin(np.abs(way - length)))])
+    length = min(leg_length_m, far / _RING[1])
+    ring = np.flatnonzero(
+        (way >= _RING[0] * length) & (way <= _RING[1] * length)
+    )  # holds the farthest at least
     few = places[rng.choice(ring, size=_CANDIDATES)]
     apart = np.linalg.norm(few[:, None].astype(np.float64) - np.array(visited), axis=2).min(axis=1)
     return _voxel(few[int(apart.argmax())])

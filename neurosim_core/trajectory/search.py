@@ -7,6 +7,7 @@ help. The order of everything is fixed, so the same grid gives the same way.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,7 @@ def _search(
     # In:
     start: int,
     goal: int,
+    cost_max_m: float,
     # Out:
     cost_out: wp.array[wp.float32],
     parent_out: wp.array[wp.int32],
@@ -67,7 +69,7 @@ def _search(
     while count > 0:
         node = heap[0]
         place[node] = _CLOSED
-        if node == goal:
+        if node == goal or key[node] > cost_max_m:
             break
         count -= 1
         if count > 0:  # the last node sinks from the root
@@ -148,6 +150,8 @@ def search(
     voxel_m: float,
     start: tuple[int, int, int],
     goal: tuple[int, int, int] | None = None,
+    *,
+    cost_max_m: float = math.inf,
 ) -> Search:
     """Find the cheapest ways from a voxel over the 26 neighbours of each.
 
@@ -156,6 +160,7 @@ def search(
         voxel_m: Spacing [m].
         start: Voxel.
         goal: Voxel at which to stop (A*); None: find the ways to all voxels (Dijkstra).
+        cost_max_m: Ways that cost more need not be found [m].
     """
     size = slowness.size
     empty = {"dtype": wp.int32, "device": "cpu"}
@@ -169,6 +174,7 @@ def search(
             voxel_m,
             int(np.ravel_multi_index(start, slowness.shape)),
             -1 if goal is None else int(np.ravel_multi_index(goal, slowness.shape)),
+            cost_max_m,
             cost,
             parent,
             wp.empty(size, dtype=wp.float32, device="cpu"),
