@@ -15,7 +15,7 @@ class LightingConfig(Settings):
     mode: Literal["baked", "unshadowed"] = "baked"
     """`baked`: shadows and ambient occlusion, computed once when the scene is loaded. `unshadowed`: evaluated
     for each pixel, exact, without shadows."""
-    edge_max_m: float = Field(default=0.35, ge=0.01)
+    edge_max_m: float = Field(default=0.5, ge=0.01)
     """`baked`: edges of triangles are split until none is longer [m]; light is linear between their ends."""
     ambient_ray_count: int = Field(default=16, ge=1, le=1024)
     """`baked`: rays per point and side that look for occluders of the ambient light."""

@@ -30,7 +30,6 @@ wp.set_module_options({"enable_backward": False})
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _BURIED = 0.1  # occluders at 5 % of the ambient radius all around
 _OFFSET_M = wp.constant(1.0e-3)
-_INSET_MAX_M = wp.constant(0.03)
 
 
 @wp.func
@@ -193,7 +192,7 @@ def _bake(
     ray = int(0)
     while ray < ray_count:
         corner = group_corner[begin + ray % count]
-        origin, face_normal, point = _sample_point(vertices, faces, corner, normal)
+        origin, face_normal, point = _sample_point(vertices, faces, corner, ray, normal)
         local = hemisphere[ray]
         direction = local[0] * tangent + local[1] * bitangent + local[2] * normal
         below = wp.dot(direction, face_normal)
@@ -218,7 +217,9 @@ def _bake(
             shadow_ray = int(0)
             while shadow_ray < shadow_ray_count:
                 corner = group_corner[begin + shadow_ray % count]
-                origin, _face_normal, _corner_point = _sample_point(vertices, faces, corner, normal)
+                origin, _face_normal, _corner_point = _sample_point(
+                    vertices, faces, corner, shadow_ray, normal
+                )
                 to_light = light_position[lamp] + light_radius_m * sphere[shadow_ray] - origin
                 distance = wp.length(to_light)
                 if not wp.mesh_query_ray_anyhit(occluders, origin, to_light / distance, distance):
@@ -231,8 +232,11 @@ def _bake(
 
 
 @wp.func
-def _sample_point(vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner: int, normal: wp.vec3):
-    # A little inside the corner, a little off the surface: not in the edge where two surfaces meet.
+def _sample_point(
+    vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner: int, ray: int, normal: wp.vec3
+):
+    # Off the surface and inside the corner: never on the edge where surfaces meet, and spread over the inner part
+    # of the face, so that occluders smaller than faces are averaged and not aliased.
     face = faces[corner // 3]
     p0 = vertices[face[0]]
     p1 = vertices[face[1]]
@@ -242,7 +246,8 @@ def _sample_point(vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner
     if wp.dot(face_normal, normal) < 0.0:
         face_normal = -face_normal
     inwards = (p0 + p1 + p2) / 3.0 - point
-    inset = wp.min(0.25, _INSET_MAX_M / wp.max(wp.length(inwards), 1.0e-9))
+    golden = 0.618034 * float(ray)
+    inset = 0.1 + 0.6 * (golden - wp.floor(golden))
     return point + inset * inwards + _OFFSET_M * face_normal, face_normal, point
 
 

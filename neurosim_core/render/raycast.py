@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type"
+# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches and typed literals have a meaning in kernels)
 """The ray caster: one kernel factory, specialised on the outputs asked for and the terms of the scene.

@@ -105,8 +105,9 @@ def test_box_throws_a_shadow(device):
     got = light[0, on_floor, :, 0]
     reach = np.abs(corner[..., :2]).max(axis=-1)
     unshaded = 2.0 / np.linalg.norm(corner - (0.0, 0.0, 2.0), axis=-1) ** 3
-    # The penumbra of a ball of 0.1 m at equal distances is 0.1 m to each side; points sit up to 0.03 m off.
-    inside, outside = reach < 1.0 - 0.14, reach > 1.0 + 0.14
+    # The penumbra of a ball of 0.1 m at equal distances is 0.1 m to each side; points sit up to
+    # 0.7 of the way to the middle of a face, 0.1 m.
+    inside, outside = reach < 1.0 - 0.2, reach > 1.0 + 0.2
     assert inside.sum() > 50
     assert (got[inside] == 0.0).all()
     np.testing.assert_allclose(got[outside], unshaded[outside], rtol=1e-5)
@@ -171,12 +172,12 @@ def test_floor_under_a_carpet_does_not_darken_the_floor_beside_it(device):
     mesh, light = bake(scene, device)
     floor = light[0, mesh.origin < 2]
     reach = np.abs(mesh.vertices[mesh.faces][mesh.origin < 2][..., :2]).max(axis=-1)
-    beside = (reach.max(axis=1) > 1.01) & (
-        reach.min(axis=1) < 1.01
-    )  # faces that reach from below into the open
+    # Faces that reach from below into the open.
+    beside = (reach.max(axis=1) > 1.01) & (reach.min(axis=1) < 1.01)
     assert beside.any()
-    # Points below the rim itself see half; those further in are buried, and would give less than 0.02.
-    assert (floor[beside] / AMBIENT.up > 0.6).all()
+    # Half of what lies around points below the rim is open, a quarter at its corners; points further in are
+    # buried, and would give less than 0.02.
+    assert (floor[beside] / AMBIENT.up > 0.3).all()
 
 
 def test_coincident_corners_share_one_value(device):

@@ -54,7 +54,7 @@ def test_house(house):
     away = inside(depth) & inside(depth_gl) & np.isfinite(depth)
     assert away.mean() > 0.5
     error = np.abs(depth[away] - depth_gl[away])
-    # OpenGL snaps corners to 1/256 of a pixel; at 5 m and grazing angles that is a few tenths of a millimetre.
+    # OpenGL snaps corners to 1/256 of a pixel; at 5 m and grazing angles that is tenths of a millimetre.
     assert np.median(error) < 1e-3
     assert np.percentile(error, 95) < 0.02
     # Mip levels are chosen differently, and pyrender's display curve is a power of 1 / 2.2.

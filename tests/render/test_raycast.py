@@ -169,7 +169,7 @@ def test_far_checkerboard_is_its_linear_mean(device, config):
 
 
 def test_mip_level_is_the_log_of_the_footprint_in_texels(device):
-    """Each level has its own grey, so that radiance tells the level: log2 of distance * spread / cos in texels."""
+    """Each level has its own grey, so radiance tells the level: log2 of distance * spread / cos in texels."""
     texture = Texture(name="m", srgb=np.zeros((256, 256, 3), np.uint8))
     arrays = upload_scene(textured_plane(texture, size_m=4096.0), UNSHADOWED, device)  # a texel is 16 m
     levels = arrays.data.levels.numpy()
