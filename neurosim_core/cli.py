@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
+import shutil
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +18,7 @@ import yaml
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     arguments = _parser().parse_args(argv)
+    _quiet_warp()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
         return int(arguments.command(arguments))
@@ -24,6 +28,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("neurosim: interrupted", file=sys.stderr)
         return 130
+
+
+def _quiet_warp() -> None:
+    """Keep Warp's start-up and module lines out of what people read."""
+    import warp as wp
+
+    wp.config.quiet = True  # type: ignore[attr-defined]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -104,7 +115,15 @@ def _scene(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from neurosim_core.flight import view
+    from neurosim_core.flight import rerun_file
 
-    view(arguments.flight, save=arguments.save)
-    return 0
+    file = rerun_file(arguments.flight, save=arguments.save)
+    if arguments.save is not None:
+        print(f"wrote {file}")
+        return 0
+    beside = str(Path(sys.executable).parent)  # a virtual environment need not be active
+    viewer = shutil.which("rerun", path=os.pathsep.join([beside, *os.get_exec_path()]))
+    if viewer is None:
+        raise ImportError("the Rerun viewer is not installed: pip install 'neurosim[view]'")
+    options = ["--web-viewer"] if arguments.web else []
+    return subprocess.run([viewer, str(file), *options], check=False).returncode

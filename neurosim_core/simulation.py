@@ -1,3 +1,4 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
 """The data flow, readable top to bottom: config -> Model -> State -> packets.
 
 A run is cut into batches (`schedule.py`). Within a batch the vehicle is integrated from boundary to boundary,
@@ -9,8 +10,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
@@ -23,11 +24,11 @@ from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import Controller, make_controller
 from neurosim_core.frames import as_rows
-from neurosim_core.packets import Collision, ImuSample, Odometry, Packet
+from neurosim_core.packets import Collision, Events, ImuSample, Odometry, Packet
 from neurosim_core.render.renderer import SceneOnDevice, upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, make_free_space
-from neurosim_core.scene.mesh import load_mesh_scene
+from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Scene
 from neurosim_core.schedule import Boundary, Schedule, batch_end_ns, boundaries, boundary_count_max
 from neurosim_core.sensors.cast import (
@@ -69,6 +70,14 @@ class Model:
     """Wall-clock time that each part of the set-up took [s]."""
 
     @property
+    def render_terms(self) -> tuple[str, ...]:
+        """What the renderer computes because of the scene and its settings."""
+        terms = getattr(self.scene_on_device, "terms", None)
+        return (
+            () if terms is None else tuple(name for name, value in terms._asdict().items() if value is True)
+        )
+
+    @property
     def duration_ns(self) -> int:
         """Length of the run [ns]."""
         return to_ns(self.config.duration_s)
@@ -92,32 +101,47 @@ class State:
     failure: DynamicsError | None = None
     """The integration failed; packets up to its stamp have been returned."""
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    """steps, renders, events, events_dropped, collisions, ..."""
+    """steps, commands, renders, events dropped, collisions."""
     wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Wall-clock time by phase [s]."""
 
 
-def make_model(config: SimulationConfig) -> Model:
+def load_scene(config: ApartmentConfig | MeshSceneConfig) -> Scene:
+    """Generate or read a scene.
+
+    Raises:
+        SceneError: A file cannot be used.
+    """
+    return make_apartment(config) if isinstance(config, ApartmentConfig) else load_mesh_scene(config)
+
+
+def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | None = None) -> Model:
     """Load or generate the scene, plan the path and decide what has to be computed.
+
+    Args:
+        config: What to fly.
+        on_phase: Told the name of each part of the work when it begins.
 
     Raises:
         ValueError: The scene cannot be loaded, no path exists, or the device is not there.
     """
     setup_s: dict[str, float] = defaultdict(float)
+
+    def phase(name: str) -> AbstractContextManager[None]:
+        if on_phase is not None:
+            on_phase(name)
+        return timed(setup_s, name)
+
     device = _device(config.device)
-    with timed(setup_s, "scene"):
-        scene = (
-            make_apartment(config.scene)
-            if isinstance(config.scene, ApartmentConfig)
-            else load_mesh_scene(config.scene)
-        )
-    with timed(setup_s, "free space"):
+    with phase("scene"):
+        scene = load_scene(config.scene)
+    with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
     airframe = config.vehicle.airframe()
-    with timed(setup_s, "path"):
+    with phase("path"):
         path = make_path(config.path, free_space, airframe, duration_s=config.duration_s)
     casts = plan_casts(config.sensors)
-    with timed(setup_s, "light"):
+    with phase("light"):
         scene_on_device = upload_scene(scene, config.render, device=device) if casts else None
     samplers = {
         n: s for n, s in config.sensors.items() if isinstance(s, ImuSensorConfig | OdometrySensorConfig)
@@ -226,9 +250,8 @@ def step(model: Model, state: State, command: ArrayLike) -> list[Packet]:
     packets = start(model, state) if state.stamp_ns == 0 else []
     control = model.schedule.control
     end_ns = control.stamp_ns(control.first_tick(state.stamp_ns + 1))
-    state.vehicle.arrays.rotor_speed_command.assign(
-        as_rows(command, name="command", count=1, width=model.airframe.rotor_count)
-    )
+    rotor_speed = as_rows(command, name="command", count=1, width=model.airframe.rotor_count)
+    state.vehicle.arrays.rotor_speed_command.assign(rotor_speed)
     while state.stamp_ns < end_ns and not state.ended:
         until_ns = batch_end_ns(model.schedule, state.stamp_ns, end_ns)
         packets += advance(model, state, until_ns, closed_loop=False)
@@ -262,7 +285,9 @@ def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True
     batch = boundaries(model.schedule, state.stamp_ns, end_ns)
     with timed(state.wall_s, "dynamics and control"):
         for slot, boundary in enumerate(batch):
-            state.vehicle.advance(boundary.stamp_ns - state.stamp_ns)
+            elapsed_ns = boundary.stamp_ns - state.stamp_ns
+            state.vehicle.advance(elapsed_ns)
+            state.counts["steps"] += -(-elapsed_ns // state.vehicle.max_step_ns)
             state.stamp_ns = boundary.stamp_ns
             _pass(model, state, boundary, slot=slot, closed_loop=closed_loop)
     return _observe(model, state, batch)
@@ -281,6 +306,7 @@ def _pass(model: Model, state: State, boundary: Boundary, *, slot: int, closed_l
             imu.measure(slot)
     if closed_loop and boundary.control:
         state.controller.update(state.vehicle.arrays)
+        state.counts["commands"] += 1
 
 
 def _observe(model: Model, state: State, batch: Sequence[Boundary]) -> list[Packet]:
@@ -308,11 +334,11 @@ def _observe(model: Model, state: State, batch: Sequence[Boundary]) -> list[Pack
     with timed(state.wall_s, "events"):
         for cast in seeing:
             packets += read_events(cast, until_ns=state.stamp_ns)
+        state.counts["events dropped"] += sum(p.dropped_count for p in packets if isinstance(p, Events))
     with timed(state.wall_s, "read-back"):
         for cast in seeing:
             packets += read_images(cast)
         packets += _read_samplers(model, state, batch, states)
-    state.counts["boundaries"] += len(batch)
     rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
     kept = [packet for packet in packets if packet.stamp_ns <= state.stamp_ns]
     return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))
@@ -329,7 +355,11 @@ def _read_samplers(
         for slot, boundary in enumerate(batch):
             if index not in boundary.samplers:
                 continue
-            header = {"stamp_ns": boundary.stamp_ns, "sequence": state.sequence[name], "sensor": name}
+            header: dict[str, Any] = {
+                "stamp_ns": boundary.stamp_ns,
+                "sequence": state.sequence[name],
+                "sensor": name,
+            }
             state.sequence[name] += 1
             if imu is not None:
                 packets.append(

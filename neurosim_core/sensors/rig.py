@@ -100,6 +100,11 @@ class Cast:
     outputs: frozenset[str]
     """What a ray answers."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All cameras of the cast."""
+        return (*self.event_cameras, *self.image_cameras)
+
 
 def plan_casts(sensors: dict[str, SensorConfig]) -> tuple[Cast, ...]:
     """Group the cameras of a rig into as few casts as possible.
