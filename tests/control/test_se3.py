@@ -174,6 +174,31 @@ def test_far_setpoint(name):
     assert Rotation.from_quat(states[2][:, 0]).as_matrix()[:, 2, 2].min() > 0.5
 
 
+def test_height_is_kept_before_distance():
+    """A vehicle with little thrust to spare flies sideways only as hard as height allows."""
+    config = preset("crazyflie", mass_kg=0.05)  # thrust over weight 1.17
+    vehicle = Multirotor(config)
+    vehicle.reset()
+    controller = make_controller("position", config)
+    controller.set([20.0, 0.0, 0.0, 0.0])
+    _, states = fly(vehicle, controller, rate_hz=100.0, duration_ns=4_000_000_000)
+    assert states[0][:, 0, 2].min() > -0.1
+    assert states[0][-1, 0, 0] > 5.0
+
+
+def test_yaw_rate_of_velocity_mode(device):
+    """The heading turns at the rate asked for, while the velocity is kept."""
+    config = preset("racer")
+    vehicle = Multirotor(config, device=device)
+    vehicle.reset()
+    controller = make_controller("velocity", config, device=device)
+    controller.set([1.0, -0.5, 0.2, 0.8])
+    _, states = fly(vehicle, controller, rate_hz=200.0, duration_ns=3_000_000_000)
+    yaw = np.unwrap(Rotation.from_quat(states[2][:, 0]).as_euler("ZXY")[:, 0])
+    assert (yaw[-1] - yaw[-201]) == pytest.approx(0.8, abs=1e-3)  # the last second
+    np.testing.assert_allclose(states[1][-1, 0], [1.0, -0.5, 0.2], atol=1e-3)
+
+
 def test_known_drag_is_cancelled():
     """Straight and level at 5 m/s: no error, where without the term it is that of drag over the gain."""
     config = preset("hummingbird")
