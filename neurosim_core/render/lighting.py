@@ -235,8 +235,8 @@ def _bake(
 def _sample_point(
     vertices: wp.array[wp.vec3], faces: wp.array[wp.vec3i], corner: int, ray: int, normal: wp.vec3
 ):
-    # Off the surface and inside the corner: never on the edge where surfaces meet, and spread over the inner part
-    # of the face, so that occluders smaller than faces are averaged and not aliased.
+    # Off the surface and inside the corner: never on the edge where surfaces meet, and spread over the inner
+    # part of the face, so that occluders smaller than faces are averaged and not aliased.
     face = faces[corner // 3]
     p0 = vertices[face[0]]
     p1 = vertices[face[1]]
