@@ -1,4 +1,4 @@
-"""The command `neurosim`: run | scene | view."""
+"""The command `neurosim`: run | scene | view | bench."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
         return int(arguments.command(arguments))
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
         print(f"neurosim: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -76,6 +76,20 @@ def _parser() -> argparse.ArgumentParser:
         "--save", type=Path, metavar="RRD", help="write the Rerun file instead of opening a window"
     )
     view.set_defaults(command=_view)
+
+    bench = commands.add_parser("bench", help="measure speed on this machine")
+    bench.add_argument("what", choices=["step"], help="step: whole steps a second with one event camera")
+    bench.add_argument(
+        "--scene", type=Path, metavar="FILE", help="mesh file; default: the generated apartment"
+    )
+    bench.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
+    bench.add_argument("--width", type=int, default=640, metavar="PX", help="columns of the event camera")
+    bench.add_argument("--height", type=int, default=480, metavar="PX", help="rows of the event camera")
+    bench.add_argument("--instants", type=int, default=16, metavar="K", help="renders per launch")
+    bench.add_argument(
+        "--steps", type=int, default=1600, metavar="N", help="renders per repetition (of five)"
+    )
+    bench.set_defaults(command=_bench)
     return parser
 
 
@@ -111,6 +125,23 @@ def _scene(arguments: argparse.Namespace) -> int:
     from neurosim_core.scene.report import report_scene
 
     report_scene(arguments.file, arguments.out)
+    return 0
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.step import measure_steps, print_steps
+
+    times = measure_steps(
+        scene=arguments.scene,
+        device=arguments.device,
+        width=arguments.width,
+        height=arguments.height,
+        instants=arguments.instants,
+        step_count=arguments.steps,
+    )
+    print_steps(times, Console())
     return 0
 
 

@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike, NDArray
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import Controller, make_controller
-from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Events, ImuSample, Odometry, Packet
 from neurosim_core.render.renderer import SceneOnDevice, upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
@@ -250,8 +249,7 @@ def step(model: Model, state: State, command: ArrayLike) -> list[Packet]:
     packets = start(model, state) if state.stamp_ns == 0 else []
     control = model.schedule.control
     end_ns = control.stamp_ns(control.first_tick(state.stamp_ns + 1))
-    rotor_speed = as_rows(command, name="command", count=1, width=model.airframe.rotor_count)
-    state.vehicle.arrays.rotor_speed_command.assign(rotor_speed)
+    state.vehicle.command(command)
     while state.stamp_ns < end_ns and not state.ended:
         until_ns = batch_end_ns(model.schedule, state.stamp_ns, end_ns)
         packets += advance(model, state, until_ns, closed_loop=False)

@@ -1,0 +1,92 @@
+"""Build every kernel for CUDA, ahead of time and without a GPU, so that one that does not build fails CI.
+
+Kernels that are made to measure exist once something asks for them: a short flight with every sensor, all
+command modes and the pieces that a run does not use by itself are asked for here.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import pkgutil
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import warp as wp
+
+import neurosim_core
+from neurosim_core import run
+from neurosim_core.control import MODES, make_controller
+from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
+from neurosim_core.trajectory import HoverConfig, hover
+from neurosim_core.vehicle import Multirotor, preset
+
+ARCHITECTURES = (80, 90)
+LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
+SENSORS = {
+    "events": {"kind": "event_camera", "lens": LENS, "sampling_rate_hz": 100, "packet_rate_hz": 100},
+    "rgb": {"kind": "rgb", "lens": LENS},
+    "depth": {"kind": "depth", "lens": LENS},
+    "exact_imu": {"kind": "imu"},
+    "noisy_imu": {
+        "kind": "imu",
+        "accelerometer_noise_density": 1e-3,
+        "accelerometer_random_walk": 1e-4,
+        "accelerometer_bias_instability_m_s2": 1e-3,
+        "accelerometer_range_m_s2": 160.0,
+        "accelerometer_resolution_m_s2": 1e-3,
+    },
+}
+
+
+def make_kernels() -> None:
+    """Ask for the kernels that are made to measure."""
+    for found in pkgutil.walk_packages(neurosim_core.__path__, "neurosim_core."):
+        if not found.name.endswith("__main__"):
+            importlib.import_module(found.name)
+    scene = {"kind": "apartment", "rooms": 1}
+    for lighting in ("baked", "unshadowed"):
+        for _ in run({"duration_s": 0.02, "device": "cpu", "scene": scene, "sensors": SENSORS,
+                      "render": {"lighting": {"mode": lighting}}}):  # fmt: skip
+            pass
+    raycast_kernel(OUTPUTS, Terms(textured=True, emissive=True, baked=True, supersampled=True))
+    for name in ("crazyflie", "hummingbird", "racer"):
+        vehicle = Multirotor(preset(name), device="cpu")
+        for mode in MODES:
+            paths = hover(HoverConfig(), position=[0.0, 0.0, 1.0]) if mode == "path" else None
+            make_controller(mode, vehicle.config, device="cpu", paths=paths).update(vehicle.arrays)
+
+
+def build(module: wp.Module) -> tuple[str, float]:
+    """Build one module for all architectures; raise if that fails."""
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        wp.compile_aot_module(module, arch=list(ARCHITECTURES), module_dir=folder)
+        made = [path for path in Path(folder).rglob("*") if path.suffix in (".ptx", ".cubin")]
+        if len(made) < len(ARCHITECTURES):
+            raise RuntimeError(f"{module.name}: expected {len(ARCHITECTURES)} binaries, got {len(made)}")
+    return module.name, time.perf_counter() - begin
+
+
+def main() -> int:
+    """Build all modules of the package; return the exit status."""
+    wp.config.quiet = True
+    make_kernels()
+    kernels = (thing for thing in gc.get_objects() if isinstance(thing, wp.Kernel))
+    modules = {k.module.name: k.module for k in kernels if k.func.__module__.startswith("neurosim_core")}
+    failed = 0
+    with ThreadPoolExecutor(2) as pool:
+        jobs = {name: pool.submit(build, module) for name, module in sorted(modules.items())}
+    for name, job in jobs.items():
+        error = job.exception()
+        failed += error is not None
+        print(f"{name}: {error or f'{job.result()[1]:.1f} s'}")
+    print(f"{len(modules) - failed} modules built for {ARCHITECTURES}, {failed} failed")
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Benchmarks: what the product says about its own speed and errors."""
