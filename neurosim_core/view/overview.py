@@ -293,8 +293,8 @@ def _draw_snapshot(figure: Any, snapshot: Snapshot | None) -> None:
         _heading(figure, x, y, f"Events in {snapshot.event_window_ns * 1e-6:g} ms")
         right = 1.0 - (y - 10) / HEIGHT_PX
         for text, color, back in (
-            (f"{off:,} darker".replace(",", " "), OFF_SRGB, 0),
-            (f"{on:,} brighter".replace(",", " "), ON_SRGB, 130),
+            (f"{_short(off)} darker", OFF_SRGB, 0),
+            (f"{_short(on)} brighter", ON_SRGB, 122),
         ):
             figure.text(
                 (x + _PANEL_W - back) / WIDTH_PX,
@@ -376,12 +376,13 @@ def _draw_plan(figure: Any, scene: Scene, track: Track, snapshot: Snapshot | Non
     bounds = scene.bounds_m
     height_m = float(np.median(track.position[:, 2])) if len(track.position) else float(bounds[:, 2].mean())
     plan = cut_plan(scene, height_m=height_m)
-    _heading(figure, x, y, "Path", f"plan cut at {height_m:.2f} m", width=width)
     axes = _axes(figure, x, y, width, height)
     axes.axis("off")
 
     size = plan.bounds[1] - plan.bounds[0]
     turned = _fit(size[::-1], width, height) > _fit(size, width, height)
+    directions = "x up, y left" if turned else "x right, y up"
+    _heading(figure, x, y, "Path", f"plan cut at {height_m:.2f} m, {directions}", width=width)
 
     def place(points: NDArray[np.float64]) -> Any:
         """World (x, y) to the paper: x right and y up, or turned so that x is up and y left."""
@@ -402,7 +403,7 @@ def _draw_plan(figure: Any, scene: Scene, track: Track, snapshot: Snapshot | Non
     axes.set_aspect("equal", adjustable="box", anchor="N")
     if len(track.position) > 1:
         _draw_path(figure, axes, track, snapshot, place, float(size.max()))
-    _draw_scale_bar(figure, axes, float(size.max()), turned=turned)
+    _draw_scale_bar(figure, axes, float(size.max()))
 
 
 def _fit(size: NDArray[np.float64], width: float, height: float) -> float:
@@ -475,8 +476,8 @@ def _draw_path(
     )
 
 
-def _draw_scale_bar(figure: Any, axes: Any, size_m: float, *, turned: bool) -> None:
-    """Draw a bar of a round length at the bottom left of the plan, with the directions of the axes."""
+def _draw_scale_bar(figure: Any, axes: Any, size_m: float) -> None:
+    """Draw a bar of a round length at the bottom left of the plan."""
     lengths = [m * 10.0**power for power in range(-2, 3) for m in (1.0, 2.0, 5.0)]
     length_m = max((m for m in lengths if m <= size_m / 5), default=lengths[0])
     axes.apply_aspect()
@@ -485,11 +486,10 @@ def _draw_scale_bar(figure: Any, axes: Any, size_m: float, *, turned: bool) -> N
     bar.set_xticks([])
     bar.set_yticks([])
     bar.set_facecolor(_INK)
-    directions = "x up, y left" if turned else "x right, y up"
     figure.text(
         (_PLAN_X + length_m * shown + 10) / WIDTH_PX,
         57 / HEIGHT_PX,
-        f"{length_m:g} m   {directions}",
+        f"{length_m:g} m",
         fontsize=10.5,
         color=_FAINT,
         va="center",

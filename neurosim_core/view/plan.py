@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.materials import srgb_to_linear
+from neurosim_core.scene.materials import mip_chain, srgb_to_linear
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.source import linear_to_srgb8
 
@@ -93,10 +93,24 @@ def face_colors(scene: Scene, faces: NDArray[np.int64]) -> NDArray[np.float64]:
         linear[mine] = np.array(material.base_color) + np.array(material.emission)
         if material.texture is None or not len(mine):
             continue
-        texels = material.texture.srgb
-        height, width = texels.shape[:2]
         uv = np.einsum("sk,fkc->fsc", _SAMPLES, scene.uv[scene.faces[faces[mine]]])
-        column = np.floor(uv[..., 0] * width).astype(np.int64) % width
-        row = np.floor((1.0 - uv[..., 1]) * height).astype(np.int64) % height
-        linear[mine] *= srgb_to_linear(texels[row, column]).mean(axis=1)
+        linear[mine] *= _mean_texels(material.texture.srgb, uv)
     return linear_to_srgb8(np.clip(linear, 0.0, 1.0)) / 255.0
+
+
+def _mean_texels(srgb: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Average a texture over faces, in linear light; returns shape [F, 3].
+
+    Each face reads the mip level whose texels are as far apart as its samples `uv`, shape [F, samples, 2].
+    """
+    levels = mip_chain(srgb_to_linear(srgb))
+    spacing = np.ptp(uv, axis=1) / 3.0 * [srgb.shape[1], srgb.shape[0]]  # texels; four samples along a side
+    level = np.log2(np.maximum(spacing.max(axis=1), 1.0)).astype(np.int64).clip(0, len(levels) - 1)
+    mean = np.empty((len(uv), 3))
+    for index in np.unique(level):
+        faces = np.flatnonzero(level == index)
+        height, width = levels[index].shape[:2]
+        column = np.floor(uv[faces, :, 0] * width).astype(np.int64) % width
+        row = np.floor((1.0 - uv[faces, :, 1]) * height).astype(np.int64) % height
+        mean[faces] = levels[index][row, column].mean(axis=1)
+    return mean

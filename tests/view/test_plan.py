@@ -90,3 +90,24 @@ def test_colors_are_averaged_in_linear_light():
     # The two triangles mirror each other, and so do their samples; 8 bits of sRGB leave 0.005 of light.
     linear = ((colors[:, 0] + 0.055) / 1.055) ** 2.4
     assert linear.mean() == pytest.approx(0.5, abs=0.005)
+
+
+def test_large_faces_take_the_mean_of_their_texture():
+    """A fine chequerboard, repeated: samples would alias, the mip level does not."""
+    board = 255 * np.kron(np.indices((32, 32)).sum(axis=0) % 2, np.ones((2, 2), dtype=int)).astype(np.uint8)
+    plane = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
+    )
+    scene = make_scene(
+        plane,
+        uv=np.float32([[0, 0], [7.3, 0], [7.3, 5.1], [0, 5.1]]),
+        materials=(
+            Material(
+                name="m",
+                base_color=(1.0, 1.0, 1.0),
+                texture=Texture(name="t", srgb=board[..., None].repeat(3, 2)),
+            ),
+        ),
+    )
+    colors = cut_plan(scene, height_m=1.0).colors
+    assert colors == pytest.approx(188 / 255, abs=1.5 / 255)  # linear 0.5; packed levels may round
