@@ -156,6 +156,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         width: int,
         height: int,
         # In:
+        instant_count: int,
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         image_slot: wp.array[int],
@@ -167,12 +168,11 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         instance_out: wp.array3d[int],
     ) -> None:
         index = first + wp.tid()
-        tile = index // 64
         in_tile = index % 64
+        block = index // 64
+        instant = block % instant_count  # a tile of all instants, then the next: they see the same triangles
+        tile = block // instant_count
         tile_columns = (width + 7) // 8
-        tiles = tile_columns * ((height + 7) // 8)
-        instant = tile // tiles
-        tile = tile % tiles
         col = (tile % tile_columns) * 8 + in_tile % 8
         row = (tile // tile_columns) * 8 + in_tile // 8
         if col >= width or row >= height:

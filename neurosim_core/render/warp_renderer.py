@@ -253,7 +253,16 @@ class WarpRenderer:
         launch_split(
             self._kernel,
             dim=instant_count * self._instant_threads,
-            inputs=[self._arrays.data, self._rays, self._width, self._height, p_WC, q_WC, image_slot],
+            inputs=[
+                self._arrays.data,
+                self._rays,
+                self._width,
+                self._height,
+                instant_count,
+                p_WC,
+                q_WC,
+                image_slot,
+            ],
             outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
             device=self._arrays.device,
             thread_count=self._thread_count,
