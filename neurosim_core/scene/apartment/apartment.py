@@ -7,12 +7,14 @@ from typing import Literal
 from pydantic import Field
 
 from neurosim_core.scene.apartment.assembly import Assembly
-from neurosim_core.scene.apartment.floorplan import FloorPlan, make_floor_plan
+from neurosim_core.scene.apartment.floorplan import make_floor_plan
 from neurosim_core.scene.apartment.looks import Palette
 from neurosim_core.scene.apartment.rooms import furnish
 from neurosim_core.scene.apartment.shell import add_shell
 from neurosim_core.scene.scene import Ambient, Scene
 from neurosim_core.settings import Settings
+
+_FLIGHT_HEIGHT_M = 1.4
 
 
 class ApartmentConfig(Settings):
@@ -37,7 +39,8 @@ class ApartmentConfig(Settings):
 def make_apartment(config: ApartmentConfig) -> Scene:
     """Generate a furnished flat.
 
-    World frame: the middle of the flat is the origin, its floor is z = 0. Objects are named `sofa_1`, `floor_2`, …
+    World frame: the middle of the flat is the origin, its floor is z = 0. Objects are named `sofa_1`,
+    `floor_2` and so on; without `ceiling_*` and `roof_1` one looks into the flat from above.
     """
     plan = make_floor_plan(
         seed=config.seed,
@@ -53,7 +56,7 @@ def make_apartment(config: ApartmentConfig) -> Scene:
         room.name: palette.finish(room.name, room.role, index) for index, room in enumerate(plan.rooms)
     }
     add_shell(assembly, plan, finishes, ceiling_m=config.ceiling_m)
-    for index, room in enumerate(plan.rooms):
+    spaces = [
         furnish(
             room,
             index,
@@ -64,14 +67,10 @@ def make_apartment(config: ApartmentConfig) -> Scene:
             density=config.furniture,
             ceiling_m=config.ceiling_m,
         )
+        for index, room in enumerate(plan.rooms)
+    ]
     return assembly.finish(
         f"apartment with {config.rooms} rooms, seed {config.seed}",
         ambient=Ambient(up=(0.26, 0.26, 0.27), down=(0.2, 0.19, 0.18)),
-        inside_m=_inside(plan),
+        inside_m=max(space.roomiest(_FLIGHT_HEIGHT_M) for space in spaces)[1],
     )
-
-
-def _inside(plan: FloorPlan) -> tuple[float, float, float]:
-    """A point in front of a door, which is always free; in the middle of a flat that has none."""
-    x, y = plan.rooms[0].rect.center
-    return x, y, 1.4

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.scene.apartment.geometry import Part, merge
+from neurosim_core.scene.apartment.geometry import Part, merge, turned
 from neurosim_core.scene.scene import Ambient, Light, LinearRgb, Material, Scene, Texture
 
 
@@ -63,34 +63,18 @@ class Piece:
 
     def moved(self, offset: tuple[float, float, float], yaw_rad: float = 0.0) -> Piece:
         """The piece turned about its z axis, then shifted [m]."""
-        spots = [
-            Part(vertices=np.array([lamp.position]), **_NO_FACES).moved(offset, yaw_rad=yaw_rad)
-            for lamp in self.lamps
-        ]
-        return Piece(
-            kind=self.kind,
-            parts=[(part.moved(offset, yaw_rad=yaw_rad), surface) for part, surface in self.parts],
-            lamps=[
-                replace(
-                    lamp,
-                    position=(
-                        float(spot.vertices[0, 0]),
-                        float(spot.vertices[0, 1]),
-                        float(spot.vertices[0, 2]),
-                    ),
-                )
-                for lamp, spot in zip(self.lamps, spots, strict=True)
-            ],
-        )
+        lamps = []
+        for lamp in self.lamps:
+            at = turned(np.array(lamp.position), yaw_rad, axis=2) + np.asarray(offset)
+            lamps.append(replace(lamp, position=(float(at[0]), float(at[1]), float(at[2]))))
+        parts = [(part.moved(offset, yaw_rad=yaw_rad), surface) for part, surface in self.parts]
+        return Piece(kind=self.kind, parts=parts, lamps=lamps)
 
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [m], shape [2, 3]."""
         points = np.concatenate([part.vertices for part, _ in self.parts])
         return np.stack([points.min(axis=0), points.max(axis=0)])
-
-
-_NO_FACES = {"normals": np.zeros((1, 3)), "uv": np.zeros((1, 2)), "faces": np.zeros((0, 3), np.int64)}
 
 
 class Assembly:
@@ -109,7 +93,7 @@ class Assembly:
         self._lights: list[Light] = []
 
     def instance(self, kind: str) -> int:
-        """A new object, named `kind_1`, `kind_2`, …"""
+        """A new object; objects are named `kind_1`, `kind_2` and so on."""
         self._counts[kind] = self._counts.get(kind, 0) + 1
         self._instances.append(f"{kind}_{self._counts[kind]}")
         return len(self._instances) - 1

@@ -83,7 +83,7 @@ def coffee_table(rng: np.random.Generator, look: Look) -> Piece:
         for angle in np.arange(3) * 2.0 * np.pi / 3.0 + 0.5:
             reach = np.array([np.cos(angle), np.sin(angle), 0.0])
             top = 0.24 * reach + (0.0, -radius, height - 0.025)
-            piece.add(look.wood, tube([0.36 * reach + (0.0, -radius, 0.0), top], [0.014, 0.022], sides=12))
+            piece.add(look.wood, tube([0.36 * reach + (0.0, -radius, 0.006), top], [0.014, 0.022], sides=12))
         depth = 2.0 * radius
     else:
         width, depth = 1.1, 0.6
@@ -119,7 +119,7 @@ def nightstand(rng: np.random.Generator, look: Look) -> Piece:
         wood, rounded_box((width, depth, 0.03), 0.01, center=(0.0, -0.5 * depth, height - 0.015), segments=2)
     )
     piece.add(
-        wood, rounded_box((width - 0.01, depth - 0.012, 0.024), 0.006, center=(0.0, -0.5 * depth, 0.18))
+        wood, rounded_box((width - 0.014, depth - 0.012, 0.024), 0.006, center=(0.0, -0.5 * depth, 0.18))
     )
     for side in (-1.0, 1.0):
         piece.add(
@@ -235,7 +235,7 @@ def bookshelf(rng: np.random.Generator, look: Look, *, width: float = 0.9, heigh
         z = 0.06 + index * pitch
         piece.add(
             wood,
-            rounded_box((width - 1.4 * board, depth - 0.012, board), 0.004, center=(0.0, -0.5 * depth, z)),
+            box((width - 1.4 * board, depth - 0.012, board), center=(0.0, -0.5 * depth, z)),
         )
         if index < count:
             _fill_shelf(
@@ -249,15 +249,15 @@ def _fill_shelf(
 ) -> None:
     x, end = -0.5 * width, 0.5 * width
     while x < end - 0.06:
-        if rng.uniform() < 0.14 and end - x > 0.3:
-            kind = int(rng.integers(3))
+        if rng.uniform() < 0.14 and end - x > 0.36:
+            kind = int(rng.choice([0, 1, 1, 2]))
             if kind == 0:
-                piece.include(vase(rng, look, scale=0.55), (x + 0.11, -0.16, z))
+                piece.include(vase(rng, look, scale=0.55, twigs=False), (x + 0.16, -0.16, z))
             elif kind == 1:
-                piece.include(books(rng, look, count=4), (x + 0.13, -0.16, z))
+                piece.include(books(rng, look, count=4), (x + 0.16, -0.155, z))
             else:
-                piece.include(bowl(look, scale=0.7), (x + 0.12, -0.16, z))
-            x += 0.27
+                piece.include(bowl(look, scale=0.7), (x + 0.16, -0.16, z))
+            x += 0.33
             continue
         run_end = min(end, x + rng.uniform(0.18, 0.5))
         base = rng.uniform(0.17, clear - 0.02)

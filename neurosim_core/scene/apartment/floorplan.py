@@ -106,8 +106,8 @@ class Opening:
 class Wall:
     """One side of a room, from inside.
 
-    Its frame: x runs to the right for somebody in the room who looks at it, y into the wall, z up; the origin is the
-    lower left corner. Furniture shares this frame: its back is at y = 0, its front towards -y.
+    Its frame: x runs to the right for somebody in the room who looks at it, y into the wall, z up; the
+    origin is the lower left corner. Furniture shares this frame: its back is at y = 0, its front towards -y.
     """
 
     origin: tuple[float, float]
@@ -242,7 +242,7 @@ def _badness(cells: list[Rect], roles: tuple[Role, ...], outline: Rect) -> float
 
 
 def _shared(a: Rect, b: Rect) -> tuple[Literal["x", "y"], float, float, float, bool] | None:
-    """Passage axis, wall position, extent, and whether `a` is on the lower side; None when they do not touch."""
+    """Passage axis, wall position, extent, whether `a` is on the lower side; None if they do not touch."""
     low, high = max(a.y0, b.y0), min(a.y1, b.y1)
     if high > low and (a.x1 == b.x0 or a.x0 == b.x1):
         return "x", (a.x1 if a.x1 == b.x0 else a.x0), low, high, a.x1 == b.x0
@@ -313,15 +313,18 @@ def _room(
         ("x", cell.x0, False, (rect.x0, rect.y0), 0.5 * math.pi, rect.depth, cell.x0 == outline.x0),
     )
     rng = stream(seed, "windows", name)
+    lit = sorted((side for side in sides if side[6]), key=lambda side: -side[5])
+    lit = lit[: 2 if role in ("living", "studio") else 1]
     walls = []
-    for axis, at, lower, origin, yaw, length, outer in sides:
+    for side in sides:
+        axis, at, lower, origin, yaw, length, outer = side
         openings = []
         for door in doors:
             if door.axis == axis and door.at_m == at and door.rooms[0 if lower else 1] == index:
                 start = origin[0] if axis == "y" else origin[1]
                 ends = sorted(abs(value - start) for value in (door.low_m, door.high_m))
                 openings.append(Opening("door", ends[0], ends[1], 0.0, door_height_m))
-        if outer:
+        if side in lit:
             openings += _windows(role, length, ceiling_m, rng)
         walls.append(Wall(origin, yaw, length, outer, tuple(sorted(openings, key=lambda o: o.x0))))
     north, east, south, west = walls

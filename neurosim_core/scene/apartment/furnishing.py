@@ -117,6 +117,7 @@ class RoomSpace:
         front_m: float = 0.5,
         sides_m: float = 0.0,
         liking: Callable[[Wall, float], float] | None = None,
+        window: bool = False,
     ) -> list[tuple[Wall, float]]:
         """Places along the walls where a piece fits, the best first.
 
@@ -126,6 +127,7 @@ class RoomSpace:
             front_m: Floor in front of it that must be free of other bodies [m].
             sides_m: The same on both sides [m].
             liking: Higher for better places; of a wall and a position along it.
+            window: It may hide a window.
         """
         (x0, y0, z0), (x1, _, z1) = piece.bounds
         ranked: list[tuple[float, Wall, float]] = []
@@ -136,7 +138,7 @@ class RoomSpace:
                 continue
             for x in np.unique(np.concatenate([np.arange(low, high, 0.1), [high, 0.5 * (low + high)]])):
                 rect = wall.rect(x + x0 - sides_m, x + x1 + sides_m, WALL_GAP_M - y0)
-                if not self.fits(Volume(rect, z0 + _LIFT_M, z1 + _LIFT_M)):
+                if not self.fits(Volume(rect, z0 + _LIFT_M, z1 + _LIFT_M), window=window):
                     continue
                 front = wall.rect(x + x0, x + x1, WALL_GAP_M - y0 + front_m)
                 if not self.room.rect.contains(front) or any(
@@ -156,10 +158,11 @@ class RoomSpace:
         front_m: float = 0.5,
         sides_m: float = 0.0,
         liking: Callable[[Wall, float], float] | None = None,
+        window: bool = False,
     ) -> tuple[Wall, float] | None:
         """Place a piece at the best spot along the walls; where that is, or None when it fits nowhere."""
-        for wall, x in self.spots(piece, rng, front_m=front_m, sides_m=sides_m, liking=liking):
-            if self.put_at_wall(piece, wall, x):
+        for wall, x in self.spots(piece, rng, front_m=front_m, sides_m=sides_m, liking=liking, window=window):
+            if self.put_at_wall(piece, wall, x, window=window):
                 (x0, y0, _), (x1, _, _) = piece.bounds
                 self.keep_free(wall.rect(x + x0, x + x1, WALL_GAP_M - y0 + front_m))
                 return wall, x
@@ -170,7 +173,7 @@ class RoomSpace:
         return self.put_at_wall(piece, wall, x, out=0.003, group=True, window=window)
 
     def open_spot(
-        self, bounds: NDArray[np.float64], rng: np.random.Generator, *, around_m: float, tries: int = 60
+        self, bounds: NDArray[np.float64], rng: np.random.Generator, *, around_m: float, group: bool = False
     ) -> tuple[float, float] | None:
         """The most central place found for something with `around_m` of free floor around it.
 
@@ -178,7 +181,7 @@ class RoomSpace:
             bounds: Lowest and highest corner of it [m], shape [2, 3].
             rng: Proposes places.
             around_m: Free floor on all sides [m].
-            tries: Number of proposals.
+            group: It may stand in what other pieces want free.
 
         Returns:
             Where its origin has to be [m], or None.
@@ -191,15 +194,30 @@ class RoomSpace:
         if room.width < x1 - x0 or room.depth < y1 - y0:
             return None
         best: tuple[float, float, float] | None = None
-        for _ in range(tries):
+        for _ in range(80):
             x = float(rng.uniform(room.x0 - x0, room.x1 - x1))
             y = float(rng.uniform(room.y0 - y0, room.y1 - y1))
-            if not self.fits(Volume(Rect(x + x0, y + y0, x + x1, y + y1), z0 + _LIFT_M, z1 + _LIFT_M)):
+            volume = Volume(Rect(x + x0, y + y0, x + x1, y + y1), z0 + _LIFT_M, z1 + _LIFT_M)
+            if not self.fits(volume, group=group):
                 continue
             away = abs(x - room.center[0]) / room.width + abs(y - room.center[1]) / room.depth
             if best is None or away < best[0]:
                 best = away, x, y
         return None if best is None else best[1:]
+
+    def roomiest(self, height_m: float) -> tuple[float, tuple[float, float, float]]:
+        """The point at a height that is furthest from walls and furniture's bounds, and that distance [m]."""
+        room = self.room.rect
+        xs, ys = np.arange(room.x0 + 0.2, room.x1 - 0.2, 0.1), np.arange(room.y0 + 0.2, room.y1 - 0.2, 0.1)
+        x, y = (grid.reshape(-1) for grid in np.meshgrid(xs, ys))
+        clear = np.minimum(np.minimum(x - room.x0, room.x1 - x), np.minimum(y - room.y0, room.y1 - y))
+        for body in self._bodies:
+            dx = np.maximum(np.maximum(body.rect.x0 - x, x - body.rect.x1), 0.0)
+            dy = np.maximum(np.maximum(body.rect.y0 - y, y - body.rect.y1), 0.0)
+            dz = max(body.low - height_m, height_m - body.high, 0.0)
+            clear = np.minimum(clear, np.sqrt(dx * dx + dy * dy + dz * dz))
+        best = int(np.argmax(clear))
+        return float(clear[best]), (float(x[best]), float(y[best]), height_m)
 
 
 def wall_point(wall: Wall, x: float, out: float) -> tuple[float, float]:

@@ -40,11 +40,21 @@ class Part:
 
     def turned(self, angle_rad: float, *, axis: int) -> Part:
         """The part turned about a coordinate axis through the origin, right-handed."""
-        c, s = _cos_sin(angle_rad)
-        turn = np.eye(3)
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn[first, first], turn[first, second], turn[second, first], turn[second, second] = c, -s, s, c
-        return replace(self, vertices=self.vertices @ turn.T, normals=self.normals @ turn.T)
+        return replace(
+            self,
+            vertices=turned(self.vertices, angle_rad, axis=axis),
+            normals=turned(self.normals, angle_rad, axis=axis),
+        )
+
+
+def turned(points: Array, angle_rad: float, *, axis: int) -> Array:
+    """Vectors turned about a coordinate axis, right-handed, shape [..., 3]."""
+    c, s = _cos_sin(angle_rad)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    result: Array = points.copy()
+    result[..., first] = c * points[..., first] - s * points[..., second]
+    result[..., second] = s * points[..., first] + c * points[..., second]
+    return result
 
 
 def _cos_sin(angle_rad: float) -> tuple[float, float]:
@@ -153,7 +163,11 @@ def _cube(lines: int, *, sharp: bool = False) -> _Cube:
     quads = np.stack(
         [cell, cell + 1, cell + lines + 1, cell, cell + lines + 1, cell + lines], axis=1
     ).reshape(-1, 3)
-    corner, normals, points, side, faces = [], [], [], [], []
+    corner: list[Array] = []
+    normals: list[Array] = []
+    points: list[Array] = []
+    side: list[NDArray[np.int64]] = []
+    faces: list[NDArray[np.int64]] = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             right, up = (axis + 1) % 3, (axis + 2) % 3
@@ -175,7 +189,13 @@ def _cube(lines: int, *, sharp: bool = False) -> _Cube:
             normals.append(bent / np.linalg.norm(bent, axis=1, keepdims=True))
             points.append(spot)
             side.append(np.full(lines * lines, axis))
-    return _Cube(*(np.concatenate(values) for values in (corner, normals, points, side, faces)))
+    return _Cube(
+        corner=np.concatenate(corner),
+        normals=np.concatenate(normals),
+        points=np.concatenate(points),
+        side=np.concatenate(side),
+        faces=np.concatenate(faces),
+    )
 
 
 def _planar_uv(positions: Array, side: NDArray[np.int64], grain: int) -> Array:
@@ -261,8 +281,8 @@ def lathe(
     """A body turned about the z axis.
 
     Args:
-        profile: Radius and height [m] of the outline, shape [N, 2], counter-clockwise seen with the axis on the
-            left: from the bottom outwards and up. A point is a sharp edge where the outline bends by more
+        profile: Radius and height [m] of the outline, shape [N, 2], counter-clockwise seen with the axis on
+            the left: from the bottom outwards and up. A point is a sharp edge where the outline bends by more
             than `crease_rad`.
         sides: Facets around.
         crease_rad: Bend from which on an edge is sharp [rad].

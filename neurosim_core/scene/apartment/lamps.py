@@ -10,7 +10,7 @@ from neurosim_core.scene.apartment.looks import Look
 
 _WARM = np.array([1.0, 0.9, 0.76])
 _LIGHT_BELOW_M = 0.16
-"""Distance from a lamp to its light: renderers may give lights a radius, which must stay clear of the lamp [m]."""
+"""Distance from a lamp to its light [m]: renderers may give lights a radius, which must stay free."""
 
 
 def _lamp(x: float, y: float, z: float, strength: float) -> Lamp:
@@ -19,7 +19,7 @@ def _lamp(x: float, y: float, z: float, strength: float) -> Lamp:
 
 
 def pendant(rng: np.random.Generator, look: Look, *, ceiling: float, bottom: float, strength: float) -> Piece:
-    """A hanging lamp: a metal bell, a paper ball or a cloth drum. Its middle is x = y = 0, its top the ceiling."""
+    """A hanging lamp on x = y = 0, from the ceiling down: a metal bell, a paper ball or a cloth drum."""
     piece = Piece("pendant")
     kind = int(rng.integers(3))
     if kind == 0:
@@ -30,7 +30,7 @@ def pendant(rng: np.random.Generator, look: Look, *, ceiling: float, bottom: flo
         piece.add(look.glow, lathe(inner, sides=32, crease_rad=0.9, center=(0, 0, bottom)))
         piece.add(
             look.bulb,
-            cushion((0.09, 0.09, 0.11), center=(0.0, 0.0, bottom + 0.1), power=(2, 2, 2), segments=6),
+            cushion((0.09, 0.09, 0.11), center=(0.0, 0.0, bottom + 0.1), power=(2, 2, 2), segments=4),
         )
     elif kind == 1:
         tall = 0.36
@@ -45,7 +45,7 @@ def pendant(rng: np.random.Generator, look: Look, *, ceiling: float, bottom: flo
         piece.add(look.glow, lathe(drum, sides=36, center=(0, 0, bottom)))
         piece.add(
             look.bulb,
-            cushion((0.09, 0.09, 0.11), center=(0.0, 0.0, bottom + 0.11), power=(2, 2, 2), segments=6),
+            cushion((0.09, 0.09, 0.11), center=(0.0, 0.0, bottom + 0.11), power=(2, 2, 2), segments=4),
         )
         for turn in (0.0, np.pi / 2.0):
             spoke = tube([(-0.176, 0.0, tall - 0.01), (0.176, 0.0, tall - 0.01)], 0.003, sides=6).turned(
@@ -88,7 +88,9 @@ def floor_lamp(rng: np.random.Generator, look: Look, *, strength: float) -> Piec
         for angle in np.arange(3) * 2.0 * np.pi / 3.0 + rng.uniform(0.0, 2.0):
             reach = np.array([np.cos(angle), np.sin(angle), 0.0])
             head = 0.03 * reach + center + (0.0, 0.0, height - 0.24)
-            piece.add(look.wood, tube([0.19 * reach + center, head], [0.013, 0.016], sides=14))
+            piece.add(
+                look.wood, tube([0.19 * reach + center + (0.0, 0.0, 0.003), head], [0.013, 0.016], sides=14)
+            )
         piece.add(
             look.wood, cylinder(0.05, height - 0.27, height - 0.23, x=0.0, y=-0.22, sides=28, edge_m=0.008)
         )
@@ -101,7 +103,7 @@ def floor_lamp(rng: np.random.Generator, look: Look, *, strength: float) -> Piec
     ]
     piece.add(look.glow, lathe(shade, sides=36, center=center))
     piece.add(
-        look.bulb, cushion((0.07, 0.07, 0.1), center=(0.0, -0.22, height - 0.14), power=(2, 2, 2), segments=5)
+        look.bulb, cushion((0.07, 0.07, 0.1), center=(0.0, -0.22, height - 0.14), power=(2, 2, 2), segments=4)
     )
     piece.lamps.append(_lamp(0.0, -0.22, height + _LIGHT_BELOW_M, strength))
     return piece

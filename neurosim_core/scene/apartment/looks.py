@@ -196,6 +196,10 @@ class Palette:
                 lambda rng: surfaces.wallpaper(rng, ground, motif, kind),
                 (size, size),
             )
+        if role == "bedroom" and rng.uniform() < 0.4:
+            floor = plain(
+                f"carpet {index + 1}", str(rng.choice(["#b9ab96", "#8f979c", "#a39382"])), "pile", 1.2
+            )
         if role in ("kitchen", "bathroom"):
             floor, accent = self._tiled(role, rng, index)
         return RoomFinish(
@@ -248,7 +252,7 @@ class Palette:
             front=plain(
                 f"front {name}", str(rng.choice([*scheme.accents, "#e9e6df", "#e9e6df"])), "plaster", 1.5
             ),
-            fabric=plain(f"fabric {fabric}", fabric, "weave", 0.8),
+            fabric=plain(f"fabric {fabric}", fabric, "weave", 0.6),
             accent=plain(f"fabric {accent}", accent, "weave", 0.5),
             knit=plain(f"knit {knit}", knit, "knit", 0.6),
             linen=plain("linen", "#efebe2", "weave", 0.6),

@@ -1,14 +1,16 @@
 """Books, vases, bowls, plants, pictures, curtains, rugs and radiators.
 
-Pieces that stand are centred on x = y = 0, with z = 0 below; those that hang on a wall have their back at y = 0
-and their height as they hang. Dimensions in metres.
+Pieces that stand are centred on x = y = 0, with z = 0 below; those that hang on a wall have their back at
+y = 0 and their height as they hang. Dimensions in metres.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurosim_core.scene.apartment.assembly import Piece, Surface
 from neurosim_core.scene.apartment.geometry import (
@@ -71,7 +73,7 @@ def vase(rng: np.random.Generator, look: Look, *, scale: float = 1.0, twigs: boo
         (swell[-1] - 0.008, tall - 0.05),
     ]
     surface = (look.pot, look.ceramic, look.stone)[int(rng.integers(3))]
-    piece.add(surface, lathe(np.array(outline) * scale, sides=28))
+    piece.add(surface, lathe(np.array(outline) * scale, sides=24))
     if twigs and rng.uniform() < 0.6:
         for _ in range(6):
             lean = rng.uniform(-0.5, 0.5, 2)
@@ -90,7 +92,7 @@ def vase(rng: np.random.Generator, look: Look, *, scale: float = 1.0, twigs: boo
                 at = root + share * (top - root) + 0.012 * rng.standard_normal(3)
                 piece.add(
                     look.linen,
-                    cushion((0.022, 0.022, 0.034), center=at, power=(2, 2, 2), segments=2).shifted(
+                    cushion((0.022, 0.022, 0.034), center=at, power=(2, 2, 2), segments=1).shifted(
                         (scale - 1.0) * at
                     ),
                 )
@@ -111,7 +113,7 @@ def bowl(look: Look, *, scale: float = 1.0) -> Piece:
         (0.05, 0.018),
         (0.0, 0.016),
     ]
-    piece.add(look.pot, lathe(np.array(outline) * scale, sides=36, crease_rad=0.8))
+    piece.add(look.pot, lathe(np.array(outline) * scale, sides=26, crease_rad=0.8))
     for index, (surface, angle) in enumerate(
         zip((look.accent, look.fabric, look.leaf), (0.3, 2.4, 4.5), strict=True)
     ):
@@ -175,8 +177,8 @@ def plant(rng: np.random.Generator, look: Look, *, height: float = 1.2) -> Piece
 
 
 def _blade(
-    along: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
-    half_width: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+    along: NDArray[np.float64],
+    half_width: NDArray[np.float64],
 ) -> Part:
     """A leaf along x, rising in z, folded along its rib; uv runs over the leaf once."""
     count = len(along)
@@ -191,23 +193,39 @@ def _blade(
 
 
 def picture(look: Look, poster: Surface, *, width: float, height: float, middle: float = 1.55) -> Piece:
-    """A framed print on the wall."""
+    """A framed print on the wall: the frame's bars are bevelled towards the print."""
     piece = Piece("picture")
-    bar, deep = 0.025, 0.028
-    for side in (-1.0, 1.0):
-        x = side * 0.5 * (width + bar)
-        piece.add(
-            look.dark_wood,
-            rounded_box((bar, deep, height + 2.0 * bar), 0.006, center=(x, -0.5 * deep, middle), grain=2),
-        )
-        z = middle + side * 0.5 * (height + bar)
-        piece.add(
-            look.dark_wood,
-            rounded_box((width + 0.006, deep - 0.002, bar), 0.006, center=(0.0, -0.5 * deep, z)),
-        )
+    for turn, long, across in (
+        (0.0, width, height),
+        (0.5, height, width),
+        (1.0, width, height),
+        (1.5, height, width),
+    ):
+        half = 0.5 * long
+        out, lip = 0.028, 0.012
+        # Corners of the lower bar from outside in: wall, front, front, print; mitred at both ends.
+        rows = [(0.025, -0.001), (0.025, -out), (0.012, -out), (0.0, -lip)]
+        for (wide0, y0), (wide1, y1) in itertools.pairwise(rows):
+            z0, z1 = (-0.5 * across - wide for wide in (wide0, wide1))
+            points = np.array(
+                [
+                    [(-half - wide0, y0, z0), (half + wide0, y0, z0)],
+                    [(-half - wide1, y1, z1), (half + wide1, y1, z1)],
+                ]
+            )
+            bar = grid_surface(
+                points, points[..., [0, 1]] + points[..., [0, 2]], normals=_flat_normals(points)
+            )
+            piece.add(look.dark_wood, bar.turned(-turn * np.pi, axis=1).shifted((0.0, 0.0, middle)))
     corner = (-0.5 * width, -0.012, middle - 0.5 * height)
     piece.add(poster, picture_quad(corner, (width, 0.0, 0.0), (0.0, 0.0, height)))
     return piece
+
+
+def _flat_normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The normal of a planar four-cornered patch, for each of its corners, shape [2, 2, 3]."""
+    normal = np.cross(points[0, 1] - points[0, 0], points[1, 0] - points[0, 0])
+    return np.broadcast_to(normal / np.linalg.norm(normal), (2, 2, 3))
 
 
 def mirror(look: Look, *, width: float = 0.6, height: float = 0.8, middle: float = 1.55) -> Piece:

@@ -145,7 +145,7 @@ POSTERS = (poster_hills, poster_shapes, poster_blocks, poster_contours, poster_s
 
 
 def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
-    """A woven rug with borders and a field of stepped diamonds, or of zigzags and stripes; fits one rug exactly."""
+    """A woven rug with borders around stepped diamonds, zigzags or a medallion; fits one rug exactly."""
     u, v = grid_px()
     knots_u, knots_v = np.floor(u * 192.0) / 192.0, np.floor(v * 144.0) / 144.0
     x, y = np.abs(knots_u - 0.5), np.abs(knots_v - 0.5)
@@ -177,7 +177,20 @@ def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
 def spines(rng: np.random.Generator) -> Picture:
     """Backs of books in a grid of cells, each with bands, title bars and worn edges."""
     width, height = 512 // SPINE_COLUMNS, 512 // SPINE_ROWS
-    colors = "#7b2d26 #23395b #c9a227 #3d5a45 #e8dcc4 #2b2b2b #a3603a #5b7a8c #8c3b52 #d8cfc0 #44355b #b5482e".split()
+    colors = [
+        "#7b2d26",
+        "#23395b",
+        "#c9a227",
+        "#3d5a45",
+        "#e8dcc4",
+        "#2b2b2b",
+        "#a3603a",
+        "#5b7a8c",
+        "#8c3b52",
+        "#d8cfc0",
+        "#44355b",
+        "#b5482e",
+    ]
     picture = np.empty((512, 512, 3), np.float32)
     across = np.abs(np.linspace(-1.0, 1.0, width, dtype=np.float32))
     for row in range(SPINE_ROWS):
@@ -214,7 +227,7 @@ def screen(rng: np.random.Generator) -> Picture:
             x += length + 6
             if x > 480:
                 break
-    return picture
+    return np.asarray(picture, np.float32)
 
 
 def view(rng: np.random.Generator) -> Picture:

@@ -57,7 +57,7 @@ def furnish(
     seed: int,
     density: float,
     ceiling_m: float,
-) -> None:
+) -> RoomSpace:
     """Furnish one room; its furniture depends on its name and the seed, not on the other rooms.
 
     Args:
@@ -69,6 +69,9 @@ def furnish(
         seed: Chooses the furniture.
         density: Share of the optional things that are there, 0 to 1.
         ceiling_m: Height of the room [m].
+
+    Returns:
+        What space is left.
     """
     make = _Furnisher(
         space=RoomSpace(room, assembly, ceiling_m),
@@ -88,6 +91,7 @@ def furnish(
             half = 0.5 * (green.bounds[1] - green.bounds[0])
             green = green.moved((0.0, -float(half[1]) - 0.02, 0.0))
             make.space.along_wall(green, make.rng, front_m=0.05, liking=corner_liking)
+    return make.space
 
 
 def _studio(make: _Furnisher) -> None:
@@ -138,14 +142,15 @@ def _kitchen(make: _Furnisher) -> None:
     if make.wants(0.6):
         make.space.along_wall(cabinets.bookshelf(make.rng, make.look, width=0.8, height=1.5), make.rng)
     _main_lamps(make, strength=1.0)
+    clock = ornaments.clock(make.look)
     for wall in make.room.walls:
-        if make.space.hang(ornaments.clock(make.look), wall, 0.5 * wall.length_m):
+        if any(make.space.hang(clock, wall, share * wall.length_m) for share in (0.5, 0.35, 0.65, 0.2, 0.8)):
             break
 
 
 def _study(make: _Furnisher) -> None:
     desk = cabinets.desk(make.rng, make.look, width=1.5)
-    spot = make.space.along_wall(desk, make.rng, front_m=0.9, liking=middle_liking)
+    spot = make.space.along_wall(desk, make.rng, front_m=0.9, liking=middle_liking, window=True)
     if spot:
         wall, x = spot
         deep = -float(desk.bounds[0, 1])
@@ -207,14 +212,21 @@ _ARRANGEMENTS: dict[Role, Callable[[_Furnisher], None]] = {
 def _sofa_group(make: _Furnisher) -> None:
     """A sofa with a rug and a low table in front, an armchair beside it and a television across the room."""
     space, rng, look = make.space, make.rng, make.look
-    for width, front in ((2.3, 1.7), (2.3, 1.3), (1.8, 1.3), (1.8, 0.8)):
+    for width, front, window in (
+        (2.3, 1.7, False),
+        (2.3, 1.3, False),
+        (1.8, 1.3, False),
+        (2.3, 1.3, True),
+        (1.8, 0.8, True),
+    ):
         sofa = seating.sofa(rng, look, width=width)
-        spot = space.along_wall(sofa, rng, front_m=front, sides_m=0.1, liking=middle_liking)
+        spot = space.along_wall(sofa, rng, front_m=front, sides_m=0.1, liking=middle_liking, window=window)
         if spot:
             break
     else:
         return
     wall, x = spot
+    _pictures_above(make, wall, x)
     edge = WALL_GAP_M - float(sofa.bounds[0, 1])
     rug_width, rug_depth = width + 0.1, 1.55
     rug = ornaments.rug(make.palette.rug(make.index, rug_width, rug_depth), width=rug_width, depth=rug_depth)
@@ -245,13 +257,15 @@ def _bed_group(make: _Furnisher, *, width: float) -> None:
     """A bed with nightstands and lamps on both sides, a rug at its foot or side."""
     space, rng, look = make.space, make.rng, make.look
     bed = seating.bed(rng, look, width=width)
-    for sides in (0.5, 0.1):
-        spot = space.along_wall(bed, rng, front_m=0.55, sides_m=sides, liking=middle_liking)
+    for sides, front, window in ((0.5, 0.55, False), (0.5, 0.3, True), (0.1, 0.55, False), (0.1, 0.3, True)):
+        spot = space.along_wall(bed, rng, front_m=front, sides_m=sides, liking=middle_liking, window=window)
         if spot:
             break
     else:
         return
     wall, x = spot
+    if make.wants(0.7):
+        _pictures_above(make, wall, x)
     stand = cabinets.nightstand(rng, look)
     high, deep = float(stand.bounds[1, 2]), -float(stand.bounds[0, 1])
     half = float(bed.bounds[1, 0])
@@ -343,9 +357,9 @@ def _shelves(make: _Furnisher, *, count: int) -> None:
 def _rug_in_the_open(make: _Furnisher, width: float, depth: float) -> None:
     rug = ornaments.rug(make.palette.rug(make.index, width, depth), width=width, depth=depth)
     turn = 0.0 if make.room.rect.width >= make.room.rect.depth else 0.5 * np.pi
-    spot = make.space.open_spot(rug.moved((0, 0, 0), turn).bounds, make.rng, around_m=0.0)
+    spot = make.space.open_spot(rug.moved((0, 0, 0), turn).bounds, make.rng, around_m=0.0, group=True)
     if spot:
-        make.space.put(rug, (*spot, 0.0), turn)
+        make.space.put(rug, (*spot, 0.0), turn, group=True)
 
 
 def _floor_lamp(make: _Furnisher) -> None:
@@ -414,15 +428,26 @@ def _curtains(make: _Furnisher, wall: Wall, opening: Opening, fabric: Surface) -
                 break
 
 
+def _picture(make: _Furnisher, width: float, height: float) -> Piece:
+    poster = make.palette.poster(2 * make.index + make.prints % 2, width, height)
+    make.prints += 1
+    return ornaments.picture(make.look, poster, width=width, height=height, middle=1.6)
+
+
+def _pictures_above(make: _Furnisher, wall: Wall, x: float) -> None:
+    """Two or three prints in a row above a piece of furniture."""
+    count = int(make.rng.integers(2, 4))
+    for k in range(count):
+        at = x + 0.74 * (k - 0.5 * (count - 1))
+        make.space.hang(_picture(make, *((0.6, 0.8) if count == 2 else (0.45, 0.6))), wall, at)
+
+
 def _hang_pictures(make: _Furnisher) -> None:
     """Prints on free stretches of wall, above whatever stands there."""
     formats = ((0.6, 0.8), (0.45, 0.6), (0.75, 1.0), (0.36, 0.48))
     for wall in make.room.walls:
-        for share in (0.5, 0.25, 0.75):
-            if not make.wants(0.7):
-                continue
-            width, height = formats[int(make.rng.integers(len(formats)))]
-            poster = make.palette.poster(10 * make.index + make.prints, width, height)
-            piece = ornaments.picture(make.look, poster, width=width, height=height, middle=1.6)
-            if make.space.hang(piece, wall, share * wall.length_m):
-                make.prints += 1
+        hung = 0
+        for share in (0.5, 0.32, 0.68, 0.16, 0.84):
+            if hung < 2 and make.wants(0.7):
+                size = formats[int(make.rng.integers(len(formats)))]
+                hung += make.space.hang(_picture(make, *size), wall, share * wall.length_m)

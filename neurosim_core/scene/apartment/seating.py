@@ -9,20 +9,24 @@ from __future__ import annotations
 import numpy as np
 
 from neurosim_core.scene.apartment.assembly import Piece, Surface
-from neurosim_core.scene.apartment.geometry import Part, cushion, cylinder, lathe, rounded_box, tube
+from neurosim_core.scene.apartment.geometry import Part, box, cushion, cylinder, lathe, rounded_box, tube
 from neurosim_core.scene.apartment.looks import Look
 
 
 def legs(
     width: float, depth: float, height: float, *, radius: float = 0.02, splay: float = 0.0
 ) -> list[Part]:
-    """Four round, tapered legs below a rectangle whose back is at y = 0; they reach 1 cm into what they carry."""
+    """Four round, tapered legs below a rectangle whose back is at y = 0; they reach into what they carry."""
     parts = []
     for sx in (-1.0, 1.0):
         for y, sy in ((-radius, 1.0), (radius - depth, -1.0)):
             x = sx * (0.5 * width - radius)
-            foot = (x + sx * splay * height, y + sy * splay * height * (0.0 if sy > 0.0 else 1.0), 0.0)
-            parts.append(tube([foot, (x, y, height + 0.01)], [0.65 * radius, radius], sides=12))
+            foot = (
+                x + sx * splay * height,
+                y + sy * splay * height * (0.0 if sy > 0.0 else 1.0),
+                0.7 * radius * splay,
+            )
+            parts.append(tube([foot, (x, y, height + 0.008)], [0.65 * radius, radius], sides=12))
     return parts
 
 
@@ -48,7 +52,9 @@ def sofa(rng: np.random.Generator, look: Look, *, width: float = 2.2) -> Piece:
     piece.add(fabric, back)
     for side in (-1.0, 1.0):
         x = side * 0.5 * (width - arm)
-        piece.add(fabric, rounded_box((arm, depth, 0.50), 0.075, center=(x, -0.5 * depth, 0.37), segments=3))
+        piece.add(
+            fabric, rounded_box((arm, depth, 0.496), 0.075, center=(x, -0.5 * depth, 0.372), segments=3)
+        )
     count = 3 if width > 2.0 else 2
     pitch = (width - 2.0 * arm) / count
     for index in range(count):
@@ -73,38 +79,28 @@ def sofa(rng: np.random.Generator, look: Look, *, width: float = 2.2) -> Piece:
 
 
 def armchair(rng: np.random.Generator, look: Look) -> Piece:
-    """A shell chair with a seat cushion on splayed wooden legs."""
+    """An upholstered chair with a raked back and wooden arms on tapered legs."""
     piece = Piece("armchair")
-    width, depth = 0.74, 0.76
-    piece.add(
-        look.wood,
-        *(
-            part.shifted((0.0, -0.1, 0.0))
-            for part in legs(width - 0.24, depth - 0.22, 0.26, radius=0.022, splay=0.12)
-        ),
-    )
-    piece.add(
-        look.accent,
-        rounded_box((width - 0.06, depth - 0.04, 0.14), 0.06, center=(0.0, -0.5 * depth, 0.32), segments=3),
-    )
-    back = cushion((width, 0.2, 0.62), power=(4.0, 2.6, 3.0), segments=7).turned(-0.14, axis=0)
-    piece.add(look.accent, back.shifted((0.0, -0.16, 0.60)))
+    width, depth, seat = 0.72, 0.78, 0.40
     for side in (-1.0, 1.0):
-        arm = cushion(
-            (0.15, depth - 0.08, 0.34),
-            center=(side * (0.5 * width - 0.075), -0.5 * depth, 0.43),
-            power=(2.6, 3.6, 3.0),
-        )
-        piece.add(look.accent, arm)
-    seat = cushion(
-        (width - 0.24, depth - 0.18, 0.16),
-        center=(0.0, -0.5 * depth - 0.06, 0.44),
-        power=(5, 5, 2.4),
-        segments=6,
-    )
-    piece.add(look.accent, seat)
+        x = side * (0.5 * width - 0.025)
+        front, back = -depth + 0.07, -0.12
+        piece.add(look.wood, tube([(x, front - 0.03, 0.003), (x, front, 0.58)], [0.014, 0.02], sides=12))
+        piece.add(look.wood, tube([(x, back + 0.06, 0.003), (x, back, 0.55)], [0.014, 0.02], sides=12))
+        rest = rounded_box((0.06, depth - 0.08, 0.03), 0.014, center=(x, -0.5 * depth, 0.585), grain=1)
+        piece.add(look.wood, rest)
+        rail = box((0.02, depth - 0.16, 0.05), center=(x, -0.5 * depth, 0.27), grain=1)
+        piece.add(look.wood, rail)
+    piece.add(look.wood, box((width - 0.05, 0.02, 0.05), center=(0.0, -depth + 0.07, 0.272)))
+    cloth = look.accent
+    wide = width - 0.11
+    piece.add(cloth, rounded_box((wide, depth - 0.14, 0.1), 0.03, center=(0.0, -0.5 * depth - 0.03, 0.29)))
+    pad = cushion((wide, depth - 0.16, 0.15), power=(8.0, 8.0, 2.8), segments=7).turned(-0.06, axis=0)
+    piece.add(cloth, pad.shifted((0.0, -0.5 * depth - 0.04, seat + 0.01)))
+    back_pad = cushion((wide, 0.15, 0.62), power=(8.0, 2.6, 6.0), segments=7).turned(-0.26, axis=0)
+    piece.add(cloth, back_pad.shifted((0.0, -0.17, seat + 0.27)))
     if rng.uniform() < 0.6:
-        piece.add(look.knit, pillow(0.38).turned(-0.25, axis=0).shifted((0.0, -0.32, 0.66)))
+        piece.add(look.knit, pillow(0.38).turned(-0.32, axis=0).shifted((0.0, -0.31, seat + 0.27)))
     return piece
 
 
@@ -121,7 +117,7 @@ def chair(rng: np.random.Generator, look: Look, *, wood: Surface | None = None) 
         ),
     )
     piece.add(
-        wood, rounded_box((width, depth, 0.035), 0.015, center=(0.0, -0.5 * depth, seat - 0.02), segments=2)
+        wood, rounded_box((width, depth, 0.035), 0.015, center=(0.0, -0.5 * depth, seat - 0.02), segments=1)
     )
     piece.add(
         look.fabric,
@@ -129,7 +125,7 @@ def chair(rng: np.random.Generator, look: Look, *, wood: Surface | None = None) 
             (width - 0.05, depth - 0.06, 0.05),
             center=(0.0, -0.5 * depth - 0.01, seat + 0.01),
             power=(6, 6, 2.2),
-            segments=5,
+            segments=4,
         ),
     )
     top = 0.86
@@ -140,11 +136,11 @@ def chair(rng: np.random.Generator, look: Look, *, wood: Surface | None = None) 
             tube(
                 [(x, -0.05, seat - 0.05), (x, -0.04, seat + 0.2), (x, -0.016, top)],
                 [0.017, 0.015, 0.012],
-                sides=12,
+                sides=10,
             ),
         )
     piece.add(
-        wood, rounded_box((width - 0.02, 0.022, 0.11), 0.01, center=(0.0, -0.02, top - 0.04), segments=2)
+        wood, rounded_box((width - 0.02, 0.022, 0.11), 0.01, center=(0.0, -0.02, top - 0.04), segments=1)
     )
     if rng.uniform() < 0.6:
         for x in np.linspace(-0.1, 0.1, 4):
@@ -175,7 +171,7 @@ def stool(look: Look) -> Piece:
     )
     for angle in np.arange(4) * 0.5 * np.pi + 0.25 * np.pi:
         reach = np.array([np.cos(angle), np.sin(angle), 0.0])
-        foot, head = 0.18 * reach + (0.0, -0.2, 0.0), 0.11 * reach + (0.0, -0.2, height - 0.04)
+        foot, head = 0.18 * reach + (0.0, -0.2, 0.003), 0.11 * reach + (0.0, -0.2, height - 0.04)
         piece.add(look.metal, tube([foot, head], 0.011, sides=10))
     ring = np.linspace(0.0, 2.0 * np.pi, 33)
     path = np.stack([0.158 * np.cos(ring), 0.158 * np.sin(ring) - 0.2, np.full_like(ring, 0.22)], axis=1)
@@ -193,7 +189,11 @@ def office_chair(rng: np.random.Generator, look: Look) -> Piece:
         reach = np.array([np.cos(angle), np.sin(angle), 0.0])
         piece.add(
             look.metal,
-            tube([center + (0, 0, 0.11), center + 0.27 * reach + (0, 0, 0.075)], [0.024, 0.014], sides=10),
+            tube(
+                [np.array([0.0, -0.32, 0.11]), center + 0.27 * reach + (0, 0, 0.075)],
+                [0.024, 0.014],
+                sides=10,
+            ),
         )
         axle = 0.018 * np.array([-reach[1], reach[0], 0.0])
         at = center + 0.27 * reach + (0.0, 0.0, 0.032)
@@ -253,7 +253,7 @@ def bed(rng: np.random.Generator, look: Look, *, width: float = 1.6) -> Piece:
         for x in np.linspace(-0.36, 0.36, 4) * width:
             piece.add(look.dark_wood, rounded_box((0.02, 0.02, 0.5), 0.006, center=(x, -0.05, 0.76), grain=2))
     duvet = _draped(width + 0.1, 1.42, 0.13, rng)
-    piece.add(look.fabric, duvet.shifted((0.0, -0.72 - 0.71, 0.45)))
+    piece.add(look.linen if rng.uniform() < 0.5 else look.fabric, duvet.shifted((0.0, -0.72 - 0.71, 0.45)))
     throw = _draped(width + 0.14, 0.5, 0.15, rng)
     piece.add(look.knit, throw.shifted((0.0, -1.72, 0.452)))
     for side in (-1.0, 1.0):

@@ -1,4 +1,4 @@
-"""The building itself: floors, walls with their openings, ceilings, mouldings, window views and the outside."""
+"""The building itself: floors, walls with their openings, ceilings, mouldings, views, the outside."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ _CASING_M = 0.075
 """Width of door and window casings."""
 _BASEBOARD_M = 0.014
 """Thickness of baseboards."""
+_CUT = Surface(name="cut wall", color=(0.06, 0.06, 0.065))
+"""The tops of the walls, dark as in a plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +53,8 @@ def add_shell(
 ) -> None:
     """Build every room of the plan.
 
-    Ceilings are objects `ceiling_k` and the top is `roof_1`, so that they can be left out of a picture from above;
-    the walls have tops just below the roof.
+    Ceilings are objects `ceiling_k` and the top is `roof_1`, so that they can be left out of a picture from
+    above; the walls have tops just below the roof.
     """
     for room in plan.rooms:
         _add_room(assembly, room, finishes[room.name], ceiling_m)
@@ -110,9 +112,9 @@ def _add_casing(assembly: Assembly, instance: int, wall: Wall, opening: Opening,
         assembly.add(instance, surface, _to_world(upright, wall))
     width = opening.x1 - opening.x0 + 2.0 * lip + 2.0 * _CASING_M + 0.03
     head = rounded_box(
-        (width, depth + 0.008, _CASING_M + 0.012),
+        (width, depth + 0.01, _CASING_M + 0.012),
         0.006,
-        center=(0.5 * (opening.x0 + opening.x1), middle - 0.004, opening.z1 + lip + 0.5 * _CASING_M + 0.008),
+        center=(0.5 * (opening.x0 + opening.x1), middle - 0.003, opening.z1 + lip + 0.5 * _CASING_M + 0.008),
     )
     assembly.add(instance, surface, _to_world(head, wall))
 
@@ -157,7 +159,7 @@ def _add_window(assembly: Assembly, wall: Wall, opening: Opening, finish: RoomFi
     bar, thick = 0.055, 0.05
     at = deep - 0.06
     bars = [
-        box((bar, thick, height), center=(x, at, 0.5 * (z0 + z1)), grain=2)
+        box((bar, thick, height + 0.008), center=(x, at, 0.5 * (z0 + z1)), grain=2)
         for x in (x0 + 0.4 * bar, x1 - 0.4 * bar)
     ]
     panes = max(2, round(width / 0.7))
@@ -167,11 +169,13 @@ def _add_window(assembly: Assembly, wall: Wall, opening: Opening, finish: RoomFi
         for x in np.linspace(x0, x1, panes + 1)[1:-1]
     ]
     bars += [
-        box((width, thick + 0.006, bar), center=(0.5 * (x0 + x1), at, z), grain=0)
+        box((width + 0.008, thick + 0.006, bar), center=(0.5 * (x0 + x1), at, z), grain=0)
         for z in (z0 + 0.4 * bar, z1 - 0.4 * bar)
     ]
     if height > 1.2:
-        bars.append(box((width, thick - 0.016, slim), center=(0.5 * (x0 + x1), at, z0 + 0.7 * height)))
+        bars.append(
+            box((width + 0.006, thick - 0.016, slim), center=(0.5 * (x0 + x1), at, z0 + 0.7 * height))
+        )
     assembly.add(instance, finish.trim, *(_to_world(part, wall) for part in (*reveal, *bars)))
     assembly.add(instance, finish.sill, _to_world(board, wall))
     assembly.add(assembly.instance("view"), finish.view(width, height), _to_world(view, wall))
@@ -203,4 +207,4 @@ def _add_outside(assembly: Assembly, plan: FloorPlan, finish: RoomFinish, ceilin
             x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
             inside = any(r.rect.x0 < x < r.rect.x1 and r.rect.y0 < y < r.rect.y1 for r in plan.rooms)
             if not inside:
-                assembly.add(tops, finish.sill, quad((x0, y0, ceiling_m), (x1 - x0, 0, 0), (0, y1 - y0, 0)))
+                assembly.add(tops, _CUT, quad((x0, y0, ceiling_m), (x1 - x0, 0, 0), (0, y1 - y0, 0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -47,7 +48,7 @@ def noise(
     return np.asarray(field / field.std(), np.float32)
 
 
-def blend(low: NDArray[np.float32], high: NDArray[np.float32], share: Field) -> Picture:
+def blend(low: NDArray[np.float32], high: NDArray[np.float32], share: NDArray[np.floating[Any]]) -> Picture:
     """From colour (or picture) `low` to `high` by a share that is clipped to [0, 1]."""
     weight = np.clip(share, 0.0, 1.0)[..., None]
     return np.asarray(low + (high - low) * weight, np.float32)
@@ -79,12 +80,12 @@ def _edge(share: Field, count: float) -> Field:
 def plaster(rng: np.random.Generator) -> Picture:
     """Rolled wall paint: nearly white, with the roller's grain, faint clouds and a few rubbed spots."""
     grain = 0.6 * noise(rng, slope=0.8, coarsest=20.0) + 0.5 * noise(rng, slope=1.7)
-    return blend(rgb("#c4c3c0"), rgb("#ffffff"), 0.66 + 0.19 * grain)
+    return blend(rgb("#c4c3c0"), rgb("#ffffff"), 0.68 + 0.15 * grain)
 
 
 def wood(rng: np.random.Generator, dark: str, light: str) -> Picture:
     """Continuous grain along u: wavy year rings, fibres and pores."""
-    u, v = grid_px()
+    _, v = grid_px()
     warp = noise(rng, slope=2.2, stretch=5.0) * 0.018
     rings = np.sin(2.0 * np.pi * (9.0 * v + 26.0 * warp)).astype(np.float32)
     fibre = noise(rng, slope=0.9, stretch=26.0, coarsest=10.0)
@@ -262,7 +263,7 @@ def _scattered_leaves(rng: np.random.Generator) -> Field:
 
 def metal(rng: np.random.Generator) -> Picture:
     """Brushed steel along u."""
-    return blend(rgb("#77797b"), rgb("#e4e6e8"), 0.55 + 0.17 * noise(rng, slope=0.7, stretch=40.0))
+    return blend(rgb("#8f9193"), rgb("#f4f5f6"), 0.62 + 0.13 * noise(rng, slope=0.7, stretch=40.0))
 
 
 def concrete(rng: np.random.Generator) -> Picture:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurosim_core.scene.apartment.assembly import Piece, Surface
 from neurosim_core.scene.apartment.geometry import (
@@ -20,9 +21,9 @@ from neurosim_core.scene.apartment.geometry import (
     lathe,
     merge,
     quad,
-    without_slivers,
     rounded_box,
     tube,
+    without_slivers,
 )
 from neurosim_core.scene.apartment.looks import Look
 from neurosim_core.scene.apartment.ornaments import bowl, vase
@@ -32,7 +33,7 @@ COUNTER_M = 0.91
 
 
 def kitchen_counter(rng: np.random.Generator, look: Look, splash: Surface, *, width: float) -> Piece:
-    """A run of units: drawers, doors, oven and hob, sink and tap, tiles behind, cupboards and a hood above."""
+    """A run of units: drawers, doors, oven and hob, sink and tap, tiles behind, cupboards and hood above."""
     piece = Piece("kitchen_counter")
     depth = 0.6
     units = max(3, round(width / 0.6))
@@ -171,7 +172,8 @@ def _sink(piece: Piece, look: Look, x: float, top: float) -> None:
     neck = np.stack(
         [np.zeros(13), -0.07 - 0.08 * (1.0 - np.cos(turn)), top + 0.24 + 0.08 * np.sin(turn)], axis=1
     )
-    path = np.concatenate([[(0.0, -0.07, top - 0.01)], neck, [(0.0, -0.23, top + 0.2)]]) + (x, 0.0, 0.0)
+    path = np.concatenate([[(0.0, -0.07, top - 0.01)], neck, [(0.0, -0.23, top + 0.2)]])
+    path[:, 0] += x
     piece.add(look.steel, tube(path, 0.012, sides=14))
     piece.add(
         look.steel, tube([(x, -0.07, top + 0.06), (x + 0.07, -0.07, top + 0.08)], [0.009, 0.006], sides=10)
@@ -218,7 +220,6 @@ def _basin(
             (0.5 * (1 + floor) + 0.03, rim, base + 0.35 * hollow),
             (floor, rim, base + 0.05 * hollow),
             (0.55 * floor, rim, base),
-            (0.0, 0.0, base),
         ],
     )
     parts = []
@@ -235,6 +236,12 @@ def _basin(
             axis=-1,
         )
         parts.append(grid_surface(points, uv, closed_u=True))
+    rim_of_floor = np.append(0.55 * floor * unit * (half - rim), np.full((len(angle), 1), base), axis=1)
+    middle = np.broadcast_to((0.0, 0.0, base), rim_of_floor.shape)
+    points = np.stack([rim_of_floor, middle])
+    parts.append(
+        grid_surface(points, points[..., :2], normals=np.broadcast_to((0.0, 0.0, 1.0), points.shape))
+    )
     return without_slivers(merge(parts))
 
 
@@ -323,7 +330,7 @@ def bathtub(look: Look) -> Piece:
         ),
     )
     piece.add(look.steel, tube([(0.6, -0.02, 0.66), (0.66, -0.02, 0.7)], 0.008, sides=10))
-    towel = [rounded_box((0.4, 0.016, 0.36), 0.007, center=(-0.25, -0.755, 0.42), segments=2)]
+    towel = [rounded_box((0.4, 0.016, 0.35), 0.007, center=(-0.25, -0.755, 0.42), segments=2)]
     towel.append(rounded_box((0.402, 0.09, 0.016), 0.007, center=(-0.25, -0.722, 0.592), segments=2))
     piece.add(look.knit, *towel)
     return piece
@@ -359,8 +366,8 @@ def toilet(look: Look) -> Piece:
 
 
 def _unit(
-    vectors: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    vectors: NDArray[np.float64],
+) -> NDArray[np.float64]:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
