@@ -66,7 +66,7 @@ def test_classes_match_brute_force(rows):
 
 @settings(deadline=None, max_examples=50)
 @given(
-    times=st.lists(st.integers(1, 100_000), max_size=80),
+    times=st.lists(st.integers(1, 100_000) | st.integers(1, 100).map(lambda ms: 1000 * ms), max_size=80),
     ends_ms=st.sets(st.integers(1, 99), max_size=12),
     length_ms=st.integers(1, 40),
 )

@@ -59,6 +59,8 @@ def test_snapshot_holds_exactly_the_window_before_the_picture():
     rng = np.random.default_rng(0)
     summary = FlightSummary()
     packets = [events(rng, k, 100) for k in range(8)]
+    for packet in packets:
+        packet.t[-1] = packet.stamp_ns // 1000  # on the border: belongs to the window that ends there
     for k, packet in enumerate(packets):
         if k in (3, 6):  # pictures at 40 and 70 ms, before the events of the same stamp
             summary.log(picture(packet.stamp_ns, 90 if k == 3 else 10))

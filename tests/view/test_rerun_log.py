@@ -133,7 +133,8 @@ def test_scalars_and_poses_are_read_back(tmp_path):
     assert [t for t, _ in poses] == [k * 5 * MS + 1 for k in range(50)]
     assert np.array([p[0] for _, p in poses])[:, 0] == pytest.approx(0.1 * np.arange(50), rel=1e-6)  # float32
     strokes = [v["strips"][0] for _, v in rows["/world/trail"]]
-    trail = np.concatenate([stroke[1:] for stroke in strokes])  # each begins where the one before ended
+    assert [stroke[0] for stroke in strokes[1:]] == [stroke[-1] for stroke in strokes[:-1]]
+    trail = np.concatenate([stroke[1:] for stroke in strokes])
     assert trail[:, 0] == pytest.approx(0.1 * np.arange(50), rel=1e-6)
     assert 4 <= len(strokes) <= 6  # one per 50 ms
 
