@@ -106,9 +106,7 @@ def solve_minimum_snap(points: Array, durations_s: Array, rest: NDArray[np.bool_
     unknown = np.zeros((inner, 3, axes))
     if free.any():
         diagonal = blocks[:-1, 5:8, 5:8] + blocks[1:, 1:4, 1:4]
-        lower = blocks[
-            1:-1, 5:8, 1:4
-        ]  # row: right end, column: left end of the pieces between inner waypoints
+        lower = blocks[1:-1, 5:8, 1:4]  # row: right end of a piece, column: its left end
         # positions enter by their difference alone: constants have no snap
         right = -(
             blocks[:-1, 5:8, 4, None] * step[:-1, None, :] + blocks[1:, 1:4, 4, None] * step[1:, None, :]

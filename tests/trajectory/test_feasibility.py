@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neurosim_core.trajectory import feasibility
 from neurosim_core.trajectory.feasibility import (
     GRAVITY_M_S2,
     FlightLimits,
@@ -54,6 +55,32 @@ def test_bounds_hold_and_are_tight(seed):
     assert bounds.thrust_to_weight_min >= thrust_min - 0.02
     if thrust_min > 0.3:
         assert bounds.tilt_rate_rad_s <= 1.2 * tilt_rate
+
+
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_bounds_hold_however_coarse(parts, monkeypatch):
+    """Where the thrust axis swings by a radian within a part, its swing counts."""
+    monkeypatch.setattr(feasibility, "_PARTS", parts)
+    finite = 0
+    for seed in range(40):
+        path = random_path(seed, reach_m=1.0)
+        bounds = flight_bounds(path)
+        speed, thrust_max, thrust_min, tilt_rate = sampled(path)
+        assert speed <= bounds.speed_m_s * (1.0 + 1e-12)
+        assert thrust_max <= bounds.thrust_to_weight_max * (1.0 + 1e-12)
+        assert thrust_min >= bounds.thrust_to_weight_min - 1e-12
+        assert tilt_rate <= bounds.tilt_rate_rad_s * (1.0 + 1e-12)
+        finite += np.isfinite(bounds.tilt_rate_rad_s)
+    assert finite > 5
+
+
+def test_a_tilted_jerk_along_the_thrust_counts():
+    """Thrust (t - 1/2, 0, 3 + 14 t) turns fastest where it is weakest, at |thrust x jerk| / |thrust|^2."""
+    east, up = [0.0, 0.0, -0.25, 1.0 / 6.0], [0.0, 0.0, 0.5 * (3.0 - 9.81), 14.0 / 6.0]
+    path = Path(np.array([0, 10**9]), np.array([[east, [0.0] * 4, up, [0.0] * 4]]))
+    rate = (0.5 * 14.0 + 3.0) / (0.25 + 9.0)
+    assert sampled(path)[3] == pytest.approx(rate, rel=1e-9)
+    assert rate <= flight_bounds(path).tilt_rate_rad_s <= 1.5 * rate
 
 
 def test_control_points_lie_on_the_curve_at_the_ends_of_parts():

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import optimize
 
+from neurosim_core.trajectory import heading
 from neurosim_core.trajectory.feasibility import control_points, derivative
 from neurosim_core.trajectory.heading import follow_travel
 from neurosim_core.trajectory.minsnap import minimum_snap
@@ -49,6 +51,19 @@ def test_turns_back_at_the_limit():
     assert 0.499 <= np.abs(samples.yaw_rate).max() <= 0.5 * (1.0 + 1e-12)
     turning = np.flatnonzero(np.abs(samples.yaw_rate) > 0.01)
     assert 2.0 * math.pi <= (turning[-1] - turning[0]) * 1e-3 <= 2.0 * math.pi + 1.5
+
+
+@pytest.mark.parametrize("step_max", [0.025, 0.075])
+def test_the_limited_heading_is_the_nearest(step_max):
+    """Against SciPy's bounded least squares in the steps as unknowns."""
+    k = np.arange(150)
+    values = np.where(k > 60, 3.0, 0.0) + 0.3 * np.sin(0.05 * k) + np.where(k > 110, -1.0, 0.0)
+    limits = np.full(150, step_max)
+    limits[0] = np.inf
+    oracle = optimize.lsq_linear(np.tril(np.ones((150, 150))), values, bounds=(-limits, limits), max_iter=500)
+    limited = heading._nearest_with_slope(values, step_max)
+    assert np.abs(np.diff(limited)).max() <= step_max * (1.0 + 1e-12)
+    assert limited == pytest.approx(np.cumsum(oracle.x), abs=0.02)  # ADMM stops at about 0.01 rad
 
 
 def test_a_vertical_path_keeps_its_heading():

@@ -202,6 +202,16 @@ def test_a_proof_fails_where_a_path_comes_too_close(rooms):
     assert 0.3 <= proof.clearance_m <= 0.35 + 1e-6 <= proof.sample_min_m + 1e-3
 
 
+def test_a_proof_sees_the_curve_and_not_its_chords(rooms):
+    """A parabola comes down to 0.5 m above the floor between the ends of a part, 0.6 mm higher."""
+    tip = 12.5 / 35.0  # the middle of one of the 35 parts that a piece of this extent is cut into
+    height = [0.5 + 3.0 * tip**2, -6.0 * tip, 3.0]
+    coefficients = [[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], height, [0.0, 0.0, 0.0]]
+    path = Path(np.array([0, 10**9]), np.array([coefficients]))
+    assert prove_clearance(path, rooms, 0.4999).holds.all()
+    assert not prove_clearance(path, rooms, 0.5003).holds.any()
+
+
 def test_a_proof_sees_what_samples_miss():
     """A wire between two samples: both ends have room, the line between them does not."""
     space = as_space(ROOMS, box((4.0, 2.5, 0.0), (4.002, 2.502, 2.5)))
