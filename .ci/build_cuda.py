@@ -73,7 +73,7 @@ def build(module: wp.Module) -> tuple[str, float]:
 
 def main() -> int:
     """Build all modules of the package; return the exit status."""
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     make_kernels()
     kernels = (thing for thing in gc.get_objects() if isinstance(thing, wp.Kernel))
     modules = {k.module.name: k.module for k in kernels if k.func.__module__.startswith("neurosim_core")}

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from neurosim_core.config import SimulationConfig, load_config
     from neurosim_core.simulation import make_model, make_state, run, step
 
+__version__ = "0.1.0"
+
 __all__ = ["SimulationConfig", "load_config", "make_model", "make_state", "run", "step"]
 
 _HOME = {

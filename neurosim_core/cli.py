@@ -31,10 +31,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _quiet_warp() -> None:
-    """Keep Warp's start-up and module lines out of what people read."""
+    """Keep Warp's lines about modules, and about a GPU that is not there, out of what people read."""
     import warp as wp
 
-    wp.config.quiet = True  # type: ignore[attr-defined]
+    wp.config.log_level = wp.LOG_ERROR  # type: ignore[attr-defined]
+    wp.init()  # type: ignore[no-untyped-call]
+    wp.config.log_level = wp.LOG_WARNING  # type: ignore[attr-defined]
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -8,7 +8,6 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from neurosim_core import __version__
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.packets import Collision, Odometry, Packet
@@ -190,7 +190,7 @@ def _sinks(
             header = FlightHeader(
                 config_yaml=to_yaml(config),
                 seed=config.seed,
-                version=version("neurosim"),
+                version=__version__,
                 scene=model.scene.name,
                 sensors=describe_sensors(config.sensors),
                 path_stamp_ns=stamps,
@@ -205,7 +205,14 @@ def _sinks(
                 path_position=path_position,
             )
             sinks.append(stack.enter_context(logger).log)
+            sinks.append(lambda packet: _log_clearance(logger, model, packet))
         yield sinks
+
+
+def _log_clearance(logger: RerunLogger, model: Model, packet: Packet) -> None:
+    if isinstance(packet, Odometry):
+        clearance_m = float(model.free_space.clearance(packet.position)[0])
+        logger.log_scalar("clearance", packet.stamp_ns, clearance_m)
 
 
 def _has(library: str, console: Console, product: str) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

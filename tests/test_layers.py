@@ -16,7 +16,7 @@ FORBIDDEN = {
     "cortex": {"neurosim_core", "cortex_ros2_bridge", "warp", "rclpy"},
     "cortex_ros2_bridge": {"neurosim_core", "warp", "zmq"},
 }
-LAZY = {"torch", "rerun", "h5py", "hdf5plugin", "matplotlib", "pyrender", "OpenGL", "gymnasium"}
+LAZY = {"torch", "rerun", "h5py", "matplotlib", "pyrender", "OpenGL", "gymnasium"}
 LAZY |= {"cyclonedds", "rclpy"}
 """Heavy or optional: imported where they are used, never when a module is imported."""
 
