@@ -88,14 +88,12 @@ def vase(rng: np.random.Generator, look: Look, *, scale: float = 1.0, twigs: boo
                     sides=6,
                 ),
             )
-            for share in (0.55, 0.75, 0.95):
-                at = root + share * (top - root) + 0.012 * rng.standard_normal(3)
-                piece.add(
-                    look.linen,
-                    cushion((0.022, 0.022, 0.034), center=at, power=(2, 2, 2), segments=1).shifted(
-                        (scale - 1.0) * at
-                    ),
-                )
+            for share in (0.5, 0.75, 0.98):
+                # Buds sit on the twig, each turned its own way, so that no facets of two lie in one plane.
+                at = root + share * (top - root) + 0.006 * rng.standard_normal(3)
+                bud = cushion((0.02, 0.023, 0.032), power=(2, 2, 2), segments=2)
+                bud = bud.turned(rng.uniform(0.2, 0.6), axis=0).turned(rng.uniform(0.0, 6.0), axis=2)
+                piece.add(look.linen, replace(bud, vertices=scale * (bud.vertices + at)))
     return piece
 
 
@@ -230,9 +228,14 @@ def _flat_normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def mirror(look: Look, *, width: float = 0.6, height: float = 0.8, middle: float = 1.55) -> Piece:
     """A mirror; it looks like pale glass, reflections are not rendered."""
-    piece = picture(
-        look, replace(look.steel, color=(0.72, 0.78, 0.8)), width=width, height=height, middle=middle
+    glass = Surface(
+        name="mirror",
+        color=(0.62, 0.7, 0.72),
+        texture="plaster",
+        tile_m=(3.0, 3.0),
+        emission=(0.03, 0.04, 0.05),
     )
+    piece = picture(look, glass, width=width, height=height, middle=middle)
     return replace(piece, kind="mirror")
 
 
