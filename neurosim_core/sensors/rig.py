@@ -35,7 +35,7 @@ class EventSensorConfig(CameraConfig):
     """The law of its pixels."""
     sampling_rate_hz: RateHz = 250.0
     """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
-    packet_rate_hz: RateHz = 100.0
+    packet_rate_hz: RateHz = 125.0
     """How many packets of events are sent a second [Hz]; the events in them are those of the whole window."""
 
     @model_validator(mode="after")
