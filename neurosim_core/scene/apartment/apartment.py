@@ -71,6 +71,6 @@ def make_apartment(config: ApartmentConfig) -> Scene:
     ]
     return assembly.finish(
         f"apartment with {config.rooms} rooms, seed {config.seed}",
-        ambient=Ambient(up=(0.26, 0.26, 0.27), down=(0.2, 0.19, 0.18)),
+        ambient=Ambient(up=(0.3, 0.3, 0.31), down=(0.23, 0.22, 0.21)),
         inside_m=max(space.roomiest(_FLIGHT_HEIGHT_M) for space in spaces)[1],
     )

@@ -162,7 +162,7 @@ class Palette:
             texture="view",
             tile_m=(width_m, height_m),
             color=(1.0, 1.0, 1.0),
-            emission=(0.34, 0.38, 0.44),
+            emission=(0.2, 0.235, 0.285),
             exact=True,
         )
 
