@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 
 NS_PER_S = 1_000_000_000
 NS_PER_US = 1_000
@@ -40,18 +41,21 @@ class Rate:
         if not (0.0 < self.rate_hz <= NS_PER_S):
             raise ValueError(f"rate_hz must be in (0, 1e9], got {self.rate_hz}")
 
-    @property
-    def _period(self) -> Fraction:
-        return NS_PER_S / Fraction(str(self.rate_hz))
+    @cached_property
+    def _period(self) -> tuple[int, int]:
+        """Numerator and denominator of the period [ns]."""
+        return (NS_PER_S / Fraction(str(self.rate_hz))).as_integer_ratio()
 
     def stamp_ns(self, tick: int) -> int:
         """Return the stamp of a tick [ns]."""
-        return math.floor(tick * self._period)
+        numerator, denominator = self._period
+        return tick * numerator // denominator
 
     def first_tick(self, stamp_ns: int) -> int:
         """Return the first tick at or after a stamp."""
         # floor(k p) >= s  <=>  k p >= s  for integer s
-        return math.ceil(stamp_ns / self._period)
+        numerator, denominator = self._period
+        return -(-stamp_ns * denominator // numerator)
 
     def has_tick(self, stamp_ns: int) -> bool:
         """Return whether a tick is at this stamp."""
