@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import yaml
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     arguments = _parser().parse_args(argv)
-    _quiet_warp()
+    _start_warp()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
         return int(arguments.command(arguments))
@@ -30,13 +31,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _quiet_warp() -> None:
-    """Keep Warp's lines about modules, and about a GPU that is not there, out of what people read."""
+def _start_warp() -> None:
+    """Start Warp without its lines about modules, and about a GPU on a machine that has none.
+
+    The latter is written by native code straight to the standard error stream: the stream is held back while
+    Warp starts, and what else was written to it is written again.
+    """
     import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR  # type: ignore[attr-defined]
-    wp.init()  # type: ignore[no-untyped-call]
     wp.config.log_level = wp.LOG_WARNING  # type: ignore[attr-defined]
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            wp.init()  # type: ignore[no-untyped-call]
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        held.seek(0)
+        lines = held.read().decode(errors="replace").splitlines(keepends=True)
+    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
 
 
 def _parser() -> argparse.ArgumentParser:

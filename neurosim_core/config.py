@@ -24,7 +24,7 @@ from neurosim_core.sensors.rig import (
     SensorConfig,
 )
 from neurosim_core.settings import Settings
-from neurosim_core.trajectory import PathConfig, TourConfig
+from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig, preset
 
 
@@ -100,7 +100,7 @@ class SimulationConfig(Settings):
     vehicle: VehicleConfig = VehicleConfig()
     """The multirotor."""
     path: PathConfig = TourConfig()
-    """Where it flies."""
+    """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...}."""
     control: ControlConfig = ControlConfig()
     """What flies it."""
     sensors: dict[Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], SensorConfig] = Field(
@@ -108,6 +108,16 @@ class SimulationConfig(Settings):
     )
     """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
     exist."""
+
+    @model_validator(mode="after")
+    def _path_keeps_off_the_scene(self) -> SimulationConfig:
+        radius_m = self.vehicle.collision_radius_m
+        if isinstance(self.path, CollisionFreeConfig) and self.path.clearance_m <= radius_m:
+            raise ValueError(
+                f"path.clearance_m must be more than vehicle.collision_radius_m = {radius_m:g}, "
+                f"got {self.path.clearance_m:g}"
+            )
+        return self
 
     @field_validator("sensors")
     @classmethod

@@ -55,7 +55,7 @@ class Report:
 
 
 def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
-    """Return the folder for a new flight, made if need be.
+    """Return the folder for a new flight; `fly` makes it once there is something to put in it.
 
     Args:
         out: Where the user wants it; None: ./flight, or ./flight-2, ... if there is one already.
@@ -72,7 +72,6 @@ def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
         raise FileExistsError(
             f"{out} already holds a flight ({', '.join(held)}): add --overwrite, or name another --out"
         )
-    out.mkdir(parents=True, exist_ok=True)
     return out
 
 
@@ -85,7 +84,7 @@ def fly(
 
     Args:
         config: What to fly.
-        folder: Where to leave the flight; exists.
+        folder: Where to leave the flight; made if need be.
         rerun: Write flight.rrd.
         console: Where to print; standard output if None.
 
@@ -94,7 +93,6 @@ def fly(
     """
     console = console or Console()
     report = Report()
-    (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
     begin = time.perf_counter()
     with console.status("preparing") as status:
         model = make_model(config, on_phase=lambda phase: status.update(f"preparing: {phase}"))
@@ -104,6 +102,8 @@ def fly(
         waiting = next(packets)
     report.setup_s = time.perf_counter() - begin
     _print_plan(console, model)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
 
     summary = FlightSummary(describe_sensors(config.sensors))
     begin = time.perf_counter()

@@ -74,6 +74,7 @@ WRONG = [
         {"sensors": {"dvs": {"kind": "event_camera", "sampling_rate_hz": 500, "packet_rate_hz": 30}}},
         ["sensors.dvs", "packet_rate_hz must divide", "500", "30"],
     ),
+    ({"path": {"kind": "tour", "clearance_m": 0.2}}, ["path.clearance_m", "collision_radius_m = 0.2"]),
     ({"sensors": {"a b": {"kind": "rgb"}}}, ["sensors", "a b"]),
     ({"sensors": {"collision": {"kind": "rgb"}}}, ["sensors", "collision", "taken"]),
     ({"sensors": {"x": {"kind": "sonar"}}}, ["sensors.x.kind", "sonar", "event_camera"]),

@@ -33,9 +33,9 @@ class EventSensorConfig(CameraConfig):
     kind: Literal["event_camera"] = "event_camera"
     pixel: EventCameraConfig = EventCameraConfig()
     """The law of its pixels."""
-    sampling_rate_hz: RateHz = 250.0
+    sampling_rate_hz: RateHz = 240.0
     """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
-    packet_rate_hz: RateHz = 125.0
+    packet_rate_hz: RateHz = 120.0
     """How many packets of events are sent a second [Hz]; the events in them are those of the whole window."""
 
     @model_validator(mode="after")

@@ -1,0 +1,62 @@
+"""Which cameras share a cast, and which must not."""
+
+from __future__ import annotations
+
+import pytest
+
+from neurosim_core.clock import Rate
+from neurosim_core.config import load_config
+from neurosim_core.sensors.rig import plan_casts
+
+LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
+OTHER = {"width": 32, "height": 24, "horizontal_fov_rad": 1.0}
+EVENTS = {"kind": "event_camera", "lens": LENS, "sampling_rate_hz": 240, "packet_rate_hz": 120}
+
+
+def casts(sensors):
+    return plan_casts(load_config({"sensors": sensors}).sensors)
+
+
+def test_one_ray_answers_all_cameras_that_share_pose_lens_and_clock():
+    (cast,) = casts(
+        {
+            "rgb": {"kind": "rgb", "lens": LENS, "rate_hz": 20},
+            "events": EVENTS,
+            "depth": {"kind": "depth", "lens": LENS, "rate_hz": 30},
+        }
+    )
+    assert cast.rate == Rate(240.0)
+    assert cast.event_cameras == ("events",)
+    assert set(cast.image_cameras) == {"rgb", "depth"}
+    assert cast.outputs == {"log_radiance", "rgb", "depth"}
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"kind": "rgb", "lens": OTHER, "rate_hz": 20},
+        {"kind": "rgb", "lens": LENS, "mount": {"position_m": [0, 0, 1]}, "rate_hz": 20},
+        {"kind": "rgb", "lens": LENS, "rate_hz": 25},  # 240 / 25 is no integer
+        {**EVENTS, "sampling_rate_hz": 480},
+    ],
+    ids=["lens", "mount", "clock", "event clock"],
+)
+def test_cameras_that_differ_have_casts_of_their_own(camera):
+    both = casts({"events": EVENTS, "other": camera})
+    assert len(both) == 2
+    assert both[0].outputs == {"log_radiance"}
+
+
+def test_two_event_cameras_with_other_pixels_share_a_cast():
+    (cast,) = casts({"a": EVENTS, "b": {**EVENTS, "pixel": {"threshold_on": 0.4}}})
+    assert cast.event_cameras == ("a", "b")
+
+
+def test_slow_image_cameras_join_fast_ones():
+    (cast,) = casts({"slow": {"kind": "rgb", "lens": LENS, "rate_hz": 10},
+                     "fast": {"kind": "depth", "lens": LENS, "rate_hz": 30}})  # fmt: skip
+    assert cast.rate == Rate(30.0)
+
+
+def test_sensors_that_need_no_picture_need_no_cast():
+    assert casts({"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}}) == ()

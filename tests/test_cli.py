@@ -1,0 +1,149 @@
+"""The command line: what it leaves, what it says, and how it fails."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from neurosim_core.config import load_config
+from neurosim_core.flight import new_folder
+from neurosim_core.packets import Events
+from neurosim_core.record import Flight
+
+LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
+SETTINGS = {
+    "duration_s": 0.3,
+    "scene": {"kind": "apartment", "rooms": 1},
+    "render": {"lighting": {"mode": "unshadowed"}},
+    "sensors": {
+        "events": {"kind": "event_camera", "lens": LENS},
+        "rgb": {"kind": "rgb", "lens": LENS},
+        "depth": {"kind": "depth", "lens": LENS},
+        "imu": {"kind": "imu"},
+        "odometry": {"kind": "odometry"},
+    },
+}
+
+
+def neurosim(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "neurosim_core", *arguments],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=300,
+    )
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("flown")
+    (folder / "scene.yaml").write_text(yaml.safe_dump(SETTINGS))
+    done = neurosim("run", "scene.yaml", "--out", "flight", "--seed", "3", "--device", "cpu", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "flight", done.stdout
+
+
+def test_run_leaves_a_flight_that_can_be_read_back(flown):
+    folder, _ = flown
+    assert {p.name for p in folder.iterdir()} == {"config.yaml", "flight.h5", "flight.rrd", "overview.png"}
+    config = load_config(folder / "config.yaml")
+    assert (config.duration_s, config.seed) == (0.3, 3)
+    with Flight(folder / "flight.h5") as flight:
+        packets = list(flight.packets())
+    assert {p.sensor for p in packets} == set(SETTINGS["sensors"])
+    assert sum(p.sensor == "rgb" for p in packets) == 7
+    assert packets[-1].stamp_ns == 300_000_000
+    assert load_config(yaml.safe_load(flight.header.config_yaml)) == config
+
+
+def test_the_report_says_what_was_flown(flown):
+    folder, said = flown
+    with Flight(folder / "flight.h5") as flight:
+        events = sum(len(p) for p in flight.packets() if isinstance(p, Events))
+    for part in (
+        "real-time factor",
+        "collisions",
+        "none",
+        "compiled dynamics",
+        "motor_lag",
+        "time went to",
+        f"{events:,}",
+    ):
+        assert part in said
+
+
+def test_the_overview_is_a_picture(flown):
+    folder, _ = flown
+    picture = np.asarray(Image.open(folder / "overview.png").convert("RGB"))
+    assert picture.shape == (900, 1600, 3)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000
+
+
+def test_a_recording_gives_back_what_the_run_yields(flown):
+    """The file holds the packets of the same run in this process, byte for byte."""
+    import neurosim_core as ns
+
+    folder, _ = flown
+    with Flight(folder / "flight.h5") as flight:
+        for read, made in zip(flight.packets(), ns.run(folder / "config.yaml"), strict=True):
+            assert type(read) is type(made)
+            for name, value in vars(made).items():
+                np.testing.assert_array_equal(getattr(read, name), value, err_msg=name)
+
+
+def test_a_rerun_file_can_be_made_from_the_recording(flown, tmp_path):
+    folder, _ = flown
+    done = neurosim("view", str(folder), "--save", str(tmp_path / "again.rrd"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "again.rrd").stat().st_size > 100_000
+
+
+def test_a_flight_is_not_overwritten_unasked(flown):
+    folder, _ = flown
+    done = neurosim("run", "--out", str(folder))
+    assert done.returncode == 1
+    assert "--overwrite" in done.stderr
+
+
+def test_folders_are_numbered_when_none_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for expected in ("flight", "flight-2", "flight-3"):
+        folder = new_folder(None)
+        assert folder == Path(expected)
+        folder.mkdir()
+
+
+def test_printed_settings_are_settings(tmp_path):
+    done = neurosim("run", "--print-config", "--set", "scene.seed=3", "--duration", "2")
+    assert done.returncode == 0, done.stderr
+    file = tmp_path / "scene.yaml"
+    file.write_text(done.stdout)
+    assert load_config(file) == load_config({"scene": {"seed": 3}, "duration_s": 2.0})
+    assert sum(line.lstrip().startswith("#") for line in done.stdout.splitlines()) > 50
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "nothing.yaml"], "nothing.yaml"),
+        (["run", "--set", "scene.romms=3"], "did you mean 'rooms'"),
+        (["run", "--set", "duration_s"], "KEY=VALUE"),
+        (["run", "--device", "cuda:77"], "cuda:77"),
+        (["run", "--set", "scene={kind: mesh, file: nothing.glb}"], "nothing.glb"),
+        (["scene", "nothing.glb"], "nothing.glb"),
+        (["view", "nowhere"], "no flight at"),
+    ],
+)
+def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path):
+    done = neurosim(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
