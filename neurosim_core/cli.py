@@ -39,7 +39,7 @@ def _start_warp() -> None:
     """
     import warp as wp
 
-    wp.config.log_level = wp.LOG_WARNING  # type: ignore[attr-defined]
+    wp.config.log_level = wp.LOG_WARNING
     sys.stderr.flush()
     stderr = os.dup(2)
     with tempfile.TemporaryFile() as held:

@@ -1,0 +1,91 @@
+"""Every command and example of the README runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BIN = Path(sys.executable).parent
+
+
+def named(kind: str, language: str) -> dict[str, str]:
+    pattern = rf"<!-- {kind}: (\w+) -->\s*```{language}\n(.*?)```"
+    return dict(re.findall(pattern, README, flags=re.DOTALL))
+
+
+def shell(command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(BIN), os.environ["PATH"]])
+    return subprocess.run(
+        ["bash", "-c", command],
+        cwd=cwd,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= 150
+
+
+def test_ci_runs_the_test_command():
+    spec = importlib.util.spec_from_file_location("readme_command", ROOT / ".ci" / "readme_command.py")
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    commands = module.readme_commands()
+    assert set(commands) == {"run", "tests"}
+    assert all(c.startswith("python3 -m venv .venv && .venv/bin/pip install -e") for c in commands.values())
+    assert "readme_command.py tests" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_the_run_command(tmp_path):
+    """The last part of the command, as it stands; what is before it has installed this environment."""
+    command = named("command", "bash")["run"].rsplit("&&", 1)[-1].strip()
+    assert command == ".venv/bin/neurosim run"
+    done = shell("neurosim run", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in (tmp_path / "flight").iterdir()} == {
+        "config.yaml", "flight.h5", "flight.rrd", "overview.png"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(named("example", "python")))
+def test_examples(name, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", named("example", "python")[name]],
+        cwd=tmp_path, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    count = int(done.stdout.splitlines()[-1].split()[0])  # Warp tells of itself before
+    assert count == 5 * 64 * 48 if name == "parts" else count > 1000
+
+
+def test_the_other_commands(house, tmp_path):
+    """The list under "What else there is", shortened where a flight would take long."""
+    listed = re.findall(r"^(neurosim [^#\n]*?)\s*#", README, flags=re.MULTILINE)
+    assert len(listed) == 6
+    small = (
+        " --duration 0.05 --set sensors.events.kind=event_camera"
+        " --set 'sensors.events.lens={width: 32, height: 24, horizontal_fov_rad: 1.5}'"
+    )
+    (tmp_path / "house.glb").symlink_to(house)
+    for command in sorted(listed, key=lambda c: "print-config" not in c):  # makes scene.yaml first
+        if command.startswith("neurosim run") and "print-config" not in command:
+            command += small
+        elif "view" in command:
+            shell(f"neurosim run{small} --out flight", tmp_path)
+            command += " --save again.rrd"
+        elif "bench" in command:
+            command += " --width 64 --height 48 --steps 32"
+        done = shell(command, tmp_path)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
