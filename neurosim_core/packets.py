@@ -38,8 +38,9 @@ class EventArrays(NamedTuple):
 class Events(Packet):
     """The events of one window of time, sorted by (t, y, x, polarity).
 
-    The window is the half-open interval (`start_ns`, `stamp_ns`]. Arrays have shape [n]: NumPy arrays
-    on a CPU device and Warp arrays on a CUDA device (`numpy()` gives NumPy arrays in both cases).
+    The window is the half-open interval (`start_ns`, `stamp_ns`]. Arrays have shape [n]. A run yields NumPy
+    arrays; an `EventCamera` alone yields Warp arrays on a CUDA device, unless told otherwise. `numpy()` gives
+    NumPy arrays in all cases.
     """
 
     t: Any

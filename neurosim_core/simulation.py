@@ -4,12 +4,17 @@
 A run is cut into batches (`schedule.py`). Within a batch the vehicle is integrated from boundary to boundary,
 and its states stay on the device. Then every cast renders all its instants in one launch, every event camera
 scans them in one launch, and everything is read back once.
+
+On a CUDA device `run_model` launches the next batch before it reads one back, so the device always has work.
+Each batch under way has a lane: slots of the trace and buffers of the casts that no other batch writes to.
+What was launched beyond the end of a run is never read.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -18,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig, load_config
@@ -32,6 +37,7 @@ from neurosim_core.scene.scene import Scene
 from neurosim_core.schedule import Boundary, Schedule, batch_end_ns, boundaries, boundary_count_max
 from neurosim_core.sensors.cast import (
     CastState,
+    Instants,
     flush_events,
     make_cast_state,
     read_events,
@@ -41,12 +47,15 @@ from neurosim_core.sensors.cast import (
 )
 from neurosim_core.sensors.imu import Imu
 from neurosim_core.sensors.rig import Cast, ImuSensorConfig, OdometrySensorConfig, plan_casts
-from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace
+from neurosim_core.streams import Graphs, HostCopy, Milestone, make_stream, on
+from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace, TraceRows
 from neurosim_core.trajectory import Path, make_path
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig
 
 COLLISION = "collision"
 """Name under which collisions are reported."""
+
+_LANES_ON_CUDA = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,6 +91,28 @@ class Model:
         return to_ns(self.config.duration_s)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImuChannel:
+    """An IMU and its samples on the host; its slots are those of the trace."""
+
+    imu: Imu
+    specific_force: HostCopy
+    angular_rate: HostCopy
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Batch:
+    """A stretch of a run that was launched and has not been read."""
+
+    boundaries: Sequence[Boundary]
+    step_count: int
+    """Steps of the integration."""
+    command_count: int
+    slot: int
+    """Slot of the first boundary in the trace."""
+    seen: Sequence[tuple[CastState, Instants]]
+
+
 @dataclass(kw_only=True, eq=False)
 class State:
     """What changes during a run."""
@@ -90,8 +121,26 @@ class State:
     controller: Controller
     trace: Trace
     casts: list[CastState]
-    imus: dict[str, Imu]
+    imus: dict[str, ImuChannel]
+    lanes: Sequence[Milestone]
+    """For each batch that may be under way, the point where the device has finished it."""
+    flight_stream: wp.Stream | None
+    """Where the vehicle moves, ahead of the renderers."""
+    render_stream: wp.Stream | None
+    event_stream: wp.Stream | None
+    """Where events are found, while the next batch is rendered."""
+    flown: Milestone
+    """End of the batch launched last on `flight_stream`."""
+    rendered: Milestone
+    """End of the batch launched last on `render_stream`."""
+    graphs: Graphs
     stamp_ns: int = 0
+    """How far packets have been returned [ns]."""
+    launched_ns: int = 0
+    """How far the device has been told to go [ns]."""
+    launched_count: int = 0
+    """Batches launched so far."""
+    under_way: deque[Batch] = field(default_factory=deque)
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
     """The vehicle touched the scene at the last boundary."""
@@ -165,9 +214,18 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
     )
 
 
-def make_state(model: Model) -> State:
-    """Allocate everything a run needs, with the vehicle at rest at the start of the path."""
+def make_state(model: Model, *, lane_count: int | None = None) -> State:
+    """Allocate everything a run needs, with the vehicle at rest at the start of the path.
+
+    Args:
+        model: What does not change.
+        lane_count: How many batches `run_model` keeps under way. By default 2 on a CUDA device, and 1 where a
+            launch returns when it has finished. It changes no packet.
+    """
     config, device = model.config, model.device
+    if lane_count is None:
+        ahead = wp.get_device(device).is_cuda and config.render.backend == "warp"
+        lane_count = _LANES_ON_CUDA if ahead else 1
     vehicle = Multirotor(model.airframe, count=1, device=device, max_step_ns=to_ns(config.vehicle.max_step_s))
     start = model.path.evaluate([0])
     half_yaw = 0.5 * start.yaw[0]
@@ -176,14 +234,19 @@ def make_state(model: Model) -> State:
         velocity=start.velocity,
         orientation=[[0.0, 0.0, np.sin(half_yaw), np.cos(half_yaw)]],
     )
-    capacity = boundary_count_max(model.schedule)
+    slot_count = lane_count * boundary_count_max(model.schedule)
+    imus = {
+        name: Imu(sensor, vehicle, seed=config.seed, name=name, slot_count=slot_count)
+        for name, sensor in config.sensors.items()
+        if isinstance(sensor, ImuSensorConfig)
+    }
     return State(
         vehicle=vehicle,
         controller=make_controller(
             "path", model.airframe, config.control.gains, device=device, paths=model.path
         ),
         trace=Trace(
-            capacity=capacity,
+            capacity=slot_count,
             vehicle_count=1,
             rotor_count=model.airframe.rotor_count,
             device=device,
@@ -194,16 +257,27 @@ def make_state(model: Model) -> State:
                 config.sensors,
                 model.scene_on_device,
                 capacity=config.instants_per_launch,
+                lane_count=lane_count,
                 device=device,
             )
             for cast in model.casts
             if model.scene_on_device is not None
         ],
         imus={
-            name: Imu(sensor, vehicle, seed=config.seed, name=name, slot_count=capacity)
-            for name, sensor in config.sensors.items()
-            if isinstance(sensor, ImuSensorConfig)
+            name: ImuChannel(
+                imu=imu,
+                specific_force=HostCopy(imu.specific_force),
+                angular_rate=HostCopy(imu.angular_rate),
+            )
+            for name, imu in imus.items()
         },
+        lanes=[Milestone(device) for _ in range(lane_count)],
+        flight_stream=make_stream(device, urgent=True),
+        render_stream=make_stream(device),
+        event_stream=make_stream(device, urgent=True),
+        flown=Milestone(device),
+        rendered=Milestone(device),
+        graphs=Graphs(device),
     )
 
 
@@ -221,11 +295,18 @@ def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = N
 
 
 def run_model(model: Model, state: State) -> Iterator[Packet]:
-    """Yield every packet from the state's present stamp to the end of the run; see `run`."""
+    """Yield every packet from the state's present stamp to the end of the run; see `run`.
+
+    Where the state has several lanes, the vehicle is up to as many batches ahead of the packets.
+    """
     if state.stamp_ns == 0:
         yield from start(model, state)
-    while state.stamp_ns < model.duration_ns and not state.ended:
-        yield from advance(model, state, batch_end_ns(model.schedule, state.stamp_ns, model.duration_ns))
+    while not state.ended:
+        while len(state.under_way) < len(state.lanes) and state.launched_ns < model.duration_ns:
+            launch(model, state, batch_end_ns(model.schedule, state.launched_ns, model.duration_ns))
+        if not state.under_way:
+            break
+        yield from read(model, state)
         if state.failure is not None:
             raise state.failure
     yield from finish(state)
@@ -266,8 +347,8 @@ def start(model: Model, state: State) -> list[Packet]:
         samplers=tuple(range(len(model.schedule.samplers))),
         casts=tuple(range(len(model.casts))),
     )
-    _pass(model, state, everything, slot=0, closed_loop=True)
-    return _observe(model, state, [everything])
+    _launch(model, state, [everything], closed_loop=True)
+    return read(model, state)
 
 
 def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> list[Packet]:
@@ -279,16 +360,61 @@ def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True
             (`failure`).
         end_ns: End of the batch [ns], after the state's stamp.
         closed_loop: Let the path controller command; otherwise the last command is held.
+
+    Raises:
+        RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.
     """
-    batch = boundaries(model.schedule, state.stamp_ns, end_ns)
-    with timed(state.wall_s, "dynamics and control"):
-        for slot, boundary in enumerate(batch):
-            elapsed_ns = boundary.stamp_ns - state.stamp_ns
-            state.vehicle.advance(elapsed_ns)
-            state.counts["steps"] += -(-elapsed_ns // state.vehicle.max_step_ns)
-            state.stamp_ns = boundary.stamp_ns
-            _pass(model, state, boundary, slot=slot, closed_loop=closed_loop)
-    return _observe(model, state, batch)
+    if state.under_way:
+        raise RuntimeError("run_model() was broken off with batches under way: only it can go on")
+    launch(model, state, end_ns, closed_loop=closed_loop)
+    return read(model, state)
+
+
+def launch(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> None:
+    """Launch one batch, at most to what `batch_end_ns` gives, without waiting for a CUDA device.
+
+    Args:
+        model: What does not change.
+        state: A lane is free in it.
+        end_ns: End of the batch [ns], after what was launched before.
+        closed_loop: Let the path controller command; otherwise the last command is held.
+    """
+    _launch(model, state, boundaries(model.schedule, state.launched_ns, end_ns), closed_loop=closed_loop)
+
+
+def read(model: Model, state: State) -> list[Packet]:
+    """Wait for the oldest batch under way and return what the sensors yield in it, in the order of time.
+
+    Args:
+        model: What does not change.
+        state: `stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or
+            the integration failed (`failure`).
+    """
+    lane = (state.launched_count - len(state.under_way)) % len(state.lanes)
+    batch = state.under_way.popleft()
+    with timed(state.wall_s, "read-back"):
+        state.lanes[lane].wait()
+        rows = state.trace.numpy(batch.slot, len(batch.boundaries))
+    state.stamp_ns = batch.boundaries[-1].stamp_ns
+    state.counts["steps"] += batch.step_count
+    state.counts["commands"] += batch.command_count
+    state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
+    if rows.status[-1].any():
+        state.failure = _failure(state.vehicle)
+        state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
+    with timed(state.wall_s, "collision check"):
+        packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
+    with timed(state.wall_s, "events"):
+        for cast, instants in batch.seen:
+            packets += read_events(cast, instants, until_ns=state.stamp_ns)
+        state.counts["events dropped"] += sum(p.dropped_count for p in packets if isinstance(p, Events))
+    with timed(state.wall_s, "read-back"):
+        for cast, instants in batch.seen:
+            packets += read_images(cast, instants)
+        packets += _read_samplers(model, state, batch, rows)
+    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
+    kept = [packet for packet in packets if packet.stamp_ns <= state.stamp_ns]
+    return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))
 
 
 def finish(state: State) -> list[Packet]:
@@ -296,61 +422,95 @@ def finish(state: State) -> list[Packet]:
     return [packet for cast in state.casts for packet in flush_events(cast, until_ns=state.stamp_ns)]
 
 
-def _pass(model: Model, state: State, boundary: Boundary, *, slot: int, closed_loop: bool) -> None:
-    """Do what is due at a boundary, on the device only."""
-    state.trace.record(state.vehicle.arrays, slot)
-    for index in boundary.samplers:
-        if (imu := state.imus.get(model.samplers[index])) is not None:
-            imu.measure(slot)
-    if closed_loop and boundary.control:
-        state.controller.update(state.vehicle.arrays)
-        state.counts["commands"] += 1
-
-
-def _observe(model: Model, state: State, batch: Sequence[Boundary]) -> list[Packet]:
-    """Render and scan what the batch has seen, read everything back, and return it in the order of time."""
-    seeing = []
-    with timed(state.wall_s, "render"):
+def _launch(model: Model, state: State, batch: Sequence[Boundary], *, closed_loop: bool) -> None:
+    """Fly a batch, let the cameras see it, and launch the copies to the host."""
+    lane = state.launched_count % len(state.lanes)
+    slot = lane * (state.trace.states.shape[0] // len(state.lanes))
+    stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in batch)]
+    elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
+    with timed(state.wall_s, "dynamics and control"), on(state.flight_stream):
+        pattern = tuple(
+            (span, boundary.control, boundary.samplers)
+            for span, boundary in zip(elapsed_ns, batch, strict=True)
+        )
+        state.graphs.run(
+            (slot, closed_loop, pattern),
+            lambda: _fly(model, state, batch, elapsed_ns, slot=slot, closed_loop=closed_loop),
+        )
+        state.flown.set()
+    seen = []
+    with timed(state.wall_s, "render"), on(state.render_stream):
+        state.flown.hold()
         for index, cast in enumerate(state.casts):
-            slots = [slot for slot, boundary in enumerate(batch) if index in boundary.casts]
-            if slots:
-                render_instants(cast, state.trace, slots, [batch[slot].stamp_ns for slot in slots])
-                seeing.append(cast)
-                state.counts["renders"] += len(slots)
-    with timed(state.wall_s, "events"):
-        for cast in seeing:
-            scan_events(cast)
-    with timed(state.wall_s, "read-back"):
-        states = state.trace.numpy(len(batch))[:, 0]
-        try:
-            state.vehicle.check()
-        except DynamicsError as error:
-            state.failure = error
-            state.stamp_ns = min(state.stamp_ns, error.stamp_ns)
-    with timed(state.wall_s, "collision check"):
-        packets = _collide(model, state, batch, states)  # may end the run before the end of the batch
-    with timed(state.wall_s, "events"):
-        for cast in seeing:
-            packets += read_events(cast, until_ns=state.stamp_ns)
-        state.counts["events dropped"] += sum(p.dropped_count for p in packets if isinstance(p, Events))
-    with timed(state.wall_s, "read-back"):
-        for cast in seeing:
-            packets += read_images(cast)
-        packets += _read_samplers(model, state, batch, states)
-    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
-    kept = [packet for packet in packets if packet.stamp_ns <= state.stamp_ns]
-    return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))
+            due = [place for place, boundary in enumerate(batch) if index in boundary.casts]
+            if due:
+                stamps_ns = [batch[place].stamp_ns for place in due]
+                slots = [slot + place for place in due]
+                seen.append((cast, render_instants(cast, state.trace, slots, stamps_ns, lane=lane)))
+        state.rendered.set()
+    with timed(state.wall_s, "events"), on(state.event_stream):
+        state.rendered.hold()
+        for cast, instants in seen:
+            scan_events(cast, instants)
+        state.lanes[lane].set()
+    state.under_way.append(
+        Batch(
+            boundaries=batch,
+            step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
+            command_count=sum(closed_loop and boundary.control for boundary in batch),
+            slot=slot,
+            seen=seen,
+        )
+    )
+    state.launched_count += 1
+    state.launched_ns = batch[-1].stamp_ns
 
 
-def _read_samplers(
-    model: Model, state: State, batch: Sequence[Boundary], states: NDArray[np.float64]
-) -> list[Packet]:
+def _fly(
+    model: Model,
+    state: State,
+    batch: Sequence[Boundary],
+    elapsed_ns: Sequence[int],
+    *,
+    slot: int,
+    closed_loop: bool,
+) -> None:
+    """Move the vehicle from boundary to boundary and do what is due there, on the device only."""
+    for place, (boundary, span_ns) in enumerate(zip(batch, elapsed_ns, strict=True), slot):
+        if span_ns > 0:
+            state.vehicle.advance(span_ns)
+        state.trace.record(state.vehicle.arrays, place)
+        for index in boundary.samplers:
+            if (channel := state.imus.get(model.samplers[index])) is not None:
+                channel.imu.measure(place)
+        if closed_loop and boundary.control:
+            state.controller.update(state.vehicle.arrays)
+    state.trace.check_room(
+        model.free_space.arrays, slot, len(batch), radius_m=model.config.vehicle.collision_radius_m
+    )
+    state.trace.fetch(slot, len(batch))
+    for channel in state.imus.values():
+        channel.specific_force.fetch(slot, len(batch))
+        channel.angular_rate.fetch(slot, len(batch))
+
+
+def _failure(vehicle: Multirotor) -> DynamicsError:
+    """Return why a vehicle is held."""
+    try:
+        vehicle.check()
+    except DynamicsError as error:
+        return error
+    raise AssertionError("the status of a vehicle that is held does not change")
+
+
+def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
     packets: list[Packet] = []
     for index, name in enumerate(model.samplers):
         imu = state.imus.get(name)
         if imu is not None:
-            specific_force, angular_rate = imu.specific_force.numpy()[:, 0], imu.angular_rate.numpy()[:, 0]
-        for slot, boundary in enumerate(batch):
+            specific_force = imu.specific_force.rows(batch.slot, len(batch.boundaries))[:, 0]
+            angular_rate = imu.angular_rate.rows(batch.slot, len(batch.boundaries))[:, 0]
+        for place, boundary in enumerate(batch.boundaries):
             if index not in boundary.samplers:
                 continue
             header: dict[str, Any] = {
@@ -363,12 +523,12 @@ def _read_samplers(
                 packets.append(
                     ImuSample(
                         **header,
-                        specific_force=np.array(specific_force[slot]),
-                        angular_rate=np.array(angular_rate[slot]),
+                        specific_force=specific_force[place],
+                        angular_rate=angular_rate[place],
                     )
                 )
             else:
-                row = states[slot]
+                row = rows.states[place, 0]
                 packets.append(
                     Odometry(
                         **header,
@@ -382,14 +542,14 @@ def _read_samplers(
     return packets
 
 
-def _collide(
-    model: Model, state: State, batch: Sequence[Boundary], states: NDArray[np.float64]
-) -> list[Packet]:
+def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
     """Report each beginning of a touch; end the run at the first one if so configured."""
-    radius_m = model.config.vehicle.collision_radius_m
-    margins_m = model.free_space.clearance(states[:, POSITION]) - radius_m
+    states, bounds_m = rows.states[:, 0], model.free_space.bounds_m
+    positions = states[:, POSITION]
+    to_bounds_m = np.minimum(positions - bounds_m[0], bounds_m[1] - positions).min(axis=1)
+    margins_m = np.minimum(rows.clearance, to_bounds_m - model.config.vehicle.collision_radius_m)
     packets: list[Packet] = []
-    for boundary, row, margin_m in zip(batch, states, margins_m, strict=True):
+    for boundary, row, margin_m in zip(batch.boundaries, states, margins_m, strict=True):
         touching = bool(margin_m <= 0.0)
         if touching and not state.touching:
             packets.append(

@@ -1,11 +1,14 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type"
-"""The states of the vehicles at the boundaries of one batch, on the device until the batch is read back."""
+"""The states of the vehicles at the boundaries of batches, on the device until a batch is read back."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+
+from neurosim_core.scene.freespace import DistanceField, check_collision
+from neurosim_core.streams import HostCopy
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,9 +28,11 @@ def _record_state(
     velocity: wp.array[wp.vec3d],
     body_rate: wp.array[wp.vec3d],
     rotor_speed: wp.array2d[wp.float64],
+    status: wp.array[wp.int32],
     slot: int,
     # Out:
     states_out: wp.array3d[wp.float64],
+    status_out: wp.array2d[wp.int32],
 ) -> None:
     vehicle = wp.tid()
     for axis in range(3):
@@ -38,6 +43,7 @@ def _record_state(
         states_out[slot, vehicle, 3 + part] = orientation[vehicle][part]
     for rotor in range(rotor_speed.shape[1]):
         states_out[slot, vehicle, 13 + rotor] = rotor_speed[vehicle, rotor]
+    status_out[slot, vehicle] = status[vehicle]
 
 
 @wp.kernel
@@ -65,14 +71,34 @@ def _camera_poses(
     q_WC_out[instant] = wp.quat(q_WC)
 
 
+class TraceRows(NamedTuple):
+    """Slots of a `Trace` on the host."""
+
+    states: NDArray[np.float64]
+    """Shape [slot, vehicle, 13 + R]."""
+    status: NDArray[np.int32]
+    """Shape [slot, vehicle]."""
+    clearance: NDArray[np.float32]
+    """[m], shape [slot]."""
+
+
 class Trace:
-    """A device buffer of vehicle states, one slot for each boundary of a batch."""
+    """Device buffers with one slot for each boundary of the batches under way, and their copies on the host.
+
+    Attributes:
+        states: States, float64, shape [slot, vehicle, 13 + R].
+        status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, vehicle].
+        clearance: Room around vehicle 0 as of the last `check_room` [m], float32, shape [slot].
+    """
 
     def __init__(self, *, capacity: int, vehicle_count: int, rotor_count: int, device: str) -> None:
         self.states = wp.zeros((capacity, vehicle_count, 13 + rotor_count), dtype=wp.float64, device=device)
+        self.status = wp.zeros((capacity, vehicle_count), dtype=wp.int32, device=device)
+        self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
+        self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance)]
 
     def record(self, arrays: Any, slot: int) -> None:
-        """Copy the present state of all vehicles into a slot.
+        """Copy the present state and status of all vehicles into a slot.
 
         Args:
             arrays: Device arrays of the vehicles (`Multirotor.arrays`).
@@ -87,11 +113,31 @@ class Trace:
                 arrays.velocity,
                 arrays.body_rate,
                 arrays.rotor_speed,
+                arrays.status,
                 slot,
             ],
-            outputs=[self.states],
+            outputs=[self.states, self.status],
             device=self.states.device,
         )
+
+    def check_room(self, field: DistanceField, first: int, count: int, *, radius_m: float) -> None:
+        """Write how much room vehicle 0 has in some slots to `clearance`; see `freespace.check_collision`.
+
+        Args:
+            field: Of the scene.
+            first: First slot.
+            count: Number of slots, at least one.
+            radius_m: Of the vehicle [m].
+        """
+        stride = self.states.strides[0]
+        positions: Any = wp.array(
+            ptr=self.states.ptr + first * stride,
+            dtype=wp.vec3d,
+            shape=(count,),
+            strides=(stride,),
+            device=self.states.device,
+        )
+        check_collision(field, positions, self.clearance[first : first + count], radius_m=radius_m)
 
     def camera_poses(
         self,
@@ -123,6 +169,11 @@ class Trace:
             device=self.states.device,
         )
 
-    def numpy(self, count: int) -> NDArray[np.float64]:
-        """Return the first `count` states on the host, shape [count, vehicle, 13 + R]."""
-        return np.array(self.states[:count].numpy())
+    def fetch(self, first: int, count: int) -> None:
+        """Launch the copy of some slots to the host."""
+        for copy in self._copies:
+            copy.fetch(first, count)
+
+    def numpy(self, first: int, count: int) -> TraceRows:
+        """Return some slots that were fetched, and that the device has finished with."""
+        return TraceRows(*(copy.rows(first, count) for copy in self._copies))

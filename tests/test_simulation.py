@@ -59,10 +59,10 @@ def room(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def settings(room: Path) -> dict[str, Any]:
+def settings(room: Path, device: str) -> dict[str, Any]:
     return {
         "duration_s": 0.2,
-        "device": "cpu",
+        "device": device,
         "scene": {
             "kind": "mesh",
             "file": str(room),
@@ -78,6 +78,12 @@ def settings(room: Path) -> dict[str, Any]:
 
 def fly(settings: dict[str, Any], **overrides: Any) -> list[Packet]:
     return list(ns.run({**settings, **overrides}))
+
+
+def fly_ahead(settings: dict[str, Any], lane_count: int, **overrides: Any) -> list[Packet]:
+    """Fly with so many batches under way; on a CPU they are done one after the other, but read as late."""
+    model = simulation.make_model(ns.load_config({**settings, **overrides}))
+    return list(simulation.run_model(model, simulation.make_state(model, lane_count=lane_count)))
 
 
 def of(packets: list[Packet], sensor: str) -> list[Any]:
@@ -110,6 +116,37 @@ def test_two_runs_give_the_same_bytes(settings):
 @pytest.mark.parametrize("instants", [1, 3, 64])
 def test_packets_do_not_depend_on_the_size_of_a_launch(settings, instants):
     assert content(fly(settings, instants_per_launch=instants)) == content(fly(settings))
+
+
+@pytest.mark.parametrize("lane_count", [1, 2, 3])
+@pytest.mark.parametrize("instants", [4, 64])
+def test_packets_do_not_depend_on_the_batches_under_way(settings, lane_count, instants):
+    """Also where events are many: the buffers for them grow, and scans are done again."""
+    events = {**SENSORS["events"], "pixel": {"threshold_on": 0.01, "threshold_off": 0.01}}
+    settings = {**settings, "sensors": {**SENSORS, "events": events}}
+    ahead = fly_ahead(settings, lane_count, instants_per_launch=instants)
+    assert content(ahead) == content(fly(settings))
+
+
+def test_a_run_that_was_broken_off_can_go_on(settings):
+    """What was under way is not lost, and nothing but `run_model` may follow."""
+    model = simulation.make_model(ns.load_config({**settings, "instants_per_launch": 8}))
+    state = simulation.make_state(model, lane_count=3)
+    packets: list[Packet] = []
+    for packet in simulation.run_model(model, state):
+        packets.append(packet)
+        if packet.stamp_ns == state.stamp_ns == 80_000_000:
+            break
+    with pytest.raises(RuntimeError, match="broken off"):
+        simulation.advance(model, state, 96_000_000)
+    last = packets[-1]
+    packets += simulation.run_model(model, state)
+
+    def others(packets: list[Packet]) -> list[Packet]:
+        """Without those of the stamp where it broke off: it had another, which nobody took."""
+        return [packet for packet in packets if packet.stamp_ns != last.stamp_ns]
+
+    assert content(others(packets)) == content(others(fly(settings)))
 
 
 def test_a_sensor_does_not_change_the_others(settings):
@@ -186,7 +223,10 @@ def test_a_collision_ends_the_run_or_is_reported(settings):
 
 def test_where_a_collision_ends_does_not_depend_on_the_size_of_a_launch(settings):
     settings = {**settings, "path": THROUGH_THE_WALL, "duration_s": 1.5}
-    assert content(fly(settings, instants_per_launch=5)) == content(fly(settings))
+    ended = content(fly(settings))
+    assert content(fly(settings, instants_per_launch=5)) == ended
+    for lane_count in (1, 3):
+        assert content(fly_ahead(settings, lane_count, instants_per_launch=5)) == ended
 
 
 def test_an_outside_controller_flies_the_same(settings):
@@ -215,6 +255,25 @@ def test_a_vehicle_that_cannot_be_integrated_is_an_error(settings):
     packets += simulation.advance(model, state, 80_000_000)
     assert isinstance(state.failure, DynamicsError)
     assert max(p.stamp_ns for p in packets) <= state.failure.stamp_ns == state.stamp_ns
+
+
+@pytest.mark.parametrize("lane_count", [1, 3])
+def test_a_failure_comes_after_the_packets_before_it(settings, lane_count):
+    """It is raised where its batch is read, though later ones were launched."""
+    sensors = {"odometry": SENSORS["odometry"], "events": SENSORS["events"]}
+    model = simulation.make_model(ns.load_config({**settings, "instants_per_launch": 8, "sensors": sensors}))
+    state = simulation.make_state(model, lane_count=lane_count)
+    packets = simulation.start(model, state)
+    for end_ns in (16_000_000, 32_000_000):
+        packets += simulation.advance(model, state, end_ns)
+    state.vehicle.arrays.body_rate.assign([[1e9, 1e9, 1e9]])
+    with pytest.raises(DynamicsError) as caught:
+        packets.extend(simulation.run_model(model, state))
+    assert caught.value.stamp_ns == 32_000_000
+    assert state.stamp_ns == 32_000_000
+    assert content(packets) == content(
+        [p for p in fly({**settings, "sensors": sensors}) if p.stamp_ns <= 32_000_000]
+    )
 
 
 def test_the_last_packet_of_events_ends_with_the_run(settings):

@@ -9,6 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Mount
+from neurosim_core.scene.freespace import DistanceField
 from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace
 
 
@@ -22,10 +23,15 @@ def test_camera_pose_is_body_pose_times_mount(device):
         velocity=wp.array(rng.normal(size=(1, 3)), dtype=wp.vec3d, device=device),
         body_rate=wp.array(rng.normal(size=(1, 3)), dtype=wp.vec3d, device=device),
         rotor_speed=wp.array(rng.normal(size=(1, 6)), dtype=wp.float64, device=device),
+        status=wp.array([7], dtype=wp.int32, device=device),
     )
     trace = Trace(capacity=3, vehicle_count=1, rotor_count=6, device=device)
     trace.record(arrays, 2)
-    state = trace.numpy(3)[2, 0]
+    trace.fetch(1, 2)
+    wp.synchronize_device(device)
+    rows = trace.numpy(1, 2)
+    assert rows.status.tolist() == [[0], [7]]
+    state = rows.states[1, 0]
     for part, array in (
         (POSITION, arrays.position),
         (ORIENTATION, arrays.orientation),
@@ -64,3 +70,27 @@ def test_optical_frame_looks_forward():
     np.testing.assert_allclose(R_BC, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-15)
     down = Rotation.from_quat(Mount(rpy_rad=(0.0, 0.5, 0.0)).optical_quaternion()).apply([0, 0, 1])
     np.testing.assert_allclose(down, [np.cos(0.5), 0.0, -np.sin(0.5)], atol=1e-15)
+
+
+def test_room_around_the_vehicle(device):
+    """Over a wide floor at z = 0 the room is the height less the radius, for the slots that are asked for."""
+    corners = np.array([[-9, -9, 0], [9, -9, 0], [0, 9, 0]], dtype=np.float32)
+    floor = wp.Mesh(
+        points=wp.array(corners, dtype=wp.vec3, device=device),
+        indices=wp.array([0, 1, 2], dtype=int, device=device),
+    )
+    field = DistanceField()
+    field.mesh = floor.id
+    height_m = np.broadcast_to(0.5 * np.arange(4, dtype=np.float32), (4, 4, 4))
+    field.distance = wp.array(np.ascontiguousarray(height_m), dtype=wp.float32, device=device)
+    field.origin = wp.vec3(-0.75, -0.75, 0.0)
+    field.voxel = 0.5
+    trace = Trace(capacity=4, vehicle_count=2, rotor_count=4, device=device)
+    states = np.zeros((4, 2, 17))
+    states[:, 0, 2] = [9.0, 0.15, 0.6, 9.0]
+    trace.states.assign(states)
+    trace.check_room(field, 1, 2, radius_m=0.2)
+    trace.fetch(0, 4)
+    wp.synchronize_device(device)
+    # float32
+    np.testing.assert_allclose(trace.numpy(0, 4).clearance, [0.0, -0.05, 0.4, 0.0], atol=1e-6)

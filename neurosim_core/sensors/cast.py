@@ -1,4 +1,8 @@
-"""One cast at work: the poses of a batch in, pictures and events out."""
+"""One cast at work: the poses of a batch in, pictures and events out.
+
+Several batches may be under way. Each has a lane, which has its own renderer: what a batch saw stays until it
+has been read.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +19,13 @@ from neurosim_core.packets import Events, Image, ImageEncoding, Packet
 from neurosim_core.render.renderer import Renderer, SceneOnDevice, make_renderer
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig, SensorConfig
+from neurosim_core.streams import HostCopy
 from neurosim_core.trace import Trace
 
 _ENCODING: dict[str, ImageEncoding] = {"rgb": "rgb8", "depth": "32FC1"}
 """Encoding of each output of a renderer."""
+
+_SLOT_LISTS_MAX = 256
 
 
 @dataclass(kw_only=True, eq=False)
@@ -43,25 +50,47 @@ class ImageChannel:
 class CastState:
     """The device buffers of one cast, for batches of at most `capacity` instants."""
 
+    device: str
     capacity: int
     rate: Rate
-    renderer: Renderer
+    renderers: list[Renderer]
+    """One for each lane."""
+    picture_copies: list[dict[str, HostCopy]]
+    """Pictures on the host by output, for each lane."""
     events: dict[str, EventChannel]
     images: dict[str, ImageChannel]
     p_BC: wp.vec3d
     q_BC: wp.quatd
     p_WC: wp.array[wp.vec3]
     q_WC: wp.array[wp.quat]
-    trace_slots: wp.array[int]
-    image_slots: wp.array[int]
-    pictures: list[tuple[int, int, str]] = field(default_factory=list)
-    """Stamp, image slot and camera of the pictures of the present batch."""
-    stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Stamps of the instants of the present batch."""
+    slots: dict[tuple[int, ...], wp.array[int]] = field(default_factory=dict)
+    """Lists of slots on the device: the same few come again and again."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Instants:
+    """What a cast sees in one batch."""
+
+    lane: int
+    stamps_ns: tuple[int, ...]
+    """Stamps of the instants, at least one."""
+    pictures: tuple[tuple[int, int, str], ...]
+    """Stamp, image slot and camera of each picture."""
+
+    @property
+    def picture_slot_count(self) -> int:
+        """Image slots in use."""
+        return max((slot for _, slot, _ in self.pictures), default=-1) + 1
 
 
 def make_cast_state(
-    cast: Cast, sensors: dict[str, SensorConfig], scene: SceneOnDevice, *, capacity: int, device: str
+    cast: Cast,
+    sensors: dict[str, SensorConfig],
+    scene: SceneOnDevice,
+    *,
+    capacity: int,
+    lane_count: int,
+    device: str,
 ) -> CastState:
     """Allocate the buffers of a cast.
 
@@ -70,89 +99,118 @@ def make_cast_state(
         sensors: All sensors of the rig.
         scene: What to look at.
         capacity: The most instants of one batch.
+        lane_count: The most batches under way.
         device: Where to compute.
     """
+    image_sensors = {name: sensors[name] for name in cast.image_cameras}
+    # of n consecutive ticks of the cast, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
+    picture_count = sum(
+        int(capacity * sensor.rate_hz / cast.rate.rate_hz) + 1
+        for sensor in image_sensors.values()
+        if isinstance(sensor, ImageSensorConfig)
+    )
+    renderers = [
+        make_renderer(
+            scene,
+            cast.lens,
+            outputs=cast.outputs,
+            instant_count=capacity,
+            image_count=max(1, min(capacity, picture_count)),
+        )
+        for _ in range(lane_count)
+    ]
     events = {}
     for name in cast.event_cameras:
         sensor = sensors[name]
         assert isinstance(sensor, EventSensorConfig)
         events[name] = EventChannel(
             camera=EventCamera(
-                sensor.pixel, width=cast.lens.width, height=cast.lens.height, device=device, sensor=name
+                sensor.pixel,
+                width=cast.lens.width,
+                height=cast.lens.height,
+                device=device,
+                sensor=name,
+                scan_count_max=lane_count,
+                on_host=True,
             ),
             packets=Rate(sensor.packet_rate_hz),
         )
     images = {}
-    for name in cast.image_cameras:
-        sensor = sensors[name]
+    for name, sensor in image_sensors.items():
         assert isinstance(sensor, ImageSensorConfig)
         images[name] = ImageChannel(output=sensor.kind, rate=Rate(sensor.rate_hz))
-    # of n consecutive ticks of the cast, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
-    picture_count = sum(int(capacity * i.rate.rate_hz / cast.rate.rate_hz) + 1 for i in images.values())
     return CastState(
+        device=device,
         capacity=capacity,
         rate=cast.rate,
-        renderer=make_renderer(
-            scene,
-            cast.lens,
-            outputs=cast.outputs,
-            instant_count=capacity,
-            image_count=max(1, min(capacity, picture_count)),
-        ),
+        renderers=renderers,
+        picture_copies=[
+            {image.output: HostCopy(getattr(renderer, image.output)) for image in images.values()}
+            for renderer in renderers
+        ],
         events=events,
         images=images,
         p_BC=wp.vec3d(*cast.mount.position_m),
         q_BC=wp.quatd(*cast.mount.optical_quaternion()),
         p_WC=wp.zeros(capacity, dtype=wp.vec3, device=device),
         q_WC=wp.zeros(capacity, dtype=wp.quat, device=device),
-        trace_slots=wp.zeros(capacity, dtype=int, device=device),
-        image_slots=wp.zeros(capacity, dtype=int, device=device),
     )
 
 
-def render_instants(cast: CastState, trace: Trace, slots: Sequence[int], stamps_ns: Sequence[int]) -> None:
-    """Render the instants of a batch in one launch.
+def render_instants(
+    cast: CastState, trace: Trace, slots: Sequence[int], stamps_ns: Sequence[int], *, lane: int
+) -> Instants:
+    """Launch the rendering of the instants of a batch, and the copy of its pictures.
 
     Args:
-        cast: Its buffers are overwritten.
+        cast: The lane's buffers are overwritten.
         trace: Where the states of the batch are.
         slots: Slots of the instants in the trace, at least one.
         stamps_ns: Their stamps.
+        lane: Of the batch; the one that had it before has been read.
     """
-    cast.stamps_ns = np.array(stamps_ns, dtype=np.int64)
-    cast.pictures = []
+    pictures = []
     image_slots = []
     used = 0
     for stamp_ns in stamps_ns:
         due = [name for name, image in cast.images.items() if image.rate.has_tick(stamp_ns)]
-        cast.pictures += [(stamp_ns, used, name) for name in due]
+        pictures += [(stamp_ns, used, name) for name in due]
         image_slots.append(used if due else -1)
         used += bool(due)
     count = len(slots)
-    _upload(cast.trace_slots, slots)
-    _upload(cast.image_slots, image_slots)
     trace.camera_poses(
-        cast.trace_slots, count=count, p_BC=cast.p_BC, q_BC=cast.q_BC, p_WC=cast.p_WC, q_WC=cast.q_WC
+        _slots_on_device(cast, slots),
+        count=count,
+        p_BC=cast.p_BC,
+        q_BC=cast.q_BC,
+        p_WC=cast.p_WC,
+        q_WC=cast.q_WC,
     )
-    cast.renderer.render(cast.p_WC, cast.q_WC, cast.image_slots, instant_count=count)
+    cast.renderers[lane].render(
+        cast.p_WC, cast.q_WC, _slots_on_device(cast, image_slots), instant_count=count
+    )
+    for copy in cast.picture_copies[lane].values():
+        copy.fetch(0, used)
+    return Instants(lane=lane, stamps_ns=tuple(stamps_ns), pictures=tuple(pictures))
 
 
-def scan_events(cast: CastState) -> None:
+def scan_events(cast: CastState, instants: Instants) -> None:
     """Let every event camera see the instants just rendered; at stamp 0 they take them as their reference."""
-    log_radiance = cast.renderer.log_radiance
+    log_radiance = cast.renderers[instants.lane].log_radiance
     for channel in cast.events.values():
-        if cast.stamps_ns[0] == 0:
+        if instants.stamps_ns[0] == 0:
             channel.camera.reset(log_radiance[0], stamp_ns=0)
         else:
-            channel.camera.feed_device(log_radiance, cast.stamps_ns)
+            channel.camera.feed_device(log_radiance, instants.stamps_ns)
 
 
-def read_events(cast: CastState, *, until_ns: int) -> list[Events]:
+def read_events(cast: CastState, instants: Instants, *, until_ns: int) -> list[Events]:
     """Return the packets of events whose windows ended in the batch, at most at a stamp."""
     packets: list[Events] = []
     for channel in cast.events.values():
-        stamps = (int(stamp) for stamp in cast.stamps_ns if 0 < stamp <= until_ns)
-        packets += channel.camera.collect_windows([s for s in stamps if channel.packets.has_tick(s)])
+        stamps = (stamp for stamp in instants.stamps_ns if 0 < stamp <= until_ns)
+        ends = [stamp for stamp in stamps if channel.packets.has_tick(stamp)]
+        packets += channel.camera.collect_windows(ends, scan_count=0 if instants.stamps_ns[0] == 0 else 1)
     return packets
 
 
@@ -163,19 +221,19 @@ def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     for channel in cast.events.values():
         begun_ns = channel.packets.stamp_ns(channel.packets.first_tick(end_ns) - 1)
         if 0 <= begun_ns < end_ns and not channel.packets.has_tick(end_ns):
-            packets += channel.camera.collect_windows([end_ns])
+            packets += channel.camera.collect_windows([end_ns], scan_count=0)
     return packets
 
 
-def read_images(cast: CastState) -> list[Packet]:
-    """Return the pictures of the batch, copied to the host."""
+def read_images(cast: CastState, instants: Instants) -> list[Packet]:
+    """Return the pictures of a batch that the device has finished with."""
     read: dict[str, NDArray[Any]] = {}
-    count = max((slot for _, slot, _ in cast.pictures), default=-1) + 1
     packets: list[Packet] = []
-    for stamp_ns, slot, name in cast.pictures:
+    for stamp_ns, slot, name in instants.pictures:
         image = cast.images[name]
         if image.output not in read:
-            read[image.output] = np.array(getattr(cast.renderer, image.output)[:count].numpy())
+            copy = cast.picture_copies[instants.lane][image.output]
+            read[image.output] = copy.rows(0, instants.picture_slot_count)
         packets.append(
             Image(
                 stamp_ns=stamp_ns,
@@ -189,5 +247,11 @@ def read_images(cast: CastState) -> list[Packet]:
     return packets
 
 
-def _upload(array: wp.array[int], values: Sequence[int]) -> None:
-    wp.copy(array, wp.array(np.array(values, dtype=np.int32), dtype=int, device="cpu"), count=len(values))
+def _slots_on_device(cast: CastState, slots: Sequence[int]) -> wp.array[int]:
+    """Return slots as an array that was uploaded before, if the same were."""
+    key = tuple(slots)
+    if key not in cast.slots:
+        if len(cast.slots) >= _SLOT_LISTS_MAX:
+            del cast.slots[next(iter(cast.slots))]
+        cast.slots[key] = wp.array(np.array(key, dtype=np.int32), dtype=int, device=cast.device)
+    return cast.slots[key]

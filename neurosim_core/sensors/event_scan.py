@@ -38,9 +38,9 @@ TILE_SIZE = wp.constant(256)
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
 
-_COUNT = wp.constant(0)
-_WRITE = wp.constant(1)
-_TABLE = wp.constant(2)
+_OPEN = wp.constant(0)
+_PUT = wp.constant(1)
+_CLOSE = wp.constant(2)
 
 _ULP = wp.constant(wp.float64(2.0**-23))
 _LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
@@ -59,8 +59,6 @@ class Pixel:
     """Levels crossed upwards since the reset."""
     down: wp.int32
     """Levels crossed downwards since the reset."""
-    event_count: wp.int32
-    """Events that are kept."""
     invalid_count: wp.int32
     """Samples that are no log radiance; the sample before was held."""
     invalid_first: wp.int32
@@ -69,26 +67,46 @@ class Pixel:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // one global atomic per block; every thread of the block must come here
-    __shared__ unsigned long long block_total;
+    // keys gather in shared memory, and one atomic per block finds their place; what does not fit goes alone
+    constexpr unsigned SIZE = 1536;
+    __shared__ int64_t gathered[SIZE];
+    __shared__ unsigned gathered_count;
     __shared__ unsigned long long block_start;
-    if (threadIdx.x == 0) block_total = 0;
+    unsigned long long* total = (unsigned long long*)counters.data;
+    if (step == 1) {
+        const unsigned place = atomicAdd(&gathered_count, 1u);
+        if (place < SIZE) {
+            gathered[place] = key;
+        } else {
+            const unsigned long long slot = atomicAdd(total, 1ull);
+            if (slot < (unsigned long long)keys.shape[0]) keys.data[slot] = key;
+        }
+        return;
+    }
+    if (step == 0) {
+        if (threadIdx.x == 0) gathered_count = 0;
+        __syncthreads();
+        return;
+    }
     __syncthreads();
-    unsigned long long slot = 0;
-    if (count > 0) slot = atomicAdd(&block_total, (unsigned long long)count);
+    const unsigned count = gathered_count < SIZE ? gathered_count : SIZE;
+    if (threadIdx.x == 0 && count > 0) block_start = atomicAdd(total, (unsigned long long)count);
     __syncthreads();
-    if (threadIdx.x == 0 && block_total > 0)
-        block_start = atomicAdd((unsigned long long*)counters.data, block_total);
-    __syncthreads();
-    return (int64_t)(block_start + slot);
+    for (unsigned place = threadIdx.x; place < count; place += blockDim.x) {
+        const unsigned long long slot = block_start + place;
+        if (slot < (unsigned long long)keys.shape[0]) keys.data[slot] = gathered[place];
+    }
 #else
-    const int64_t slot = counters.data[0];
-    counters.data[0] = slot + count;
-    return slot;
+    if (step != 1) return;
+    const int64_t slot = counters.data[0]++;
+    if (slot < (int64_t)keys.shape[0]) keys.data[slot] = key;
 #endif
 """)
-def _reserve(count: wp.int32, counters: wp.array[wp.int64]) -> wp.int64:
-    """Return the first of `count` consecutive slots."""
+def _write(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
+    """Append a key (step _PUT) and count it, also where there is no room for it.
+
+    Every thread of a block comes here once before with _OPEN, and once after with _CLOSE.
+    """
     ...
 
 
@@ -176,8 +194,7 @@ def _count_lead(
 
 @wp.func
 def walk(
-    mode: wp.int32,
-    slot: wp.int64,
+    tabulate: wp.bool,
     pixel: wp.int32,
     row: wp.int32,
     place: wp.int64,
@@ -193,8 +210,9 @@ def walk(
     row_limit: wp.array[wp.int32],
     table: wp.array2d[wp.int32],
     keys: wp.array[wp.int64],
+    counters: wp.array[wp.int64],
 ) -> Pixel:
-    """Take one pixel over a stack of frames; count its events, write them, or enter them in the table.
+    """Take one pixel over a stack of frames, and write its events, or enter their number in the table.
 
     The first `lead` frames are known to be quiet.
     """
@@ -208,7 +226,6 @@ def walk(
     last = state.last
     if lead > 0:
         last = log_radiance[lead - 1, pixel]
-    event_count = wp.int32(0)
     invalid_count = wp.int32(0)
     invalid_first = wp.int32(0)
 
@@ -231,33 +248,30 @@ def walk(
             upper = _level(base, up + 1, down, threshold_on, threshold_off)
             quiet = _quiet_range(lower, upper, base_slack)
             found = up - up_before + down - down_before
-            if mode == _TABLE:
+            if tabulate:
                 wp.atomic_add(table, frame, row, found)
             elif row < row_limit[frame]:
-                if mode == _WRITE:
-                    polarity = wp.where(up > up_before, 1, 0)
-                    for event in range(found):
-                        where = slot + wp.int64(event_count + event)
-                        if where < wp.int64(keys.shape[0]):
-                            step = event + 1
-                            level = _level(
-                                base,
-                                up_before + step * polarity,
-                                down_before + step * (1 - polarity),
-                                threshold_on,
-                                threshold_off,
-                            )
-                            keys[where] = _key(
-                                level,
-                                wp.float64(last),
-                                value,
-                                stamps[frame],
-                                stamps[frame + 1],
-                                place,
-                                time_shift,
-                                polarity,
-                            )
-                event_count += found
+                polarity = wp.where(up > up_before, 1, 0)
+                for event in range(found):
+                    step = event + 1
+                    level = _level(
+                        base,
+                        up_before + step * polarity,
+                        down_before + step * (1 - polarity),
+                        threshold_on,
+                        threshold_off,
+                    )
+                    key = _key(
+                        level,
+                        wp.float64(last),
+                        value,
+                        stamps[frame],
+                        stamps[frame + 1],
+                        place,
+                        time_shift,
+                        polarity,
+                    )
+                    _write(_PUT, key, keys, counters)
             last = sample
         else:
             if invalid_count == 0:
@@ -267,7 +281,6 @@ def walk(
     state.last = last
     state.up = up
     state.down = down
-    state.event_count = event_count
     state.invalid_count = invalid_count
     state.invalid_first = invalid_first
     return state
@@ -377,10 +390,9 @@ def scan(
         table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
     """
     pixel = first_pixel + wp.tid()
-    state = Pixel()
-    place = wp.int64(0)
-    row = wp.int32(0)
+    _write(_OPEN, wp.int64(0), keys_out, counters_out)
     if pixel < end_pixel:
+        state = Pixel()
         before = crossed[pixel]
         state.up = before[0]
         state.down = before[1]
@@ -390,12 +402,8 @@ def scan(
             state.last = last[pixel]
             row = pixel // width
             place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << _COLUMN_SHIFT)
-            mode = _COUNT
-            if tabulate:
-                mode = _TABLE
             state = walk(
-                mode,
-                wp.int64(0),
+                tabulate,
                 pixel,
                 row,
                 place,
@@ -411,35 +419,9 @@ def scan(
                 row_limit,
                 table_out,
                 keys_out,
+                counters_out,
             )
-    if not tabulate:
-        slot = _reserve(state.event_count, counters_out)
-        if pixel < end_pixel:
-            if state.event_count > 0:
-                before = crossed[pixel]
-                again = Pixel()
-                again.last = last[pixel]
-                again.up = before[0]
-                again.down = before[1]
-                walk(
-                    _WRITE,
-                    slot,
-                    pixel,
-                    row,
-                    place,
-                    base[pixel],
-                    again,
-                    threshold_on,
-                    threshold_off,
-                    time_shift,
-                    log_radiance,
-                    stamps,
-                    frame_count,
-                    lead[pixel],
-                    row_limit,
-                    table_out,
-                    keys_out,
-                )
+        if not tabulate:
             last_out[pixel] = state.last
             crossed_out[pixel] = wp.vec2i(state.up, state.down)
             if state.invalid_count > 0:
@@ -447,12 +429,14 @@ def scan(
                 flat = wp.int64(state.invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
                 wp.atomic_add(counters_out, 1, wp.int64(state.invalid_count))
                 wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+    _write(_CLOSE, wp.int64(0), keys_out, counters_out)
 
 
 @wp.kernel
 def mark_late(
     # In:
     stamps: wp.array[wp.int64],
+    stamp_count: wp.int32,
     time_shift: wp.int32,
     # In/out:
     keys: wp.array[wp.int64],
@@ -461,6 +445,7 @@ def mark_late(
 
     Args:
         stamps: Ends of windows from the keys' time origin [ns], at least 1 us apart, increasing.
+        stamp_count: How many there are.
         time_shift: Bits of a key below its microseconds.
         keys: Keys, in any order; overwritten.
     """
@@ -468,14 +453,14 @@ def mark_late(
     key = keys[event]
     time_us = key >> wp.int64(time_shift)
     low = wp.int32(0)
-    high = stamps.shape[0]
+    high = stamp_count
     while low < high:
         middle = (low + high) // 2
         if stamps[middle] // _US < time_us:
             low = middle + 1
         else:
             high = middle
-    if low < stamps.shape[0]:
+    if low < stamp_count:
         end_ns = stamps[low]
         sub_ns = key & wp.int64(1023)
         if end_ns // _US == time_us and sub_ns > end_ns - time_us * _US:
@@ -486,15 +471,17 @@ def mark_late(
 def carry_over(
     # In:
     keys: wp.array[wp.int64],
+    first: wp.int32,
     origin_step_us: wp.int64,
     time_shift: wp.int32,
     # Out:
     keys_out: wp.array[wp.int64],
+    first_out: wp.int32,
 ) -> None:
-    """Copy keys to a time origin that is later by `origin_step_us`, and clear `late`."""
+    """Copy keys, from and to a position, with a time origin that is later, and clear `late`."""
     event = wp.tid()
-    key = keys[event] & ~(wp.int64(1) << wp.int64(time_shift - 1))
-    keys_out[event] = key - (origin_step_us << wp.int64(time_shift))
+    key = keys[first + event] & ~(wp.int64(1) << wp.int64(time_shift - 1))
+    keys_out[first_out + event] = key - (origin_step_us << wp.int64(time_shift))
 
 
 @wp.kernel

@@ -11,9 +11,10 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 import itertools
 import logging
 import os
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,14 @@ from neurosim_core.packets import Events
 from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
 from neurosim_core.settings import Settings
+from neurosim_core.streams import HostCopy, Milestone, make_stream, on
 
 _log = logging.getLogger(__name__)
 
 _BLOCK_SIZE = 256
 _PIXELS_PER_THREAD_MIN = 16_384
+_COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
+"""Types of the times, columns, rows and polarities that are handed out."""
 
 
 class EventCameraConfig(Settings):
@@ -54,6 +58,25 @@ class _Chunk:
     end_pixel: int
     keys: wp.array[wp.int64]
     counters: wp.array[wp.int64]
+    counters_on_host: HostCopy
+
+
+@dataclass(eq=False)
+class _Scan:
+    """The scan of one stack, and the buffers that are its own until its events have been taken over."""
+
+    chunks: list[_Chunk]
+    done: Milestone
+    stamps_on_host: wp.array[wp.int64]
+    stamps: wp.array[wp.int64]
+    row_limit: wp.array[wp.int32]
+    frames: Any = None
+    """Shape [frame, pixel]."""
+    stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    origin_us: int = 0
+    """Origin of its keys' time."""
+    state: int = 0
+    """Where in the ring the state before it is; the state after it comes next."""
 
 
 class EventCamera:
@@ -64,7 +87,8 @@ class EventCamera:
 
     - `feed` takes a stack of frames and returns its events.
     - `feed_device` launches the scan of a stack without waiting for it, and later `collect` or
-      `collect_windows` reads back the number of events and hands them out, sorted.
+      `collect_windows` reads back the number of events and hands them out, sorted. They do so on a stream of
+      their own, so they wait for one scan and not for what was launched after it.
 
     Args:
         config: Thresholds and limits.
@@ -72,13 +96,24 @@ class EventCamera:
         height: Height of the sensor [px], 1 to 65536.
         device: Warp device; on "cpu" the scan is split over the cores.
         sensor: Name of the sensor in the packets.
+        scan_count_max: How many stacks may be fed before the first of them is collected.
+        on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
+            later: nothing is allocated on the device, and nothing that was launched since is waited for.
 
     Raises:
         ValueError: If width or height is out of range.
     """
 
     def __init__(
-        self, config: EventCameraConfig, *, width: int, height: int, device: str = "cpu", sensor: str = ""
+        self,
+        config: EventCameraConfig,
+        *,
+        width: int,
+        height: int,
+        device: str = "cpu",
+        sensor: str = "",
+        scan_count_max: int = 1,
+        on_host: bool = False,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -94,21 +129,32 @@ class EventCamera:
 
         pixel_count = width * height
         self._base = self._empty(pixel_count, wp.float32)
-        self._last = [self._empty(pixel_count, wp.float32) for _ in range(2)]
-        self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in range(2)]
+        # scans under way begin with a state each, and the last of them needs room for the state after it
+        ring = range(scan_count_max + 1)
+        self._last = [self._empty(pixel_count, wp.float32) for _ in ring]
+        self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in ring]
         self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
         self._screened = self.device.is_cpu
         scratch = pixel_count if self._screened else 0
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
-        self._chunks = [
-            _Chunk(first, end, self._empty(2 * (end - first), wp.int64), self._empty(3, wp.int64))
-            for first, end in self._chunk_bounds()
-        ]
-        self._make_frame_buffers(16)
+        self._table = self._empty((1, height), wp.int32)
+        self._idle = [self._make_scan(16) for _ in range(scan_count_max)]
+        self._under_way: deque[_Scan] = deque()
+        self._reader = make_stream(device, urgent=True)
+        self._taken = Milestone(device)
+        self._read = Milestone(device)
+        self._on_host = on_host or self.device.is_cpu
+        self._keys = self._key_buffer(0)
+        self._spare_keys = self._key_buffer(0)
+        self._order = self._empty(0, wp.int32)
+        self._columns: list[tuple[Any, HostCopy]] = []
+        self._make_window_buffers(16)
         wp.load_module(event_scan, device=self.device)
 
         self._now_ns: int | None = None
-        self._scanned: tuple[Any, NDArray[np.int64]] | None = None
+        self._fed_ns = 0
+        self._origin_us = 0
+        self._state = 0
         self._forget()
 
     def reset(self, log_radiance: Any, stamp_ns: int = 0) -> None:
@@ -131,7 +177,7 @@ class EventCamera:
         wp.copy(self._base, frame.flatten())
         wp.copy(self._last[0], self._base)
         self._crossed[0].zero_()
-        self._now_ns = int(stamp_ns)
+        self._now_ns = self._fed_ns = int(stamp_ns)
         self._forget()
 
     def feed(self, log_radiance: Any, stamps_ns: Any) -> Events:
@@ -160,8 +206,9 @@ class EventCamera:
     def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
         """Launch the scan of a stack of frames, without waiting for it.
 
-        Nothing is allocated unless the stack is longer than any before. `collect` or `collect_windows` comes
-        next; until then `log_radiance` must stay as it is.
+        Nothing is allocated unless the stack is longer than any before. After `scan_count_max` calls
+        `collect` or `collect_windows` comes next; until then `log_radiance` must stay as it is. All calls
+        must be on one stream.
 
         Args:
             log_radiance: Frames on the camera's device, float32, contiguous, shape [K_max, H, W].
@@ -169,13 +216,13 @@ class EventCamera:
                 strictly increasing, later than what the camera has seen. The frames after K are not read.
 
         Raises:
-            RuntimeError: If the camera was not reset, or the stack before was not collected.
+            RuntimeError: If the camera was not reset, or a stack before must be collected.
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
-        now_ns = self._require_reset()
-        if self._scanned is not None:
-            raise RuntimeError("collect() must be called between two feed_device()")
+        self._require_reset()
+        if not self._idle:
+            raise RuntimeError(f"collect() must be called after {len(self._under_way)} feed_device()")
         stamps = _as_stamps(stamps_ns)
         count = len(stamps)
         fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == (self.height, self.width)
@@ -190,23 +237,32 @@ class EventCamera:
                 f"log_radiance must be float32 on {self.device},"
                 f" got {log_radiance.dtype.__name__} on {log_radiance.device}"
             )
-        if stamps[0] <= now_ns:
-            raise ValueError(f"stamps_ns must be later than {now_ns}, got {stamps[0]}")
+        if stamps[0] <= self._fed_ns:
+            raise ValueError(f"stamps_ns must be later than {self._fed_ns}, got {stamps[0]}")
         if (span_us := int(stamps[-1]) // NS_PER_US - self._origin_us) >> (63 - self._time_shift):
             limit_s = (1 << (63 - self._time_shift)) / 1e6
             raise ValueError(
                 f"stamps_ns must be within {limit_s:g} s of the last window, got {span_us / 1e6:g} s"
             )
 
-        if count > self._row_limit.shape[0]:
-            self._make_frame_buffers(count)
-        relative = self._stamps_host.numpy()
-        relative[0] = now_ns
+        self._taken.hold()
+        scan = self._idle.pop()
+        if count > scan.row_limit.shape[0]:
+            scan = self._make_scan(count)
+        relative = scan.stamps_on_host.numpy()
+        relative[0] = self._fed_ns
         relative[1 : count + 1] = stamps
         relative[: count + 1] -= self._origin_us * NS_PER_US
-        wp.copy(self._stamps, self._stamps_host, count=count + 1)
-        self._scanned = (log_radiance.reshape((log_radiance.shape[0], self.width * self.height)), stamps)
-        self._launch(tabulate=False)
+        if self.device.is_cuda:
+            wp.copy(scan.stamps, scan.stamps_on_host, count=count + 1)
+        scan.frames = log_radiance.reshape((log_radiance.shape[0], self.width * self.height))
+        scan.stamps_ns = stamps
+        scan.origin_us = self._origin_us
+        scan.state = self._state
+        self._state = (self._state + 1) % len(self._last)
+        self._fed_ns = int(stamps[-1])
+        self._under_way.append(scan)
+        self._launch(scan, tabulate=False)
 
     def collect(self) -> Events:
         """Return all events up to the last frame fed, and wait for them.
@@ -215,11 +271,12 @@ class EventCamera:
             RuntimeError: If the camera was not reset.
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
-        self._finish_scan()
-        now_ns = self._require_reset()
-        return self._cut([now_ns])[0]
+        with on(self._reader):
+            while self._under_way:
+                self._take_over()
+            return self._cut([self._require_reset()])[0]
 
-    def collect_windows(self, ends_ns: Sequence[int]) -> list[Events]:
+    def collect_windows(self, ends_ns: Sequence[int], *, scan_count: int | None = None) -> list[Events]:
         """Return the events fed so far as one packet per window, and wait for them.
 
         Windows are (end before, end]. An event belongs to a window by its crossing time, not by the
@@ -227,26 +284,33 @@ class EventCamera:
         Events after the last window stay in the camera.
 
         Args:
-            ends_ns: Ends of the windows [ns]; increasing by at least 1 us, not after the last frame fed.
+            ends_ns: Ends of the windows [ns]; increasing by at least 1 us, not after the last frame that was
+                waited for.
+            scan_count: How many of the stacks that have not been collected to wait for, from the oldest on;
+                None: all.
 
         Raises:
             RuntimeError: If the camera was not reset.
             ValueError: If `ends_ns` is wrong; also if a value of the frames was not finite or beyond +-1000,
                 in which case the camera must be reset.
         """
-        self._finish_scan()
-        now_ns = self._require_reset()
-        ends = [int(end) for end in ends_ns]
-        bounds = [self._window_start_ns, *ends]
-        if any(b - a < NS_PER_US for a, b in zip(bounds, ends, strict=False)) or bounds[-1] > now_ns:
-            raise ValueError(
-                f"ends_ns must increase by at least 1000 from {bounds[0]} and not pass {now_ns}, got {ends}"
-            )
-        return self._cut(ends)
+        with on(self._reader):
+            for _ in range(len(self._under_way) if scan_count is None else scan_count):
+                self._take_over()
+            now_ns = self._require_reset()
+            ends = [int(end) for end in ends_ns]
+            bounds = [self._window_start_ns, *ends]
+            if any(b - a < NS_PER_US for a, b in zip(bounds, ends, strict=False)) or bounds[-1] > now_ns:
+                raise ValueError(
+                    f"ends_ns must increase by at least 1000 from {bounds[0]} and not pass {now_ns},"
+                    f" got {ends}"
+                )
+            return self._cut(ends)
 
     def _forget(self) -> None:
-        self._scanned = None
-        self._keys = self._key_buffer(0)
+        self._idle += self._under_way
+        self._under_way.clear()
+        self._state = 0
         self._key_count = 0
         self._dropped: list[tuple[int, int]] = []
         self._drop_reported = False
@@ -270,12 +334,28 @@ class EventCamera:
         rows = [self.height * chunk // chunk_count for chunk in range(chunk_count + 1)]
         return [(a * self.width, b * self.width) for a, b in itertools.pairwise(rows)]
 
-    def _make_frame_buffers(self, frame_count: int) -> None:
-        pinned = self.device.is_cuda
-        self._stamps_host = wp.empty(frame_count + 1, dtype=wp.int64, device="cpu", pinned=pinned)
-        self._stamps = self._empty(frame_count + 1, wp.int64)
-        self._row_limit = wp.full(frame_count, self.height, dtype=wp.int32, device=self.device)
-        self._table = self._empty((1, self.height), wp.int32)
+    def _make_scan(self, frame_count: int) -> _Scan:
+        """Return buffers for stacks of at most `frame_count` frames."""
+        chunks = []
+        for first, end in self._chunk_bounds():
+            counters = self._empty(3, wp.int64)
+            chunks.append(
+                _Chunk(first, end, self._empty(2 * (end - first), wp.int64), counters, HostCopy(counters))
+            )
+        stamps = self._empty(frame_count + 1, wp.int64)
+        return _Scan(
+            chunks=chunks,
+            done=Milestone(self.device),
+            stamps_on_host=_pinned(stamps),
+            stamps=stamps,
+            row_limit=wp.full(frame_count, self.height, dtype=wp.int32, device=self.device),
+        )
+
+    def _make_window_buffers(self, window_count: int) -> None:
+        self._bounds = self._empty(window_count, wp.int64)
+        self._bounds_on_host = _pinned(self._bounds)
+        self._found = wp.zeros(window_count, dtype=wp.int32, device=self.device)
+        self._found_on_host = HostCopy(self._found)
 
     def _as_warp(self, value: Any, shape: tuple[int, ...]) -> Any:
         """Return an array as a contiguous float32 Warp array of this shape on the device."""
@@ -295,20 +375,20 @@ class EventCamera:
         flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
         return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
 
-    def _launch(self, *, tabulate: bool) -> None:
-        """Scan the stack from the state before it; the state after it goes to the second buffers."""
-        assert self._scanned is not None
-        frames, stamps = self._scanned
+    def _launch(self, scan: _Scan, *, tabulate: bool) -> None:
+        """Scan a stack from the state before it; done again, it gives the same state after it."""
+        before, after = scan.state, (scan.state + 1) % len(self._last)
 
         def launch(chunk: _Chunk) -> None:
             chunk.counters.zero_()
             thresholds = [self.config.threshold_on, self.config.threshold_off]
-            extent = [chunk.first_pixel, chunk.end_pixel, frames]
+            extent = [chunk.first_pixel, chunk.end_pixel, scan.frames]
+            frame_count = len(scan.stamps_ns)
             if self._screened:
                 wp.launch(
                     event_scan.screen,
                     dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),
-                    inputs=[*thresholds, *extent, len(stamps), self._base, self._crossed[0]],
+                    inputs=[*thresholds, *extent, frame_count, self._base, self._crossed[before]],
                     outputs=[*self._quiet_range, self._lead],
                     device=self.device,
                 )
@@ -324,76 +404,77 @@ class EventCamera:
                     self._row_shift,
                     self._time_shift,
                     *extent,
-                    self._stamps,
-                    len(stamps),
+                    scan.stamps,
+                    frame_count,
                     self._lead,
-                    self._row_limit,
+                    scan.row_limit,
                     self._base,
-                    self._last[0],
-                    self._crossed[0],
+                    self._last[before],
+                    self._crossed[before],
                     tabulate,
                 ],
-                outputs=[self._last[1], self._crossed[1], chunk.keys, chunk.counters, self._table],
+                outputs=[self._last[after], self._crossed[after], chunk.keys, chunk.counters, self._table],
                 device=self.device,
             )
+            chunk.counters_on_host.fetch(0, 3)
 
-        if len(self._chunks) > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(len(self._chunks) - 1, thread_name_prefix="event-scan")
-        futures = [self._pool.submit(launch, chunk) for chunk in self._chunks[1:]] if self._pool else []
-        launch(self._chunks[0])
+        if len(scan.chunks) > 1 and self._pool is None:
+            self._pool = ThreadPoolExecutor(len(scan.chunks) - 1, thread_name_prefix="event-scan")
+        futures = [self._pool.submit(launch, chunk) for chunk in scan.chunks[1:]] if self._pool else []
+        launch(scan.chunks[0])
         for future in futures:
             future.result()
+        scan.done.set()
 
-    def _finish_scan(self) -> None:
-        """Wait for the scan, redo it if the buffer was too small, and take over its keys and state."""
-        if self._scanned is None:
-            return
-        stamps = self._scanned[1]
-        counts = self._read_counts()
-        limited = sum(counts) > self.config.event_count_max and self._limit_rows()
+    def _take_over(self) -> None:
+        """Wait for the oldest scan, redo it if its buffer was too small, and append its keys."""
+        scan = self._under_way[0]
+        counts = self._read_counts(scan)
+        limited = sum(counts) > self.config.event_count_max and self._limit_rows(scan)
         if limited:
-            counts = self._read_counts()
-        if any(count > chunk.keys.shape[0] for count, chunk in zip(counts, self._chunks, strict=True)):
-            for count, chunk in zip(counts, self._chunks, strict=True):
+            counts = self._read_counts(scan)
+        if any(count > chunk.keys.shape[0] for count, chunk in zip(counts, scan.chunks, strict=True)):
+            for count, chunk in zip(counts, scan.chunks, strict=True):
                 if count > chunk.keys.shape[0]:
                     chunk.keys = self._empty(1 << (count - 1).bit_length(), wp.int64)
-            self._launch(tabulate=False)
+            self._launch(scan, tabulate=False)
         if limited:
-            self._row_limit.fill_(self.height)
+            scan.row_limit.fill_(self.height)
 
-        parts = [(self._keys, self._key_count)]
-        parts += [(chunk.keys, count) for count, chunk in zip(counts, self._chunks, strict=True)]
-        self._key_count = sum(count for _, count in parts)
-        self._keys = self._key_buffer(self._key_count)
-        start = 0
-        for keys, count in parts:
-            if count > 0:
-                wp.copy(self._keys, keys, dest_offset=start, count=count)
-                start += count
-        self._last.reverse()
-        self._crossed.reverse()
-        self._now_ns = int(stamps[-1])
-        self._scanned = None
+        start = self._key_count
+        self._key_count += sum(counts)
+        self._reserve_keys(kept=start)
+        step_us = self._origin_us - scan.origin_us
+        for count, chunk in zip(counts, scan.chunks, strict=True):
+            if count > 0 and step_us == 0:
+                wp.copy(self._keys, chunk.keys, dest_offset=start, count=count)
+            elif count > 0:
+                self._copy_keys(chunk.keys, 0, count, self._keys, start, step_us)
+            start += count
+        self._taken.set()
+        self._now_ns = int(scan.stamps_ns[-1])
+        scan.frames = None
+        self._idle.append(self._under_way.popleft())
 
-    def _read_counts(self) -> list[int]:
-        """Wait for the scan and return the number of events of each chunk."""
-        counters = np.stack([chunk.counters.numpy() for chunk in self._chunks])
+    def _read_counts(self, scan: _Scan) -> list[int]:
+        """Wait for a scan and return the number of events of each chunk."""
+        scan.done.wait()
+        counters = np.stack([chunk.counters_on_host.rows(0, 3) for chunk in scan.chunks])
         if invalid_count := int(counters[:, 1].sum()):
-            assert self._scanned is not None
-            first = len(self._scanned[1]) * self.width * self.height - int(counters[:, 2].max())
+            first = len(scan.stamps_ns) * self.width * self.height - int(counters[:, 2].max())
             frame, pixel = divmod(first, self.width * self.height)
             row, col = divmod(pixel, self.width)
             self._now_ns = None
-            self._scanned = None
+            self._idle += self._under_way
+            self._under_way.clear()
             raise ValueError(_invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
         return [int(count) for count in counters[:, 0]]
 
-    def _limit_rows(self) -> bool:
+    def _limit_rows(self, scan: _Scan) -> bool:
         """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
-        assert self._scanned is not None
-        stamps = self._scanned[1]
+        stamps = scan.stamps_ns
         self._table = wp.zeros((len(stamps), self.height), dtype=wp.int32, device=self.device)
-        self._launch(tabulate=True)
+        self._launch(scan, tabulate=True)
         total = np.cumsum(self._table.numpy(), axis=1, dtype=np.int64)
         rows = (total <= self.config.event_count_max).sum(axis=1)
         self._table = self._empty((1, self.height), wp.int32)
@@ -413,8 +494,8 @@ class EventCamera:
                 stamp_ns,
             )
             self._drop_reported = True
-        wp.copy(self._row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
-        self._launch(tabulate=False)
+        wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
+        self._launch(scan, tabulate=False)
         return True
 
     def _key_buffer(self, count: int) -> wp.array[wp.int64]:
@@ -422,55 +503,55 @@ class EventCamera:
         keys: wp.array[wp.int64] = self._empty(2 * count if self.device.is_cuda else count, wp.int64)
         return keys
 
+    def _reserve_keys(self, *, kept: int) -> None:
+        """Make room for the keys there are now, of which the first `kept` are in the buffer."""
+        if self._key_count * (2 if self.device.is_cuda else 1) <= self._keys.shape[0]:
+            return
+        room = 1 << (self._key_count - 1).bit_length()
+        keys = self._key_buffer(room)
+        if kept > 0:
+            wp.copy(keys, self._keys, count=kept)
+        self._keys = keys
+        self._spare_keys = self._key_buffer(room)
+        if self.device.is_cuda:
+            self._order = self._empty(2 * room, wp.int32)
+            if self._on_host:
+                columns = [self._empty(room, dtype) for dtype in _COLUMN_TYPES]
+                self._columns = [(column, HostCopy(column)) for column in columns]
+
+    def _copy_keys(
+        self, keys: Any, first: int, count: int, keys_out: Any, first_out: int, origin_step_us: int
+    ) -> None:
+        wp.launch(
+            event_scan.carry_over,
+            dim=count,
+            inputs=[keys, first, origin_step_us, self._time_shift],
+            outputs=[keys_out, first_out],
+            device=self.device,
+        )
+
     def _sort_keys(self) -> None:
         if self.device.is_cpu:
-            self._keys.numpy().sort()  # ten times as fast as Warp's radix sort on a CPU
+            self._keys.numpy()[: self._key_count].sort()  # ten times as fast as Warp's radix sort on a CPU
             return
-        order = self._empty(2 * self._key_count, wp.int32)
         span_us = self._require_reset() // NS_PER_US - self._origin_us
         end_bit = self._time_shift + span_us.bit_length()
-        wp.utils.radix_sort_pairs(self._keys, order, self._key_count, begin_bit=SUB_BITS - 1, end_bit=end_bit)
+        wp.utils.radix_sort_pairs(
+            self._keys, self._order, self._key_count, begin_bit=SUB_BITS - 1, end_bit=end_bit
+        )
 
     def _cut(self, ends: list[int]) -> list[Events]:
         """Sort the keys, hand out those of the windows that end so, and carry the others over."""
-        count = self._key_count
-        cuts = [0] * len(ends)
-        columns = [self._empty(count, dtype) for dtype in (wp.int64, wp.uint16, wp.uint16, wp.uint8)]
-        if count > 0 and ends:
-            origin_ns = self._origin_us * NS_PER_US
-            bounds = wp.array(np.array(ends) - origin_ns, dtype=wp.int64, device=self.device)
-            found = self._empty(len(ends), wp.int32)
-            wp.launch(
-                event_scan.mark_late,
-                dim=count,
-                inputs=[bounds, self._time_shift],
-                outputs=[self._keys],
-                device=self.device,
-            )
-            self._sort_keys()
-            wp.launch(
-                event_scan.find_ends,
-                dim=len(ends),
-                inputs=[self._keys, count, bounds, self._time_shift],
-                outputs=[found],
-                device=self.device,
-            )
-            wp.launch(
-                event_scan.decode,
-                dim=count,
-                inputs=[self._keys, self._origin_us, self._row_shift, self._time_shift],
-                outputs=columns,
-                device=self.device,
-            )
-            cuts = found.numpy().tolist()
-
+        if not ends:
+            return []
+        columns, cuts = self._decode(ends) if self._key_count > 0 else ([], [0] * len(ends))
         packets = []
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
             dropped = sum(lost for stamp_ns, lost in self._dropped if stamp_ns <= end_ns)
             self._dropped = [(stamp_ns, lost) for stamp_ns, lost in self._dropped if stamp_ns > end_ns]
-            # Warp refuses an empty slice
-            parts = [c[start:cut] if cut > start else self._empty(0, c.dtype) for c in columns]
-            t, x, y, polarity = (p.numpy() for p in parts) if self.device.is_cpu else parts
+            t, x, y, polarity = (
+                [column[start:cut] for column in columns] if cut > start else self._no_events()
+            )
             packets.append(
                 Events(
                     stamp_ns=end_ns,
@@ -488,25 +569,73 @@ class EventCamera:
             )
             self._sequence += 1
             self._window_start_ns = end_ns
-        self._carry_over(cuts[-1] if cuts else 0)
+        self._carry_over(cuts[-1])
         return packets
+
+    def _decode(self, ends: list[int]) -> tuple[list[Any], list[int]]:
+        """Sort the keys and return them as columns, and the index of the first key after each window."""
+        count = self._key_count
+        if len(ends) > self._bounds.shape[0]:
+            self._make_window_buffers(len(ends))
+        self._bounds_on_host.numpy()[: len(ends)] = np.array(ends) - self._origin_us * NS_PER_US
+        if self.device.is_cuda:
+            wp.copy(self._bounds, self._bounds_on_host, count=len(ends))
+        wp.launch(
+            event_scan.mark_late,
+            dim=count,
+            inputs=[self._bounds, len(ends), self._time_shift],
+            outputs=[self._keys],
+            device=self.device,
+        )
+        self._sort_keys()
+        wp.launch(
+            event_scan.find_ends,
+            dim=len(ends),
+            inputs=[self._keys, count, self._bounds, self._time_shift],
+            outputs=[self._found],
+            device=self.device,
+        )
+        self._found_on_host.fetch(0, len(ends))
+        copied = self._on_host and self.device.is_cuda
+        columns = [c for c, _ in self._columns] if copied else [self._empty(count, d) for d in _COLUMN_TYPES]
+        wp.launch(
+            event_scan.decode,
+            dim=count,
+            inputs=[self._keys, self._origin_us, self._row_shift, self._time_shift],
+            outputs=columns,
+            device=self.device,
+        )
+        if copied:
+            for _, copy in self._columns:
+                copy.fetch(0, count)
+        self._read.set()
+        self._read.wait()
+        cuts = self._found_on_host.rows(0, len(ends)).tolist()
+        if copied:
+            columns = [copy.rows(0, cuts[-1]) for _, copy in self._columns]
+        elif self._on_host:
+            columns = [column.numpy() for column in columns]
+        return columns, cuts
+
+    def _no_events(self) -> list[Any]:
+        if self._on_host:
+            return [np.zeros(0, wp.dtype_to_numpy(dtype)) for dtype in _COLUMN_TYPES]
+        return [self._empty(0, dtype) for dtype in _COLUMN_TYPES]  # Warp refuses an empty slice
 
     def _carry_over(self, first: int) -> None:
         """Keep the keys from `first` on for later windows, with their time from the last window's end."""
-        count = self._key_count - first
         origin_us = self._window_start_ns // NS_PER_US
-        keys = self._key_buffer(count)
+        count = self._key_count - first
         if count > 0:
-            wp.launch(
-                event_scan.carry_over,
-                dim=count,
-                inputs=[self._keys[first:], origin_us - self._origin_us, self._time_shift],
-                outputs=[keys],
-                device=self.device,
-            )
-        self._keys = keys
+            self._copy_keys(self._keys, first, count, self._spare_keys, 0, origin_us - self._origin_us)
+            self._keys, self._spare_keys = self._spare_keys, self._keys
         self._key_count = count
         self._origin_us = origin_us
+
+
+def _pinned(array: Any) -> Any:
+    """Return an array of the host to upload from; the array itself if it is there."""
+    return wp.empty_like(array, device="cpu", pinned=True) if array.device.is_cuda else array
 
 
 def _core_count() -> int:

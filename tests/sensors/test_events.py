@@ -327,6 +327,59 @@ def test_windows_do_not_depend_on_the_stacks(splits, seed, device):
     assert sorted(rows(*whole)) == rows(run(frames, stamps, device))
 
 
+@pytest.mark.parametrize("scan_count_max", [2, 3])
+@pytest.mark.parametrize("config", [{}, {"event_count_max": 40}, {"threshold_on": 0.01}])
+def test_scans_under_way_change_nothing(device, scan_count_max, config):
+    """Stacks fed before earlier ones are collected: same packets, also where a scan is done again."""
+    rng = np.random.default_rng(11)
+    frames = rng.normal(scale=0.3, size=(33, 6, 7)).cumsum(axis=0).astype(np.float32)
+    stamps = np.arange(33) * 1_700
+
+    def windows(camera: EventCamera, ahead: int) -> list[Events]:
+        camera.reset(frames[0])
+        stacks = [wp.array(frames[k : k + 4], device=device) for k in range(1, 33, 4)]
+        packets: list[Events] = []
+        end_ns = 0
+        for fed in range(len(stacks) + ahead):
+            if fed < len(stacks):
+                camera.feed_device(stacks[fed], stamps[1 + 4 * fed : 5 + 4 * fed])
+            if fed >= ahead:
+                ends = list(range(end_ns + 5005, int(stamps[4 * (fed - ahead + 1)]) + 1, 5005))
+                packets += camera.collect_windows(ends, scan_count=1)
+                end_ns = ends[-1] if ends else end_ns
+        return [*packets, camera.collect()]
+
+    camera = EventCamera(
+        EventCameraConfig(**config),
+        width=7,
+        height=6,
+        device=device,
+        scan_count_max=scan_count_max,
+        on_host=True,
+    )
+    ahead = windows(camera, scan_count_max - 1)
+    alone = windows(make_camera(7, 6, device, **config), 0)
+    assert all(isinstance(column, np.ndarray) for p in ahead for column in (p.t, p.x, p.y, p.polarity))
+    assert sum(packet.dropped_count for packet in ahead) > 0 or "event_count_max" not in config
+    assert len(ahead) == len(alone) > 8
+    for a, b in zip(ahead, alone, strict=True):
+        assert_same(a, b)
+        assert a.sequence == b.sequence
+
+
+def test_more_scans_than_agreed_are_refused(device):
+    camera = EventCamera(EventCameraConfig(), width=5, height=4, device=device, scan_count_max=2)
+    camera.reset(np.zeros((4, 5), np.float32))
+    frames = wp.zeros((1, 4, 5), dtype=float, device=device)
+    camera.feed_device(frames, [1000])
+    with pytest.raises(ValueError, match="later than 1000"):
+        camera.feed_device(frames, [1000])
+    camera.feed_device(frames, [2000])
+    with pytest.raises(RuntimeError, match=r"after 2 feed_device"):
+        camera.feed_device(frames, [3000])
+    assert camera.collect().stamp_ns == 2000
+
+
 def test_windows_are_cut_by_nanoseconds(device):
     """Crossings at 2500.0 and 2500.5 ns share a microsecond; the window ends at 2500."""
     camera = make_camera(2, 1, device)
@@ -371,7 +424,7 @@ def test_a_million_events_do_not_drift(device):
     camera.reset(np.full((1, 1), -5.0, np.float32))
     t = np.concatenate(
         [
-            camera.feed(f, s).t
+            camera.feed(f, s).numpy().t
             for f, s in zip(samples.reshape(40, -1, 1, 1), stamps.reshape(40, -1), strict=True)
         ]
     )

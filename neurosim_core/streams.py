@@ -1,0 +1,116 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,type-arg"
+"""How the host keeps a GPU busy: streams, graphs of launches that come again, copies that need no wait.
+
+On a CPU a launch returns when it has finished, and all of this does nothing.
+
+Streams wait for CUDA's default stream and make it wait for them. Warp frees device memory on that stream, so
+an array that is freed between two launches holds up both: what runs ahead of the host keeps its buffers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+_GRAPH_COUNT_MAX = 64
+
+
+def make_stream(device: Any, *, urgent: bool = False) -> wp.Stream | None:
+    """Return a new stream; None on a CPU.
+
+    Args:
+        device: Where.
+        urgent: Its launches go before those of other streams that are waiting.
+    """
+    place = wp.get_device(device)
+    return wp.Stream(place, priority=-1 if urgent else 0) if place.is_cuda else None
+
+
+def on(stream: wp.Stream | None) -> AbstractContextManager[Any]:
+    """Launch what follows on a stream, after what the present stream holds; None: stay."""
+    return nullcontext() if stream is None else wp.ScopedStream(stream)
+
+
+class Milestone:
+    """A point in a stream that the host or another stream can wait for."""
+
+    def __init__(self, device: Any) -> None:
+        self._device = wp.get_device(device)
+        self._event = wp.Event(self._device) if self._device.is_cuda else None
+
+    def set(self) -> None:
+        """Put it behind what the present stream holds."""
+        if self._event is not None:
+            self._device.stream.record_event(self._event)
+
+    def wait(self) -> None:
+        """Let the host wait until the device has come here."""
+        if self._event is not None:
+            wp.synchronize_event(self._event)
+
+    def hold(self) -> None:
+        """Let the present stream wait until the device has come here."""
+        if self._event is not None:
+            self._device.stream.wait_event(self._event)
+
+
+class Graphs:
+    """Sequences of launches, replayed as CUDA graphs when they come again; they must not allocate or wait."""
+
+    def __init__(self, device: Any) -> None:
+        self._device = wp.get_device(device)
+        self._graphs: dict[Hashable, Any] = {}
+
+    def run(self, key: Hashable, launch: Callable[[], None]) -> None:
+        """Do what `launch` does.
+
+        Args:
+            key: Same key, same launches with the same arguments.
+            launch: Called the first time, which compiles and warms up, and the second time to record it.
+        """
+        if self._device.is_cpu:
+            launch()
+            return
+        graph = self._graphs.pop(key, None)
+        if graph is None:
+            launch()
+            graph = False
+        else:
+            if graph is False:
+                with wp.ScopedCapture(self._device) as capture:
+                    launch()
+                graph = capture.graph
+            wp.capture_launch(graph)
+        if len(self._graphs) >= _GRAPH_COUNT_MAX:
+            del self._graphs[next(iter(self._graphs))]
+        self._graphs[key] = graph  # at the end: the one that was not used for longest goes first
+
+
+class HostCopy:
+    """The copy of a device array in pinned memory of the host; on a CPU the array itself.
+
+    Args:
+        array: Contiguous, with at least one axis.
+    """
+
+    def __init__(self, array: Any) -> None:
+        self._array = array
+        self._copied = array.device.is_cuda
+        self._host = wp.empty_like(array, device="cpu", pinned=True) if self._copied else array
+        self._rows: NDArray[Any] = self._host.numpy()
+        self._row_size = array.size // array.shape[0] if array.size else 0
+
+    def fetch(self, first: int, count: int) -> None:
+        """Launch the copy of `count` rows of the array."""
+        if self._copied and count > 0:
+            offset, size = first * self._row_size, count * self._row_size
+            wp.copy(self._host, self._array, dest_offset=offset, src_offset=offset, count=size)
+
+    def rows(self, first: int, count: int) -> NDArray[Any]:
+        """Return rows that were fetched, in memory of their own; waits for nothing."""
+        return np.array(self._rows[first : first + count])
