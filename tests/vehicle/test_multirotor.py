@@ -107,7 +107,8 @@ def test_hover_is_a_fixed_point(device):
     # the hover speed is rounded: 1e-16 g for 10 s is 5e-14 m; the rest is rounding of 10,000 steps
     assert np.abs(state.position).max() < 1e-11
     assert np.abs(state.velocity).max() < 1e-11
-    assert state.orientation == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-14)
+    # fused multiply-adds on CUDA leave a torque of rounding size, and 1.1e-14 after 10,000 steps
+    assert state.orientation == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=2e-14)
 
 
 def test_free_fall_is_exact(device):
