@@ -92,15 +92,6 @@ class Model:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ImuChannel:
-    """An IMU and its samples on the host; its slots are those of the trace."""
-
-    imu: Imu
-    specific_force: HostCopy
-    angular_rate: HostCopy
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Batch:
     """A stretch of a run that was launched and has not been read."""
 
@@ -121,7 +112,9 @@ class State:
     controller: Controller
     trace: Trace
     casts: list[CastState]
-    imus: dict[str, ImuChannel]
+    imus: dict[str, Imu]
+    imu_copies: dict[str, tuple[HostCopy, HostCopy]]
+    """Specific force and angular rate of each IMU on the host, in the slots of the trace."""
     lanes: Sequence[Milestone]
     """For each batch that may be under way, the point where the device has finished it."""
     flight_stream: wp.Stream | None
@@ -263,14 +256,8 @@ def make_state(model: Model, *, lane_count: int | None = None) -> State:
             for cast in model.casts
             if model.scene_on_device is not None
         ],
-        imus={
-            name: ImuChannel(
-                imu=imu,
-                specific_force=HostCopy(imu.specific_force),
-                angular_rate=HostCopy(imu.angular_rate),
-            )
-            for name, imu in imus.items()
-        },
+        imus=imus,
+        imu_copies={n: (HostCopy(i.specific_force), HostCopy(i.angular_rate)) for n, i in imus.items()},
         lanes=[Milestone(device) for _ in range(lane_count)],
         flight_stream=make_stream(device, urgent=True),
         render_stream=make_stream(device),
@@ -481,17 +468,16 @@ def _fly(
             state.vehicle.advance(span_ns)
         state.trace.record(state.vehicle.arrays, place)
         for index in boundary.samplers:
-            if (channel := state.imus.get(model.samplers[index])) is not None:
-                channel.imu.measure(place)
+            if (imu := state.imus.get(model.samplers[index])) is not None:
+                imu.measure(place)
         if closed_loop and boundary.control:
             state.controller.update(state.vehicle.arrays)
     state.trace.check_room(
         model.free_space.arrays, slot, len(batch), radius_m=model.config.vehicle.collision_radius_m
     )
     state.trace.fetch(slot, len(batch))
-    for channel in state.imus.values():
-        channel.specific_force.fetch(slot, len(batch))
-        channel.angular_rate.fetch(slot, len(batch))
+    for copy in itertools.chain.from_iterable(state.imu_copies.values()):
+        copy.fetch(slot, len(batch))
 
 
 def _failure(vehicle: Multirotor) -> DynamicsError:
@@ -506,10 +492,9 @@ def _failure(vehicle: Multirotor) -> DynamicsError:
 def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
     packets: list[Packet] = []
     for index, name in enumerate(model.samplers):
-        imu = state.imus.get(name)
-        if imu is not None:
-            specific_force = imu.specific_force.rows(batch.slot, len(batch.boundaries))[:, 0]
-            angular_rate = imu.angular_rate.rows(batch.slot, len(batch.boundaries))[:, 0]
+        copies = state.imu_copies.get(name)
+        if copies is not None:
+            specific_force, angular_rate = (c.rows(batch.slot, len(batch.boundaries))[:, 0] for c in copies)
         for place, boundary in enumerate(batch.boundaries):
             if index not in boundary.samplers:
                 continue
@@ -519,7 +504,7 @@ def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) ->
                 "sensor": name,
             }
             state.sequence[name] += 1
-            if imu is not None:
+            if copies is not None:
                 packets.append(
                     ImuSample(
                         **header,
