@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 from hypothesis import given
@@ -24,7 +25,7 @@ def batches(schedule: Schedule, duration_ns: int) -> list[tuple[int, int]]:
     cuts = [0]
     while cuts[-1] < duration_ns:
         cuts.append(batch_end_ns(schedule, cuts[-1], duration_ns))
-    return list(zip(cuts[:-1], cuts[1:], strict=True))
+    return list(itertools.pairwise(cuts))
 
 
 @given(schedules)
