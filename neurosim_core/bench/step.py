@@ -30,7 +30,7 @@ class StepTimes:
     height: int
     instants: int
     steps_per_s: tuple[float, ...]
-    """Whole steps a second, one figure for each repetition."""
+    """Whole steps a second, one figure for each repetition; each flies past another part of the scene."""
     events_per_step: float
     phases_us: dict[str, float]
     """Host time by phase, per step [us]; on CUDA work is queued, and waited for where it is read back."""
@@ -39,6 +39,11 @@ class StepTimes:
     def median(self) -> float:
         """Median of the repetitions [1/s]."""
         return float(np.median(self.steps_per_s))
+
+    @property
+    def overall(self) -> float:
+        """Steps of all repetitions over their time [1/s]."""
+        return float(1.0 / np.mean(1.0 / np.array(self.steps_per_s)))
 
 
 def measure_steps(
@@ -129,7 +134,8 @@ def print_steps(times: StepTimes, console: Console) -> None:
     rates = times.steps_per_s
     table.add_row(
         "whole steps",
-        f"{times.median:,.0f} /s (median of {len(rates)}, {min(rates):,.0f} to {max(rates):,.0f})",
+        f"{times.median:,.0f} /s (median of {len(rates)}, {min(rates):,.0f} to {max(rates):,.0f};"
+        f" overall {times.overall:,.0f})",
     )
     table.add_row("events", f"{times.events_per_step:,.0f} per step")
     table.add_row("host time", ", ".join(f"{k} {v:.1f} us" for k, v in times.phases_us.items()))

@@ -159,6 +159,18 @@ def _key(
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // not used there, and arrays on the stack take the compiler two seconds
+    for (int pixel = begin; pixel < end; ++pixel) {
+        const float* sample = log_radiance.data + pixel;
+        int lead = 0;
+        while (lead < frame_count && *sample > low_32.data[pixel] && *sample < high_32.data[pixel]) {
+            ++lead;
+            sample += log_radiance.shape[1];
+        }
+        lead_out.data[pixel] = lead;
+    }
+#else
     // frame by frame, so that memory is read in order and the inner loop becomes vector instructions
     constexpr int SIZE = 256;
     const int count = end - begin < SIZE ? end - begin : SIZE;
@@ -178,6 +190,7 @@ def _key(
         if (!any) break;
     }
     for (int i = 0; i < count; ++i) lead_out.data[begin + i] = lead[i];
+#endif
 """)
 def _count_lead(
     begin: wp.int32,

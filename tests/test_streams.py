@@ -1,0 +1,73 @@
+"""Graphs replay what they were given, copies hold what they fetched; on a CPU both cost nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from neurosim_core import streams
+from neurosim_core.streams import Graphs, HostCopy, Milestone, make_stream, on
+
+
+@wp.kernel
+def _add(step: float, values: wp.array[float]) -> None:
+    values[wp.tid()] += step
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 64])
+def test_replays_do_what_the_launches_do(device, monkeypatch, capacity):
+    """Keys that alternate, come late or are forgotten meanwhile: the sum of all steps, every time."""
+    monkeypatch.setattr(streams, "_GRAPH_COUNT_MAX", capacity)
+    values = wp.zeros(3, dtype=float, device=device)
+    graphs = Graphs(device)
+    calls = []
+
+    def launch(step: float) -> None:
+        calls.append(step)
+        for _ in range(2):
+            wp.launch(_add, dim=3, inputs=[step, values], device=device)
+
+    steps = [1.0, 2.0, 1.0, 1.0, 4.0, 2.0, 1.0, 2.0, 2.0, 1.0]
+    with on(make_stream(device)):
+        for step in steps:
+            graphs.run(step, lambda step=step: launch(step))
+        np.testing.assert_array_equal(values.numpy(), np.full(3, 2 * sum(steps)))
+    if device == "cpu":
+        assert calls == steps
+    elif capacity > 2:
+        assert calls == [1.0, 2.0, 1.0, 4.0, 2.0]  # once to launch and once to record
+
+
+def test_a_copy_holds_the_rows_that_were_fetched(device):
+    array = wp.array(np.arange(24, dtype=np.float64).reshape(4, 2, 3), dtype=wp.vec3d, device=device)
+    copy, done = HostCopy(array), Milestone(device)
+    with on(make_stream(device, urgent=True)):
+        copy.fetch(1, 2)
+        done.set()
+        array.zero_()
+    done.wait()
+    rows = copy.rows(1, 2)
+    if device != "cpu":  # there the copy is the array
+        np.testing.assert_array_equal(rows, np.arange(6, 18).reshape(2, 2, 3))
+    array.fill_(7.0)
+    copy.fetch(0, 4)
+    wp.synchronize_device(device)
+    np.testing.assert_array_equal(copy.rows(3, 1), np.full((1, 2, 3), 7.0))
+    assert not np.shares_memory(copy.rows(0, 4), copy.rows(0, 4))
+    assert rows.shape == (2, 2, 3)
+
+
+def test_a_stream_can_wait_for_another(device):
+    """A long chain of launches on one stream, read on a second one behind its milestone."""
+    values = wp.zeros(1 << 20, dtype=float, device=device)
+    first, second, done = make_stream(device), make_stream(device), Milestone(device)
+    with on(first):
+        for _ in range(50):
+            wp.launch(_add, dim=values.shape[0], inputs=[1.0, values], device=device)
+        done.set()
+    out = wp.zeros_like(values)
+    with on(second):
+        done.hold()
+        wp.copy(out, values)
+        assert (out.numpy() == 50.0).all()
