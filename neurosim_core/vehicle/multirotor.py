@@ -407,7 +407,10 @@ class Multirotor:
 
     @property
     def stamp_ns(self) -> int:
-        """Time that `step` and `advance` have been called for since the reset [ns]."""
+        """Time that `step` and `advance` have been called for since the reset [ns].
+
+        A CUDA graph that is replayed moves `arrays.stamp_ns`, not this.
+        """
         return self._stamp_ns
 
     @property
