@@ -259,6 +259,20 @@ def test_a_tree_built_again_gives_the_same_bits(width):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("narrow", [8, 4])
+def test_narrower_packets_give_the_same_hits(width, narrow, monkeypatch):
+    """So that other processors are right, and no ray is led by its neighbours."""
+    if narrow >= width:
+        pytest.skip("as wide as this processor's")
+    scene = make_apartment(ApartmentConfig())
+    origins, rays = views(scene, 2000)
+    wide = cast(EmbreeTree(scene.vertices, scene.faces), origins, rays, width)
+    monkeypatch.setattr(embree._library(), "width", narrow)
+    again = cast(EmbreeTree(scene.vertices, scene.faces), origins, rays, narrow)
+    np.testing.assert_array_equal(again[0] >= 0, wide[0] >= 0)
+    np.testing.assert_allclose(again[1], wide[1], rtol=1e-6)
+
+
 def test_the_tree_is_freed(width, monkeypatch):
     library = embree._library()
     released = []
