@@ -36,6 +36,9 @@ class RenderConfig(Settings):
     backend: Literal["warp", "pyrender"] = "warp"
     """`warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only, for
     comparison."""
+    cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
+    """Who finds what rays hit on a CPU device. `embree`: Embree, in packets of rays, several times faster.
+    `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"

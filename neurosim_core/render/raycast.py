@@ -4,8 +4,8 @@
 """The ray caster: one kernel factory, specialised on the outputs asked for and the terms of the scene.
 
 One traversal per ray answers everything. A thread is a pixel of an instant; blocks of 64 threads are tiles of
-8 x 8 pixels, so that their rays walk the same nodes of the tree. What a specialisation does not need is not
-in its code.
+8 x 8 pixels, so that their rays walk the same nodes of the tree. With Embree a thread is a packet of 4 x 4
+pixels, four of them a tile. What a specialisation does not need is not in its code.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
 from neurosim_core.scene.materials import sample_texture
 
@@ -40,6 +41,8 @@ class Terms(NamedTuple):
     """Light is interpolated between corners instead of evaluated for each pixel."""
     supersampled: bool
     """Radiance is the mean over several rays per pixel."""
+    embree: int = 0
+    """Embree finds what rays hit, so many at once (`embree.packet_width`), on the CPU only; 0: Warp does."""
 
 
 @wp.struct
@@ -47,6 +50,10 @@ class SceneData:
     """The arrays of a scene that the kernel reads. Corner k of face f is at 3 f + k."""
 
     mesh: wp.uint64
+    embree_scene: wp.uint64
+    """`EmbreeTree.scene`; 0 if Warp finds what rays hit."""
+    embree_intersect: wp.uint64
+    """`EmbreeTree.intersect`, likewise."""
     face_material: wp.array[int]
     face_instance: wp.array[int]
     face_lod: wp.array[float]
@@ -72,6 +79,22 @@ class SceneData:
     exposure: float
 
 
+@wp.struct
+class Hit:
+    """What a ray hits first."""
+
+    face: int
+    """-1: nothing, and the rest has no meaning."""
+    t: float
+    """Distance along the ray [m]."""
+    u: float
+    """Weight of the first corner."""
+    v: float
+    """Weight of the second corner."""
+    normal: wp.vec3
+    """Unit normal of the face's front."""
+
+
 @wp.func
 def _to_srgb(linear: float) -> wp.uint8:
     # IEC 61966-2-1
@@ -93,12 +116,13 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     with_images = len(outputs) > int(with_log)
     baked = terms.baked
     supersampled = terms.supersampled
+    cast_packet = packet_caster(terms.embree) if terms.embree else None
     with_geometry = with_depth or with_normal or with_instance
 
     @wp.func
-    def shade(
-        scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: wp.MeshQueryRay
-    ) -> wp.vec3:
+    def shade(scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit) -> wp.vec3:
+        if hit.face < 0:
+            return scene.sky
         corner = 3 * hit.face
         u = hit.u
         v = hit.v
@@ -147,6 +171,56 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             emission = scene.emission[material]
         return reflect_light(albedo, light, emission)
 
+    @wp.func
+    def write_geometry(
+        scene: SceneData,
+        ray: wp.vec3,
+        cosine: float,
+        hit: Hit,
+        slot: int,
+        row: int,
+        col: int,
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ) -> None:
+        if wp.static(with_depth):
+            depth_out[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
+        if wp.static(with_normal):
+            normal = wp.vec3(0.0)
+            if hit.face >= 0:
+                normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
+            normal_out[slot, row, col] = normal
+        if wp.static(with_instance):
+            name = int(-1)
+            if hit.face >= 0:
+                name = scene.face_instance[hit.face]
+            instance_out[slot, row, col] = name
+
+    @wp.func
+    def write_radiance(
+        scene: SceneData,
+        total: wp.vec3,
+        layer_count: int,
+        instant: int,
+        slot: int,
+        row: int,
+        col: int,
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+    ) -> None:
+        radiance = total
+        if wp.static(supersampled):
+            radiance = (1.0 / float(layer_count - 1)) * radiance
+        if wp.static(with_log):
+            luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
+            log_radiance_out[instant, row, col] = wp.log(luma + scene.dark_floor)
+        if wp.static(with_rgb):
+            if slot >= 0:
+                rgb_out[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
+                rgb_out[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
+                rgb_out[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
+
     @wp.kernel(module="unique", enable_backward=False)
     def raycast(
         first: int,
@@ -188,45 +262,132 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         pixel = row * width + col
         radiance = wp.vec3(0.0)
         for layer in range(rays.shape[0]):
-            ray_C = rays[layer, pixel]
-            ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
             if wp.static(supersampled):
                 # Layer 0 goes through the centre and is for geometry, the others are for radiance.
                 if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
                     continue
-            hit = wp.mesh_query_ray(scene.mesh, origin, ray, _FAR_M)
+            ray_C = rays[layer, pixel]
+            ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            query = wp.mesh_query_ray(scene.mesh, origin, ray, _FAR_M)
+            hit = Hit()
+            hit.face = wp.where(query.result, query.face, -1)
+            hit.t = query.t
+            hit.u = query.u
+            hit.v = query.v
+            hit.normal = query.normal
             if wp.static(with_radiance):
                 if wp.static(not supersampled) or layer > 0:
-                    if hit.result:
-                        radiance += shade(scene, ray, origin, ray_C[3], hit)
-                    else:
-                        radiance += scene.sky
+                    radiance += shade(scene, ray, origin, ray_C[3], hit)
             if wp.static(with_geometry):
                 if slot >= 0 and layer == 0:
-                    if wp.static(with_depth):
-                        depth_out[slot, row, col] = wp.where(hit.result, hit.t * ray_C[2], wp.inf)
-                    if wp.static(with_normal):
-                        normal = wp.vec3(0.0)
-                        if hit.result:
-                            normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
-                        normal_out[slot, row, col] = normal
-                    if wp.static(with_instance):
-                        name = int(-1)
-                        if hit.result:
-                            name = scene.face_instance[hit.face]
-                        instance_out[slot, row, col] = name
-        if wp.static(supersampled):
-            radiance = (1.0 / float(rays.shape[0] - 1)) * radiance
-        if wp.static(with_log):
-            luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
-            log_radiance_out[instant, row, col] = wp.log(luma + scene.dark_floor)
-        if wp.static(with_rgb):
-            if slot >= 0:
-                rgb_out[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
-                rgb_out[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
-                rgb_out[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
+                    write_geometry(
+                        scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
+                    )
+        if wp.static(with_radiance):
+            write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
 
-    return raycast
+    @wp.kernel(module="unique", enable_backward=False)
+    def raycast_packets(
+        first: int,
+        # Model:
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        # In:
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        # Out:
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ) -> None:
+        # A packet is the same pixels in every launch: the last bit of a hit may depend on the other rays.
+        index = first + wp.tid()
+        in_tile = index % 4
+        block = index // 4
+        instant = block % instant_count
+        tile = block // instant_count
+        tile_columns = (width + 7) // 8
+        left = (tile % tile_columns) * 8 + (in_tile % 2) * 4
+        top = (tile // tile_columns) * 8 + (in_tile // 2) * 4
+        if left >= width or top >= height:
+            return
+        slot = int(-1)
+        if wp.static(with_images):
+            slot = image_slot[instant]
+            if wp.static(not with_log):
+                if slot < 0:
+                    return
+        origin = p_WC[instant]
+        q = q_WC[instant]
+        ray = wp.zeros(shape=(16,), dtype=wp.vec3)
+        face = wp.zeros(shape=(16,), dtype=int)
+        t = wp.zeros(shape=(16,), dtype=float)
+        u = wp.zeros(shape=(16,), dtype=float)
+        v = wp.zeros(shape=(16,), dtype=float)
+        normal = wp.zeros(shape=(16,), dtype=wp.vec3)
+        radiance = wp.zeros(shape=(16,), dtype=wp.vec3)
+        columns = wp.min(width - left, 4)
+        rows = wp.min(height - top, 4)
+        for layer in range(rays.shape[0]):
+            if wp.static(supersampled):
+                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
+                    continue
+            for y in range(rows):
+                for x in range(columns):
+                    ray_C = rays[layer, (top + y) * width + left + x]
+                    ray[4 * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            cast_packet(
+                scene.embree_intersect, scene.embree_scene, origin, ray, _FAR_M, face, t, u, v, normal
+            )
+            for y in range(rows):
+                for x in range(columns):
+                    lane = 4 * y + x
+                    ray_C = rays[layer, (top + y) * width + left + x]
+                    hit = Hit()
+                    hit.face = face[lane]
+                    hit.t = t[lane]
+                    hit.u = u[lane]
+                    hit.v = v[lane]
+                    hit.normal = wp.normalize(normal[lane])
+                    if wp.static(with_radiance):
+                        if wp.static(not supersampled) or layer > 0:
+                            radiance[lane] += shade(scene, ray[lane], origin, ray_C[3], hit)
+                    if wp.static(with_geometry):
+                        if slot >= 0 and layer == 0:
+                            write_geometry(
+                                scene,
+                                ray[lane],
+                                ray_C[2],
+                                hit,
+                                slot,
+                                top + y,
+                                left + x,
+                                depth_out,
+                                normal_out,
+                                instance_out,
+                            )
+        if wp.static(with_radiance):
+            for y in range(rows):
+                for x in range(columns):
+                    write_radiance(
+                        scene,
+                        radiance[4 * y + x],
+                        rays.shape[0],
+                        instant,
+                        slot,
+                        top + y,
+                        left + x,
+                        log_radiance_out,
+                        rgb_out,
+                    )
+
+    return raycast_packets if terms.embree else raycast
 
 
 def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:

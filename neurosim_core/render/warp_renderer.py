@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -13,12 +14,14 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
+from neurosim_core.render.embree import PACKET, EmbreeError, EmbreeTree, packet_width
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine, spread_order
 from neurosim_core.render.raycast import TILE, SceneData, Terms, raycast_kernel
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
 
+_logger = logging.getLogger(__name__)
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _MIDDLE_GREY = 0.2
 _BRIGHT = 0.6
@@ -35,6 +38,8 @@ class SceneArrays:
     """All triangles, refined if light is baked; for rays and for nearest-point queries."""
     face_origin: wp.array[int]
     """Face of the scene that each face of `mesh` is a part of, shape [F]."""
+    embree: EmbreeTree | None
+    """The triangles of `mesh`, if Embree finds what the rays of cameras hit."""
     terms: Terms
     data: SceneData
     exposure: float
@@ -53,8 +58,11 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
 
     Args:
         scene: What to render.
-        config: How to light it.
+        config: How to light it, and who casts rays on a CPU.
         device: "cpu", "cuda:0", …
+
+    Raises:
+        EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.
     """
     baked = config.lighting.mode == "baked"
     mesh = refine(scene, config.lighting.edge_max_m if baked else None)
@@ -65,6 +73,7 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         emissive=any(max(m.emission) > 0.0 for m in scene.materials),
         baked=baked,
         supersampled=config.samples_per_pixel > 1,
+        embree=_embree_width(config, device),
     )
     start = time.perf_counter()
     light: NDArray[np.float32] | None = None
@@ -84,8 +93,12 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         bvh_constructor="sah",  # on a CPU three times faster to traverse than "median" and as fast as "cubql"
         bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
     )
+    embree = EmbreeTree(mesh.vertices, mesh.faces) if terms.embree else None
     data = SceneData()
     data.mesh = tree.id
+    if embree is not None:
+        data.embree_scene = wp.uint64(embree.scene)
+        data.embree_intersect = wp.uint64(embree.intersect)
     data.face_material = wp.array(material, dtype=int, device=device)
     data.face_instance = wp.array(scene.face_instance[mesh.origin], dtype=int, device=device)
     data.base_color = wp.array(_rows([m.base_color for m in scene.materials]), dtype=wp.vec3, device=device)
@@ -117,11 +130,25 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         device=device,
         mesh=tree,
         face_origin=wp.array(mesh.origin, dtype=int, device=device),
+        embree=embree,
         terms=terms,
         data=data,
         exposure=exposure,
         light_s=light_s,
     )
+
+
+def _embree_width(config: RenderConfig, device: str) -> int:
+    """Return how many rays Embree casts at once, 0 if Warp casts them."""
+    if config.cpu_traversal == "warp" or not wp.get_device(device).is_cpu:
+        return 0
+    try:
+        return packet_width()
+    except EmbreeError as error:
+        if config.cpu_traversal == "embree":
+            raise EmbreeError(f"cpu_traversal is 'embree', but {error}") from None
+        _logger.info("rays are cast by Warp, several times slower than by Embree: %s", error)
+        return 0
 
 
 def _rows(values: list[tuple[float, float, float]]) -> NDArray[np.float32]:
@@ -219,7 +246,7 @@ class WarpRenderer:
         self._width, self._height = lens.width, lens.height
         self._thread_count = thread_count
         tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
-        self._instant_threads = tiles * TILE * TILE
+        self._instant_threads = tiles * TILE * TILE // (PACKET if arrays.terms.embree else 1)
         rays = _ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
         self._rays = wp.array(rays, dtype=wp.vec4, device=device)
