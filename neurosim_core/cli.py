@@ -89,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
 
     view = commands.add_parser("view", help="look at a flight in Rerun")
     view.add_argument("flight", type=Path, help="folder that `neurosim run` left, or a flight.h5")
+    view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(
         "--save", type=Path, metavar="RRD", help="write the Rerun file instead of opening a window"
     )
@@ -134,8 +135,8 @@ def _run(arguments: argparse.Namespace) -> int:
     from neurosim_core.flight import fly, new_folder
 
     folder = new_folder(arguments.out, overwrite=arguments.overwrite)
-    fly(config, folder, rerun=not arguments.no_rrd)
-    return 0
+    report = fly(config, folder, rerun=not arguments.no_rrd)
+    return 130 if report.interrupted else 0
 
 
 def _scene(arguments: argparse.Namespace) -> int:

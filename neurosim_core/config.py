@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from neurosim_core.control import Se3Config
-from neurosim_core.render.renderer import RenderConfig
+from neurosim_core.render.renderer import RenderConfig, RendererName
 from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
@@ -49,7 +49,18 @@ class VehicleConfig(Settings):
 
     @model_validator(mode="after")
     def _airframe_exists(self) -> VehicleConfig:
-        self.airframe()
+        try:
+            self.airframe()
+        except ValidationError as error:
+            known = ", ".join(MultirotorConfig.model_fields)
+            reasons = [
+                f"unknown parameter, known: {known}"
+                if item["type"] == "extra_forbidden"
+                else f"{item['msg'].removeprefix('Value error, ')}, got {_shorten(item['input'])}"
+                for item in error.errors()
+            ]
+            keys = [".".join(("parameters", *map(str, item["loc"]))) for item in error.errors()]
+            raise ValueError("; ".join(f"{k}: {r}" for k, r in zip(keys, reasons, strict=True))) from None
         return self
 
     def airframe(self) -> MultirotorConfig:
@@ -93,6 +104,8 @@ class SimulationConfig(Settings):
     result."""
     scene: SceneConfig = ApartmentConfig()
     """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
+    renderer: RendererName = "warp"
+    """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only."""
     render: RenderConfig = RenderConfig()
     """How the scene is lit and rendered."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()
@@ -136,7 +149,8 @@ def load_config(
         source: A YAML file, a mapping with the same keys, or None for the defaults. A relative scene file is
             looked up beside the YAML file.
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
-            another kind; a key may be dotted ("scene.seed").
+            another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
+            the default set are changed, and new ones added to it.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
 
@@ -146,11 +160,11 @@ def load_config(
     """
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
-    for key, value in (overrides or {}).items():
-        nested: Any = value
-        for part in reversed(key.split(".")):
-            nested = {part: nested}
-        raw = _merge(raw, nested)
+    patches = [_nest(key, value) for key, value in (overrides or {}).items()]
+    if "sensors" not in raw and any("sensors" in patch for patch in patches):
+        raw["sensors"] = {name: sensor.model_dump() for name, sensor in _default_sensors().items()}
+    for patch in patches:
+        raw = _merge(raw, patch)
     if isinstance(source, str | Path):
         raw = _beside(raw, Path(source).resolve().parent)
     raw = _with_default_kinds(raw)
@@ -185,6 +199,14 @@ def _read(path: Path) -> dict[str, Any]:
     return raw
 
 
+def _nest(key: str, value: Any) -> dict[str, Any]:
+    """Return {"a": {"b": value}} for the key "a.b"."""
+    nested = value
+    for part in reversed(key.split(".")):
+        nested = {part: nested}
+    return dict(nested)
+
+
 def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
     """Return `base` with the keys of `patch`; a group of another kind replaces the one it meets."""
     if "kind" in patch and patch["kind"] != base.get("kind"):
@@ -210,7 +232,8 @@ def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
     for key, item in SimulationConfig.model_fields.items():
         group = raw.get(key)
         if isinstance(group, Mapping) and "kind" not in group and hasattr(item.default, "kind"):
-            raw = {**raw, key: {"kind": item.default.kind, **group}}
+            kind = "mesh" if key == "scene" and "file" in group else item.default.kind
+            raw = {**raw, key: {"kind": kind, **group}}
     return raw
 
 
@@ -234,7 +257,7 @@ def _explain(error: ValidationError) -> Iterator[str]:
             yield f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}"
         else:
             message = item["msg"].removeprefix("Value error, ")
-            got = "" if item["type"] == "value_error" and not keys else f", got {_shorten(item['input'])}"
+            got = "" if item["type"] == "value_error" else f", got {_shorten(item['input'])}"
             yield f"{shown}: {message}{got}" if shown else message
 
 

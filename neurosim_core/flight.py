@@ -24,7 +24,7 @@ from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_se
 from neurosim_core.sensors.rig import Cast
 from neurosim_core.simulation import Model, State, load_scene, make_model, make_state, run_model
 from neurosim_core.vehicle import DynamicsError
-from neurosim_core.view.overview import FlightSummary, save_overview
+from neurosim_core.view.overview import FlightSummary, Track, save_overview
 from neurosim_core.view.rerun_log import RerunLogger, open_recording
 
 _LIBRARIES = {"h5py": "record", "rerun": "view", "matplotlib": "view"}
@@ -99,7 +99,7 @@ def fly(
         status.update("preparing: kernels (compiled on the first run, then cached)")
         state = make_state(model)
         packets = run_model(model, state)
-        waiting = next(packets)
+        first = next(packets, None)  # builds all kernels; there is none without sensors
     report.setup_s = time.perf_counter() - begin
     _print_plan(console, model)
     folder.mkdir(parents=True, exist_ok=True)
@@ -110,7 +110,7 @@ def fly(
     with _sinks(model, folder, rerun=rerun, console=console) as sinks, _progress(console) as progress:
         task = progress.add_task("flying", total=model.duration_ns, rate="", factor="")
         try:
-            for packet in _chain(waiting, packets):
+            for packet in packets if first is None else itertools.chain([first], packets):
                 for sink in sinks:
                     sink(packet)
                 summary.log(packet)
@@ -134,7 +134,7 @@ def fly(
         save_overview(
             folder / "overview.png",
             scene=model.scene,
-            track=summary.track(),
+            track=summary.track() if report.tracking_errors_m else _planned_track(model, state.stamp_ns),
             snapshot=summary.snapshot(),
             event_count=report.event_count,
             real_time_factor=report.real_time_factor,
@@ -215,16 +215,22 @@ def _log_clearance(logger: RerunLogger, model: Model, packet: Packet) -> None:
         logger.log_scalar("clearance", packet.stamp_ns, clearance_m)
 
 
+def _planned_track(model: Model, end_ns: int) -> Track:
+    """Return the planned path up to a stamp, for a flight without odometry."""
+    samples = model.path.evaluate(np.linspace(0, end_ns, 501).astype(np.int64))
+    return Track(
+        stamp_ns=samples.stamps_ns,
+        position=samples.position,
+        velocity=samples.velocity,
+        heading=np.stack([np.cos(samples.yaw), np.sin(samples.yaw)], axis=1),
+    )
+
+
 def _has(library: str, console: Console, product: str) -> bool:
     if importlib.util.find_spec(library) is not None:
         return True
     console.print(f"[yellow]{product} is left out: pip install 'neurosim\\[{_LIBRARIES[library]}]'[/]")
     return False
-
-
-def _chain(first: Packet, rest: Iterator[Packet]) -> Iterator[Packet]:
-    yield first
-    yield from rest
 
 
 def _note(report: Report, model: Model, packet: Packet) -> None:

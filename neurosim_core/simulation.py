@@ -81,9 +81,8 @@ class Model:
     def render_terms(self) -> tuple[str, ...]:
         """What the renderer computes because of the scene and its settings."""
         terms = getattr(self.scene_on_device, "terms", None)
-        return (
-            () if terms is None else tuple(name for name, value in terms._asdict().items() if value is True)
-        )
+        present = {} if terms is None else terms._asdict()
+        return tuple(name for name, value in present.items() if value)
 
     @property
     def duration_ns(self) -> int:
@@ -183,7 +182,9 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
         path = make_path(config.path, free_space, airframe, duration_s=config.duration_s)
     casts = plan_casts(config.sensors)
     with phase("light"):
-        scene_on_device = upload_scene(scene, config.render, device=device) if casts else None
+        scene_on_device = (
+            upload_scene(scene, config.render, device=device, renderer=config.renderer) if casts else None
+        )
     samplers = {
         n: s for n, s in config.sensors.items() if isinstance(s, ImuSensorConfig | OdometrySensorConfig)
     }
@@ -217,7 +218,7 @@ def make_state(model: Model, *, lane_count: int | None = None) -> State:
     """
     config, device = model.config, model.device
     if lane_count is None:
-        ahead = wp.get_device(device).is_cuda and config.render.backend == "warp"
+        ahead = wp.get_device(device).is_cuda and config.renderer == "warp"
         lane_count = _LANES_ON_CUDA if ahead else 1
     vehicle = Multirotor(model.airframe, count=1, device=device, max_step_ns=to_ns(config.vehicle.max_step_s))
     start = model.path.evaluate([0])
@@ -529,12 +530,8 @@ def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) ->
 
 def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
     """Report each beginning of a touch; end the run at the first one if so configured."""
-    states, bounds_m = rows.states[:, 0], model.free_space.bounds_m
-    positions = states[:, POSITION]
-    to_bounds_m = np.minimum(positions - bounds_m[0], bounds_m[1] - positions).min(axis=1)
-    margins_m = np.minimum(rows.clearance, to_bounds_m - model.config.vehicle.collision_radius_m)
     packets: list[Packet] = []
-    for boundary, row, margin_m in zip(batch.boundaries, states, margins_m, strict=True):
+    for boundary, row, margin_m in zip(batch.boundaries, rows.states[:, 0], rows.clearance, strict=True):
         touching = bool(margin_m <= 0.0)
         if touching and not state.touching:
             packets.append(

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from neurosim_core import cli
 from neurosim_core.config import load_config
 from neurosim_core.flight import new_folder
 from neurosim_core.packets import Events
@@ -103,6 +104,33 @@ def test_a_rerun_file_can_be_made_from_the_recording(flown, tmp_path):
     done = neurosim("view", str(folder), "--save", str(tmp_path / "again.rrd"))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "again.rrd").stat().st_size > 100_000
+
+
+@pytest.mark.parametrize(("options", "passed"), [([], ""), (["--web"], " --web-viewer")])
+def test_view_opens_the_viewer(flown, tmp_path, options, passed, monkeypatch, capfd):
+    """A stand-in for the viewer tells what it is started with."""
+    folder, _ = flown
+    viewer = tmp_path / "rerun"
+    viewer.write_text('#!/bin/sh\necho "viewer $*"\n')
+    viewer.chmod(0o755)
+    monkeypatch.setattr(cli.shutil, "which", lambda *_, **__: str(viewer))
+    assert cli.main(["view", str(folder), *options]) == 0
+    assert f"viewer {folder / 'flight.rrd'}{passed}" in capfd.readouterr().out
+
+
+def test_a_run_without_sensors_is_a_run(tmp_path):
+    done = neurosim("run", "--duration", "0.1", "--set", "sensors={}", "--out", "none", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "0.000 s" not in done.stdout
+
+
+def test_a_flight_without_odometry_shows_the_planned_path(tmp_path):
+    file = tmp_path / "scene.yaml"
+    file.write_text(yaml.safe_dump({**SETTINGS, "sensors": {"rgb": SETTINGS["sensors"]["rgb"]}}))
+    done = neurosim("run", "scene.yaml", "--out", "flight", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    plan = np.asarray(Image.open(tmp_path / "flight" / "overview.png").convert("RGB"))[:, 1000:]
+    assert ((plan == (0x2B, 0x8A, 0x3E)).all(axis=-1)).sum() > 5  # the mark and name of the start
 
 
 def test_a_flight_is_not_overwritten_unasked(flown):

@@ -60,7 +60,9 @@ WRONG = [
     ({"sensors": {"x": {"rate_hz": 3}}}, ["sensors.x.kind", "required"]),
     ({"scene": {"kind": "apartment", "romms": 4}}, ["scene.romms", "unknown key", "'rooms'"]),
     ({"vehicle": {"preset": "zeppelin"}}, ["zeppelin", "crazyflie", "hummingbird", "racer"]),
-    ({"vehicle": {"parameters": {"mass_kg": 0.0}}}, ["mass_kg", "0"]),
+    ({"vehicle": {"parameters": {"mass_kg": 0.0}}}, ["vehicle: parameters.mass_kg", "greater than 0", "0.0"]),
+    ({"vehicle": {"parameters": {"mass": 1.0}}}, ["parameters.mass", "unknown parameter", "mass_kg"]),
+    ({"renderer": "opengl"}, ["renderer", "opengl", "pyrender"]),
     ({"control": {"gains": {"position_gain_per_s2": -1}}}, ["control.gains.position_gain_per_s2", "-1"]),
     (
         {"sensors": {"dvs": {"kind": "event_camera", "pixel": {"threshold_on": 0.0}}}},
@@ -103,6 +105,32 @@ def test_overrides_win_and_may_be_dotted(tmp_path):
     config = load_config(file, overrides={"scene.seed": 5, "duration_s": 2.0})
     assert (config.duration_s, config.scene.seed) == (2.0, 5)
     assert load_config(file, overrides={"scene": {"kind": "mesh", "file": "/a.glb"}}).scene.kind == "mesh"
+
+
+def test_overrides_change_the_default_sensors(tmp_path):
+    """Where the source names no sensors, a key of one changes that one and leaves the others."""
+    config = load_config(overrides={"sensors.events.pixel.threshold_on": 0.3, "sensors.rgb.lens.width": 640})
+    default = load_config()
+    assert set(config.sensors) == set(default.sensors)
+    assert config.sensors["events"].pixel.threshold_on == 0.3
+    assert config.sensors["rgb"].lens.width == 640
+    assert config.sensors["imu"] == default.sensors["imu"]
+    more = load_config(overrides={"sensors": {"left": {"kind": "rgb"}}})
+    assert set(more.sensors) == {*default.sensors, "left"}
+    named = load_config({"sensors": {"left": {"kind": "rgb"}}}, overrides={"sensors.left.rate_hz": 5})
+    assert set(named.sensors) == {"left"}
+
+
+@pytest.mark.parametrize(
+    ("sampling_hz", "packets_hz"), [(500, 100), (1000, 100), (240, 80), (250, 62.5), (333, 83.25), (30, 30)]
+)
+def test_packets_end_on_renders_whatever_the_rate(sampling_hz, packets_hz):
+    config = load_config({"sensors": {"dvs": {"kind": "event_camera", "sampling_rate_hz": sampling_hz}}})
+    assert config.sensors["dvs"].packets.rate_hz == packets_hz
+
+
+def test_a_scene_file_is_a_mesh(tmp_path):
+    assert load_config({"scene": {"file": "/a.glb"}}).scene.kind == "mesh"
 
 
 def test_scene_file_is_relative_to_the_settings_file(tmp_path):

@@ -291,6 +291,14 @@ def test_events_of_a_run_are_sorted_within_their_windows(settings):
         assert ((t * 1000 > packet.start_ns - 1000) & (t * 1000 <= packet.stamp_ns)).all()
 
 
+def test_leaving_the_scene_is_no_collision(settings):
+    """Above a room without a roof, or beside a lone wall, there is nothing to hit."""
+    outside = {"kind": "hover", "position_m": [0.0, 0.0, 9.0]}
+    packets = fly({**settings, "path": outside, "sensors": {"odometry": SENSORS["odometry"]}})
+    assert not of(packets, "collision")
+    assert packets[-1].stamp_ns == 200_000_000
+
+
 def test_an_unknown_device_is_named(settings):
     with pytest.raises(ValueError, match="cuda:77"):
         fly(settings, device="cuda:77")

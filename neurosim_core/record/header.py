@@ -98,7 +98,7 @@ def _describe(name: str, sensor: SensorConfig) -> SensorDescription:
         position = np.array(sensor.mount.position_m)
         orientation = sensor.mount.rotation().as_quat()
     else:
-        rate_hz = sensor.packet_rate_hz if sensor.kind == "event_camera" else sensor.rate_hz
+        rate_hz = sensor.packets.rate_hz if sensor.kind == "event_camera" else sensor.rate_hz
         position = np.array(sensor.mount.position_m)
         orientation = sensor.mount.optical_quaternion()
         K = sensor.lens.intrinsics()

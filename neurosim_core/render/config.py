@@ -33,9 +33,6 @@ class LightingConfig(Settings):
 class RenderConfig(Settings):
     """How pictures are computed, the same for all cameras of a run."""
 
-    backend: Literal["warp", "pyrender"] = "warp"
-    """`warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only, for
-    comparison."""
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
     """Who finds what rays hit on a CPU device. `embree`: Embree, in packets of rays, several times faster.
     `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded."""

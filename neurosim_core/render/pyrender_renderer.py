@@ -31,7 +31,7 @@ _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 _GAMMA = 2.2  # of pyrender's shader
 _INSTALL_OPENGL = (
     "OpenGL without a display needs EGL and a driver, for example: apt-get install libegl1 libgl1-mesa-dri; "
-    "or render with backend: warp, which needs neither"
+    "or use renderer: warp, which needs neither"
 )
 
 
@@ -158,8 +158,8 @@ class PyrenderRenderer:
         unknown = sorted(set(outputs) - {"rgb", "depth"})
         if unknown or not outputs:
             raise ValueError(
-                f"the pyrender backend renders ['rgb', 'depth'], asked for {sorted(outputs)}: "
-                "use backend: warp for event cameras and the rest"
+                f"pyrender renders ['rgb', 'depth'], asked for {sorted(outputs)}: "
+                "use renderer: warp for event cameras and the rest"
             )
         pyrender = _import_pyrender()
         self._scene = scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import warp as wp
 
@@ -14,7 +14,18 @@ from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer
 from neurosim_core.render.warp_renderer import upload_scene as upload_warp_scene
 from neurosim_core.scene.scene import Scene
 
-__all__ = ["LightingConfig", "RenderConfig", "Renderer", "SceneOnDevice", "make_renderer", "upload_scene"]
+__all__ = [
+    "LightingConfig",
+    "RenderConfig",
+    "Renderer",
+    "RendererName",
+    "SceneOnDevice",
+    "make_renderer",
+    "upload_scene",
+]
+
+RendererName = Literal["warp", "pyrender"]
+"""Names of the renderers."""
 
 SceneOnDevice = SceneArrays | PyrenderScene
 """A scene as one of the renderers keeps it, shared by all cameras."""
@@ -52,18 +63,21 @@ class Renderer(Protocol):
         """
 
 
-def upload_scene(scene: Scene, config: RenderConfig, *, device: str) -> SceneOnDevice:
-    """Prepare a scene for the backend that `config` names.
+def upload_scene(
+    scene: Scene, config: RenderConfig, *, device: str, renderer: RendererName = "warp"
+) -> SceneOnDevice:
+    """Prepare a scene for a renderer.
 
     Args:
         scene: What to render.
-        config: Backend, light, exposure.
-        device: Where the Warp backend renders, and where light is baked.
+        config: Light, exposure and the like.
+        device: Where Warp renders, and where light is baked.
+        renderer: `warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only.
 
     Raises:
-        PyrenderError: The backend is pyrender and it cannot be used here.
+        PyrenderError: pyrender cannot be used here.
     """
-    if config.backend == "pyrender":
+    if renderer == "pyrender":
         return upload_pyrender_scene(scene, config, device=device)
     return upload_warp_scene(scene, config, device=device)
 
@@ -86,7 +100,7 @@ def make_renderer(
         image_count: M, number of image slots.
 
     Raises:
-        ValueError: An output is unknown, or the backend does not have it.
+        ValueError: An output is unknown, or the renderer does not have it.
     """
     if isinstance(scene, PyrenderScene):
         return PyrenderRenderer(scene, lens, outputs=outputs, image_count=image_count)

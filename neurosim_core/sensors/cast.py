@@ -133,7 +133,7 @@ def make_cast_state(
                 scan_count_max=lane_count,
                 on_host=True,
             ),
-            packets=Rate(sensor.packet_rate_hz),
+            packets=sensor.packets,
         )
     images = {}
     for name, sensor in image_sensors.items():

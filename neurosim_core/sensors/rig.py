@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Annotated, Literal
@@ -33,14 +35,24 @@ class EventSensorConfig(CameraConfig):
     kind: Literal["event_camera"] = "event_camera"
     pixel: EventCameraConfig = EventCameraConfig()
     """The law of its pixels."""
-    sampling_rate_hz: RateHz = 240.0
+    sampling_rate_hz: RateHz = 500.0
     """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
-    packet_rate_hz: RateHz = 120.0
-    """How many packets of events are sent a second [Hz]; the events in them are those of the whole window."""
+    packet_rate_hz: RateHz | None = None
+    """How many packets of events are sent a second [Hz]; each holds the events of its whole window. null: the
+    highest rate up to 100 Hz that divides the sampling rate."""
+
+    @property
+    def packets(self) -> Rate:
+        """The clock at which packets end."""
+        if self.packet_rate_hz is not None:
+            return Rate(self.packet_rate_hz)
+        sampling = Fraction(str(self.sampling_rate_hz))
+        shares = (sampling / count for count in itertools.count(max(1, math.ceil(sampling / 100))))
+        return Rate(float(next(share for share in shares if Fraction(str(float(share))) == share)))
 
     @model_validator(mode="after")
     def _packets_end_on_renders(self) -> EventSensorConfig:
-        if not _divides(self.packet_rate_hz, self.sampling_rate_hz):
+        if self.packet_rate_hz is not None and not _divides(self.packet_rate_hz, self.sampling_rate_hz):
             raise ValueError(
                 f"packet_rate_hz must divide sampling_rate_hz = {self.sampling_rate_hz:g} without remainder, "
                 f"got {self.packet_rate_hz:g}"

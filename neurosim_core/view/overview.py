@@ -449,12 +449,15 @@ def _draw_path(
             Polygon(wedge, closed=True, facecolor="#f59f00", edgecolor="none", alpha=0.45, zorder=2.5)
         )
         axes.plot(*wedge[0], marker="o", markersize=6, color=_INK, zorder=7)
-    for index, text, color in ((0, "start", "#2b8a3e"), (-1, "end", "#c92a2a")):
+    # the names stand on opposite sides, so that both can be read where a flight is short
+    for index, text, color, side in ((0, "start", "#2b8a3e", -1), (-1, "end", "#c92a2a", 1)):
         axes.plot(*points[index], marker="o", markersize=9, color=color, mec="white", mew=1.6, zorder=6)
         axes.annotate(
             text,
             points[index],
-            xytext=(8, 8),
+            xytext=(8 * side, 8 * side),
+            ha="left" if side > 0 else "right",
+            va="bottom" if side > 0 else "top",
             textcoords="offset points",
             fontsize=10.5,
             fontweight="bold",

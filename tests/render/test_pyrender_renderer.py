@@ -29,7 +29,7 @@ def both(scene, lens, poses):
     pictures = []
     for backend in ("warp", "pyrender"):
         try:
-            uploaded = upload_scene(scene, RenderConfig(backend=backend, lighting=LIGHT), device="cpu")
+            uploaded = upload_scene(scene, RenderConfig(lighting=LIGHT), device="cpu", renderer=backend)
             renderer = make_renderer(
                 uploaded, lens, outputs={"rgb", "depth"}, instant_count=len(poses), image_count=len(poses)
             )
@@ -75,11 +75,11 @@ def test_slanted_surfaces_to_a_fraction_of_a_pixel():
 
 def test_what_pyrender_does_not_have_is_refused():
     try:
-        uploaded = upload_scene(scene_of(plane(1.0)), RenderConfig(backend="pyrender"), device="cpu")
+        uploaded = upload_scene(scene_of(plane(1.0)), RenderConfig(), device="cpu", renderer="pyrender")
     except PyrenderError as error:
         pytest.skip(str(error))
     lens = PinholeConfig(width=8, height=8, horizontal_fov_rad=1.0)
-    with pytest.raises(ValueError, match="use backend: warp for event cameras"):
+    with pytest.raises(ValueError, match="use renderer: warp for event cameras"):
         make_renderer(uploaded, lens, outputs={"log_radiance", "rgb"}, instant_count=1)
 
 
@@ -87,4 +87,4 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch):
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     with pytest.raises(PyrenderError, match="apt-get install libegl1 libgl1-mesa-dri"):
-        upload_scene(scene_of(plane(1.0)), RenderConfig(backend="pyrender"), device="cpu")
+        upload_scene(scene_of(plane(1.0)), RenderConfig(), device="cpu", renderer="pyrender")
