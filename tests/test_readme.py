@@ -37,6 +37,12 @@ def test_the_readme_is_short():
     assert len(README.splitlines()) <= 150
 
 
+def test_the_readme_is_finished():
+    for image in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
+        assert (ROOT / image).is_file()
+    assert not re.search(r"FIGURE|TODO|TBD|XXX", README)
+
+
 def test_ci_runs_the_test_command():
     spec = importlib.util.spec_from_file_location("readme_command", ROOT / ".ci" / "readme_command.py")
     assert spec is not None
