@@ -7,12 +7,10 @@ many levels it crossed upwards and downwards since. The reference level is a fun
 
     L_ref = base + up * threshold_on - down * threshold_off     (float64)
 
-so nothing accumulates: after any number of events it has the rounding of one evaluation.
+so nothing accumulates: after any number of events it has the rounding of one evaluation. Where both sums
+agree within that rounding, the level is the base itself.
 
-A sample is a float32, so a level counts as reached when the sample is as near to it as the input can tell:
-within one float32 ulp each of sample, base and threshold, 2^-23 (|sample| + |base| + threshold). A step of k
-thresholds, rounded to float32, thus gives exactly k events from any base, there and back. A crossing found so
-is stamped at the sample.
+The tie rule (stated in `EventCamera`) is in `_bound`: the float32 that a sample must reach, for each level.
 
 Crossing times are rounded to 2^-10 ns, then written as a key that sorts in the order of the packets:
 
@@ -42,7 +40,12 @@ _OPEN = wp.constant(0)
 _PUT = wp.constant(1)
 _CLOSE = wp.constant(2)
 
-_ULP = wp.constant(wp.float64(2.0**-23))
+_HALF_ULP = wp.constant(wp.float64(2.0**-24))
+"""Of a float32 in [1, 2)."""
+_ROUNDING = wp.constant(wp.float64(2.0**-50))
+"""Bound of the relative error of the sums in a level."""
+_STEP_ROUNDING = wp.constant(wp.float64(2.0**-23))
+"""Relative error of k C computed in float32: half an ulp for C, and half an ulp for the product."""
 _LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
 _TICKS_PER_NS = wp.constant(wp.float64(1024.0))
 _COLUMN_SHIFT = wp.constant(wp.int64(SUB_BITS))
@@ -114,23 +117,45 @@ def _write(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters: wp
 def _level(
     base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
 ) -> wp.float64:
-    return base + (wp.float64(up) * threshold_on - wp.float64(down) * threshold_off)
+    rise = wp.float64(up) * threshold_on
+    fall = wp.float64(down) * threshold_off
+    step = rise - fall
+    if wp.abs(step) <= _ROUNDING * (rise + fall):
+        return base
+    return base + step
 
 
 @wp.func
-def _base_slack(base: wp.float64, threshold_on: wp.float64, threshold_off: wp.float64) -> wp.float64:
-    return _ULP * (wp.abs(base) + wp.max(threshold_on, threshold_off))
+def _half_ulp(base: wp.float32) -> wp.float64:
+    """Return half the distance from a float32 to the next larger in magnitude; 0 below 2^-126."""
+    return wp.float64(wp.cast(wp.cast(base, wp.int32) & 0x7F800000, wp.float32)) * _HALF_ULP
 
 
 @wp.func
-def _quiet_range(lower: wp.float64, upper: wp.float64, base_slack: wp.float64) -> wp.vec2:
-    """Return a float32 range inside which, ends excluded, a sample is sure to reach neither level.
+def _bound(level: wp.float64, base: wp.float64, half_ulp: wp.float64, direction: wp.float64) -> wp.float32:
+    """Return the float32 at which a sample reaches a level from below (direction 1) or above (-1)."""
+    if level == base:
+        return wp.float32(base)
+    slack = wp.max(half_ulp, _STEP_ROUNDING * wp.abs(level - base))
+    return wp.float32(level - direction * slack)
 
-    It is narrower by the largest slack that a sample between the levels can have, and by the rounding of the
-    range itself; what falls outside is decided in float64. This test alone meets nearly all samples.
-    """
-    margin = wp.float64(2.0) * _ULP * wp.max(wp.abs(lower), wp.abs(upper)) + base_slack
-    return wp.vec2(wp.float32(lower + margin), wp.float32(upper - margin))
+
+@wp.func
+def _bounds(
+    base_32: wp.float32,
+    up: wp.int32,
+    down: wp.int32,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+) -> wp.vec2:
+    """Return the samples that reach the level below and the level above; between them a pixel is quiet."""
+    base = wp.float64(base_32)
+    half_ulp = _half_ulp(base_32)
+    lower = _level(base, up, down + 1, threshold_on, threshold_off)
+    upper = _level(base, up + 1, down, threshold_on, threshold_off)
+    return wp.vec2(
+        _bound(lower, base, half_ulp, wp.float64(-1.0)), _bound(upper, base, half_ulp, wp.float64(1.0))
+    )
 
 
 @wp.func
@@ -230,12 +255,9 @@ def walk(
     The first `lead` frames are known to be quiet.
     """
     base = wp.float64(base_32)
-    base_slack = _base_slack(base, threshold_on, threshold_off)
     up = state.up
     down = state.down
-    upper = _level(base, up + 1, down, threshold_on, threshold_off)
-    lower = _level(base, up, down + 1, threshold_on, threshold_off)
-    quiet = _quiet_range(lower, upper, base_slack)
+    quiet = _bounds(base_32, up, down, threshold_on, threshold_off)
     last = state.last
     if lead > 0:
         last = log_radiance[lead - 1, pixel]
@@ -247,19 +269,14 @@ def walk(
         if sample > quiet[0] and sample < quiet[1]:
             last = sample
         elif wp.abs(sample) <= _LIMIT:
-            value = wp.float64(sample)
-            slack = _ULP * wp.abs(value) + base_slack
             up_before = up
             down_before = down
-            while value + slack >= upper:
+            while sample >= quiet[1]:
                 up += 1
-                upper = _level(base, up + 1, down, threshold_on, threshold_off)
-            lower = _level(base, up, down + 1, threshold_on, threshold_off)
-            while value - slack <= lower:
+                quiet = _bounds(base_32, up, down, threshold_on, threshold_off)
+            while sample <= quiet[0]:
                 down += 1
-                lower = _level(base, up, down + 1, threshold_on, threshold_off)
-            upper = _level(base, up + 1, down, threshold_on, threshold_off)
-            quiet = _quiet_range(lower, upper, base_slack)
+                quiet = _bounds(base_32, up, down, threshold_on, threshold_off)
             found = up - up_before + down - down_before
             if tabulate:
                 wp.atomic_add(table, frame, row, found)
@@ -277,7 +294,7 @@ def walk(
                     key = _key(
                         level,
                         wp.float64(last),
-                        value,
+                        wp.float64(sample),
                         stamps[frame],
                         stamps[frame + 1],
                         place,
@@ -338,12 +355,7 @@ def screen(
     end = wp.min(begin + TILE_SIZE, end_pixel)
     for pixel in range(begin, end):
         before = crossed[pixel]
-        value = wp.float64(base[pixel])
-        quiet = _quiet_range(
-            _level(value, before[0], before[1] + 1, threshold_on, threshold_off),
-            _level(value, before[0] + 1, before[1], threshold_on, threshold_off),
-            _base_slack(value, threshold_on, threshold_off),
-        )
+        quiet = _bounds(base[pixel], before[0], before[1], threshold_on, threshold_off)
         low_out[pixel] = quiet[0]
         high_out[pixel] = quiet[1]
     _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)

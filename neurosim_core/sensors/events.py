@@ -3,7 +3,8 @@
 
 Each pixel holds a reference log radiance L_ref. Between two frames log radiance is linear in time; each time
 it reaches L_ref + threshold_on (or L_ref - threshold_off) an event is emitted at the crossing time, and L_ref
-becomes the level crossed. The kernels, the tie rule and the place of later noise terms are in `event_scan`.
+becomes the level crossed. The tie rule is in `EventCamera`; the kernels and the place of later noise terms
+are in `event_scan`.
 
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """
@@ -38,7 +39,10 @@ _COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
 
 
 class EventCameraConfig(Settings):
-    """An ideal event camera: the same two thresholds in every pixel, no noise, no dead time."""
+    """An ideal event camera: the same two thresholds in every pixel, no noise, no dead time.
+
+    What counts as reaching a threshold, when samples are rounded to float32, is in `EventCamera`.
+    """
 
     threshold_on: float = Field(default=0.2, ge=1e-3, le=100.0)
     """Rise of log radiance (natural logarithm) that fires an event of polarity 1."""
@@ -89,6 +93,18 @@ class EventCamera:
     - `feed_device` launches the scan of a stack without waiting for it, and later `collect` or
       `collect_windows` reads back the number of events and hands them out, sorted. They do so on a stream of
       their own, so they wait for one scan and not for what was launched after it.
+
+    A pixel's levels are base + m threshold_on - n threshold_off, where base is its log radiance at the reset.
+    Tie rule: a sample rises to a level if it may have been that level, or more, before it was rounded,
+
+        sample >= float32(level - max(half an ulp of base, 2^-23 |level - base|)),
+
+    and the mirror image of this where it falls to one. The first term is the rounding of base, the second
+    that of k C computed in float32, and the conversion that of the sample. So a step of k thresholds gives
+    exactly k events from any base, there and back, computed in float64 or in float32. The level at base
+    itself has no slack: a signal that creeps back to where it began reaches it once its samples equal base.
+    At other levels an event may be early by the time that the signal takes to change by these roundings,
+    about one ulp (5e-7 at 5). A crossing found so is stamped at the sample.
 
     Args:
         config: Thresholds and limits.

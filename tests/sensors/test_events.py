@@ -55,7 +55,23 @@ def assert_same(a: Events, b: Events) -> None:
         np.testing.assert_array_equal(first, second)
 
 
-def brute_force(frames: np.ndarray, stamps: Any, on: float, off: float) -> list[tuple[int, int, int, int]]:
+def reach(level: Fraction, base: Fraction, direction: int) -> Fraction:
+    """The sample that reaches a level from below (direction 1) or above (-1), by the documented tie rule."""
+    if level == base:
+        return base
+    half_ulp = Fraction(float(np.spacing(np.float32(abs(base))))) / 2
+    slack = max(half_ulp, abs(level - base) / 2**23)
+    return Fraction(float(np.float32(float(level - direction * slack))))
+
+
+def reach_exactly(level: Fraction, base: Fraction, direction: int) -> Fraction:
+    """No tie rule: samples are taken for exact."""
+    return level
+
+
+def brute_force(
+    frames: np.ndarray, stamps: Any, on: float, off: float, reach: Any = reach
+) -> list[tuple[int, int, int, int]]:
     """The law in rational arithmetic, pixel by pixel; samples are exact, levels are sums of exact steps."""
     events = []
     threshold_on, threshold_off = Fraction(on), Fraction(off)
@@ -63,16 +79,14 @@ def brute_force(frames: np.ndarray, stamps: Any, on: float, off: float) -> list[
         for x in range(frames.shape[2]):
             signal = [Fraction(float(value)) for value in frames[:, y, x]]
             reference = base = signal[0]
+            upper, lower = reach(base + threshold_on, base, 1), reach(base - threshold_off, base, -1)
             for k in range(1, len(signal)):
                 low, high = signal[k - 1], signal[k]
-                slack = (abs(high) + abs(base) + max(threshold_on, threshold_off)) / 2**23
-                while True:
-                    if high + slack >= reference + threshold_on:
-                        reference, polarity = reference + threshold_on, 1
-                    elif high - slack <= reference - threshold_off:
-                        reference, polarity = reference - threshold_off, 0
-                    else:
-                        break
+                while high >= upper or high <= lower:
+                    polarity = int(high >= upper)
+                    reference += threshold_on if polarity else -threshold_off
+                    upper = reach(reference + threshold_on, base, 1)
+                    lower = reach(reference - threshold_off, base, -1)
                     fraction = min((reference - low) / (high - low), Fraction(1))
                     ticks = round(fraction * int(stamps[k] - stamps[k - 1]) * 1024)  # of 2^-10 ns
                     time_ns = int(stamps[k - 1]) + Fraction(max(ticks, 1), 1024)
@@ -125,23 +139,73 @@ def test_log_ramp_of_any_slope_split_into_frames(slope, base, on, off, frame_cou
     assert np.all(events.polarity == (slope > 0.0))
 
 
-@pytest.mark.parametrize("base", [0.0, -0.2, 0.3, 1.0, -3.7, 7.99, -11.3, 100.1])
-@pytest.mark.parametrize("threshold", [0.2, 0.1, 0.15, 0.35, 1.0])
-def test_step_of_k_thresholds_gives_k_events(base, threshold, device):
-    """From any base, up or down, although neither k C nor the sample is exact in float32."""
-    k = np.arange(-60, 61)
-    frames = np.stack([np.full(k.shape, base), base + k * threshold]).astype(np.float32)
-    events = run(frames[:, None, :], [0, MS], device, threshold_on=threshold, threshold_off=threshold)
-    x = events.numpy().x
-    np.testing.assert_array_equal(np.bincount(x, minlength=len(k)), np.abs(k))
+@pytest.mark.parametrize("arithmetic", [np.float64, np.float32])
+@pytest.mark.parametrize("threshold", [0.05, 0.1, 0.15, 0.2, 0.3, 0.35, 0.5, 1.0])
+def test_step_of_k_thresholds_gives_k_events(threshold, arithmetic, device):
+    """From any base, up or down and back again, although neither k C nor the samples are exact in float32.
+
+    In float64 base and sample are rounded once each; in float32 so are C and k C.
+    """
+    special = [0.0, 0.001, -0.2, 0.3, 1.0, -1.7, -3.7, 5.0, 7.99, -9.0, 11.3, -11.3, 100.0, 100.1]
+    rng = np.random.default_rng(8)
+    base = np.concatenate(
+        [special, *(rng.uniform(-scale, scale, 40) for scale in (1e-3, 0.1, 1.0, 10.0, 100.0))]
+    )
+    base = base.astype(arithmetic)
+    k = np.concatenate([np.arange(-20, 21), [-60, 60]])
+    step = k.astype(arithmetic) * arithmetic(threshold)
+    frames = np.broadcast_to(base, (3, len(k), len(base))).astype(np.float32)
+    frames[1] = base + step[:, None]
+    camera = make_camera(len(base), len(k), device, threshold_on=threshold, threshold_off=threshold)
+    camera.reset(frames[0])
+    for frame, polarity in ((1, k > 0), (2, k < 0)):
+        events = camera.feed(frames[frame : frame + 1], [frame * MS]).numpy()
+        counts = np.zeros((len(k), len(base)), int)
+        np.add.at(counts, (events.y, events.x), 1)
+        np.testing.assert_array_equal(counts, np.broadcast_to(np.abs(k)[:, None], counts.shape))
+        np.testing.assert_array_equal(events.polarity, polarity[events.y])
 
 
-def test_step_in_float32_arithmetic_gives_k_events(device):
-    """Users compute base + k C in float32, with three roundings instead of one."""
-    base = np.linspace(-10.0, 10.0, 1001, dtype=np.float32)
-    for k in (1, 2, 3, 7, 15):
-        frames = np.stack([base, base + np.float32(k) * np.float32(0.2)])[:, None, :]
-        assert len(run(frames, [0, MS], device)) == k * len(base)
+@pytest.mark.parametrize(
+    ("base", "step"), [(5.0, 0.1999993), (-9.0, 0.199998), (0.0, 0.19999994), (100.0, 0.19998)]
+)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_step_short_of_the_threshold_by_more_than_rounding_is_silent(base, step, sign, device):
+    assert len(one_pixel([base, base + sign * step], [0, MS], device)) == 0
+
+
+@pytest.mark.parametrize("base", [0.0, -1.7, 5.0])
+@pytest.mark.parametrize("tail", ["sigmoid", "gauss"])
+def test_bar_with_tails_against_exact_samples(base, tail, device):
+    """A bar of width 1.5 px, 2 turns per second: pixels creep back to where they began.
+
+    Its samples come near no level but the first one, where there is no slack: the events are those of samples
+    taken for exact.
+    """
+    y, x = np.mgrid[:12, :12] - 5.5
+    stamps = np.arange(0, 280) * MS
+    angle = 4.0 * np.pi * stamps[:, None, None] * 1e-9
+    distance = np.abs(x * np.sin(angle) - y * np.cos(angle))
+    if tail == "sigmoid":
+        bar = 1.0 / (1.0 + np.exp((distance - 1.5) / 0.25))
+    else:
+        bar = np.exp(-0.5 * (distance / 1.5) ** 2)
+    frames = (base + 1.3 * bar).astype(np.float32)
+    events = run(frames, stamps, device)
+    assert len(events) > 1000
+    assert rows(events) == brute_force(frames, stamps, 0.2, 0.2, reach_exactly)
+
+
+@pytest.mark.parametrize("base", [0.3, 5.0, -9.0])
+def test_slow_ramp_is_early_by_its_rounding_at_most(base, device):
+    """1e-3 / s at 1 kHz, about an ulp per sample: the event is at most 1.5 ulp early, and never late."""
+    stamps = np.arange(0, 600) * MS
+    samples = (np.float32(base) + 0.1995 + 1e-3 * stamps * 1e-9).astype(np.float32)
+    samples[0] = base
+    [(time_us, _, _, polarity)] = rows(one_pixel(samples, stamps, device))
+    ulp = float(np.spacing(np.float32(abs(base))))
+    assert polarity == 1
+    assert -1.5 * ulp / 1e-3 <= time_us * 1e-6 - 0.5 <= 1e-3 + 0.5 * ulp / 1e-3
 
 
 @relaxed
