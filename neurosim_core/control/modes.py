@@ -2,14 +2,14 @@
 # mypy: disable-error-code="no-untyped-call,no-untyped-def,untyped-decorator"
 """Command modes: what a setpoint is at each level, and the controller that turns it into rotor speeds.
 
-    mode          setpoint row (float64)                                   closes on
-    motor_speeds  R rotor speeds [rad/s]                                   nothing, only limits apply
-    rates         collective thrust [N], body rate in B [rad/s]            body rate
-    attitude      collective thrust [N], q_WB xyzw                         attitude
-    velocity      velocity in W [m/s], yaw rate [rad/s]                    velocity; the heading turns at the
-    rate position      position in W [m], yaw [rad]                             position and yaw
-    path          nothing: the path is evaluated at the vehicle's stamp    position and yaw, with all
-    derivatives
+    mode          setpoint row (float64)                          closes on
+    ------------  ----------------------------------------------  ------------------------------------------
+    motor_speeds  R rotor speeds [rad/s]                          nothing, only limits apply
+    rates         collective thrust [N], body rate in B [rad/s]   body rate
+    attitude      collective thrust [N], q_WB xyzw                attitude
+    velocity      velocity in W [m/s], yaw rate [rad/s]           velocity; the heading turns at the yaw rate
+    position      position in W [m], yaw [rad]                    position and yaw
+    path          nothing: evaluated at the vehicle's stamp       position and yaw, with all derivatives
 
 Each level sets up the one below it (se3.py). Yaw is that of a Z-X-Y sequence: y_B is orthogonal to (cos yaw,
 sin yaw, 0). A mode is compiled when it is first used, and only then.
