@@ -343,6 +343,7 @@ class Multirotor:
             duration_ns: How long [ns], > 0.
 
         Raises:
+            TypeError: The duration is not an integer.
             ValueError: The shape is wrong, a command is not finite, or the duration is not positive.
             DynamicsError: A vehicle cannot be moved on; the others have been.
         """
@@ -366,8 +367,11 @@ class Multirotor:
         """Move all vehicles with the command in `arrays`; device form of `step`, without checks.
 
         Raises:
+            TypeError: The duration is not an integer.
             ValueError: The duration is not positive.
         """
+        if not isinstance(duration_ns, (int, np.integer)):
+            raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
         launch = self._launches.get(duration_ns)
         if launch is None:
             launch = self._record_advance(duration_ns)
