@@ -476,3 +476,9 @@ def test_kernels_build_for_cuda(terms, tmp_path):
 
     wp.compile_aot_module(make_kernels(terms).advance.module, module_dir=tmp_path, arch=90)
     assert list(tmp_path.iterdir())
+
+
+def test_a_duration_is_an_integer():
+    vehicle = Multirotor(preset("hummingbird"))
+    with pytest.raises(TypeError, match=r"duration_ns must be an integer, got 1\.5"):
+        vehicle.step(np.full(4, 500.0), 1.5)
