@@ -68,9 +68,15 @@ def read_gltf(path: Path, *, textures_required: bool) -> Source:
     except (KeyError, IndexError, TypeError, AttributeError, struct.error, ValueError) as error:
         if isinstance(error, SceneError):
             raise
-        raise SceneError(
-            f"{path}: malformed glTF ({type(error).__name__}: {error}); a glTF 2.0 validator says where"
-        ) from error
+        if isinstance(error, KeyError):
+            wrong = f"{error.args[0]!r} is missing in it, or not known"
+        elif isinstance(error, IndexError):
+            wrong = "a number in it points past the end of a list"
+        elif isinstance(error, (TypeError, AttributeError)):
+            wrong = "an entry of it is of the wrong kind"
+        else:
+            wrong = f"an entry of it has the wrong form ({error})"
+        raise SceneError(f"{path}: malformed glTF, {wrong}; a glTF 2.0 validator says where") from error
 
 
 class _Reader:
@@ -120,6 +126,19 @@ class _Reader:
             raise SceneError(f"{self.path}: not glTF, there is no 'asset' in its JSON")
         return tree
 
+    def _entry(self, kind: str, index: int) -> dict[str, Any]:
+        """Return entry `index` of the top-level list `kind`."""
+        entries = self.tree.get(kind, [])
+        if not isinstance(entries, list) or not isinstance(index, int) or not 0 <= index < len(entries):
+            raise SceneError(
+                f"{self.path}: malformed glTF, it refers to number {index!r} of its {kind}, "
+                f"of which there are {len(entries)}"
+            )
+        entry = entries[index]
+        if not isinstance(entry, dict):
+            raise SceneError(f"{self.path}: malformed glTF, number {index} of its {kind} is no JSON object")
+        return entry
+
     def _uri(self, uri: str) -> bytes | None:
         """Return the bytes behind a URI, None if there is no such file."""
         if uri.startswith("data:"):
@@ -145,8 +164,9 @@ class _Reader:
         return buffers
 
     def _view(self, index: int) -> tuple[memoryview, int | None]:
-        view = self.tree["bufferViews"][index]
+        view = self._entry("bufferViews", index)
         start = view.get("byteOffset", 0)
+        self._entry("buffers", view["buffer"])
         data = memoryview(self._buffers[view["buffer"]])[start : start + view["byteLength"]]
         if len(data) < view["byteLength"]:
             raise SceneError(f"{self.path}: truncated, buffer view {index} ends after its buffer")
@@ -164,7 +184,7 @@ class _Reader:
 
     def _accessor(self, index: int) -> NDArray[Any]:
         """Return accessor `index`, shape [count, width]; normalised integers as floats."""
-        accessor = self.tree["accessors"][index]
+        accessor = self._entry("accessors", index)
         component, width, count = accessor["componentType"], _WIDTH[accessor["type"]], accessor["count"]
         if "bufferView" in accessor:
             values = self._elements(
@@ -188,7 +208,7 @@ class _Reader:
 
     def _image_index(self, texture: dict[str, Any]) -> int:
         """Return the index of the picture behind a texture reference, -1 if there is none."""
-        entry = self.tree["textures"][texture["index"]]
+        entry = self._entry("textures", texture["index"])
         webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
         return int(entry.get("source", webp.get("source", -1)))
 
@@ -196,7 +216,7 @@ class _Reader:
         """Decode images, several at once: Pillow releases the interpreter lock."""
 
         def decode(index: int) -> NDArray[np.uint8] | None:
-            image = self.tree["images"][index]
+            image = self._entry("images", index)
             name = image.get("name") or (
                 image["uri"] if "uri" in image and not image["uri"].startswith("data:") else f"image {index}"
             )
@@ -272,7 +292,7 @@ class _Reader:
             transform = (info or {}).get("extensions", {}).get("KHR_texture_transform", {})
             transformed += bool(transform)
             if info and "samplers" in self.tree and "sampler" in self.tree["textures"][info["index"]]:
-                sampler = self.tree["samplers"][self.tree["textures"][info["index"]]["sampler"]]
+                sampler = self._entry("samplers", self.tree["textures"][info["index"]]["sampler"])
                 clamped += sampler.get("wrapS", 10497) != 10497 or sampler.get("wrapT", 10497) != 10497
             coordinates.append(
                 {"set": transform.get("texCoord", (info or {}).get("texCoord", 0)), "transform": transform}
@@ -311,7 +331,7 @@ class _Reader:
         """Return the matrix of each node of the default scene, parents before children."""
         nodes = self.tree.get("nodes", [])
         if "scenes" in self.tree:
-            roots = self.tree["scenes"][self.tree.get("scene", 0)].get("nodes", [])
+            roots = self._entry("scenes", self.tree.get("scene", 0)).get("nodes", [])
         else:
             children = {child for node in nodes for child in node.get("children", [])}
             roots = [index for index in range(len(nodes)) if index not in children]
@@ -321,10 +341,9 @@ class _Reader:
             index, parent, depth = stack.pop()
             if depth > _MAX_DEPTH or index in world:
                 raise SceneError(f"{self.path}: node {index} has two parents or is its own ancestor")
-            world[index] = parent @ self._local(nodes[index])
-            stack.extend(
-                (child, world[index], depth + 1) for child in reversed(nodes[index].get("children", []))
-            )
+            node = self._entry("nodes", index)
+            world[index] = parent @ self._local(node)
+            stack.extend((child, world[index], depth + 1) for child in reversed(node.get("children", [])))
         return world
 
     def read(self) -> Source:
@@ -339,7 +358,7 @@ class _Reader:
                 self._lamp(node["extensions"]["KHR_lights_punctual"]["light"], matrix)
             if "mesh" not in node:
                 continue
-            mesh = self.tree["meshes"][node["mesh"]]
+            mesh = self._entry("meshes", node["mesh"])
             if node["mesh"] not in primitives:
                 primitives[node["mesh"]] = self._primitives(mesh, coordinates)
             name = unique_name(node.get("name") or mesh.get("name") or f"node {index}", taken)
@@ -347,7 +366,7 @@ class _Reader:
                 arrays, place = dict(primitive), matrix
                 skin = arrays.pop("skin")
                 if "skin" in node and skin is not None:
-                    arrays = self._posed(arrays, skin, self.tree["skins"][node["skin"]], world)
+                    arrays = self._posed(arrays, skin, self._entry("skins", node["skin"]), world)
                     place = np.eye(4)
                 source.parts.append(
                     Part(name=name, matrix=place, instance=len(source.instance_names), **arrays)
@@ -381,6 +400,8 @@ class _Reader:
                     f"{len(positions)}"
                 )
             material = primitive.get("material", len(coordinates) - 1)
+            if "material" in primitive:
+                self._entry("materials", material)
             where = coordinates[material]
             uv = None
             if f"TEXCOORD_{where['set']}" in attributes:
@@ -480,7 +501,7 @@ class _Reader:
         generator = str(self.tree.get("asset", {}).get("generator", ""))
         if "trimesh" in generator.lower():
             source.up_reason = (
-                "glTF is y up by specification, but its writer, trimesh, stores any axes as they are"
+                "glTF is y up by specification, though its writer, trimesh, stores any axes as they are"
             )
         else:
             source.up_axis = "y"

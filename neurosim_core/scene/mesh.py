@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 from pathlib import Path
@@ -36,6 +37,10 @@ __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
 _log = logging.getLogger(__name__)
 
 _EXTENT_MAX_M = 20_000.0
+_STOREY_M = (1.8, 15.0)
+"""Heights that a building is taken to have, from one low room to a hall [m]."""
+_LEVEL_RAD = math.radians(2.0)
+"""How far a level or upright surface of a building may lean."""
 _COLOR_WIDTH = 4096
 """Widest texture that vertex colours are packed into [px]."""
 
@@ -50,7 +55,8 @@ class MeshSceneConfig(Settings):
     unit_m: float | None = Field(default=None, gt=0.0)
     """Length of one unit of the file [m], 0.001 for millimetres. None: what the file or its format says."""
     up_axis: Axis | None = None
-    """Axis of the file that points up: x, y or z. None: what the file says, else what its geometry shows."""
+    """Axis of the file that points up: x, y or z. None: what the file says, else y or z where it shows a
+    building that stands so, else what its format has by default."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Added to every point, after units and axes [m]; brings far-off coordinates near the origin."""
     inside_m: tuple[float, float, float] | None = None
@@ -86,7 +92,7 @@ def load_mesh_scene(config: MeshSceneConfig) -> Scene:
     if not any(len(part.faces) for part in source.parts):
         raise SceneError(f"{path}: empty, there are no triangles in it")
     parts = _placed(source.parts, path)
-    axis, sentence = _up_axis(config, source, parts)
+    axis, sentence = _up_axis(config, source, parts, unit_m)
     notes.insert(1, sentence)
     turn = unit_m * _TURN[axis]
     for part in parts:
@@ -145,7 +151,7 @@ class _Files(trimesh.resolvers.FilePathResolver):
         ):  # map_Kd may have options before the name
             file = Path(self.parent) / candidate
             if candidate and file.is_file():
-                return file.read_bytes()
+                return _utf8(file) if file.suffix.lower() == ".mtl" else file.read_bytes()
         self.missing.append(name)
         raise FileNotFoundError(name)
 
@@ -153,13 +159,27 @@ class _Files(trimesh.resolvers.FilePathResolver):
 def _read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> Source:
     files = _Files(path)
     options: dict[str, Any] = {"split_objects": True} if suffix == "obj" else {}
+    data = _checked(path, suffix)
     try:
-        with path.open("rb") as stream:
-            loaded = trimesh.load_scene(stream, file_type=suffix, resolver=files, process=False, **options)
-    except Exception as error:  # trimesh's many readers raise whatever Python raises on their way
+        loaded = trimesh.load_scene(
+            io.BytesIO(data), file_type=suffix, resolver=files, process=False, **options
+        )
+    except SceneError:
+        raise
+    except ImportError as error:
         raise SceneError(
-            f"{path}: cannot be read as {suffix.upper()}, truncated or not one "
-            f"({type(error).__name__}: {error})"
+            f"{path}: reading this {suffix.upper()} file needs the Python package {error.name!r}; install "
+            "it, or export the file as GLB"
+        ) from error
+    except Exception as error:  # trimesh's many readers raise whatever Python raises on their way
+        wrong = (
+            "a face in it uses a vertex that it does not have"
+            if isinstance(error, LookupError)
+            else "a number in it is missing or malformed"
+        )
+        raise SceneError(
+            f"{path}: cannot be read as {suffix.upper()}: {wrong}. It may be truncated, or of another "
+            "format; export it again"
         ) from error
     source = Source(up_default="y" if suffix == "obj" else "z")
     source.up_reason = f"{suffix.upper()} files do not say which way is up"
@@ -184,6 +204,11 @@ def _read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> S
             ignored += 1
             continue
         faces = np.asarray(mesh.faces, dtype=np.int64)
+        if np.shape(mesh.vertices)[1] != 3:
+            raise SceneError(
+                f"{path}: the vertices of {geometry!r} have {np.shape(mesh.vertices)[1]} coordinates, "
+                "3 are needed"
+            )
         if faces.size and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
             raise SceneError(f"{path}: {geometry!r} uses vertex {faces.max()} of {len(mesh.vertices)}")
         material, uv, color = _appearance(mesh, source, materials, store, path)
@@ -207,6 +232,72 @@ def _read_with_trimesh(path: Path, suffix: str, *, textures_required: bool) -> S
     if ignored:
         source.notes.append(f"{ignored} objects of points and lines are left out.")
     return source
+
+
+def _utf8(path: Path, data: bytes | None = None) -> bytes:
+    """Return a text file, or `data` out of it, in UTF-8: it may also be UTF-16 or Windows-1252 (Latin 1)."""
+    data = path.read_bytes() if data is None else data
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("cp1252", errors="replace")
+    if "\0" in text:
+        raise SceneError(f"{path}: cannot be read as {path.suffix[1:].upper()}: it is not text")
+    return text.encode()
+
+
+def _checked(path: Path, suffix: str) -> bytes:
+    """Return a mesh file, its text in UTF-8; refuse those that trimesh would read in part, or as empty."""
+    data = path.read_bytes()
+    if suffix == "stl":
+        expected = 84 + 50 * int.from_bytes(data[80:84], "little")
+        if len(data) >= 84 and len(data) == expected:
+            return data
+        if data.lstrip()[:5].lower() != b"solid" or b"\0" in data:
+            if len(data) < 84:
+                raise SceneError(
+                    f"{path}: cannot be read as STL: truncated, only {len(data)} bytes, or not one"
+                )
+            raise SceneError(
+                f"{path}: cannot be read as STL: truncated or not one; its header asks for {expected} bytes, "
+                f"{len(data)} are there"
+            )
+    if suffix in ("stl", "stl_ascii"):
+        text = _utf8(path, data)
+        if b"endsolid" not in text.lower():
+            raise SceneError(f"{path}: cannot be read as STL: truncated, there is no 'endsolid' at its end")
+        return text
+    if suffix == "off":
+        text = _utf8(path, data)
+        lines = [line for line in (line.partition(b"#")[0].split() for line in text.splitlines()) if line]
+        counts = [word for line in lines[:2] for word in line if word.isdigit()][:2]
+        expected = sum(map(int, counts)) + (len(lines[0]) == 1) + 1
+        if len(lines) < expected:
+            raise SceneError(
+                f"{path}: cannot be read as OFF: truncated, {len(lines)} of {expected} lines are there"
+            )
+        return text
+    if suffix != "ply":
+        return _utf8(path, data)
+    if not data.startswith(b"ply"):
+        raise SceneError(f"{path}: cannot be read as PLY: it does not start with 'ply'")
+    head, mark, body = data.partition(b"end_header")
+    if not mark:
+        raise SceneError(f"{path}: cannot be read as PLY: truncated, its header does not end")
+    head = _utf8(path, head)
+    if b"format ascii" in head:
+        body = _utf8(path, body)
+        words = [line.split() for line in head.splitlines()]
+        expected = sum(int(w[2]) for w in words if w[:1] == [b"element"] and w[2:] and w[2].isdigit())
+        there = sum(bool(line.strip()) for line in body.splitlines())
+        if there < expected:
+            raise SceneError(
+                f"{path}: cannot be read as PLY: truncated, {there} of {expected} lines are there"
+            )
+    return head + mark + body
 
 
 def _appearance(
@@ -269,10 +360,12 @@ def _unit(config: MeshSceneConfig, source: Source) -> tuple[float, str]:
     return source.unit_m, f"Unit: {source.unit_m:g} m; {source.unit_reason}."
 
 
-def _up_axis(config: MeshSceneConfig, source: Source, parts: list[dict[str, Any]]) -> tuple[Axis, str]:
+def _up_axis(
+    config: MeshSceneConfig, source: Source, parts: list[dict[str, Any]], unit_m: float
+) -> tuple[Axis, str]:
     if config.up_axis is not None:
         return config.up_axis, f"Up axis: {config.up_axis}, as declared."
-    looks = _looks_up(parts)
+    looks = _looks_up(parts, unit_m)
     if source.up_axis is not None:
         doubt = ""
         if looks not in (None, source.up_axis):
@@ -280,30 +373,50 @@ def _up_axis(config: MeshSceneConfig, source: Source, parts: list[dict[str, Any]
         return source.up_axis, f"Up axis: {source.up_axis}; {source.up_reason}.{doubt}"
     if looks is not None:
         return looks, (
-            f"Up axis: {looks}, from the geometry (flattest along {looks}, and most surfaces level in it); "
-            f"{source.up_reason}. Declare up_axis to be sure."
+            f"Up axis: {looks}, from the geometry (a building: floors at several heights, walls around "
+            f"them); {source.up_reason}. Declare up_axis to be sure."
         )
     return source.up_default, (
-        f"Up axis: {source.up_default}, by custom; {source.up_reason} and the geometry does not tell. "
+        f"Up axis: {source.up_default}, by default; {source.up_reason}, and the geometry shows no building. "
         "Declare up_axis to be sure."
     )
 
 
-def _looks_up(parts: list[dict[str, Any]]) -> Axis | None:
-    """Return the axis that a building would have up, None if it is not clear.
+def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
+    """Return the axis, y or z, along which a building stands in the file; None if no building is seen.
 
-    Clear means: flatter along it than 0.6 of both other extents, and more surface level in it (floors,
-    ceilings, table tops) than in any other.
+    A building is flatter along its up axis than 0.6 of both other extents and as high as `_STOREY_M`. More
+    surface is level in it (floors, ceilings, table tops) than faces any other axis, and that at three heights
+    or more, which a lone box has not. Upright surface faces both other axes, at least half of one full wall
+    each, which a stage set, a hill or a ball on a plane has not.
     """
-    triangles = np.concatenate([part["positions"][part["faces"]].reshape(-1, 3, 3) for part in parts])
+    triangles = unit_m * np.concatenate(
+        [part["positions"][part["faces"]].reshape(-1, 3, 3) for part in parts]
+    )
     extent = np.ptp(triangles, axis=(0, 1))
     axis = int(np.argmin(extent))
-    if extent[axis] > 0.6 * np.delete(extent, axis).min():
+    first, second = (other for other in range(3) if other != axis)
+    low, high = _STOREY_M
+    if axis == 0 or not low <= extent[axis] <= min(high, 0.6 * extent[first], 0.6 * extent[second]):
         return None
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    cross = 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(cross, axis=1)
-    level = [float(area[np.abs(cross[:, a]) > 0.99 * area].sum()) for a in range(3)]
-    return None if int(np.argmax(level)) != axis or level[axis] <= 0.0 else ("x", "y", "z")[axis]
+    facing = np.abs(cross) > math.cos(_LEVEL_RAD) * area[:, None]
+    amount = area @ facing
+    upright = np.abs(cross[:, axis]) < math.sin(_LEVEL_RAD) * area
+    walls = (cross[upright] ** 2 / area[upright, None]).sum(axis=0)  # area times the squared cosine
+    if (
+        int(np.argmax(amount)) != axis
+        or walls[first] < 0.5 * extent[axis] * extent[second]
+        or walls[second] < 0.5 * extent[axis] * extent[first]
+    ):
+        return None
+    level = facing[:, axis]
+    height = triangles[level][:, :, axis].mean(axis=1)
+    order = np.argsort(height)
+    floor = np.cumsum(np.diff(height[order], prepend=height[order[0]]) > 0.05)  # 5 cm apart: another one
+    floors = np.bincount(floor, weights=area[level][order])
+    return ("x", "y", "z")[axis] if (floors > 0.002 * amount[axis]).sum() >= 3 else None
 
 
 def _check_extent(parts: list[dict[str, Any]], path: Path) -> None:

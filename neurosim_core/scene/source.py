@@ -70,7 +70,7 @@ class Source:
     up_axis: Axis | None = None
     """What the file itself says about up; None: nothing."""
     up_default: Axis = "z"
-    """What the format means when neither the file nor its geometry says more."""
+    """What the format means where neither the file says more nor a building is seen in it."""
     up_reason: str = ""
     """Why `up_axis` is believed, or what `up_default` rests on."""
 

@@ -191,28 +191,111 @@ def test_file_that_says_up(tmp_path, where, value):
     assert scene.notes[1].startswith("Up axis: z; ")
 
 
-@pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_trimesh_files_are_judged_by_geometry(tmp_path, axis):
-    """A 6 x 5 x 2.5 m box, flattest along its up axis."""
-    size = np.roll([2.5, 6.0, 5.0], "xyz".index(axis))
-    trimesh.creation.box(size).export(tmp_path / "room.glb")
-    scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / "room.glb"))
-    assert np.ptp(scene.bounds_m, axis=0)[2] == pytest.approx(2.5)
-    assert scene.notes[1].startswith(f"Up axis: {axis}, from the geometry")
+CUPBOARD = (0.2, 2.2, 2.8, 4.8, 0.1, 2.9)
 
 
-def test_a_tall_room_is_not_judged(tmp_path):
-    """6 x 5 x 4 m: flattest along z, but not by much."""
-    trimesh.creation.box([6.0, 5.0, 4.0]).export(tmp_path / "room.glb")
-    scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / "room.glb"))
-    assert scene.notes[1].startswith("Up axis: y, by custom")
+def room(*, ceiling: bool) -> trimesh.Trimesh:
+    """Two rooms of 5 x 5 x 3 m with a door between them, and a closed cupboard as large as a lift."""
+
+    def slab(x0, x1, y0, y1, z0, z1):
+        return trimesh.creation.box(bounds=[[x0, y0, z0], [x1, y1, z1]])
+
+    walls = [slab(0, 10, 0, 5, -0.1, 0), slab(0, 10, -0.1, 0, 0, 3), slab(0, 10, 5, 5.1, 0, 3)]
+    walls += [slab(-0.1, 0, 0, 5, 0, 3), slab(10, 10.1, 0, 5, 0, 3)]
+    walls += [slab(4.95, 5.05, 0, 2, 0, 3), slab(4.95, 5.05, 3, 5, 0, 3), slab(4.95, 5.05, 2, 3, 2.1, 3)]
+    walls.append(slab(*CUPBOARD))
+    if ceiling:
+        walls.append(slab(0, 10, 0, 5, 3, 3.1))
+    return trimesh.util.concatenate(walls)
+
+
+def turned(mesh: trimesh.Trimesh, axis: str) -> trimesh.Trimesh:
+    """Return a z-up mesh with `axis` up."""
+    order = {"z": [0, 1, 2], "y": [1, 2, 0], "x": [2, 0, 1]}[axis]
+    return trimesh.Trimesh(mesh.vertices[:, order], mesh.faces, process=False)
+
+
+def flat() -> trimesh.Trimesh:
+    """Two rooms, 5 m wide and 7.5 m long."""
+    return room(ceiling=True).apply_scale([1.0, 1.5, 1.0])
+
+
+def quad(*corners: tuple[float, float, float]) -> trimesh.Trimesh:
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "axis", "loaded"),
+    [(s, a, a) for s in ("glb", "obj", "stl") for a in "yz"] + [("glb", "x", "y"), ("stl", "x", "z")],
+)
+def test_a_building_shows_which_way_is_up(tmp_path, suffix, axis, loaded):
+    """Two rooms, with a floor, walls and a cupboard: y or z is seen; x, which nobody means, never is."""
+    turned(flat(), axis).export(tmp_path / f"flat.{suffix}")
+    scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / f"flat.{suffix}"))
+    how = "from the geometry" if axis == loaded else "by default"
+    assert scene.notes[1].startswith(f"Up axis: {loaded}, {how}")
+    if axis == loaded:
+        assert np.ptp(scene.bounds_m, axis=0)[2] == pytest.approx(3.2, abs=1e-5)
+
+
+def test_a_building_in_millimetres_shows_which_way_is_up(tmp_path):
+    mesh = flat()
+    mesh.apply_scale(1000.0)
+    mesh.export(tmp_path / "flat.glb")
+    scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / "flat.glb", unit_m=0.001))
+    assert scene.notes[1].startswith("Up axis: z, from the geometry")
+    # the same numbers in metres, 3.2 km high, are no building
+    far = load_mesh_scene(MeshSceneConfig(file=tmp_path / "flat.glb"))
+    assert far.notes[1].startswith("Up axis: y, by default")
+
+
+def things() -> dict[str, trimesh.Trimesh]:
+    """Things that have a flattest axis, z, but are no building that lies on its side."""
+    box, ball = trimesh.creation.box, trimesh.creation.icosphere(subdivisions=3)
+    wall = quad((-5, 0, 0), (5, 0, 0), (5, 8, 0), (-5, 8, 0))
+    stage = [wall, quad((-5, 0, 0), (5, 0, 0), (5, 0, 3), (-5, 0, 3)), box(bounds=[[0, 0, 1], [1, 1, 2]])]
+    shelf = [box(bounds=[[0, 0.4 * k, 0], [1, 0.4 * k + 0.02, 0.3]]) for k in range(6)]
+    shelf += [box(bounds=[[x, 0, 0], [x + 0.02, 2, 0.3]]) for x in (-0.02, 1.0)]
+    rack = [box(bounds=[[0, k, 0], [8, k + 0.1, 3]]) for k in range(9)]
+    rack += [box(bounds=[[x, 0, 0], [x + 0.1, 8, 3]]) for x in (-0.1, 8.0)]
+    rack.append(box(bounds=[[0, 0, -0.1], [8, 8, 0]]))
+    tin = trimesh.creation.cylinder(radius=1.0, height=2.0)
+    return {
+        "wall": wall,
+        "box": box([6.0, 5.0, 2.5]),
+        "tall box": box([6.0, 5.0, 4.0]),
+        "ball on a plane": trimesh.util.concatenate([ball, box([10, 10, 0.1])]),
+        "tin over a plane": trimesh.util.concatenate([tin, box(bounds=[[-8, -8, -1.3], [8, 8, -1.2]])]),
+        "stage": trimesh.util.concatenate(stage),
+        "shelf": trimesh.util.concatenate(shelf),
+        "rack": trimesh.util.concatenate(rack),
+        "doll's house": flat().apply_scale(0.55),
+    }
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj"])
+@pytest.mark.parametrize("name", things())
+def test_things_stand_as_their_format_says(tmp_path, name, suffix):
+    """Each of them with each axis flattest: none changes what glTF and OBJ mean, and the note says so."""
+    for axis in "xyz":
+        turned(things()[name], axis).export(tmp_path / f"thing.{suffix}")
+        scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / f"thing.{suffix}"))
+        assert scene.notes[1].startswith("Up axis: y, by default")
+        assert scene.notes[1].endswith("the geometry shows no building. Declare up_axis to be sure.")
+
+
+def test_a_wall_stands(tmp_path):
+    """A y-up wall, 2 m wide and 1 m high, in the plane x = 0, as trimesh writes it."""
+    quad((0, 0, -1), (0, 0, 1), (0, 1, 1), (0, 1, -1)).export(tmp_path / "wall.glb")
+    scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / "wall.glb"))
+    assert np.ptp(scene.bounds_m, axis=0) == pytest.approx([0, 2, 1])
 
 
 @pytest.mark.parametrize(("suffix", "axis"), [("glb", "y"), ("obj", "y"), ("ply", "z"), ("stl", "z")])
-def test_a_cube_is_oriented_by_custom(tmp_path, suffix, axis):
+def test_a_cube_stands_as_its_format_says(tmp_path, suffix, axis):
     trimesh.creation.box([1, 1, 1]).export(tmp_path / f"cube.{suffix}")
     scene = load_mesh_scene(MeshSceneConfig(file=tmp_path / f"cube.{suffix}"))
-    assert scene.notes[1].startswith(f"Up axis: {axis}, by custom")
+    assert scene.notes[1].startswith(f"Up axis: {axis}, by default")
     directions = np.unique(scene.normals, axis=0)
     assert len(directions) == 6  # sharp at the edges
     assert scene.normals[scene.faces] == pytest.approx(np.repeat(face_normals(scene)[:, None], 3, axis=1))
@@ -613,24 +696,6 @@ def test_sun_is_a_far_light(tmp_path):
     assert scene.lights[0].intensity == pytest.approx(np.full(3, 0.5 * distance**2), rel=0.02)
 
 
-CUPBOARD = (0.2, 2.2, 2.8, 4.8, 0.1, 2.9)
-
-
-def room(*, ceiling: bool) -> trimesh.Trimesh:
-    """Two rooms of 5 x 5 x 3 m with a door between them, and a closed cupboard as large as a lift."""
-
-    def slab(x0, x1, y0, y1, z0, z1):
-        return trimesh.creation.box(bounds=[[x0, y0, z0], [x1, y1, z1]])
-
-    walls = [slab(0, 10, 0, 5, -0.1, 0), slab(0, 10, -0.1, 0, 0, 3), slab(0, 10, 5, 5.1, 0, 3)]
-    walls += [slab(-0.1, 0, 0, 5, 0, 3), slab(10, 10.1, 0, 5, 0, 3)]
-    walls += [slab(4.95, 5.05, 0, 2, 0, 3), slab(4.95, 5.05, 3, 5, 0, 3), slab(4.95, 5.05, 2, 3, 2.1, 3)]
-    walls.append(slab(*CUPBOARD))
-    if ceiling:
-        walls.append(slab(0, 10, 0, 5, 3, 3.1))
-    return trimesh.util.concatenate(walls)
-
-
 @pytest.mark.parametrize("ceiling", [True, False])
 def test_lamps_hang_in_every_room(tmp_path, ceiling):
     room(ceiling=ceiling).export(tmp_path / "flat.stl")
@@ -712,10 +777,10 @@ def broken(name: str) -> tuple[str, bytes | str]:
         ("old", "glTF version 1.0, only 2.x"),
         ("picture", "cannot be decoded"),
         ("texture file", r"texture file 'wood%20floor.png' is missing .* set missing_texture to 'ignore'"),
-        ("malformed", "malformed glTF"),
+        ("malformed", "malformed glTF, it refers to number 3 of its meshes, of which there are 0"),
         ("obj mtl", "file 'lost.mtl' is missing .* set missing_texture to 'ignore'"),
-        ("stl", "cannot be read as STL"),
-        ("ply", "cannot be read as PLY"),
+        ("stl", "cannot be read as STL: truncated .* asks for 684 bytes, 664 are there"),
+        ("ply", "cannot be read as PLY: .* may be truncated"),
         ("json", "not glTF, or truncated"),
         ("no json", "not glTF, or truncated"),
         ("not glb", "does not start with 'glTF'"),
@@ -729,6 +794,99 @@ def test_refused(tmp_path, name, message):
     with pytest.raises(SceneError, match=message) as error:
         load(tmp_path / f"thing.{suffix}", data)
     assert "thing." in str(error.value)  # names the file
+
+
+TEXT = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+def ascii_of(suffix: str) -> bytes:
+    """Return a cube of 12 triangles as text."""
+    written = trimesh.creation.box().export(
+        file_type={"stl": "stl_ascii"}.get(suffix, suffix),
+        **({"encoding": "ascii"} if suffix == "ply" else {}),
+    )
+    return written if isinstance(written, bytes) else bytes(written.encode())
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_text_in_other_encodings(tmp_path, encoding):
+    """Names and comments with an accent, in an OBJ file and in its materials; files so named are found."""
+    material = "# café\nnewmtl café\nKd 0.25 0.5 0.75\nmap_Kd café.png\n"
+    (tmp_path / "café.mtl").write_bytes(material.encode(encoding))
+    Image.fromarray(PICTURE).save(tmp_path / "café.png")
+    text = f"# café\nmtllib café.mtl\no café\n{TEXT.decode()}vt 0 0\nusemtl café\nf 1/1 2/1 3/1\n"
+    scene = load(tmp_path / "a.obj", text.encode(encoding))
+    assert scene.materials[0].texture is not None
+    assert scene.materials[0].name == "café"
+
+
+@pytest.mark.parametrize("suffix", ["ply", "binary ply", "stl", "stl_ascii", "off"])
+def test_a_byte_that_is_not_utf8(tmp_path, suffix):
+    if suffix == "binary ply":
+        data = trimesh.creation.box().export(file_type="ply").replace(b"1.0\n", b"1.0\ncomment \xe9\n", 1)
+    else:
+        old, new = {
+            "ply": (b"1.0\n", b"1.0\ncomment caf\xe9\n"),
+            "off": (b"OFF\n", b"OFF\n# caf\xe9\n"),
+        }.get(suffix, (b"solid", b"solid caf\xe9"))
+        data = ascii_of(suffix).replace(old, new, 1)
+    assert b"\xe9" in data
+    assert len(load(tmp_path / f"a.{suffix.split()[-1]}", data).faces) == 12
+
+
+@pytest.mark.parametrize(
+    ("suffix", "data", "message"),
+    [
+        ("obj", TEXT + b"f 1 2 9\n", "a face in it uses a vertex that it does not have"),
+        ("obj", b"v 0 zz 0\n" + TEXT + b"f 1 2 3\n", "a number in it is missing or malformed"),
+        ("obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "have 2 coordinates, 3 are needed"),
+        ("obj", bytes(range(256)), "it is not text"),
+        ("stl", b"hello", "truncated, only 5 bytes"),
+        ("stl", bytes(range(200, 256)) * 9, "truncated or not one; its header asks for"),
+        ("stl", ascii_of("stl")[:-30], "truncated, there is no 'endsolid'"),
+        ("ply", b"hello", "does not start with 'ply'"),
+        ("ply", ascii_of("ply")[:60], "truncated, its header does not end"),
+        ("ply", ascii_of("ply")[:-20], "truncated, 18 of 20 lines are there"),
+        ("off", ascii_of("off")[:-20], "truncated, 20 of 22 lines are there"),
+        ("off", b"hello", "cannot be read as OFF"),
+    ],
+)  # fmt: skip
+def test_refused_in_words(tmp_path, suffix, data, message):
+    with pytest.raises(SceneError, match=message) as error:
+        load(tmp_path / f"thing.{suffix}", data)
+    assert "thing." in str(error.value)
+    assert "Error" not in str(error.value)  # no name of a Python exception
+
+
+def test_a_package_that_is_missing_is_no_truncated_file(tmp_path, monkeypatch):
+    def load_scene(*_: Any, **__: Any) -> None:
+        raise ModuleNotFoundError("No module named 'lost'", name="lost")
+
+    monkeypatch.setattr(trimesh, "load_scene", load_scene)
+    with pytest.raises(SceneError, match="needs the Python package 'lost'; install it") as error:
+        load(tmp_path / "a.obj", TEXT + b"f 1 2 3\n")
+    assert "truncated" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("tree", "message"),
+    [
+        ({"nodes": [{"mesh": 0}]}, "number 0 of its meshes, of which there are 0"),
+        ({"nodes": [{"mesh": -1}], "meshes": [{"primitives": []}]}, "number -1 of its meshes"),
+        ({"nodes": [{"mesh": "x"}], "meshes": []}, "number 'x' of its meshes"),
+        ({"nodes": [{"mesh": 0}], "meshes": {}}, "number 0 of its meshes"),
+        ({"nodes": [{"mesh": 0}], "meshes": [{}]}, "'primitives' is missing in it, or not known"),
+        ({"nodes": [7]}, "number 0 of its nodes is no JSON object"),
+        ({"nodes": [{"scale": {}}]}, "an entry of it is of the wrong kind"),
+        ({"nodes": [{"matrix": [1, 2]}]}, "an entry of it has the wrong form"),
+        ({"nodes": []}, "number 0 of its nodes, of which there are 0"),
+    ],
+)
+def test_malformed_gltf_in_words(tmp_path, tree, message):
+    everything = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], **tree}
+    with pytest.raises(SceneError, match=rf"a\.gltf: malformed glTF, .*{message}") as error:
+        load(tmp_path / "a.gltf", json.dumps(everything))
+    assert "Error" not in str(error.value)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.999])
