@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,8 +197,21 @@ def report_scene(
     else:
         scene = load_mesh_scene(file if isinstance(file, MeshSceneConfig) else MeshSceneConfig(file=file))
     loaded_s = time.perf_counter() - start
-    space = make_free_space(scene, FreeSpaceConfig(), device=device)
-    report = describe(scene, space)
+    space: FreeSpace | None
+    try:
+        space = make_free_space(scene, FreeSpaceConfig(), device=device)
+    except ValueError as error:  # a sheet, or something smaller than a voxel
+        space, report = None, describe(scene)
+        none = FreeSpaceReport(
+            volume_m3=0.0,
+            floor_m2=0.0,
+            widest_m=0.0,
+            height_m=report.bounds_m[1][2],
+            notes=(f"There is no room to fly in: {error}.",),
+        )
+        report = dataclasses.replace(report, free_space=none)
+    else:
+        report = describe(scene, space)
     print_report(report, console)
     if not isinstance(file, Scene):
         console.print(f"- Loaded in {loaded_s:.2f} s.", highlight=False)
@@ -208,8 +222,10 @@ def report_scene(
     return report
 
 
-def scene_picture(scene: Scene, space: FreeSpace, report: SceneReport, *, device: str = "cpu") -> Image.Image:
-    """Draw a scene, cut open at about eye height, from above, with the plan of its free space.
+def scene_picture(
+    scene: Scene, space: FreeSpace | None, report: SceneReport, *, device: str = "cpu"
+) -> Image.Image:
+    """Draw a scene, cut open at about eye height, from above, with the plan of its free space if it has any.
 
     Returns:
         An RGB picture of 1600 x 900 px.
@@ -249,9 +265,19 @@ def scene_picture(scene: Scene, space: FreeSpace, report: SceneReport, *, device
         if y > _SIZE[1] - 24:
             break
         draw.text((left, y), name, font=normal, fill=_FAINT)
-        # the font that Pillow brings has no superscripts
-        draw.text((left + 120, y), value.replace("²", "^2").replace("³", "^3"), font=normal, fill=_INK)
+        _write(draw, (left + 120, y), value, size=17)
     return picture
+
+
+def _write(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, *, size: int) -> None:
+    """Write text with superscripts, which the font that Pillow brings has not: small digits, set high."""
+    large, small = ImageFont.load_default(size=size), ImageFont.load_default(size=0.65 * size)
+    x, y = place
+    for piece in re.split("([²³])", text):
+        raised = piece in ("²", "³")
+        shown, font = ({"²": "2", "³": "3"}[piece], small) if raised else (piece, large)
+        draw.text((x, y), shown, font=font, fill=_INK)
+        x += font.getlength(shown)
 
 
 def cut_open(scene: Scene, height_m: float) -> Scene:
@@ -353,7 +379,7 @@ def _look(arrays: SceneArrays, pose: Any, fov_rad: float, size: tuple[int, int])
 
 
 def _draw_plan(
-    arrays: SceneArrays, space: FreeSpace, report: SceneReport, bounds: NDArray[np.float64]
+    arrays: SceneArrays, space: FreeSpace | None, report: SceneReport, bounds: NDArray[np.float64]
 ) -> tuple[Image.Image, float, NDArray[np.float64]]:
     """Return the scene from above with free space in green, its pixels per metre and its lower left [m]."""
     extent = bounds[1, :2] - bounds[0, :2]
@@ -366,9 +392,11 @@ def _draw_plan(
     fov_rad = 2.0 * float(np.arctan(0.5 * width / scale / distance))
     picture = _look(arrays, pose, fov_rad, (width, height)).astype(np.float64)
 
+    lower_left = centre[:2] - 0.5 * np.array([width, height]) / scale
+    if space is None:
+        return Image.fromarray(picture.astype(np.uint8)), scale, lower_left
     layer = space.voxel_of([*space.seed_m[:2], _flight_height(report)])[2]
     free = space.reachable(CLEARANCE_M)[:, :, layer]
-    lower_left = centre[:2] - 0.5 * np.array([width, height]) / scale
     x = lower_left[0] + (np.arange(width) + 0.5) / scale
     y = lower_left[1] + (height - np.arange(height) - 0.5) / scale
     column = np.rint((x - space.origin_m[0]) / space.voxel_m).astype(int)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageDraw
 from rich.console import Console
 
 from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space
 from neurosim_core.scene.mesh import SceneError
-from neurosim_core.scene.report import cut_open, describe, print_report, report_scene, rows
+from neurosim_core.scene.report import _write, cut_open, describe, print_report, report_scene, rows
 from neurosim_core.scene.scene import Light, Material, Scene, Texture
 
 BOX_FACES = np.array(
@@ -145,6 +146,59 @@ def test_report_of_a_house(house, tmp_path):
     assert "4 of 145844 faces have no area" in stream.getvalue()
     with Image.open(tmp_path / "house.png") as picture:
         assert picture.size == (1600, 900)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)],
+        [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)],
+    ],
+    ids=["lying", "standing"],
+)
+def test_a_sheet_is_described_and_drawn(tmp_path, corners):
+    """No room around it: that is said, and everything else too."""
+    vertices = np.array(corners, dtype=np.float32)
+    normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0])
+    sheet = dataclasses.replace(
+        hall(),
+        name="sheet",
+        vertices=vertices,
+        normals=np.tile(normal / np.linalg.norm(normal), (4, 1)).astype(np.float32),
+        uv=np.zeros((4, 2), dtype=np.float32),
+        faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
+        face_material=np.zeros(2, dtype=np.int32),
+        face_instance=np.zeros(2, dtype=np.int32),
+        lights=(Light(position_m=(0.5, 0.5, 2.0), intensity=(1.0, 1.0, 1.0)),),
+    )
+    stream = io.StringIO()
+    report = report_scene(sheet, tmp_path / "sheet.png", console=Console(file=stream, width=200))
+    assert report.triangle_count == 2
+    assert report.free_space is not None
+    assert report.free_space.volume_m3 == 0.0
+    assert "none with 0.3 m clear" in stream.getvalue()
+    assert "There is no room to fly in: the scene has no free space" in stream.getvalue()
+    with Image.open(tmp_path / "sheet.png") as opened:
+        picture = np.asarray(opened).astype(int)
+    assert ((picture[:, :1010] < 250).any(axis=2)).mean() > 0.02  # it is drawn
+    assert not (picture[..., 1] - picture[..., 0] > 20).any()  # nothing green
+
+
+def test_superscripts_are_small_and_high():
+    """The picture says m², as the table does: a small 2 above the middle of the m's line, and no caret."""
+    ink = {}
+    for text in ("m²", "m", "m2"):
+        picture = Image.new("RGB", (80, 40), (255, 255, 255))
+        _write(ImageDraw.Draw(picture), (5, 5), text, size=17)
+        ink[text] = np.asarray(picture)[:, :, 0] < 128
+    after = np.flatnonzero(ink["m"].any(axis=0))[-1] + 1
+    rows_of = {text: np.flatnonzero(dark[:, after:].any(axis=1)) for text, dark in ink.items()}
+    assert len(rows_of["m"]) == 0
+    assert 0 < np.ptp(rows_of["m²"]) < 0.8 * np.ptp(rows_of["m2"])
+    assert rows_of["m²"][-1] < rows_of["m2"][-1] - 3
+    assert rows_of["m²"][0] <= rows_of["m2"][0]
+    columns = [np.flatnonzero(ink[text][:, after:].any(axis=0)) for text in ("m²", "m2")]
+    assert np.ptp(columns[0]) < np.ptp(columns[1])  # one small digit wide
 
 
 def test_no_file(tmp_path):
