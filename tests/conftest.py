@@ -33,7 +33,7 @@ def house() -> Path:
 
 
 @pytest.fixture(scope="session")
-def test_assets() -> Path:
+def small_assets() -> Path:
     """Small glTF files that are kept beside the project."""
     path = SHARED / "scenes" / "habitat_test_assets"
     if not path.exists():

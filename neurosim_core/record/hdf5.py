@@ -37,7 +37,6 @@ import contextlib
 import dataclasses
 import heapq
 import logging
-import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,6 +47,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.record.disk import Disk
 from neurosim_core.record.header import FlightHeader, Intrinsics, SensorDescription
 
 log = logging.getLogger(__name__)
@@ -106,7 +106,7 @@ class FlightWriter:
         self._pending_bytes = 0
         self._flushed_s = time.monotonic()
         try:
-            self._disk = _Disk(self._path)
+            self._disk = Disk(self._path)
         except OSError as error:
             raise OSError(f"cannot write {self._path}: {error.strerror}") from error
         # The oldest format: many programs read it, and no mark "open for writing" bars a killed file. Freed
@@ -203,102 +203,6 @@ class FlightWriter:
             for key in ("events", "ms_to_idx", "t_offset"):
                 self._file[key] = group[key]
         return stream
-
-
-class _Disk:
-    """The file below HDF5, which changes what is on disk only at `seal`.
-
-    What HDF5 appends goes to disk at once; what it writes over the part that was sealed before (a few kB of
-    its own bookkeeping) is held back until everything that it refers to is on disk. So a process that is
-    killed leaves the state of the last seal, unless that hits the millisecond in which this part is written.
-
-    After a failed write it only pretends to write: HDF5 would try again when it closes an object, and crash.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
-        self._error: OSError | None = None
-        self._offset = 0
-        self._sealed_size = 0
-        self._held: dict[tuple[int, int], bytes] = {}
-
-    @property
-    def failed(self) -> bool:
-        return self._error is not None
-
-    def seal(self) -> None:
-        """Bring what was held back to disk.
-
-        Raises:
-            OSError: A write has failed.
-        """
-        for (offset, _), data in sorted(self._held.items(), key=lambda item: item[0][0] > 0):
-            self._write(offset, memoryview(data))  # first the superblock, which says how long the file is
-        self._held.clear()
-        if self._error is not None:
-            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
-        self._sealed_size = os.fstat(self._file.fileno()).st_size
-
-    def close(self) -> None:
-        self._file.close()
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        begin = {
-            os.SEEK_SET: 0,
-            os.SEEK_CUR: self._offset,
-            os.SEEK_END: os.fstat(self._file.fileno()).st_size,
-        }
-        self._offset = begin[whence] + offset
-        return self._offset
-
-    def tell(self) -> int:
-        return self._offset
-
-    def read(self, size: int) -> bytes:
-        """Read without `readinto`; by this method h5py knows a file."""
-        buffer = bytearray(size)
-        return bytes(buffer[: self.readinto(memoryview(buffer))])
-
-    def readinto(self, buffer: memoryview) -> int:
-        self._file.seek(self._offset)
-        found = self._file.readinto(buffer)
-        for (offset, size), data in self._held.items():
-            low, high = max(offset, self._offset), min(offset + size, self._offset + len(buffer))
-            if low < high:
-                buffer[low - self._offset : high - self._offset] = data[low - offset : high - offset]
-        self._offset += found
-        return found
-
-    def write(self, data: memoryview) -> int:
-        held = min(max(self._sealed_size - self._offset, 0), len(data))
-        if held:
-            key = (self._offset, held)
-            self._held.pop(key, None)  # later writes win where they overlap
-            self._held[key] = bytes(data[:held])
-        self._write(self._offset + held, data[held:])
-        self._offset += len(data)
-        return len(data)
-
-    def truncate(self, size: int) -> int:
-        if self._error is None:
-            try:
-                self._file.truncate(size)
-            except OSError as error:
-                self._error = error
-        return size
-
-    def flush(self) -> None:
-        """Do nothing: HDF5 asks before everything is consistent; `seal` says when it is."""
-
-    def _write(self, offset: int, data: memoryview) -> None:
-        while self._error is None and len(data):
-            try:
-                self._file.seek(offset)
-                written = self._file.write(data)
-                offset, data = offset + written, data[written:]
-            except OSError as error:
-                self._error = error
 
 
 class _Column:

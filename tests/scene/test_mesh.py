@@ -967,11 +967,11 @@ ASSETS = {
 
 
 @pytest.mark.parametrize("name", ASSETS)
-def test_small_assets(test_assets, name):
-    scene = load_mesh_scene(MeshSceneConfig(file=test_assets / name))
+def test_small_assets(small_assets, name):
+    scene = load_mesh_scene(MeshSceneConfig(file=small_assets / name))
     check(scene)
     count, size = ASSETS[name]
     assert len(scene.faces) == count
     assert np.ptp(scene.bounds_m, axis=0) == pytest.approx(size, abs=0.002)
-    independent = trimesh.load_scene(test_assets / name, process=False).to_mesh()
+    independent = trimesh.load_scene(small_assets / name, process=False).to_mesh()
     assert area(scene) == pytest.approx(independent.area, rel=1e-4)  # slivers feel the rounding to float32

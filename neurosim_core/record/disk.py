@@ -1,0 +1,109 @@
+"""The file below HDF5: a program that is killed leaves the state of the last seal."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+class Disk:
+    """The file below HDF5, which changes what is on disk only at `seal`.
+
+    What HDF5 appends goes to disk at once; what it writes over the part that was sealed before (a few kB of
+    its own bookkeeping) is held back until everything that it refers to is on disk. So a process that is
+    killed leaves the state of the last seal, unless that hits the millisecond in which this part is written.
+
+    After a failed write it only pretends to write: HDF5 would try again when it closes an object, and crash.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
+        self._error: OSError | None = None
+        self._offset = 0
+        self._sealed_size = 0
+        self._held: dict[tuple[int, int], bytes] = {}
+
+    @property
+    def failed(self) -> bool:
+        """Whether a write has failed."""
+        return self._error is not None
+
+    def seal(self) -> None:
+        """Bring what was held back to disk.
+
+        Raises:
+            OSError: A write has failed.
+        """
+        for (offset, _), data in sorted(self._held.items(), key=lambda item: item[0][0] > 0):
+            self._write(offset, memoryview(data))  # first the superblock, which says how long the file is
+        self._held.clear()
+        if self._error is not None:
+            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
+        self._sealed_size = os.fstat(self._file.fileno()).st_size
+
+    def close(self) -> None:
+        """Close the file; what was not sealed is lost."""
+        self._file.close()
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move, as a file object does."""
+        begin = {
+            os.SEEK_SET: 0,
+            os.SEEK_CUR: self._offset,
+            os.SEEK_END: os.fstat(self._file.fileno()).st_size,
+        }
+        self._offset = begin[whence] + offset
+        return self._offset
+
+    def tell(self) -> int:
+        """Return the place, as a file object does."""
+        return self._offset
+
+    def read(self, size: int) -> bytes:
+        """Read without `readinto`; by this method h5py knows a file."""
+        buffer = bytearray(size)
+        return bytes(buffer[: self.readinto(memoryview(buffer))])
+
+    def readinto(self, buffer: memoryview) -> int:
+        """Read what was written last, held back or not."""
+        self._file.seek(self._offset)
+        found = self._file.readinto(buffer)
+        for (offset, size), data in self._held.items():
+            low, high = max(offset, self._offset), min(offset + size, self._offset + len(buffer))
+            if low < high:
+                buffer[low - self._offset : high - self._offset] = data[low - offset : high - offset]
+        self._offset += found
+        return found
+
+    def write(self, data: memoryview) -> int:
+        """Append at once, and hold back what goes over what was sealed."""
+        held = min(max(self._sealed_size - self._offset, 0), len(data))
+        if held:
+            key = (self._offset, held)
+            self._held.pop(key, None)  # later writes win where they overlap
+            self._held[key] = bytes(data[:held])
+        self._write(self._offset + held, data[held:])
+        self._offset += len(data)
+        return len(data)
+
+    def truncate(self, size: int) -> int:
+        """Cut the file, as a file object does."""
+        if self._error is None:
+            try:
+                self._file.truncate(size)
+            except OSError as error:
+                self._error = error
+        return size
+
+    def flush(self) -> None:
+        """Do nothing: HDF5 asks before everything is consistent; `seal` says when it is."""
+
+    def _write(self, offset: int, data: memoryview) -> None:
+        while self._error is None and len(data):
+            try:
+                self._file.seek(offset)
+                written = self._file.write(data)
+                offset, data = offset + written, data[written:]
+            except OSError as error:
+                self._error = error
