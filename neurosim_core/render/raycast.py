@@ -116,7 +116,6 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     with_images = len(outputs) > int(with_log)
     baked = terms.baked
     supersampled = terms.supersampled
-    cast_packet = packet_caster(terms.embree) if terms.embree else None
     with_geometry = with_depth or with_normal or with_instance
 
     @wp.func
@@ -286,6 +285,11 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         if wp.static(with_radiance):
             write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
 
+    if not terms.embree:
+        return raycast
+
+    cast_packet = packet_caster(terms.embree)
+
     @wp.kernel(module="unique", enable_backward=False)
     def raycast_packets(
         first: int,
@@ -387,7 +391,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                         rgb_out,
                     )
 
-    return raycast_packets if terms.embree else raycast
+    return raycast_packets
 
 
 def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
