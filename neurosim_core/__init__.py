@@ -1,4 +1,4 @@
-"""Neurosim: event cameras, RGB, depth and IMU on agile multirotors, faster than real time.
+"""Neurosim: event cameras, RGB, depth and IMU on agile multirotors.
 
 Everything is imported on first use: `import neurosim_core` starts no device and loads no heavy library.
 """

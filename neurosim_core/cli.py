@@ -15,6 +15,8 @@ from typing import Any
 
 import yaml
 
+from neurosim_core import __version__
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
@@ -57,8 +59,9 @@ def _start_warp() -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="neurosim",
-        description="Event cameras, RGB, depth and IMU on agile multirotors, faster than real time.",
+        description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
+    parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="fly, record, and draw a picture of it")
@@ -174,5 +177,5 @@ def _view(arguments: argparse.Namespace) -> int:
     viewer = shutil.which("rerun", path=os.pathsep.join([beside, *os.get_exec_path()]))
     if viewer is None:
         raise ImportError("the Rerun viewer is not installed: pip install 'neurosim[view]'")
-    options = ["--web-viewer"] if arguments.web else []
+    options = ["--web-viewer", "--bind", "127.0.0.1"] if arguments.web else []
     return subprocess.run([viewer, str(file), *options], check=False).returncode

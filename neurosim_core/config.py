@@ -188,7 +188,11 @@ def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
 def _read(path: Path) -> dict[str, Any]:
     try:
         raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise ConfigError(
+            f"{path} is binary, no settings; a mesh is named in them: scene: {{kind: mesh, file: {path}}}"
+        ) from None
+    except OSError as error:
         raise ConfigError(f"cannot read {path}: {error}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path} is not YAML: {error}") from error

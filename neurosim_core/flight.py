@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import itertools
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -67,6 +69,8 @@ def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
     if out is None:
         names = (Path("flight" if number == 1 else f"flight-{number}") for number in itertools.count(1))
         out = next(name for name in names if not name.exists())
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"--out must name a folder, got the file {out}")
     held = [name for name in ("flight.h5", "config.yaml") if (out / name).exists()]
     if held and not overwrite:
         raise FileExistsError(
@@ -107,10 +111,17 @@ def fly(
 
     summary = FlightSummary(describe_sensors(config.sensors))
     begin = time.perf_counter()
-    with _sinks(model, folder, rerun=rerun, console=console) as sinks, _progress(console) as progress:
+    with (
+        _stop_at_interrupt() as stop,
+        _sinks(model, folder, rerun=rerun, console=console) as sinks,
+        _progress(console) as progress,
+    ):
         task = progress.add_task("flying", total=model.duration_ns, rate="", factor="")
         try:
             for packet in packets if first is None else itertools.chain([first], packets):
+                if stop.is_set():
+                    report.interrupted = True
+                    break
                 for sink in sinks:
                     sink(packet)
                 summary.log(packet)
@@ -124,8 +135,6 @@ def fly(
                         rate=f"{summary.event_count / report.simulated_ns * 1e3:.2f} M events/s",
                         factor=f"{report.real_time_factor:.2f} x real time",
                     )
-        except KeyboardInterrupt:
-            report.interrupted = True
         except DynamicsError as error:
             report.failure = error
     report.flight_s = time.perf_counter() - begin
@@ -209,6 +218,26 @@ def _sinks(
         yield sinks
 
 
+@contextlib.contextmanager
+def _stop_at_interrupt() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into an event: it must not break into the writing of a file. The second one does."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # only the main thread is told of signals
+        return
+
+    def on_interrupt(_signal: int, _frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _log_clearance(logger: RerunLogger, model: Model, packet: Packet) -> None:
     if isinstance(packet, Odometry):
         clearance_m = float(model.free_space.clearance(packet.position)[0])
@@ -267,9 +296,11 @@ def _print_plan(console: Console, model: Model) -> None:
     )
     for note in (*scene.notes, *model.free_space.notes):
         console.print(f"  {note}", style="dim", highlight=False)
+    beyond_s = (model.path.end_ns - model.duration_ns) / NS_PER_S
+    rest = f"; the whole path takes {beyond_s:.1f} s more" if beyond_s > 0.0 else ""
     console.print(
         f"[bold]{config.vehicle.preset}[/] flies {length:.1f} m in {config.duration_s:g} s, "
-        f"at most {speed.max():.1f} m/s, on {model.device}",
+        f"at most {speed.max():.1f} m/s, on {model.device}{rest}",
         highlight=False,
     )
 
@@ -297,7 +328,8 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
         errors_cm = 100.0 * np.array(report.tracking_errors_m)
         rms_cm = np.sqrt((errors_cm**2).mean())
         facts.add_row("path", f"followed to {rms_cm:.1f} cm RMS, {errors_cm.max():.1f} cm at most")
-    facts.add_row("collisions", _describe_collisions(report))
+    ending = "; the run ended there" if state.ended else ""
+    facts.add_row("collisions", f"{_describe_collisions(report)}{ending}")
     for name, terms in _terms(model, state).items():
         facts.add_row(f"compiled {name}", ", ".join(terms) or "nothing optional")
     console.print()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +108,7 @@ def test_a_rerun_file_can_be_made_from_the_recording(flown, tmp_path):
     assert (tmp_path / "again.rrd").stat().st_size > 100_000
 
 
-@pytest.mark.parametrize(("options", "passed"), [([], ""), (["--web"], " --web-viewer")])
+@pytest.mark.parametrize(("options", "passed"), [([], ""), (["--web"], " --web-viewer --bind 127.0.0.1")])
 def test_view_opens_the_viewer(flown, tmp_path, options, passed, monkeypatch, capfd):
     """A stand-in for the viewer tells what it is started with."""
     folder, _ = flown
@@ -140,6 +142,26 @@ def test_a_flight_is_not_overwritten_unasked(flown):
     assert "--overwrite" in done.stderr
 
 
+def test_an_interrupted_run_is_kept_whole(tmp_path):
+    """Ctrl-C ends the flight between two packets: the file is closed, the picture drawn, the status tells."""
+    command = [sys.executable, "-m", "neurosim_core", "run", "--duration", "60", "--out", "cut", "--no-rrd"]
+    run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    file = tmp_path / "cut" / "flight.h5"
+    deadline = time.monotonic() + 120
+    while not (file.exists() and file.stat().st_size > 1_000_000):
+        assert run.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    run.send_signal(signal.SIGINT)
+    said, errors = run.communicate(timeout=60)
+    assert run.returncode == 130, errors
+    assert "interrupted" in said
+    assert (tmp_path / "cut" / "overview.png").exists()
+    with Flight(file) as flight:
+        assert flight.clean
+        assert flight.packet_count("imu") > 10
+
+
 def test_folders_are_numbered_when_none_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for expected in ("flight", "flight-2", "flight-3"):
@@ -167,6 +189,8 @@ def test_printed_settings_are_settings(tmp_path):
         (["run", "--set", "scene={kind: mesh, file: nothing.glb}"], "nothing.glb"),
         (["scene", "nothing.glb"], "nothing.glb"),
         (["view", "nowhere"], "no flight at"),
+        (["run", sys.executable], "kind: mesh"),
+        (["run", "--out", sys.executable], "--out must name a folder"),
     ],
 )
 def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path):

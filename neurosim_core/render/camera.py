@@ -74,8 +74,8 @@ class PinholeConfig(Settings):
                 f"give horizontal_fov_rad or fx, fy, cx, cy, not both: got horizontal_fov_rad and {given}"
             )
         if self.horizontal_fov_rad is None and len(given) < 4:
-            missing = [name for name in pixels if name not in given]
-            raise ValueError(f"give horizontal_fov_rad, or all of fx, fy, cx, cy: missing {missing}")
+            missing = f": missing {[name for name in pixels if name not in given]}" if given else ""
+            raise ValueError(f"give horizontal_fov_rad (such as 1.5), or all of fx, fy, cx, cy{missing}")
         return self
 
     def intrinsics(self) -> Intrinsics:

@@ -56,7 +56,7 @@ def test_ray_spread_is_the_root_of_a_pixels_solid_angle():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({}, "missing"),
+        ({}, "give horizontal_fov_rad"),
         ({"fx": 100.0, "fy": 100.0}, r"missing \['cx', 'cy'\]"),
         ({"horizontal_fov_rad": 1.0, "fx": 100.0}, "not both"),
         ({"horizontal_fov_rad": 3.2}, "less than 3.14"),
