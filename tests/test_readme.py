@@ -63,6 +63,14 @@ def test_the_run_command(tmp_path):
     assert {p.name for p in (tmp_path / "flight").iterdir()} == {
         "config.yaml", "flight.h5", "flight.rrd", "overview.png"
     }  # fmt: skip
+    reading = named("reading", "python")["flight"] + "print(len(events.t), len(rates), len(packets))"
+    read = subprocess.run(
+        [sys.executable, "-W", "error", "-c", reading], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert read.returncode == 0, read.stderr
+    events, rates, packets = map(int, read.stdout.split())
+    assert events > 1000
+    assert (rates, packets) == (1601, 81 + 801)
 
 
 @pytest.mark.parametrize("name", sorted(named("example", "python")))
