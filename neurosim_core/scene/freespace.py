@@ -291,9 +291,7 @@ class FreeSpace:
         return np.minimum(rows - self.bounds_m[0], self.bounds_m[1] - rows).min(axis=1)
 
 
-def make_free_space(
-    scene: Scene, config: FreeSpaceConfig, device: str = "cpu", *, mesh: wp.Mesh | None = None
-) -> FreeSpace:
+def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") -> FreeSpace:
     """Map the room in a scene.
 
     The seed is, in this order: `config.seed_m`; the point that the scene knows (`scene.inside_m`); or the
@@ -307,7 +305,6 @@ def make_free_space(
         scene: Triangles.
         config: Resolution and seed.
         device: Where distances are computed and where the map for kernels is kept.
-        mesh: The scene's triangles on that device, if they are there already.
 
     Raises:
         ValueError: The seed of the configuration is not in free space, or the scene has none.
@@ -322,11 +319,10 @@ def make_free_space(
             f"Free space is mapped in voxels of {voxel:.3g} m instead of {config.voxel_m:g} m: "
             f"the scene measures {' x '.join(f'{s:.3g}' for s in bounds[1] - bounds[0])} m."
         )
-    if mesh is None:
-        mesh = wp.Mesh(
-            points=wp.array(scene.vertices, dtype=wp.vec3, device=device),
-            indices=wp.array(scene.faces.reshape(-1), dtype=wp.int32, device=device),
-        )
+    mesh = wp.Mesh(
+        points=wp.array(scene.vertices, dtype=wp.vec3, device=device),
+        indices=wp.array(scene.faces.reshape(-1), dtype=wp.int32, device=device),
+    )
     origin = bounds[0] + 0.5 * ((bounds[1] - bounds[0]) - (counts - 1) * voxel)
     distance: Any = wp.empty(tuple(counts.tolist()), dtype=wp.float32, device=device)
     _launch_fill(mesh, origin, voxel, distance)

@@ -11,7 +11,6 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 
 import itertools
 import logging
-import os
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +24,7 @@ from pydantic import Field
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
+from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
 from neurosim_core.settings import Settings
@@ -346,7 +346,7 @@ class EventCamera:
         pixel_count = self.width * self.height
         chunk_count = 1
         if self.device.is_cpu:
-            chunk_count = max(1, min(_core_count(), self.height, pixel_count // _PIXELS_PER_THREAD_MIN))
+            chunk_count = max(1, min(core_count(), self.height, pixel_count // _PIXELS_PER_THREAD_MIN))
         rows = [self.height * chunk // chunk_count for chunk in range(chunk_count + 1)]
         return [(a * self.width, b * self.width) for a, b in itertools.pairwise(rows)]
 
@@ -652,12 +652,6 @@ class EventCamera:
 def _pinned(array: Any) -> Any:
     """Return an array of the host to upload from; the array itself if it is there."""
     return wp.empty_like(array, device="cpu", pinned=True) if array.device.is_cuda else array
-
-
-def _core_count() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
