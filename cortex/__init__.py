@@ -1,0 +1,106 @@
+"""Cortex: typed publish/subscribe at memory speed, safe enough for control.
+
+Everything public is here; importing the package loads nothing heavy until a name is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cortex.codec import MalformedMessage
+    from cortex.message import (
+        Array,
+        Float32,
+        Float64,
+        Int8,
+        Int16,
+        Int32,
+        Int64,
+        UInt8,
+        UInt16,
+        UInt32,
+        UInt64,
+        Unit,
+        message,
+    )
+    from cortex.node import Node
+    from cortex.policy import Policy, keep_last, latest, reliable
+    from cortex.publisher import Publisher
+    from cortex.schema import TypeMismatch
+    from cortex.service import ServiceFailed, ServiceTimeout, ServiceUnavailable
+    from cortex.subscriber import Closed, Info, Subscriber
+
+_HOME = {
+    "Array": "message",
+    "Closed": "subscriber",
+    "Float32": "message",
+    "Float64": "message",
+    "Info": "subscriber",
+    "Int8": "message",
+    "Int16": "message",
+    "Int32": "message",
+    "Int64": "message",
+    "MalformedMessage": "codec",
+    "Node": "node",
+    "Policy": "policy",
+    "Publisher": "publisher",
+    "ServiceFailed": "service",
+    "ServiceTimeout": "service",
+    "ServiceUnavailable": "service",
+    "Subscriber": "subscriber",
+    "TypeMismatch": "schema",
+    "UInt8": "message",
+    "UInt16": "message",
+    "UInt32": "message",
+    "UInt64": "message",
+    "Unit": "message",
+    "keep_last": "policy",
+    "latest": "policy",
+    "message": "message",
+    "reliable": "policy",
+}
+
+__all__ = [
+    "Array",
+    "Closed",
+    "Float32",
+    "Float64",
+    "Info",
+    "Int8",
+    "Int16",
+    "Int32",
+    "Int64",
+    "MalformedMessage",
+    "Node",
+    "Policy",
+    "Publisher",
+    "ServiceFailed",
+    "ServiceTimeout",
+    "ServiceUnavailable",
+    "Subscriber",
+    "TypeMismatch",
+    "UInt8",
+    "UInt16",
+    "UInt32",
+    "UInt64",
+    "Unit",
+    "keep_last",
+    "latest",
+    "message",
+    "reliable",
+]
+
+
+def __getattr__(name: str) -> object:
+    home = _HOME.get(name)
+    if home is None:
+        raise AttributeError(f"module 'cortex' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"cortex.{home}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

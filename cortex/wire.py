@@ -1,0 +1,251 @@
+"""The frames of WIRE.md: the 64-byte header, kinds, batches, descriptors of slots, attaching, control."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from cortex.codec import MalformedMessage, codec_of
+
+VERSION = 1
+HEADER_SIZE = 64
+PREFIX_SIZE = 16
+"""Bytes of a header that ZeroMQ subscriptions match: magic, kind, version, flags, header length, source."""
+
+MESSAGE, LARGE, SLOT, BATCH, ATTACH = b"M", b"L", b"S", b"B", b"A"
+CONTROL, REQUEST, REPLY, ERROR = b"C", b"Q", b"P", b"E"
+
+FLAG_STAMP = 1
+BODY_LIMIT = 1 << 30
+CONTROL_LIMIT = 16 << 20
+NO_COLUMN = 0xFFFFFFFF
+
+_HEADER = struct.Struct("<3sBBBHQQQqqQQ")
+_PREFIX = struct.Struct("<3sBBBHQ")
+TAIL = struct.Struct("<QQqqQQ")
+"""What follows the prefix: fingerprint, sequence, stamp_ns, publish_ns, body length, aux."""
+RECORD = struct.Struct("<qqII")
+"""Head of a batch's record: stamp_ns, publish_ns, body length, reserved."""
+MASK = struct.Struct("<Q")
+_KEY = struct.Struct("<QQ")
+_ANSWER = struct.Struct("<QIIQQ")
+_RING = struct.Struct("<IIQIiQ")
+
+
+class Header(NamedTuple):
+    """A header's fields; `stamp_ns` is None for a type without one."""
+
+    kind: bytes
+    source: int
+    fingerprint: int
+    sequence: int
+    stamp_ns: int | None
+    publish_ns: int
+    body_size: int
+    aux: int
+
+
+def prefix(kind: bytes, source: int, *, stamped: bool) -> bytes:
+    """The first 16 bytes of a header: what a subscription matches."""
+    return _PREFIX.pack(b"CTX", kind[0], VERSION, FLAG_STAMP if stamped else 0, HEADER_SIZE, source)
+
+
+def pack_header(header: Header) -> bytes:
+    """The 64 bytes of a header."""
+    return _HEADER.pack(
+        b"CTX",
+        header.kind[0],
+        VERSION,
+        0 if header.stamp_ns is None else FLAG_STAMP,
+        HEADER_SIZE,
+        header.source,
+        header.fingerprint,
+        header.sequence,
+        header.stamp_ns or 0,
+        header.publish_ns,
+        header.body_size,
+        header.aux,
+    )
+
+
+def unpack_header(frame: bytes | memoryview) -> Header:
+    """Read a header.
+
+    Raises:
+        MalformedMessage: Short frame, wrong magic, version or header length.
+    """
+    if len(frame) < HEADER_SIZE:
+        raise MalformedMessage(f"a frame of {len(frame)} bytes is shorter than a header of {HEADER_SIZE}")
+    magic, kind, version, flags, size, source, fingerprint, sequence, stamp, publish, body, aux = (
+        _HEADER.unpack_from(frame)
+    )
+    if magic != b"CTX" or version != VERSION or size != HEADER_SIZE or flags & ~FLAG_STAMP:
+        raise MalformedMessage(
+            f"not a frame of Cortex {VERSION}: magic {magic!r}, version {version}, flags {flags}, header {size}"
+        )
+    return Header(
+        bytes((kind,)),
+        source,
+        fingerprint,
+        sequence,
+        stamp if flags & FLAG_STAMP else None,
+        publish,
+        body,
+        aux,
+    )
+
+
+def control_frame(message: Any, sequence: int = 0, *, source: int = 0) -> bytes:
+    """One control message as a frame of kind `C`."""
+    codec = codec_of(type(message))
+    body = codec.encode(message, CONTROL_LIMIT)
+    if body is None:
+        raise ValueError(f"a control message of {codec.size(message)} bytes exceeds {CONTROL_LIMIT}")
+    return pack_header(Header(CONTROL, source, codec.fingerprint, sequence, None, 0, len(body), 0)) + body
+
+
+def parse_control(frame: bytes, types: Mapping[int, type]) -> tuple[Any, Header]:
+    """Decode a control frame.
+
+    Args:
+        frame: What a DEALER or ROUTER received.
+        types: The message types that are expected here, by fingerprint.
+
+    Raises:
+        MalformedMessage: Not a control frame, an unknown type, or a body that does not decode.
+    """
+    header = unpack_header(frame)
+    if header.kind != CONTROL:
+        raise MalformedMessage(f"kind {header.kind!r} where {CONTROL!r} was expected")
+    check_body(header, len(frame))
+    kind = types.get(header.fingerprint)
+    if kind is None:
+        raise MalformedMessage(f"unexpected control message of type {header.fingerprint:016x}")
+    return codec_of(kind).decode(frame, HEADER_SIZE, header.body_size), header
+
+
+def check_body(header: Header, frame_size: int, limit: int = CONTROL_LIMIT) -> None:
+    """A single frame holds exactly its header and its body, and no more than the limit."""
+    if header.body_size > limit or frame_size != HEADER_SIZE + header.body_size:
+        raise MalformedMessage(
+            f"a frame of {frame_size} bytes says that its body has {header.body_size} (limit {limit})"
+        )
+
+
+class Record(NamedTuple):
+    """One message of a batch: where its body lies in the frame."""
+
+    stamp_ns: int
+    publish_ns: int
+    offset: int
+    size: int
+
+
+def batch_records(frame: bytes, count: int) -> Iterator[Record]:
+    """Walk a batch's records; all are checked against the frame before the first is yielded.
+
+    Raises:
+        MalformedMessage: The records do not fill the frame exactly.
+    """
+    end, offset, records = len(frame), HEADER_SIZE, []
+    if count > (end - HEADER_SIZE) // RECORD.size:
+        raise MalformedMessage(f"{count} records cannot fit a batch of {end} bytes")
+    for _ in range(count):
+        if offset + RECORD.size > end:
+            raise MalformedMessage("a batch ends within the head of a record")
+        stamp_ns, publish_ns, size, reserved = RECORD.unpack_from(frame, offset)
+        offset += RECORD.size
+        if reserved or size > end - offset:
+            raise MalformedMessage(f"a batch's record of {size} bytes does not fit")
+        records.append(Record(stamp_ns, publish_ns, offset, size))
+        offset += size + (-size % 8)
+    if offset != end:
+        raise MalformedMessage(f"a batch has {end - offset} bytes after its last record")
+    return iter(records)
+
+
+class AttachKey(NamedTuple):
+    """What a reader asks for when it attaches to a publisher."""
+
+    source: int
+    reader: int
+    shared_memory: bool
+    strict: bool
+    quota: int
+    timeout_ms: int
+
+
+class RingPlace(NamedTuple):
+    """Where a ring of shared memory is found."""
+
+    ring: int
+    slots: int
+    slot_bytes: int
+    pid: int
+    fd: int
+
+
+class AttachAnswer(NamedTuple):
+    """A publisher's answer to a reader."""
+
+    sequence: int
+    column: int | None
+    rings: tuple[RingPlace, ...]
+    latched: bytes
+
+
+KEY_SIZE = PREFIX_SIZE + _KEY.size
+
+
+def attach_key(key: AttachKey, *, stamped: bool) -> bytes:
+    """The 32 bytes that a reader subscribes to, and that the answer begins with."""
+    options = (
+        int(key.shared_memory)
+        | int(key.strict) << 1
+        | min(key.quota, 255) << 8
+        | min(key.timeout_ms, 2**32 - 1) << 32
+    )
+    return prefix(ATTACH, key.source, stamped=stamped) + _KEY.pack(key.reader, options)
+
+
+def parse_attach_key(data: bytes) -> AttachKey | None:
+    """Read an attach key from a subscription; None if the subscription is something else."""
+    if len(data) != KEY_SIZE or data[:4] != b"CTX" + ATTACH:
+        return None
+    source = int.from_bytes(data[8:16], "little")
+    reader, options = _KEY.unpack_from(data, PREFIX_SIZE)
+    return AttachKey(
+        source, reader, bool(options & 1), bool(options & 2), (options >> 8) & 0xFF, options >> 32
+    )
+
+
+def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:
+    """The frame that answers a reader; `key` is the 32 bytes that it subscribed to."""
+    column = NO_COLUMN if answer.column is None else answer.column
+    head = _ANSWER.pack(answer.sequence, column, len(answer.rings), len(answer.latched), 0)
+    return key + head + b"".join(_RING.pack(*ring, 0) for ring in answer.rings) + answer.latched
+
+
+def parse_answer(frame: bytes) -> AttachAnswer:
+    """Read an attach answer.
+
+    Raises:
+        MalformedMessage: The counts do not match the frame's length.
+    """
+    if len(frame) < KEY_SIZE + _ANSWER.size:
+        raise MalformedMessage(f"an attach answer of {len(frame)} bytes is too short")
+    sequence, column, rings, latched, _ = _ANSWER.unpack_from(frame, KEY_SIZE)
+    start = KEY_SIZE + _ANSWER.size
+    if rings > 4 or latched > BODY_LIMIT or len(frame) != start + rings * _RING.size + latched:
+        raise MalformedMessage(
+            f"an attach answer of {len(frame)} bytes cannot hold {rings} rings and {latched} bytes"
+        )
+    if column != NO_COLUMN and column >= 64:
+        raise MalformedMessage(f"column {column} is not below 64")
+    places = tuple(
+        RingPlace(*_RING.unpack_from(frame, start + index * _RING.size)[:5]) for index in range(rings)
+    )
+    return AttachAnswer(
+        sequence, None if column == NO_COLUMN else column, places, frame[start + rings * _RING.size :]
+    )
