@@ -1,0 +1,447 @@
+"""Rings of message slots in shared memory: a publisher writes each large message once, readers map it.
+
+Layout and rules are section 6 of WIRE.md. A `Ring` belongs to one publisher, a `RingView` to one of its
+readers. A message in a slot is leased to readers: one byte for each slot and column, set by the publisher
+before it sends the slot's number, cleared by the reader when the last array that looks at the slot is gone.
+
+Neither side trusts the other. The publisher keeps what it knows (state, grants) in its own memory and reads
+back lease bytes only; the reader checks whatever it is told against what it can see.
+
+Memory order. A slot's content reaches the reader together with the ZeroMQ message that names it, and passing
+that message orders memory on every processor. The copy of a slot that is not leased (`RingView.snapshot`) and
+`RingView.heal` rely on more: that stores become visible, and loads happen, in program order. x86 promises
+that; elsewhere `fence` adds barriers, by reasoning, not by experience: no such machine was at hand.
+"""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cortex.memory import (
+    COLUMNS,
+    HEADER_WORDS,
+    PAGE,
+    SLOT_BYTES_MAX,
+    SLOTS_MAX,
+    STORES_IN_ORDER,
+    Head,
+    ShmUnavailable,
+    address_of,
+    create_ring_memory,
+    fence,
+    in_forked_child,
+    layout_of,
+    make_private,
+    open_ring_memory,
+)
+
+__all__ = ["Ring", "RingView", "ShmUnavailable"]
+
+_log = logging.getLogger(__name__)
+
+_SEQUENCE, _SIZE = 1, 2  # where they are in a slot's header; the state is first
+_NO_SEQUENCE = (1 << 64) - 1
+_U8 = np.dtype(np.uint8)
+
+Bytes = npt.NDArray[np.uint8]
+
+
+class Ring:
+    """The publisher's side of a ring of message slots.
+
+    A message is written so: `acquire` a slot, fill its `buffer`, `commit` it to the columns of the readers
+    that shall hold it, send the slot's number; `revoke` it from those to which it could not be sent. All
+    methods may be called from any thread; after a fork the child's copy is closed.
+
+    The lock also orders memory: taking it and giving it back are full barriers on x86, so that the state of a
+    slot is odd before its content changes and until it is whole, even where a copy bypasses the cache.
+
+    Args:
+        source: The publisher's number.
+        ring_id: Number of this ring among the publisher's, 0 to 2^32 - 1.
+        slots: How many messages the ring holds.
+        slot_bytes: Least size of a slot [bytes]; it is rounded up to a multiple of 4096.
+
+    Raises:
+        ShmUnavailable: No such memory on this system, or not enough of it.
+    """
+
+    def __init__(self, source: int, ring_id: int, *, slots: int, slot_bytes: int) -> None:
+        if not 0 < source < 1 << 64:
+            raise ValueError(f"source must be 1 to 2^64 - 1, got {source}")
+        if not 0 <= ring_id < 1 << 32:
+            raise ValueError(f"ring_id must be 0 to 2^32 - 1, got {ring_id}")
+        if not 0 < slots <= SLOTS_MAX:
+            raise ValueError(f"slots must be 1 to {SLOTS_MAX}, got {slots}")
+        if not 0 < slot_bytes <= SLOT_BYTES_MAX:
+            raise ValueError(f"slot_bytes must be 1 to {SLOT_BYTES_MAX}, got {slot_bytes}")
+        self.source, self.ring_id, self.slots, self.pid = source, ring_id, slots, os.getpid()
+        self.slot_bytes = -(-slot_bytes // PAGE) * PAGE
+        layout = layout_of(slots, self.slot_bytes)
+        self.fd, memory = create_ring_memory(source, ring_id, slots, self.slot_bytes)
+        self._close_fd = weakref.finalize(self, os.close, self.fd)
+        view = memoryview(memory)
+        table = view[layout.leases : layout.headers]
+        self._rows = [table[i : i + COLUMNS] for i in range(0, slots * COLUMNS, COLUMNS)]
+        self._headers = view[layout.headers : layout.headers + slots * HEADER_WORDS * 8].cast("Q")
+        self._buffers: list[Bytes] = [
+            np.ndarray((self.slot_bytes,), _U8, memory, layout.slots + k * self.slot_bytes)
+            for k in range(slots)
+        ]
+        self._lock = threading.RLock()  # reentrant: the garbage collector may call unpin anywhere
+        self._closed = False
+        self._last = slots - 1
+        self._state = [0] * slots
+        self._busy = [0] * slots  # pins, and one more while the slot is being written
+        self._granted: list[tuple[int, ...]] = [()] * slots  # columns of a slot's message, some given back
+        self._held: list[set[int]] = [set() for _ in range(COLUMNS)]  # slots of a column, some given back
+        self._columns_of: dict[int, tuple[int, ...]] = {0: ()}
+        in_forked_child(self, Ring._after_fork)
+
+    def acquire(self) -> int:
+        """Return a slot to write, the longest written first, or -1 if none is free.
+
+        The slot is then being written until `commit` or `abandon`.
+        """
+        with self._lock:
+            slot = self._last
+            for _ in self._busy:
+                slot += 1
+                if slot == self.slots:
+                    slot = 0
+                if self._busy[slot]:
+                    continue
+                columns = self._granted[slot]
+                if columns:
+                    row = self._rows[slot]
+                    for column in columns:
+                        if row[column]:
+                            break
+                    else:
+                        for column in columns:
+                            self._held[column].discard(slot)
+                        columns = self._granted[slot] = ()
+                    if columns:
+                        continue
+                self._last = slot
+                self._busy[slot] = 1
+                state = self._state[slot] = self._state[slot] + 1
+                self._headers[slot * HEADER_WORDS] = state
+                if not STORES_IN_ORDER:
+                    fence()
+                return slot
+        return -1
+
+    def buffer(self, slot: int) -> Bytes:
+        """Return a slot's memory, writable, shape [slot_bytes]; write only between acquire and commit."""
+        return self._buffers[slot]
+
+    def commit(self, slot: int, sequence: int, body_size: int, mask: int) -> None:
+        """Finish a slot and lease it to readers.
+
+        Args:
+            slot: From `acquire`.
+            sequence: The message's number.
+            body_size: Bytes of the message, at most `slot_bytes`.
+            mask: Bit c is set for a reader with column c that shall hold the slot.
+        """
+        with self._lock:
+            state = self._writing(slot)
+            if not 0 <= body_size <= self.slot_bytes:
+                raise ValueError(f"body_size must be 0 to {self.slot_bytes}, got {body_size}")
+            columns = self._columns_of.get(mask)
+            if columns is None:
+                columns = self._columns(mask)
+            headers, word = self._headers, slot * HEADER_WORDS
+            headers[word + _SEQUENCE] = sequence
+            headers[word + _SIZE] = body_size
+            if not STORES_IN_ORDER:
+                fence()
+            headers[word] = self._state[slot] = state + 1
+            if columns:
+                if not STORES_IN_ORDER:
+                    fence()
+                row, held = self._rows[slot], self._held
+                for column in columns:
+                    row[column] = 1
+                    held[column].add(slot)
+                self._granted[slot] = columns
+            self._busy[slot] -= 1
+
+    def abandon(self, slot: int) -> None:
+        """Give back a slot from `acquire` that will not be committed, as when a message cannot be encoded."""
+        with self._lock:
+            state = self._writing(slot)
+            self._headers[slot * HEADER_WORDS + _SEQUENCE] = (
+                _NO_SEQUENCE  # what was there is overwritten in part
+            )
+            self._headers[slot * HEADER_WORDS + _SIZE] = 0
+            if not STORES_IN_ORDER:
+                fence()
+            self._headers[slot * HEADER_WORDS] = self._state[slot] = state + 1
+            self._busy[slot] -= 1
+
+    def revoke(self, slot: int, mask: int) -> None:
+        """Take the leases of `mask` back, because the message could not be sent."""
+        with self._lock:
+            if self._closed:
+                return
+            revoked = self._columns(mask)
+            for column in revoked:
+                self._rows[slot][column] = 0
+                self._held[column].discard(slot)
+            self._granted[slot] = tuple(c for c in self._granted[slot] if c not in revoked)
+
+    def pin(self, slot: int) -> None:
+        """Keep a slot from being written, because a socket still reads from it; pins are counted."""
+        with self._lock:
+            self._busy[slot] += 1
+
+    def unpin(self, slot: int) -> None:
+        """Take back one `pin`; harmless after `close`."""
+        with self._lock:
+            self._busy[slot] -= 1
+
+    def outstanding(self, column: int) -> int:
+        """Return how many slots the reader with this column holds now, messages on the way to it included."""
+        with self._lock:
+            held = self._held[column]
+            if held:
+                rows = self._rows
+                held.difference_update([slot for slot in held if not rows[slot][column]])
+            return len(held)
+
+    def has_room(self, column: int, quota: int) -> bool:
+        """Say whether a column holds fewer than `quota` slots; cheaper than `outstanding`, and as exact."""
+        # What was granted is an upper bound of what is held: most calls need no look at the lease bytes.
+        return len(self._held[column]) < quota or self.outstanding(column) < quota
+
+    def free_column(self, column: int) -> None:
+        """Take back all leases of a column, because its reader left or died."""
+        with self._lock:
+            for row in self._rows:
+                row[column] = 0  # those not granted too: the next reader with this column shall find none
+            self._held[column].clear()
+
+    @property
+    def idle(self) -> bool:
+        """Whether no reader, socket or writer uses any slot, so that the ring can be closed unnoticed."""
+        with self._lock:
+            return not any(self._busy) and not any(
+                self.outstanding(c) for c, held in enumerate(self._held) if held
+            )
+
+    def close(self) -> None:
+        """Close the descriptor and let go of the memory; buffers that someone still has stay valid."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self.fd = -1
+            self._busy = [1] * self.slots  # so acquire finds none
+            self._rows, self._buffers, self._headers = [], [], memoryview(b"")
+            for held in self._held:
+                held.clear()
+            self._close_fd()
+
+    def _writing(self, slot: int) -> int:
+        """Return the state of a slot that is being written."""
+        if self._closed:
+            raise ValueError(f"ring {self.ring_id} is closed")
+        state = self._state[slot]
+        if not state & 1:
+            raise ValueError(f"slot {slot} is not being written: acquire comes first")
+        return state
+
+    def _columns(self, mask: int) -> tuple[int, ...]:
+        """Return the columns of a mask and remember them."""
+        if not 0 <= mask < 1 << COLUMNS:
+            raise ValueError(f"mask must be 0 to 2^{COLUMNS} - 1, got {mask}")
+        if len(self._columns_of) >= 1024:  # masks of readers long gone
+            self._columns_of = {0: ()}
+        columns = self._columns_of[mask] = tuple(c for c in range(COLUMNS) if mask >> c & 1)
+        return columns
+
+    def _after_fork(self) -> None:
+        self._lock = threading.RLock()  # another thread of the parent may have had it
+        self.close()
+
+
+class _Lease(np.ndarray[Any, np.dtype[np.uint8]]):
+    """The root of all arrays that look at one message; gives the slot back when it dies.
+
+    Arrays made from it keep it alive, because NumPy's `base` does not reach past a subclass.
+    """
+
+    __slots__ = ("index", "table")
+    index: int
+    table: memoryview
+
+    def __del__(self) -> None:
+        # Runs in any thread, perhaps while the interpreter shuts down: one store, no lock, no global name.
+        try:
+            self.table[self.index] = 0
+        except AttributeError:  # made from the root by someone who took it out of an array's `base`
+            return
+
+
+class RingView:
+    """The reader's side of a ring: the slots can be read only, the leases of one column be given back.
+
+    One thread at a time may call the methods; arrays may die in any thread, at exit, and after a fork (where
+    they give nothing back: the lease is the parent's; a child that keeps a message must copy it).
+
+    Args:
+        source: The publisher's number.
+        ring_id: Number of the ring.
+        slots: Number of slots.
+        slot_bytes: Size of a slot [bytes].
+        pid: The publisher's process.
+        fd: The ring's descriptor in that process.
+        column: The reader's column in the lease table.
+
+    Raises:
+        ShmUnavailable: The memory cannot be reached from here or is not what these arguments say.
+    """
+
+    def __init__(
+        self, source: int, ring_id: int, slots: int, slot_bytes: int, pid: int, fd: int, column: int
+    ) -> None:
+        if not 0 < slots <= SLOTS_MAX or not 0 < slot_bytes <= SLOT_BYTES_MAX or slot_bytes % PAGE:
+            raise ShmUnavailable(f"ring {ring_id}: {slots} slots of {slot_bytes} bytes are not possible")
+        if not 0 <= column < COLUMNS or not 0 < pid < 1 << 31 or not 0 <= fd < 1 << 31:
+            raise ShmUnavailable(f"ring {ring_id}: column {column}, process {pid}, descriptor {fd}")
+        self.source, self.ring_id, self.slots, self.slot_bytes = source, ring_id, slots, slot_bytes
+        self.column = column
+        layout = layout_of(slots, slot_bytes)
+        head, memory = open_ring_memory(source, ring_id, slots, slot_bytes, pid=pid, fd=fd)
+        self._head: Head | None = head
+        view = memoryview(head)
+        self._table = view[layout.leases : layout.headers]
+        self._own = self._table[column::COLUMNS]
+        self._headers = view[layout.headers : layout.headers + slots * HEADER_WORDS * 8].cast("Q")
+        self._memory = memoryview(memory)[layout.slots :]
+        self._delivered = [-1] * slots  # sequence of the message last leased from a slot
+
+    def lease(self, slot: int, sequence: int, size: int) -> Bytes:
+        """Return the message in a slot that was granted to this reader, read-only, shape [size].
+
+        The slot is given back when the array and all that was made from it without copying are gone.
+
+        Raises:
+            ValueError: The slot does not hold that message, or not for this reader.
+        """
+        self._check(slot, size)
+        index = slot * COLUMNS + self.column
+        headers, word = self._headers, slot * HEADER_WORDS
+        if self._table[index] != 1 or headers[word + _SEQUENCE] != sequence or headers[word + _SIZE] != size:
+            raise ValueError(
+                f"slot {slot} of ring {self.ring_id} should hold message {sequence} of {size} bytes, leased "
+                f"to column {self.column}, but holds message {headers[word + _SEQUENCE]} of "
+                f"{headers[word + _SIZE]} bytes, lease byte {self._table[index]}"
+            )
+        if self._delivered[slot] == sequence:
+            raise ValueError(f"message {sequence} in slot {slot} of ring {self.ring_id} was delivered before")
+        root = _Lease((size,), _U8, self._memory, slot * self.slot_bytes)
+        root.table, root.index = self._table, index
+        self._delivered[slot] = sequence
+        view: Bytes = root.view(np.ndarray)
+        return view
+
+    def release(self, slot: int) -> None:
+        """Give a granted slot back that was not leased."""
+        self._check(slot, 0)
+        if self._headers[slot * HEADER_WORDS + _SEQUENCE] != self._delivered[slot]:
+            self._table[slot * COLUMNS + self.column] = 0
+
+    def heal(self, before_sequence: int) -> int:
+        """Give back the slots of messages that were granted but dropped on the way, and return their number.
+
+        Args:
+            before_sequence: Sequence of a message that arrived: what is older and not here yet never comes.
+        """
+        if self._head is None:
+            return 0
+        leased = self._own.tobytes()
+        if not STORES_IN_ORDER:
+            fence()
+        healed = 0
+        slot = leased.find(1)
+        while slot >= 0:
+            sequence = self._headers[slot * HEADER_WORDS + _SEQUENCE]
+            # A delivered one is left to its array, which may be giving it back at this moment.
+            if sequence < before_sequence and sequence != self._delivered[slot]:
+                self._own[slot] = 0
+                healed += 1
+            slot = leased.find(1, slot + 1)
+        return healed
+
+    def snapshot(self, slot: int, sequence: int, size: int) -> bytes | None:
+        """Copy a message that is not leased to this reader; None if it is gone or goes meanwhile."""
+        self._check(slot, size)
+        headers, word = self._headers, slot * HEADER_WORDS
+        state = headers[word]
+        if not state or state & 1 or headers[word + _SEQUENCE] != sequence or headers[word + _SIZE] != size:
+            return None
+        if not STORES_IN_ORDER:
+            fence()
+        start = slot * self.slot_bytes
+        body = self._memory[start : start + size].tobytes()
+        if not STORES_IN_ORDER:
+            fence()
+        return body if headers[word] == state else None
+
+    @property
+    def idle(self) -> bool:
+        """Whether no array that looks at a slot is alive."""
+        return not self._in_use()
+
+    def close(self) -> None:
+        """Give all leases back and let go of the memory.
+
+        Messages that are still in use stay valid: they become private copies, in place. Call this before the
+        publisher can learn that the reader is gone, since it then writes to the reader's slots.
+
+        Raises:
+            OSError: The kernel has no memory left for a few pages.
+        """
+        head, self._head = self._head, None
+        if head is None:
+            return
+        in_use = self._in_use()
+        try:
+            first = address_of(self._memory)
+            for slot in in_use:
+                make_private(first + slot * self.slot_bytes, self.slot_bytes, mmap.PROT_READ)
+        except OSError as error:
+            _log.warning("ring %d: messages in use cannot be copied and will change: %s", self.ring_id, error)
+        self._own[:] = bytes(self.slots)
+        if in_use:
+            head.detach()  # when their arrays die, the column may be another reader's
+        self._table = self._own = self._headers = self._memory = memoryview(b"")
+        self._delivered = []
+
+    def _in_use(self) -> list[int]:
+        """Slots whose messages were delivered and not given back."""
+        leased, headers = self._own.tobytes(), self._headers
+        return [
+            slot
+            for slot, sequence in enumerate(self._delivered)
+            if leased[slot] and headers[slot * HEADER_WORDS + _SEQUENCE] == sequence
+        ]
+
+    def _check(self, slot: int, size: int) -> None:
+        if self._head is None:
+            raise ValueError(f"ring {self.ring_id} is closed")
+        if not 0 <= slot < self.slots:
+            raise ValueError(f"slot must be 0 to {self.slots - 1}, got {slot}")
+        if not 0 <= size <= self.slot_bytes:
+            raise ValueError(f"size must be 0 to {self.slot_bytes}, got {size}")
