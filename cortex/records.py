@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from cortex.codec import MalformedMessage
 from cortex.message import Array, Int64, UInt32, UInt64, message
+from cortex.topic import check_topic
 
 
 @message(name="cortex/PublisherRecord")
@@ -46,7 +48,8 @@ class ServiceRecord:
 class Endpoint:
     """The ZeroMQ addresses of a node over one transport ("ipc", "tcp" or "inproc").
 
-    `lossy` and `strict` are its XPUB sockets, `control` its ROUTER; `server_key` is its CURVE key (Z85), or "".
+    `lossy` and `strict` are its XPUB sockets, `control` its ROUTER; `server_key` is its CURVE key in Z85, or
+    empty.
     """
 
     transport: str
@@ -98,7 +101,11 @@ class Heartbeat:
 
 @message(name="cortex/Alive")
 class Alive:
-    """Answer to a heartbeat: who answers, its count of changes, and the revision it holds of the asker's record."""
+    """Answer to a heartbeat.
+
+    `epoch` says who answers (a registry's random number, or a node), `version` is the last change that it has
+    announced, `held` the revision that it holds of the asker's record (0: none).
+    """
 
     epoch: UInt64
     version: UInt64
@@ -107,11 +114,15 @@ class Alive:
 
 @message(name="cortex/Welcome")
 class Welcome:
-    """Answer of a registry to `Hello`: the nodes that it knows. Of a snapshot the records follow as `Changed`."""
+    """Answer of a registry to `Hello`: the nodes that it knows, and the revisions of their records.
+
+    If a snapshot was asked for, the records follow as `Changed`.
+    """
 
     epoch: UInt64
     version: UInt64
     nodes: list[UInt64]
+    revisions: list[UInt64]
 
 
 @message(name="cortex/Changed")
@@ -202,3 +213,23 @@ class ServiceError:
 
     kind: str
     text: str
+
+
+def check_record(record: NodeRecord) -> None:
+    """Refuse a record that no node of ours would send.
+
+    Raises:
+        MalformedMessage: If a number is 0, or a topic, a service or an address is not one.
+    """
+    if not record.node or not record.revision or any(not p.source for p in record.publishers):
+        raise MalformedMessage("a node, its revision and its sources must not be 0")
+    topics = [p.topic for p in record.publishers] + [s.topic for s in record.subscribers]
+    for topic in topics + [s.name for s in record.services]:
+        try:
+            check_topic(topic)
+        except ValueError as error:
+            raise MalformedMessage(f"{topic[:200]!r} is not a topic") from error
+    for endpoint in record.endpoints:
+        for address in (endpoint.lossy, endpoint.strict, endpoint.control):
+            if address and not address.startswith(f"{endpoint.transport}://"):
+                raise MalformedMessage(f"{address[:200]!r} is not an address of {endpoint.transport[:20]!r}")

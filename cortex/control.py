@@ -1,0 +1,53 @@
+"""What the registry and the directories of the nodes share: times of their protocol, limits, sockets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import zmq
+
+from cortex.codec import codec_of
+from cortex.context import HEARTBEAT_MS
+from cortex.wire import CONTROL_LIMIT, HEADER_SIZE
+
+HEARTBEAT_NS = 250_000_000
+LEASE_NS = 1_000_000_000
+STALL_NS = 300_000_000
+"""A loop that did not run for longer than this was itself stopped: then it must not judge who was silent."""
+NODES_MAX = 1024
+RECORD_BYTES_MAX = 4 << 20
+TOTAL_BYTES_MAX = 256 << 20
+QUEUE_MAX = 4 * NODES_MAX
+"""Frames that wait for one node; what exceeds it is dropped, and the node notices by the missing number."""
+
+
+def control_types(*types: type) -> dict[int, type]:
+    """The types that a socket expects, by fingerprint, as `parse_control` wants them."""
+    return {codec_of(kind).fingerprint: kind for kind in types}
+
+
+def make_control_socket(context: zmq.Context[Any], kind: int, *, tcp: bool) -> zmq.Socket[Any]:
+    """A DEALER or ROUTER that bounds what waits and what comes; over tcp it notices that its peer is gone."""
+    socket: zmq.Socket[Any] = context.socket(kind, socket_class=zmq.Socket)
+    socket.linger = 200
+    socket.set_hwm(QUEUE_MAX)
+    socket.maxmsgsize = CONTROL_LIMIT + HEADER_SIZE
+    socket.setsockopt(zmq.RECONNECT_IVL, 20)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 0 if not tcp else 500)
+    if tcp:
+        socket.setsockopt(zmq.IPV6, 1)
+        socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 4 * HEARTBEAT_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TTL, 4 * HEARTBEAT_MS)
+        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        socket.setsockopt(zmq.CONNECT_TIMEOUT, 3000)
+    return socket
+
+
+def try_send(socket: zmq.Socket[Any], frame: bytes) -> bool:
+    """Send without waiting; False if the queue is full or nobody is connected."""
+    try:
+        socket.send(frame, zmq.NOBLOCK)
+    except zmq.Again:
+        return False
+    return True

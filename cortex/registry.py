@@ -1,0 +1,414 @@
+"""The registry: who is there, kept by leases.
+
+A node sends `Hello` with its record, and a `Heartbeat` every quarter of a second. The registry answers the
+first with `Welcome` (and, for a snapshot, every record as `Changed`), the second with `Alive`, and tells all
+others `Changed` and `Gone`, numbered one by one. A node that sees a number missing, another epoch, or that
+the registry has not its newest record, says `Hello` again. So nothing needs an acknowledgement, and a
+registry that was killed is whole again after one heartbeat of each node. Nodes speak the same words to each
+other directly when there is no registry (`Directory.answer`).
+
+A registry that vanishes takes nobody with it: nodes keep what they know, and drop what a new registry has not
+confirmed within one lease.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from cortex.codec import MalformedMessage
+from cortex.control import (
+    LEASE_NS,
+    NODES_MAX,
+    RECORD_BYTES_MAX,
+    STALL_NS,
+    TOTAL_BYTES_MAX,
+    control_types,
+    make_control_socket,
+)
+from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, FileLock, domain_id, runtime_dir, sweep
+from cortex.records import (
+    Alive,
+    Changed,
+    Gone,
+    Heartbeat,
+    Hello,
+    Leave,
+    NodeRecord,
+    Refused,
+    Welcome,
+    check_record,
+)
+from cortex.security import Authenticator, Keys, apply_server, check_address, load_keys
+from cortex.wire import control_frame, parse_control
+
+logger = logging.getLogger(__name__)
+
+LINGER_S = 2.0
+"""How long an embedded registry outlives its last node [s]."""
+
+_POLL_MS = 100
+_FRAMES_PER_TURN = 1000
+_LOGGED_MAX = 256
+_LOG_BYTES_MAX = 1 << 20
+_DETACH = "import os, sys\nif os.fork():\n    os._exit(0)\nos.execv(sys.argv[1], sys.argv[1:])"
+
+
+class RegistryRunning(RuntimeError):
+    """Another process serves this domain."""
+
+
+Route = tuple["zmq.Socket[Any]", bytes]
+
+
+@dataclass(eq=False, slots=True)
+class _Entry:
+    node: int
+    revision: int
+    name: str
+    frame: bytes
+    route: Route
+    seen_ns: int
+
+
+def _differs(record: NodeRecord, entry: _Entry, route: Route) -> bool:
+    return route == entry.route and record.revision != entry.revision
+
+
+class Registry:
+    """The registry of one domain: makes its sockets, serves until `stop`, and leaves nothing behind.
+
+    Args:
+        domain: The domain.
+        listen: A tcp address besides the unix socket, e.g. "tcp://0.0.0.0:7460"; port 0 takes a free one.
+        keys: For CURVE on that address.
+        insecure: Allow plain tcp beyond this host.
+        linger_s: End this long after the last node left [s]; None serves for ever.
+        lock: The domain's lock, if the process that started us took it already.
+        nodes_max: Most nodes; others are refused.
+        record_bytes_max: Largest record; larger ones are refused.
+
+    Raises:
+        RegistryRunning: If another registry serves the domain.
+    """
+
+    def __init__(
+        self,
+        domain: int,
+        *,
+        listen: str | None = None,
+        keys: Keys | None = None,
+        insecure: bool = False,
+        linger_s: float | None = None,
+        lock: FileLock | None = None,
+        nodes_max: int = NODES_MAX,
+        record_bytes_max: int = RECORD_BYTES_MAX,
+    ):
+        if listen is not None:
+            if not listen.startswith("tcp://"):
+                raise ValueError(f"listen must be a tcp:// address, got {listen!r}")
+            check_address(listen, keys=keys, insecure=insecure)
+        self.epoch = secrets.randbits(64) or 1
+        self.version = 0
+        self.rejected = 0
+        """Frames that were malformed."""
+        self.refused = 0
+        """Records that were over a limit."""
+        self.address: str | None = None
+        """The tcp address that it listens on, with its port."""
+        self._directory = runtime_dir(domain)
+        self._limits = (nodes_max, record_bytes_max)
+        self._linger_ns = None if linger_s is None else int(linger_s * 1e9)
+        self._entries: dict[int, _Entry] = {}
+        self._routes: dict[Route, int] = {}
+        self._bytes = 0
+        self._logged: set[object] = set()
+        self._stopping = False
+        taken = lock or FileLock.acquire(self._directory / REGISTRY_LOCK)
+        if taken is None:
+            raise RegistryRunning(f"a registry already serves domain {domain} in {self._directory}")
+        self._lock = taken
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._authenticator: Authenticator | None = None
+        self._sockets: list[zmq.Socket[Any]] = []
+        self._handlers: dict[type, Callable[[Any, int, Route, int], None]] = {
+            Hello: self._on_hello,
+            Heartbeat: self._on_heartbeat,
+            Leave: self._on_leave,
+        }
+        self._types = control_types(*self._handlers)
+        try:
+            self._bind(listen, keys)
+        except BaseException:
+            self.close()
+            raise
+
+    def _bind(self, listen: str | None, keys: Keys | None) -> None:
+        local = make_control_socket(self._context, zmq.ROUTER, tcp=False)
+        self._sockets.append(local)
+        local.bind(f"ipc://{self._directory / REGISTRY_SOCKET}")
+        if listen is not None:
+            remote = make_control_socket(self._context, zmq.ROUTER, tcp=True)
+            self._sockets.append(remote)
+            if keys is not None:
+                self._authenticator = Authenticator.acquire(self._context)
+                apply_server(remote, keys)
+            remote.bind(listen)
+            self.address = str(remote.getsockopt_string(zmq.LAST_ENDPOINT))
+
+    @property
+    def node_count(self) -> int:
+        """How many nodes hold a lease."""
+        return len(self._entries)
+
+    def stop(self) -> None:
+        """Make `run` return soon. May be called from any thread and from a signal handler."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Serve until `stop`, or until the last node has been gone for `linger_s`."""
+        sweep(self._directory)
+        poller = zmq.Poller()
+        for socket in self._sockets:
+            poller.register(socket, zmq.POLLIN)
+        turn_ns = busy_ns = time.monotonic_ns()
+        while not self._stopping:
+            ready = poller.poll(_POLL_MS)
+            before_ns, turn_ns = turn_ns, time.monotonic_ns()
+            if turn_ns - before_ns > STALL_NS:
+                for entry in self._entries.values():
+                    entry.seen_ns += turn_ns - before_ns
+                busy_ns += turn_ns - before_ns
+            for socket, _ in ready:
+                self._drain(socket, turn_ns)
+            self._expire(turn_ns)
+            if self._entries:
+                busy_ns = turn_ns
+            elif self._linger_ns is not None and turn_ns - busy_ns > self._linger_ns:
+                break
+        logger.info("registry ends: %d frames rejected, %d records refused", self.rejected, self.refused)
+
+    def close(self) -> None:
+        """Release everything. A registry that starts afterwards finds nothing of this one."""
+        for socket in self._sockets:
+            socket.close()
+        if self._authenticator is not None:
+            self._authenticator.release()
+        # libzmq removes the socket's path in its own thread: only `term` says that it has, and the path must
+        # not vanish under the registry that gets the lock next.
+        self._context.term()
+        self._lock.close()
+
+    def _drain(self, socket: zmq.Socket[Any], now_ns: int) -> None:
+        for _ in range(_FRAMES_PER_TURN):
+            try:
+                identity, *frames = socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            route = (socket, identity)
+            try:
+                if len(frames) != 1:
+                    raise MalformedMessage(f"{len(frames)} frames where one was expected")
+                message, _header = parse_control(frames[0], self._types)
+                self._handlers[type(message)](message, len(frames[0]), route, now_ns)
+            except MalformedMessage as error:
+                self.rejected += 1
+                self._log_once(route, "rejected a frame: %s", error)
+
+    def _log_once(self, key: object, text: str, *arguments: object) -> None:
+        if key not in self._logged and len(self._logged) < _LOGGED_MAX:
+            self._logged.add(key)
+            logger.warning(text, *arguments)
+
+    def _on_hello(self, hello: Hello, size: int, route: Route, now_ns: int) -> None:
+        record = hello.record
+        check_record(record)
+        entry = self._entries.get(record.node)
+        reason = self._reason_to_refuse(record, size, route, entry)
+        if reason:
+            self.refused += 1
+            self._log_once((record.node, reason), "refused node %s: %s", record.name[:200], reason)
+            self._send(route, control_frame(Refused(record.node, reason)))
+            return
+        # What comes on one connection is in order; what comes on another may be older than what we have.
+        if entry is None or record.revision > entry.revision or _differs(record, entry, route):
+            self._store(record, route, now_ns, entry)
+        else:
+            self._routes.pop(entry.route, None)  # it has connected anew
+            entry.route, entry.seen_ns = route, now_ns
+            self._routes[route] = record.node
+        entries = self._entries.values()
+        nodes, revisions = [e.node for e in entries], [e.revision for e in entries]
+        self._send(route, control_frame(Welcome(self.epoch, self.version, nodes, revisions)))
+        if hello.snapshot:
+            for other in entries:
+                if other.node != record.node:
+                    self._send(route, other.frame)
+
+    def _reason_to_refuse(self, record: NodeRecord, size: int, route: Route, entry: _Entry | None) -> str:
+        nodes_max, record_bytes_max = self._limits
+        if size > record_bytes_max:
+            return f"its record has {size} bytes, {record_bytes_max} are allowed"
+        if self._routes.get(route, record.node) != record.node:
+            return "another node speaks on this connection"
+        if entry is None and len(self._entries) >= nodes_max:
+            return f"there are {nodes_max} nodes already"
+        if self._bytes - (len(entry.frame) if entry else 0) + size > TOTAL_BYTES_MAX:
+            return f"all records together would exceed {TOTAL_BYTES_MAX} bytes"
+        return ""
+
+    def _store(self, record: NodeRecord, route: Route, now_ns: int, old: _Entry | None) -> None:
+        if old is not None:
+            self._forget(old)
+        else:
+            logger.info("node %s (%016x) has come", record.name[:200], record.node)
+        self.version += 1
+        frame = control_frame(Changed(self.version, record))
+        name = record.name[:200]
+        self._entries[record.node] = _Entry(record.node, record.revision, name, frame, route, now_ns)
+        self._routes[route] = record.node
+        self._bytes += len(frame)
+        self._tell(frame, except_node=record.node)
+
+    def _on_heartbeat(self, heartbeat: Heartbeat, size: int, route: Route, now_ns: int) -> None:
+        entry = self._entries.get(heartbeat.node)
+        held = 0
+        if entry is not None and entry.route == route:
+            entry.seen_ns, held = now_ns, entry.revision
+        self._send(route, control_frame(Alive(self.epoch, self.version, held)))
+
+    def _on_leave(self, leave: Leave, size: int, route: Route, now_ns: int) -> None:
+        entry = self._entries.get(leave.node)
+        if entry is not None and entry.route == route:
+            self._remove(entry, "left")
+
+    def _expire(self, now_ns: int) -> None:
+        expired = [entry for entry in self._entries.values() if now_ns - entry.seen_ns > LEASE_NS]
+        for entry in expired:
+            self._remove(entry, "its lease has run out")
+        if expired:
+            sweep(self._directory)
+
+    def _remove(self, entry: _Entry, reason: str) -> None:
+        self._forget(entry)
+        self.version += 1
+        logger.info("node %s (%016x) is gone: %s", entry.name, entry.node, reason)
+        self._tell(control_frame(Gone(self.version, entry.node, reason)), except_node=entry.node)
+
+    def _forget(self, entry: _Entry) -> None:
+        del self._entries[entry.node]
+        self._routes.pop(entry.route, None)
+        self._bytes -= len(entry.frame)
+
+    def _tell(self, frame: bytes, *, except_node: int) -> None:
+        for entry in self._entries.values():
+            if entry.node != except_node:
+                self._send(entry.route, frame)
+
+    def _send(self, route: Route, frame: bytes) -> None:
+        socket, identity = route
+        # A ROUTER drops what a full queue or a closed connection cannot take; the numbers tell the node.
+        socket.send_multipart((identity, frame), zmq.NOBLOCK)
+
+
+def ensure_registry(domain: int, *, linger_s: float = LINGER_S) -> bool:
+    """Start a registry in a process of its own, unless one runs or is being started; True if we started it.
+
+    However many processes call this at once, one registry starts: the lock is taken here and handed over.
+    The new process has its own session, no descriptor of ours but the lock, and writes to `registry.log`. It
+    is not our child, so nobody has to wait for it.
+
+    Raises:
+        OSError: If no process can be started.
+    """
+    directory = runtime_dir(domain)
+    lock = FileLock.acquire(directory / REGISTRY_LOCK)
+    if lock is None:
+        return False
+    try:
+        arguments = ["-m", "cortex.discovery", "--domain", str(domain), "--embedded"]
+        arguments += ["--linger", str(linger_s), "--lock", str(lock.descriptor)]
+        _spawn([sys.executable, *arguments], lock.descriptor, directory / REGISTRY_LOG)
+    finally:
+        lock.close()
+    return True
+
+
+def _spawn(command: list[str], descriptor: int, log: Path) -> None:
+    environment = dict(os.environ)
+    root = str(Path(__file__).resolve().parents[1])
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
+    environment["OPENBLAS_NUM_THREADS"] = "1"  # numpy would start threads that a registry has no use for
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
+    with open(os.open(log, flags, 0o600), "ab") as output:
+        if output.tell() > _LOG_BYTES_MAX:
+            output.truncate(0)
+        detacher = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", _DETACH, *command],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            cwd="/",
+            env=environment,
+            pass_fds=(descriptor,),
+            start_new_session=True,
+        )
+    try:
+        detacher.wait(timeout=10.0)
+    except subprocess.TimeoutExpired as error:
+        detacher.kill()
+        detacher.wait()
+        raise OSError(f"{sys.executable} did not start within 10 s") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a registry; the exit code is 1 if another one serves the domain."""
+    parser = argparse.ArgumentParser(prog="cortex discovery", description="Run the registry of a domain.")
+    parser.add_argument("--domain", type=int, help="0 to 232; default: CORTEX_DOMAIN, else 0")
+    parser.add_argument("--listen", help="also serve other hosts, e.g. tcp://0.0.0.0:7460")
+    parser.add_argument("--keys", type=Path, help="key directory, for CURVE on tcp")
+    parser.add_argument("--insecure", action="store_true", help="allow plain tcp beyond this host")
+    parser.add_argument("--embedded", action="store_true", help="end after the last node has left")
+    parser.add_argument("--linger", type=float, default=LINGER_S, help="how long after, in seconds")
+    parser.add_argument("--lock", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    level = logging.WARNING if options.embedded else logging.INFO
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    try:
+        domain = domain_id(options.domain)
+        lock = None
+        if options.lock is not None:
+            lock = FileLock.adopt(runtime_dir(domain) / REGISTRY_LOCK, options.lock)
+        registry = Registry(
+            domain,
+            listen=options.listen,
+            keys=load_keys(options.keys) if options.keys else None,
+            insecure=options.insecure,
+            linger_s=options.linger if options.embedded else None,
+            lock=lock,
+        )
+    except (OSError, ValueError, RegistryRunning) as error:
+        logger.error("%s", error)
+        return 1
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: registry.stop())
+    logger.info(
+        "registry of domain %d serves%s", domain, f", also on {registry.address}" if registry.address else ""
+    )
+    try:
+        registry.run()
+    finally:
+        registry.close()
+    return 0
