@@ -1,0 +1,92 @@
+"""The codec of a message type: message to body and back (WIRE.md, section 5), built once and fast from then on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortex.checks import explain
+from cortex.decoder import Decoder, MalformedMessage
+from cortex.encoder import ENCODE_ERRORS, Encoder, Part, Tail, join, write
+from cortex.layout import has_tail, record_dtype
+from cortex.schema import schema_of
+
+__all__ = ["Codec", "MalformedMessage", "codec_of"]
+
+
+class Codec:
+    """Encodes and decodes messages of one type. All methods may be called from several threads."""
+
+    def __init__(self, message_type: type) -> None:
+        self.type = message_type
+        self.schema = schema_of(message_type)
+        self.fingerprint = self.schema.fingerprint
+        self._encoder = Encoder(self.schema, message_type)
+        block = self._encoder.block
+        is_fixed = not has_tail(self.schema)
+        self.fixed_size: int | None = block if is_fixed else None
+        """Bytes of every body, if they are always the same."""
+        self.record_dtype: np.dtype[Any] | None = record_dtype(self.schema, block) if is_fixed else None
+        """Structured dtype of a body of fixed size."""
+        self.stamp_of: Callable[[Any], int] | None = None
+        """Gets the stamp of a message, if the type has an integer field `stamp_ns`."""
+        for field in self.schema.fields:
+            if field.name == "stamp_ns" and isinstance(field.type, str) and "int" in field.type:
+                self.stamp_of = attrgetter("stamp_ns")
+        self._decoder = Decoder(self.schema, message_type)
+        self.decode = self._decoder.decode
+
+    def encode(self, message: Any, limit: int) -> bytes | None:
+        """Return the body of a message, or None if it would be larger than `limit` bytes.
+
+        Raises:
+            TypeError: A value, or an array's dtype, is not of the field's type.
+            ValueError: A value is out of range, or an array has the wrong shape.
+        """
+        parts, tail = self._layout(message)
+        return None if tail.end > limit else join(parts, tail)
+
+    def size(self, message: Any) -> int:
+        """Return the size of the body [bytes]. Raises as `encode` does."""
+        return self._layout(message)[1].end
+
+    def encode_into(self, message: Any, buffer: memoryview | NDArray[np.uint8]) -> int:
+        """Write the body to writable memory and return its size [bytes].
+
+        Raises:
+            ValueError: The memory is too small, or as `encode` does.
+            TypeError: As `encode` does.
+        """
+        parts, tail = self._layout(message)
+        if tail.end > len(buffer):
+            raise ValueError(f"{self.schema.name}: body of {tail.end} bytes, the buffer has {len(buffer)}")
+        return write(parts + tail.parts, np.frombuffer(buffer, np.uint8))
+
+    def _layout(self, message: Any) -> tuple[list[Part], Tail]:
+        try:
+            return self._encoder.layout(message)
+        except ENCODE_ERRORS as error:
+            raise explain(self.schema, self.type, message, error) from error
+
+
+_codecs: dict[type, Codec] = {}
+_lock = threading.Lock()
+
+
+def codec_of(message_type: type) -> Codec:
+    """Return the codec of a message type; the same one every time.
+
+    Raises:
+        TypeError: It is not a message type.
+    """
+    codec = _codecs.get(message_type)
+    if codec is None:
+        created = Codec(message_type)
+        with _lock:
+            codec = _codecs.setdefault(message_type, created)
+    return codec
