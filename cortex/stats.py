@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 BUCKETS = 40
 """Bucket k counts latencies in [2^(k-1), 2^k) ns; bucket 0 those below 1 ns, the last all above 4.6 minutes."""
 
@@ -51,3 +53,8 @@ def quantile_ns(histogram: Sequence[int], fraction: float) -> float:
             return low + (2.0**bucket - low) * (rank - below) / count
         below += count
     return 2.0 ** (len(histogram) - 1)
+
+
+def array_of(histogram: Sequence[int]) -> np.ndarray:
+    """A histogram as it travels."""
+    return np.array(histogram, np.uint64)

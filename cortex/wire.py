@@ -82,7 +82,8 @@ def unpack_header(frame: bytes | memoryview) -> Header:
     )
     if magic != b"CTX" or version != VERSION or size != HEADER_SIZE or flags & ~FLAG_STAMP:
         raise MalformedMessage(
-            f"not a frame of Cortex {VERSION}: magic {magic!r}, version {version}, flags {flags}, header {size}"
+            f"not a frame of Cortex {VERSION}: magic {magic!r}, version {version}, flags {flags}, "
+            f"header of {size} bytes"
         )
     return Header(
         bytes((kind,)),

@@ -1,0 +1,113 @@
+"""The node's callback thread: it runs the callbacks of subscribers and the handlers of services, nothing else.
+
+A callback that takes long delays other callbacks of its node, but neither heartbeats nor discovery, which have a
+thread of their own.
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from cortex.subscriber import WAIT_MAX_S, Subscriber
+from cortex.wakeup import Wakeup
+
+logger = logging.getLogger(__name__)
+
+
+class CallbackThread:
+    """Started with the first callback."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._lock = threading.Lock()
+        self._subscribers: list[Subscriber[Any]] = []
+        self._jobs: deque[Callable[[], object]] = deque()
+        self._wakeup = Wakeup()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def add(self, subscriber: Subscriber[Any]) -> None:
+        """Run a subscriber's callback from now on."""
+        with self._lock:
+            self._subscribers.append(subscriber)
+            self._start()
+        self._wakeup.set()
+
+    def remove(self, subscriber: Subscriber[Any]) -> None:
+        """Run it no more; if called from another thread, no call is under way afterwards unless it takes over 1 s."""
+        with self._lock:
+            if subscriber in self._subscribers:
+                self._subscribers.remove(subscriber)
+        self._wakeup.set()
+
+    def submit(self, job: Callable[[], object]) -> None:
+        """Run a function once, after what is under way."""
+        self._jobs.append(job)
+        with self._lock:
+            self._start()
+        self._wakeup.set()
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the caller is a callback."""
+        return threading.current_thread() is self._thread
+
+    def _start(self) -> None:
+        if self._thread is None and not self._closed:
+            self._thread = threading.Thread(target=self._run, name=f"{self._name} callbacks", daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        busy = False
+        while not self._closed:
+            with self._lock:
+                subscribers = list(self._subscribers)
+            if not busy and not self._jobs:
+                ready = self._wait(subscribers)
+                subscribers = [s for s in subscribers if s in ready] or subscribers
+            busy = False
+            while self._jobs:
+                self._call(self._jobs.popleft())
+            for subscriber in subscribers:
+                busy |= subscriber.dispatch()
+
+    def _wait(self, subscribers: list[Subscriber[Any]]) -> set[Subscriber[Any]]:
+        """Sleep until a socket may have something; returns whose it is, nothing if we were woken."""
+        poll, owners = select.poll(), {}
+        poll.register(self._wakeup.fd, select.POLLIN)
+        for subscriber in subscribers:
+            for fd in (subscriber.wakeup.fd, *subscriber.fds()):
+                poll.register(fd, select.POLLIN)
+                owners[fd] = subscriber
+        ready = set()
+        for fd, _ in poll.poll(WAIT_MAX_S * 1000.0):
+            if fd == self._wakeup.fd:
+                self._wakeup.clear()
+                continue
+            owner = owners[fd]
+            ready.add(owner)
+            if fd == owner.wakeup.fd:
+                owner.wakeup.clear()
+        return ready
+
+    def _call(self, job: Callable[[], object]) -> None:
+        try:
+            job()
+        except Exception:
+            logger.exception("%s: a job of the callback thread raised", self._name)
+
+    def close(self, timeout_s: float = 2.0) -> bool:
+        """Stop after the call that is under way; False if that takes longer than the time given."""
+        with self._lock:
+            self._closed = True
+            thread = self._thread
+        self._wakeup.set()
+        if thread is None or thread is threading.current_thread():
+            return True
+        thread.join(timeout_s)
+        return not thread.is_alive()

@@ -1,0 +1,48 @@
+"""The process's ZeroMQ context, and how its sockets are set up."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import zmq
+
+_lock = threading.Lock()
+_context: zmq.Context[zmq.Socket[bytes]] | None = None
+_owner = 0
+
+LINGER_MS = 1000
+"""How long a closed socket goes on sending what is queued."""
+HEARTBEAT_MS = 500
+"""Interval of ZMTP heartbeats over tcp; a peer silent for four of them is disconnected."""
+MAX_SOCKETS = 8192
+
+
+def context() -> zmq.Context[zmq.Socket[bytes]]:
+    """The one context of this process: peers in one process meet over inproc. A forked child gets its own."""
+    global _context, _owner
+    with _lock:
+        if _context is None or _owner != os.getpid():
+            _context, _owner = zmq.Context(), os.getpid()
+            _context.set(zmq.MAX_SOCKETS, MAX_SOCKETS)
+        return _context
+
+
+def new_socket(kind: int, *, tcp: bool = False, high_water_mark: int = 1000) -> zmq.Socket[bytes]:
+    """A socket that never blocks its owner at close, and over tcp notices a peer that is gone.
+
+    There are no heartbeats on ipc and inproc: the kernel reports a dead peer at once, and a stopped one may
+    still hold leases of shared memory.
+    """
+    socket = context().socket(kind)
+    socket.linger = LINGER_MS
+    socket.set_hwm(high_water_mark)
+    socket.setsockopt(zmq.RECONNECT_IVL, 20)
+    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
+    if tcp:
+        socket.setsockopt(zmq.IPV6, 1)
+        socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 4 * HEARTBEAT_MS)
+        socket.setsockopt(zmq.HEARTBEAT_TTL, 4 * HEARTBEAT_MS)
+        socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+    return socket

@@ -1,0 +1,308 @@
+"""One subscriber's connection to one publisher: attaching, sequence numbers, leases of shared memory."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import zmq
+
+from cortex.codec import Codec, MalformedMessage
+from cortex.context import new_socket
+from cortex.policy import Policy
+from cortex.records import PublisherRecord
+from cortex.schema import Schema
+from cortex.shm import RingView, ShmUnavailable
+from cortex.stats import SubscriberCounters
+from cortex.wire import (
+    ATTACH,
+    BATCH,
+    BODY_LIMIT,
+    HEADER_SIZE,
+    LARGE,
+    MASK,
+    MESSAGE,
+    RECORD,
+    SLOT,
+    TAIL,
+    AttachKey,
+    attach_key,
+    batch_records,
+    parse_answer,
+    prefix,
+)
+
+logger = logging.getLogger(__name__)
+
+QUEUE_MAX = 1000
+WHOLE_BATCH = -1
+
+
+class Item(NamedTuple):
+    """A message that has arrived and waits: where its body is.
+
+    A leased slot is the buffer itself, so that dropping the item gives the slot back. An offset of `WHOLE_BATCH`
+    marks a batch that was not taken apart; its size is then the number of messages.
+    """
+
+    link: Link
+    buffer: bytes | np.ndarray | None
+    offset: int
+    size: int
+    sequence: int
+    stamp_ns: int
+    publish_ns: int
+    slot: tuple[RingView, int] | None
+
+
+class Link:
+    """The receiving end of one publisher. Every method runs under its subscriber's lock."""
+
+    def __init__(
+        self,
+        record: PublisherRecord,
+        codec: Codec,
+        address: str,
+        *,
+        policy: Policy,
+        local: bool,
+        shared_memory: bool,
+        counters: SubscriberCounters,
+        clock_offset_ns: int,
+        secure: Callable[[zmq.Socket[bytes]], None] | None = None,
+    ) -> None:
+        self.record = record
+        self.source = record.source
+        self.codec = codec
+        self.address = address
+        self.counters = counters
+        self.expected = -1
+        self.attached = False
+        self.whole_batches = False
+        self.exhausted = True
+        self.clock_offset_ns = clock_offset_ns
+        """What to add to this publisher's clock to read it on ours [ns]."""
+        self._policy = policy
+        stamped = codec.stamp_of is not None
+        self._stamped = stamped
+        self.message_head = prefix(MESSAGE, self.source, stamped=stamped)
+        self._handlers = {
+            prefix(LARGE, self.source, stamped=stamped): self._on_large,
+            prefix(SLOT, self.source, stamped=stamped): self._on_slot,
+            prefix(BATCH, self.source, stamped=stamped): self._on_batch,
+            prefix(ATTACH, self.source, stamped=stamped): self._on_answer,
+        }
+        self._large_head, self._slot_head = list(self._handlers)[:2]
+        self._rings: dict[int, RingView] = {}
+        self._column: int | None = None
+        self._large_subscribed = True
+        self._complained: set[str] = set()
+        self.socket = new_socket(
+            zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
+        )
+        self.receive: Callable[..., bytes] = super(zmq.Socket, self.socket).recv
+        try:
+            if secure is not None:
+                secure(self.socket)
+            self.fd: int = self.socket.get(zmq.FD)
+            self.socket.connect(address)
+            for head in (self.message_head, *list(self._handlers)[:3]):
+                if head != self._slot_head or shared_memory:
+                    self.socket.subscribe(head)
+            self._key = b""
+            self._ask(shared_memory=shared_memory)
+        except BaseException:
+            self.socket.close(0)
+            raise
+
+    def _ask(self, *, shared_memory: bool) -> None:
+        policy = self._policy
+        key = AttachKey(
+            self.source,
+            secrets.randbits(64) or 1,
+            shared_memory,
+            policy.reliable,
+            min(policy.depth + 2, 255),
+            min(int(policy.timeout_s * 1000.0), 2**32 - 1),
+        )
+        self._key = attach_key(key, stamped=self._stamped)
+        self.socket.subscribe(self._key)
+
+    def reject(self, reason: str) -> None:
+        """Count a bad frame; say so once for each kind of reason."""
+        self.counters.rejected += 1
+        text = reason.split(":")[0][:40]
+        if text not in self._complained and len(self._complained) < 16:
+            self._complained.add(text)
+            logger.warning("%s: rejected a frame of %s: %s", self.record.topic, self.address, reason)
+
+    def handle(self, frame: bytes) -> list[Item]:
+        """Take in a frame that is not a plain small message."""
+        handler = self._handlers.get(frame[:16])
+        try:
+            if handler is None or len(frame) < HEADER_SIZE:
+                raise MalformedMessage("not a frame of this publisher")
+            return handler(frame)
+        except MalformedMessage as error:
+            self.reject(str(error))
+            return []
+        finally:
+            self._drop_parts()
+
+    def _drop_parts(self) -> None:
+        while self.socket.get(zmq.RCVMORE):
+            self.counters.rejected += 1
+            self.socket.recv(zmq.DONTWAIT)
+
+    def advance(self, sequence: int, count: int = 1) -> bool:
+        """Account for the numbers up to these; False if they have been seen before."""
+        if sequence < self.expected:
+            return False
+        if self.expected >= 0:
+            self.counters.lost += sequence - self.expected
+            if sequence > self.expected:
+                for ring in self._rings.values():
+                    ring.heal(sequence)
+        self.expected = sequence + count
+        return True
+
+    def _check(self, fingerprint: int, size: int) -> None:
+        if fingerprint != self.codec.fingerprint:
+            raise MalformedMessage(f"fingerprint {fingerprint:016x}, expected {self.codec.fingerprint:016x}")
+        if size > BODY_LIMIT:
+            raise MalformedMessage(f"a body of {size} bytes is over the limit of {BODY_LIMIT}")
+
+    def _on_large(self, frame: bytes) -> list[Item]:
+        fingerprint, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
+        if len(frame) != HEADER_SIZE or not self.socket.get(zmq.RCVMORE):
+            raise MalformedMessage("a large message without its body")
+        body = self.socket.recv(zmq.DONTWAIT, copy=False)
+        self._check(fingerprint, size)
+        if len(body) != size:
+            raise MalformedMessage(f"a large message of {len(body)} bytes that says it has {size}")
+        if not self.advance(sequence):
+            return []
+        data = np.frombuffer(body.buffer, np.uint8)
+        data.flags.writeable = False
+        return [Item(self, data, 0, size, sequence, stamp_ns, publish_ns, None)]
+
+    def _on_slot(self, frame: bytes) -> list[Item]:
+        fingerprint, sequence, stamp_ns, publish_ns, size, aux = TAIL.unpack_from(frame, 16)
+        if len(frame) != HEADER_SIZE + MASK.size:
+            raise MalformedMessage(f"a descriptor of {len(frame)} bytes")
+        self._check(fingerprint, size)
+        (mask,) = MASK.unpack_from(frame, HEADER_SIZE)
+        view, slot = self._rings.get(aux >> 32), aux & 0xFFFFFFFF
+        leased = self._column is not None and bool(mask >> self._column & 1)
+        if view is None or not leased:
+            if self._large_subscribed or sequence < self.expected:
+                return []  # it comes, or came, as a large message
+            if view is None or self._policy.reliable:
+                # Left out on purpose: the publisher held us to our share. The gap is counted with the next one.
+                return []
+            self.advance(sequence)
+            return [Item(self, None, 0, size, sequence, stamp_ns, publish_ns, (view, slot))]
+        try:
+            data = view.lease(slot, sequence, size)
+        except ValueError as error:
+            raise MalformedMessage(str(error)) from None
+        if not self.advance(sequence):
+            return []  # `data` gives the slot back
+        return [Item(self, data, 0, size, sequence, stamp_ns, publish_ns, None)]
+
+    def _on_batch(self, frame: bytes) -> list[Item]:
+        fingerprint, first, _, publish_ns, size, count = TAIL.unpack_from(frame, 16)
+        self._check(fingerprint, size)
+        if size != len(frame) - HEADER_SIZE or count == 0:
+            raise MalformedMessage(f"a batch of {len(frame)} bytes that says its records have {size}")
+        fixed = self.codec.fixed_size
+        if self.whole_batches and fixed is not None:
+            stride = RECORD.size + fixed + (-fixed % 8)
+            if count * stride != size:
+                raise MalformedMessage(f"a batch of {size} bytes cannot hold {count} records of {stride}")
+            if not self.advance(first, count):
+                return []
+            return [Item(self, frame, WHOLE_BATCH, count, first, 0, publish_ns, None)]
+        records = self._records(frame, first, count)
+        return records if self.advance(first, count) else []
+
+    def _records(self, frame: bytes, first: int, count: int) -> list[Item]:
+        return [
+            Item(self, frame, record.offset, record.size, first + k, record.stamp_ns, record.publish_ns, None)
+            for k, record in enumerate(batch_records(frame, count))
+        ]
+
+    def take_apart(self, item: Item) -> list[Item]:
+        """The messages of a whole batch."""
+        assert isinstance(item.buffer, bytes)
+        return self._records(item.buffer, item.sequence, item.size)
+
+    def _on_answer(self, frame: bytes) -> list[Item]:
+        if frame[: len(self._key)] != self._key:
+            return []  # the answer to an earlier attempt
+        answer = parse_answer(frame)
+        first = not self.attached
+        self.attached = True
+        self._column = answer.column
+        if answer.column is not None:
+            try:
+                for place in answer.rings:
+                    if place.ring not in self._rings:
+                        self._rings[place.ring] = RingView(
+                            self.source,
+                            place.ring,
+                            place.slots,
+                            place.slot_bytes,
+                            place.pid,
+                            place.fd,
+                            answer.column,
+                        )
+            except ShmUnavailable as error:
+                self._do_without_shared_memory(error)
+                return []
+            for number in sorted(self._rings)[:-2]:
+                self._rings.pop(number).close()
+            if self._large_subscribed:
+                self.socket.unsubscribe(self._large_head)
+                self._large_subscribed = False
+        if not first or self.expected >= 0:
+            return []
+        items = self._latched(answer.latched) if answer.latched else []
+        self.expected = answer.sequence
+        return items
+
+    def _latched(self, frame: bytes) -> list[Item]:
+        if len(frame) < HEADER_SIZE or frame[:16] not in (self.message_head, self._large_head):
+            raise MalformedMessage("a latched message that is none")
+        fingerprint, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
+        self._check(fingerprint, size)
+        if len(frame) != HEADER_SIZE + size:
+            raise MalformedMessage(f"a latched message of {len(frame)} bytes that says its body has {size}")
+        return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)]
+
+    def _do_without_shared_memory(self, error: ShmUnavailable) -> None:
+        logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, error)
+        if not self._large_subscribed:
+            self.socket.subscribe(self._large_head)
+            self._large_subscribed = True
+        self.socket.unsubscribe(self._slot_head)
+        self.socket.unsubscribe(self._key)
+        self._column = None
+        self._ask(shared_memory=False)
+
+    def close(self) -> None:
+        """Disconnect. Messages that the user still holds stay valid.
+
+        The end of the socket tells the publisher that it may write to our slots again, so the rings close first.
+        """
+        for ring in self._rings.values():
+            ring.close()
+        self._rings.clear()
+        self.socket.close(0)
+
+    def schema(self) -> Schema:
+        """The structure of this publisher's messages."""
+        return self.codec.schema

@@ -1,0 +1,658 @@
+"""A node: what a process opens to publish, subscribe and serve."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import logging
+import os
+import secrets
+import select
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from types import TracebackType
+from typing import Any, NamedTuple, TypeVar, cast
+
+import zmq
+
+from cortex.callbacks import CallbackThread
+from cortex.codec import MalformedMessage, codec_of
+from cortex.context import context
+from cortex.discovery import Directory
+from cortex.flusher import Flusher
+from cortex.host import domain_id, host_id
+from cortex.link import Link
+from cortex.outlet import Outlets
+from cortex.places import Places, clock_offset_ns, reach
+from cortex.policy import Policy, keep_last
+from cortex.publisher import INLINE_MAX, Closed, Publisher
+from cortex.raw import RawCodec, RawMessage
+from cortex.records import (
+    NodeRecord,
+    PublisherRecord,
+    PublisherStats,
+    ServiceRecord,
+    StatsReply,
+    StatsRequest,
+    SubscriberRecord,
+    SubscriberStats,
+)
+from cortex.registry import control_types
+from cortex.schema import Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
+from cortex.security import Keys
+from cortex.service import Client, Place, Server, Service, service_number
+from cortex.stats import array_of
+from cortex.subscriber import Subscriber
+from cortex.topic import check_topic
+from cortex.wakeup import Wakeup
+from cortex.wire import CONTROL, REQUEST, control_frame, parse_control, unpack_header
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Request = TypeVar("Request")
+Reply = TypeVar("Reply")
+
+TICK_S = 0.02
+TICK_BUSY_S = 0.002
+BUSY_NS = 300_000_000
+"""For so long after a change ticks are short, so that new peers meet quickly."""
+CLOCK_STEP_NS = 5_000_000
+
+_nodes: weakref.WeakSet[Node] = weakref.WeakSet()
+
+
+class TopicInfo(NamedTuple):
+    """A topic as the nodes announce it."""
+
+    topic: str
+    type_name: str
+    fingerprint: int
+    schema: str
+    publishers: tuple[str, ...]
+    """Names of the nodes that publish it."""
+    subscribers: tuple[str, ...]
+
+
+class Node:
+    """A participant: its publishers, subscribers and services, and the thread that keeps them connected.
+
+    Args:
+        name: For people; need not be unique.
+        domain: Nodes of one domain see each other; None takes `CORTEX_DOMAIN`, else 0.
+        registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port".
+        listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None: this host only.
+        peers: Control addresses of nodes to talk to without a registry.
+        keys: CURVE keys for tcp, from `cortex.security.load_keys`.
+        insecure: Allow plain tcp beyond this host.
+
+    Raises:
+        ValueError: An argument is not what it must be, or plain tcp would be open to the network.
+        PermissionError: The runtime directory is not safe, or a server's key is not authorised.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        domain: int | None = None,
+        registry: str = "auto",
+        listen: str | None = None,
+        peers: Sequence[str] = (),
+        keys: Keys | None = None,
+        insecure: bool = False,
+    ) -> None:
+        if not name or len(name) > 100:
+            raise ValueError(f"a node's name has 1 to 100 characters, got {name!r}")
+        self.name = name
+        self.domain = domain_id(domain)
+        self.id = secrets.randbits(64) or 1
+        self._keys = keys
+        self._pid = os.getpid()
+        self._host = host_id()
+        self._lock = threading.RLock()
+        self._outlets = Outlets()
+        self._publishers: list[Publisher[Any]] = []
+        self._subscribers: list[Subscriber[Any]] = []
+        self._mismatched: set[tuple[int, int]] = set()
+        self._callbacks = CallbackThread(name)
+        self._flusher = Flusher(name)
+        self._server = Server(self._callbacks.submit)
+        self._replies: deque[tuple[zmq.Socket[bytes], bytes, bytes]] = deque()
+        self._wakeup = Wakeup()
+        self._busy_until_ns = time.monotonic_ns() + BUSY_NS
+        self._clock_offset_ns = clock_offset_ns()
+        self._closed = False
+        self.rejected = 0
+        """Control frames that made no sense."""
+        self._places = Places(self.domain, self.id, self._outlets, listen, keys=keys, insecure=insecure)
+        try:
+            self._directory = Directory(
+                context(),
+                domain=self.domain,
+                record=self._record,
+                registry=registry,
+                peers=peers,
+                keys=keys,
+                insecure=insecure,
+                on_change=self._on_change,
+            )
+        except BaseException:
+            self._outlets.close()
+            self._places.close()
+            raise
+        self._thread = threading.Thread(target=self._run, name=f"{name} control", daemon=True)
+        self._thread.start()
+        _nodes.add(self)
+
+    # What users call
+
+    def publisher(
+        self,
+        topic: str,
+        message_type: type[T],
+        *,
+        latch: bool = False,
+        coalesce: bool = False,
+        inline_max: int = INLINE_MAX,
+    ) -> Publisher[T]:
+        """Publish messages of a type on a topic.
+
+        Args:
+            topic: Like "/front/image".
+            message_type: A class made by `@message`.
+            latch: Give the last message to subscribers that come later.
+            coalesce: Send the messages of a burst together: more of them per second, each up to 0.2 ms later.
+            inline_max: Bodies over this size go through shared memory where that is possible [bytes].
+        """
+        return self._add_publisher(
+            Publisher(
+                check_topic(topic),
+                codec_of(message_type),
+                self._open_outlets(),
+                latch=latch,
+                coalesce=coalesce,
+                inline_max=inline_max,
+                on_batch=self._flusher.wake,
+                on_close=self._drop_publisher,
+            ),
+            coalesce=coalesce,
+        )
+
+    def raw_publisher(self, topic: str, schema: Schema, *, latch: bool = False) -> Publisher[RawMessage]:
+        """Publish bodies that are encoded already; their type is known by its schema only."""
+        return self._add_publisher(
+            Publisher(
+                check_topic(topic),
+                cast(Any, RawCodec(schema)),
+                self._open_outlets(),
+                latch=latch,
+                on_close=self._drop_publisher,
+            ),
+            coalesce=False,
+        )
+
+    def subscriber(
+        self,
+        topic: str,
+        message_type: type[T] | None,
+        callback: Callable[[T], object] | None = None,
+        *,
+        policy: Policy | None = None,
+    ) -> Subscriber[T]:
+        """Subscribe to a topic.
+
+        Args:
+            topic: Like "/front/image"; exact, there are no wildcards.
+            message_type: A class made by `@message`; None takes whatever type each publisher has.
+            callback: Called with every message on the node's callback thread; None: use `recv` or iterate.
+            policy: What to do when messages come faster than they are taken; None: `keep_last(64)`.
+        """
+        self._check_open()
+        subscriber: Subscriber[T] = Subscriber(
+            check_topic(topic),
+            None if message_type is None else codec_of(message_type),
+            keep_last() if policy is None else policy,
+            callback=callback,
+            on_close=self._drop_subscriber,
+        )
+        with self._lock:
+            self._subscribers.append(subscriber)
+            self._match(subscriber)
+        if callback is not None:
+            self._callbacks.add(subscriber)
+        self._announce()
+        return subscriber
+
+    def service(
+        self,
+        name: str,
+        request_type: type[Request],
+        reply_type: type[Reply],
+        handler: Callable[[Request], Reply],
+    ) -> Callable[[], None]:
+        """Offer a service. The handler runs on the callback thread.
+
+        Returns:
+            A function that withdraws it.
+        """
+        self._check_open()
+        number = service_number(check_topic(name), request_type, reply_type)
+        service = Service(name, number, request_type, reply_type, handler)
+        self._server.add(service)
+        self._announce()
+
+        def withdraw() -> None:
+            self._server.remove(service)
+            self._announce()
+
+        return withdraw
+
+    def client(
+        self, name: str, request_type: type[Request], reply_type: type[Reply]
+    ) -> Client[Request, Reply]:
+        """Call a service."""
+        self._check_open()
+        number = service_number(check_topic(name), request_type, reply_type)
+        expected = schema_of(request_type)
+        return Client(name, request_type, reply_type, partial(self._find_service, name, number, expected))
+
+    def nodes(self) -> list[NodeRecord]:
+        """All nodes that are known now, this one included."""
+        return list(self._known().values())
+
+    def topics(self) -> list[TopicInfo]:
+        """All topics that are published or subscribed now, one entry for each type on a topic."""
+        found: dict[tuple[str, int], TopicInfo] = {}
+        records = self.nodes()
+        for node in records:
+            for pub in node.publishers:
+                info = found.get((pub.topic, pub.fingerprint)) or TopicInfo(
+                    pub.topic, pub.type_name, pub.fingerprint, pub.schema, (), ()
+                )
+                found[pub.topic, pub.fingerprint] = info._replace(publishers=(*info.publishers, node.name))
+        for node in records:
+            for sub in node.subscribers:
+                keys = [k for k in found if k[0] == sub.topic and sub.fingerprint in (0, k[1])]
+                for key in keys or [(sub.topic, sub.fingerprint)]:
+                    info = found.get(key) or TopicInfo(sub.topic, sub.type_name, sub.fingerprint, "", (), ())
+                    found[key] = info._replace(subscribers=(*info.subscribers, node.name))
+        return [found[key] for key in sorted(found)]
+
+    def ask_stats(self, node: int, timeout_s: float = 1.0) -> StatsReply:
+        """Ask a node for its counters.
+
+        Raises:
+            KeyError: There is no such node.
+            TimeoutError: It did not answer in time.
+        """
+        if node == self.id:
+            return self._stats()
+        place = self._reach_control(self._known()[node])
+        deadline_s = time.monotonic() + timeout_s
+        types = control_types(StatsReply)
+        with place.open() as socket:
+            socket.send(control_frame(StatsRequest(self.id)), zmq.DONTWAIT)
+            while (left_s := deadline_s - time.monotonic()) > 0.0:
+                if socket.poll(left_s * 1000.0):
+                    with contextlib.suppress(MalformedMessage):
+                        reply, _ = parse_control(socket.recv(zmq.DONTWAIT), types)
+                        return cast(StatsReply, reply)
+        raise TimeoutError(f"node {node:016x} did not answer within {timeout_s} s")
+
+    def wait_for_registry(self, timeout_s: float = 5.0) -> bool:
+        """Wait until the registry, or all peers, have answered; False if they have not in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while not self._directory.connected:
+            if time.monotonic() >= deadline_s:
+                return False
+            time.sleep(2e-3)
+        return True
+
+    def close(self) -> None:
+        """Leave: send what is queued, close publishers, subscribers and services, stop the threads."""
+        if self._pid != os.getpid():
+            return  # a forked child has copies of us, but not our threads
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            publishers, subscribers = list(self._publishers), list(self._subscribers)
+        self._flusher.close()
+        for publisher in publishers:
+            publisher.close()
+        for subscriber in subscribers:
+            subscriber.close()
+        self._callbacks.close()
+        self._wakeup.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(5.0)
+        self._outlets.close()
+
+    def __enter__(self) -> Node:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # Keeping track
+
+    def _check_open(self) -> None:
+        if self._pid != os.getpid():
+            raise RuntimeError(f"node {self.name!r} belongs to the process that this one was forked from")
+        if self._closed:
+            raise Closed(f"node {self.name!r} is closed")
+
+    def _open_outlets(self) -> Outlets:
+        self._check_open()
+        return self._outlets
+
+    def _add_publisher(self, publisher: Publisher[T], *, coalesce: bool) -> Publisher[T]:
+        with self._lock:
+            self._publishers.append(publisher)
+            for subscriber in self._subscribers:
+                if subscriber.topic == publisher.topic:
+                    self._match(subscriber)
+        if coalesce:
+            self._flusher.add(publisher)
+        self._announce()
+        return publisher
+
+    def _drop_publisher(self, publisher: Publisher[Any]) -> None:
+        self._flusher.remove(publisher)
+        with self._lock:
+            if publisher in self._publishers:
+                self._publishers.remove(publisher)
+            for subscriber in self._subscribers:
+                if subscriber.topic == publisher.topic:
+                    self._match(subscriber)
+        self._announce()
+
+    def _drop_subscriber(self, subscriber: Subscriber[Any]) -> None:
+        self._callbacks.remove(subscriber)
+        with self._lock:
+            if subscriber in self._subscribers:
+                self._subscribers.remove(subscriber)
+        self._announce()
+
+    def _announce(self) -> None:
+        if not self._closed:
+            self._directory.announce()
+            self._hurry()
+
+    def _hurry(self) -> None:
+        self._busy_until_ns = time.monotonic_ns() + BUSY_NS
+        self._wakeup.set()
+
+    def _record(self) -> NodeRecord:
+        with self._lock:
+            publishers = [
+                PublisherRecord(
+                    p.topic,
+                    p.source,
+                    p.codec.schema.name,
+                    p.codec.fingerprint,
+                    p.codec.schema.to_json(),
+                    p.latch,
+                )
+                for p in self._publishers
+            ]
+            subscribers = [
+                SubscriberRecord(
+                    s.topic,
+                    "" if s.codec is None else s.codec.schema.name,
+                    0 if s.codec is None else s.codec.fingerprint,
+                    str(s.policy),
+                )
+                for s in self._subscribers
+            ]
+        services = [
+            ServiceRecord(
+                s.name, s.number, schema_of(s.request_type).to_json(), schema_of(s.reply_type).to_json()
+            )
+            for s in self._server.services()
+        ]
+        return NodeRecord(
+            self.id,
+            self.name,
+            self._host,
+            self._pid,
+            0,
+            self._clock_offset_ns,
+            self._places.endpoints,
+            publishers,
+            subscribers,
+            services,
+        )
+
+    def _known(self) -> dict[int, NodeRecord]:
+        return {**self._directory.nodes, self.id: self._record()}
+
+    def _on_change(self, _: frozenset[int]) -> None:
+        with self._lock:
+            for subscriber in self._subscribers:
+                self._match(subscriber)
+        self._busy_until_ns = time.monotonic_ns() + BUSY_NS
+
+    def _match(self, subscriber: Subscriber[Any]) -> None:
+        """Connect a subscriber to the publishers of its topic, and let go of those that have left."""
+        directory = getattr(self, "_directory", None)
+        peers = list(directory.nodes.values()) if directory is not None else []
+        own = self._record()
+        wanted = {
+            publisher.source: (node, publisher)
+            for node in (own, *peers)
+            for publisher in node.publishers
+            if publisher.topic == subscriber.topic
+        }
+        present = subscriber.sources()
+        for source in present - wanted.keys():
+            subscriber.forget(source)
+        for source in wanted.keys() - present:
+            self._connect(subscriber, *wanted[source])
+
+    def _connect(self, subscriber: Subscriber[Any], node: NodeRecord, publisher: PublisherRecord) -> None:
+        key = (id(subscriber), publisher.source)
+        if key in self._mismatched:
+            return
+        try:
+            schema = Schema.from_json(publisher.schema)
+            if schema.fingerprint != publisher.fingerprint:
+                raise SchemaError("its fingerprint is another")
+            codec = subscriber.codec or codec_of(type_from_schema(schema))
+        except SchemaError as error:
+            self._mismatched.add(key)
+            logger.warning("%s of %s: unreadable schema: %s", publisher.topic, node.name, error)
+            return
+        if codec.fingerprint != publisher.fingerprint:
+            self._mismatched.add(key)
+            what = (
+                f"{publisher.topic}: node {node.name!r} publishes another type than this subscriber expects"
+            )
+            subscriber.complain(TypeMismatch(what, codec.schema, schema))
+            return
+        place = reach(node, self._host, self._keys)
+        if place is None:
+            logger.debug("%s of %s cannot be reached from here", publisher.topic, node.name)
+            return
+        offset_ns = 0 if node.host == self._host else node.clock_offset_ns - self._clock_offset_ns
+        try:
+            link = Link(
+                publisher,
+                codec,
+                place.endpoint.strict if subscriber.policy.reliable else place.endpoint.lossy,
+                policy=subscriber.policy,
+                local=place.local,
+                shared_memory=place.local,
+                counters=subscriber.counters,
+                clock_offset_ns=offset_ns,
+                secure=place.secure,
+            )
+        except (zmq.ZMQError, PermissionError) as error:
+            self._mismatched.add(key)
+            logger.warning("%s of %s: cannot connect: %s", publisher.topic, node.name, error)
+            return
+        subscriber.connect(link)
+
+    def _find_service(self, name: str, number: int, expected: Schema) -> Place | None:
+        other: str | None = None
+        for node in self._known().values():
+            for service in node.services:
+                if service.name == name and service.service == number:
+                    place = self._reach_control(node)
+                    return Place(node.node, place.address, place.local, place.secure)
+                if service.name == name:
+                    other = service.request_schema
+        if other is not None:
+            raise TypeMismatch(
+                f"{name}: the service has other types than this client (request shown)",
+                expected,
+                Schema.from_json(other),
+            )
+        return None
+
+    def _reach_control(self, node: NodeRecord) -> Any:
+        place = reach(node, self._host, self._keys)
+        if place is None:
+            raise ConnectionError(f"node {node.name!r} cannot be reached from here")
+        return place
+
+    def _stats(self) -> StatsReply:
+        with self._lock:
+            publishers, subscribers = list(self._publishers), list(self._subscribers)
+        return StatsReply(
+            self.id,
+            [
+                PublisherStats(
+                    p.topic,
+                    p.source,
+                    p.subscriber_count,
+                    p.counters.published,
+                    p.counters.bytes,
+                    p.counters.timeouts,
+                    p.counters.skipped,
+                )
+                for p in publishers
+            ],
+            [
+                SubscriberStats(
+                    s.topic,
+                    str(s.policy),
+                    s.counters.received,
+                    s.counters.lost,
+                    s.counters.rejected,
+                    s.counters.overtaken,
+                    array_of(s.counters.latency),
+                )
+                for s in subscribers
+            ],
+            self.rejected + self._directory.rejected + self._server.rejected,
+        )
+
+    # The control thread
+
+    def _run(self) -> None:
+        try:
+            while not self._closed:
+                self._step()
+        except Exception:
+            logger.exception("%s: the control thread has died", self.name)
+        finally:
+            self._send_replies()
+            self._directory.close()
+            self._places.close()
+
+    def _step(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._wakeup.fd, zmq.POLLIN)
+        routers = self._places.routers
+        sockets = self._directory.sockets()
+        for socket in (*routers, *sockets):
+            poller.register(socket, zmq.POLLIN)
+        busy = time.monotonic_ns() < self._busy_until_ns
+        ready = dict(poller.poll((TICK_BUSY_S if busy else TICK_S) * 1000.0))
+        if self._wakeup.fd in ready:
+            self._wakeup.clear()
+        for socket in routers:
+            if socket in ready:
+                self._answer(socket)
+        for socket in sockets:
+            if socket in ready:
+                self._directory.handle(socket)
+        self._send_replies()
+        self._tick()
+
+    def _tick(self) -> None:
+        now_ns = time.monotonic_ns()
+        self._directory.tick(now_ns)
+        self._outlets.tick()
+        offset_ns = clock_offset_ns()
+        if abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
+            self._clock_offset_ns = offset_ns  # somebody has set the clock: tell the others
+            self._directory.announce()
+        with self._lock:
+            publishers, subscribers = list(self._publishers), list(self._subscribers)
+        for publisher in publishers:
+            publisher.tick()
+        self._top_up(subscribers, now_ns)
+
+    def _top_up(self, subscribers: list[Subscriber[Any]], now_ns: int) -> None:
+        poll, owners = select.poll(), {}
+        for subscriber in subscribers:
+            if subscriber.must_read:
+                subscriber.top_up(now_ns)
+            for fd in subscriber.fds():
+                owners[fd] = subscriber
+                poll.register(fd, select.POLLIN)
+        for subscriber in {owners[fd] for fd, _ in poll.poll(0)} if owners else ():
+            subscriber.top_up(now_ns)
+
+    def _answer(self, router: zmq.Socket[bytes]) -> None:
+        for _ in range(256):
+            try:
+                parts = router.recv_multipart(zmq.DONTWAIT)
+            except zmq.Again:
+                return
+            try:
+                if len(parts) != 2:
+                    raise MalformedMessage(f"a control message of {len(parts)} frames")
+                self._answer_one(router, *parts)
+            except MalformedMessage as error:
+                self.rejected += 1
+                if self.rejected == 1:
+                    logger.warning("%s: rejected a control frame: %s", self.name, error)
+
+    def _answer_one(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
+        header = unpack_header(frame)
+        if header.kind == REQUEST:
+            self._server.handle(frame, partial(self._reply, router, identity))
+        elif header.kind == CONTROL and header.fingerprint == schema_of(StatsRequest).fingerprint:
+            self._reply(router, identity, control_frame(self._stats(), header.sequence))
+        else:
+            answer = self._directory.answer(frame)
+            if answer is not None:
+                self._reply(router, identity, answer)
+
+    def _reply(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
+        self._replies.append((router, identity, frame))
+        if threading.current_thread() is not self._thread:
+            self._wakeup.set()
+
+    def _send_replies(self) -> None:
+        while self._replies:
+            router, identity, frame = self._replies.popleft()
+            with contextlib.suppress(zmq.Again, zmq.ZMQError):  # an asker that is gone gets nothing
+                router.send_multipart([identity, frame], zmq.DONTWAIT)
+
+
+@atexit.register
+def _close_nodes() -> None:
+    """Take leave of the others when the process ends in an orderly way."""
+    for node in list(_nodes):
+        node.close()

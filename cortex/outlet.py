@@ -1,0 +1,176 @@
+"""A node's XPUB sockets: who is attached to which publisher, and how its frames reach them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import zmq
+
+from cortex.context import new_socket
+from cortex.wire import AttachKey, parse_attach_key
+
+logger = logging.getLogger(__name__)
+
+
+class Attachable(Protocol):
+    """What the outlets tell a publisher; called under the outlets' lock."""
+
+    def attach(self, outlet: Outlet, key: bytes, request: AttachKey) -> None:
+        """A reader has come."""
+        ...
+
+    def detach(self, outlet: Outlet, request: AttachKey) -> None:
+        """A reader has left or died."""
+        ...
+
+
+@dataclass(eq=False)
+class Outlet:
+    """One XPUB socket.
+
+    A strict outlet refuses a message for which some reader's queue is full (back-pressure); a lossy one drops it
+    for that reader, which sees the gap in the sequence.
+    """
+
+    socket: zmq.Socket[bytes]
+    strict: bool
+    local: bool
+    """Over ipc or inproc: readers may share memory."""
+
+    def __post_init__(self) -> None:
+        # pyzmq's own `send` spends half of its time on checking arguments that we never pass.
+        self.send: Callable[..., zmq.MessageTracker | None] = super(zmq.Socket, self.socket).send
+
+    def try_send(self, frame: bytes, flags: int = 0) -> bool:
+        """Send one frame; False if a strict reader's queue is full."""
+        try:
+            self.send(frame, zmq.DONTWAIT | flags)
+        except zmq.Again:
+            return False
+        return True
+
+    def send_anyway(self, frame: bytes, flags: int = 0) -> None:
+        """Send one frame to all readers with room in their queues; the others lose it."""
+        self.socket.setsockopt(zmq.XPUB_NODROP, 0)
+        try:
+            self.send(frame, zmq.DONTWAIT | flags)
+        finally:
+            self.socket.setsockopt(zmq.XPUB_NODROP, 1)
+
+
+def open_outlet(
+    addresses: Sequence[str],
+    *,
+    strict: bool,
+    local: bool,
+    secure: Callable[[zmq.Socket[bytes]], None] | None = None,
+) -> Outlet:
+    """Bind an XPUB socket.
+
+    Args:
+        addresses: Where to bind; a tcp address may end in `:*`.
+        strict: Whether full queues hold up the sender.
+        local: Whether the addresses are ipc or inproc.
+        secure: Sets up CURVE on the socket before it binds.
+    """
+    socket = new_socket(zmq.XPUB, tcp=not local)
+    if strict:
+        socket.setsockopt(zmq.XPUB_NODROP, 1)
+    if secure is not None:
+        secure(socket)
+    try:
+        for address in addresses:
+            socket.bind(address)
+    except zmq.ZMQError:
+        socket.close(0)
+        raise
+    return Outlet(socket, strict, local)
+
+
+class Outlets:
+    """All outlets of a node under one lock, and the publishers whose readers come and go through them."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._outlets: list[Outlet] = []
+        self._publishers: dict[int, Attachable] = {}
+        self._attached: dict[bytes, Outlet] = {}
+        self.closed = False
+
+    def add(self, outlet: Outlet) -> None:
+        """Take an outlet into service."""
+        with self.lock:
+            self._outlets.append(outlet)
+
+    def register(self, source: int, publisher: Attachable) -> None:
+        """Tell a publisher from now on who attaches to its source."""
+        with self.lock:
+            self._publishers[source] = publisher
+
+    def unregister(self, source: int) -> None:
+        """Forget a publisher."""
+        with self.lock:
+            self._publishers.pop(source, None)
+
+    def refresh(self) -> None:
+        """Read who has come and gone; the caller holds the lock."""
+        for outlet in self._outlets:
+            while outlet.socket.get(zmq.EVENTS) & zmq.POLLIN:
+                try:
+                    event = outlet.socket.recv(zmq.DONTWAIT)
+                except zmq.Again:
+                    break
+                self._handle(outlet, event)
+
+    def tick(self) -> None:
+        """Do `refresh`, unless a publisher is at it."""
+        if self.lock.acquire(blocking=False):
+            try:
+                if not self.closed:
+                    self.refresh()
+            finally:
+                self.lock.release()
+
+    def _handle(self, outlet: Outlet, event: bytes) -> None:
+        key = event[1:]
+        request = parse_attach_key(key)
+        if request is None:
+            return
+        publisher = self._publishers.get(request.source)
+        if publisher is None:
+            return
+        if event[0] == 1:
+            self._attached[key] = outlet
+            publisher.attach(outlet, key, request)
+        elif self._attached.pop(key, None) is not None:
+            publisher.detach(outlet, request)
+
+    def close(self) -> None:
+        """Close the sockets; queued frames are still sent for a second."""
+        with self.lock:
+            self.closed = True
+            for outlet in self._outlets:
+                outlet.socket.close()
+            self._outlets.clear()
+
+
+class Backoff:
+    """Sleeps that grow from 50 us to 1 ms, until a deadline."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self._deadline_s = time.monotonic() + timeout_s
+        self._pause_s = 50e-6
+
+    def wait(self) -> bool:
+        """Sleep once; False when the deadline has passed."""
+        left_s = self._deadline_s - time.monotonic()
+        if left_s <= 0.0:
+            return False
+        time.sleep(min(self._pause_s, left_s))
+        self._pause_s = min(1.3 * self._pause_s, 1e-3)
+        return True

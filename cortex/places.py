@@ -1,0 +1,197 @@
+"""Where nodes are: the addresses that a node offers, and which of another's addresses to use."""
+
+from __future__ import annotations
+
+import os
+import socket as sockets
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import zmq
+
+from cortex.context import context, new_socket
+from cortex.host import NodeFiles
+from cortex.outlet import Outlet, Outlets, open_outlet
+from cortex.records import Endpoint, NodeRecord
+from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address
+
+Secure = Callable[[zmq.Socket[bytes]], None]
+
+
+def clock_offset_ns() -> int:
+    """CLOCK_REALTIME less CLOCK_MONOTONIC [ns]."""
+    return time.time_ns() - time.monotonic_ns()
+
+
+class Places:
+    """The sockets by which a node is reached: two XPUB and a ROUTER on this host, and again on tcp if it listens.
+
+    Args:
+        domain: The node's domain.
+        node: The node's number.
+        outlets: Gets the XPUB sockets, and closes them.
+        listen: Address of an interface; None: this host only.
+        keys: For CURVE on tcp.
+        insecure: Allow plain tcp beyond this host.
+    """
+
+    def __init__(
+        self,
+        domain: int,
+        node: int,
+        outlets: Outlets,
+        listen: str | None,
+        *,
+        keys: Keys | None,
+        insecure: bool,
+    ) -> None:
+        self.routers: list[zmq.Socket[bytes]] = []
+        self.endpoints: list[Endpoint] = []
+        self._authenticator: Authenticator | None = None
+        if listen is not None:
+            check_address(f"tcp://{_bracket(listen)}:0", keys=keys, insecure=insecure)
+        self._files = NodeFiles(domain, node)
+        try:
+            self._open_local(node, outlets)
+            if listen is not None:
+                self._open_tcp(outlets, listen, keys)
+        except BaseException:
+            outlets.close()
+            self.close()
+            raise
+
+    def _open_local(self, node: int, outlets: Outlets) -> None:
+        path = self._files.endpoint
+        for role, strict in (("lossy", False), ("strict", True)):
+            addresses = [path(role), _inproc(node, os.getpid(), role)]
+            outlets.add(open_outlet(addresses, strict=strict, local=True))
+        router = self._router(tcp=False)
+        router.bind(path("control"))
+        self.endpoints.append(Endpoint("ipc", path("lossy"), path("strict"), path("control"), ""))
+
+    def _open_tcp(self, outlets: Outlets, listen: str, keys: Keys | None) -> None:
+        secure: Secure | None = None
+        if keys is not None:
+            self._authenticator = Authenticator.acquire(context())
+            secure = partial(apply_server, keys=keys)
+        any_port = [f"tcp://{_bracket(listen)}:*"]
+        lossy = open_outlet(any_port, strict=False, local=False, secure=secure)
+        outlets.add(lossy)
+        strict = open_outlet(any_port, strict=True, local=False, secure=secure)
+        outlets.add(strict)
+        router = self._router(tcp=True)
+        if secure is not None:
+            secure(router)
+        router.bind(any_port[0])
+        seen = listen if listen not in ("0.0.0.0", "::", "*") else _outward_address()
+
+        def reachable(socket: zmq.Socket[bytes]) -> str:
+            port = socket.last_endpoint.decode().rstrip("\0").rpartition(":")[2]
+            return f"tcp://{_bracket(seen)}:{port}"
+
+        self.endpoints.append(
+            Endpoint(
+                "tcp",
+                reachable(lossy.socket),
+                reachable(strict.socket),
+                reachable(router),
+                "" if keys is None else keys.public,
+            )
+        )
+
+    def _router(self, *, tcp: bool) -> zmq.Socket[bytes]:
+        router = new_socket(zmq.ROUTER, tcp=tcp)
+        router.setsockopt(zmq.ROUTER_MANDATORY, 1)
+        router.setsockopt(zmq.MAXMSGSIZE, 16 << 20)
+        self.routers.append(router)
+        return router
+
+    def close(self) -> None:
+        """Close the ROUTERs and remove the files."""
+        for router in self.routers:
+            router.close()
+        if self._authenticator is not None:
+            self._authenticator.release()
+            self._authenticator = None
+        self._files.close()
+
+
+class Reach(NamedTuple):
+    """How to reach a node from here."""
+
+    endpoint: Endpoint
+    local: bool
+    secure: Secure | None
+
+    @property
+    def address(self) -> str:
+        """Its control address."""
+        return self.endpoint.control
+
+    def open(self) -> zmq.Socket[bytes]:
+        """A DEALER to its control address."""
+        socket = new_socket(zmq.DEALER, tcp=not self.local)
+        socket.linger = 0
+        try:
+            if self.secure is not None:
+                self.secure(socket)
+            socket.connect(self.address)
+        except BaseException:
+            socket.close(0)
+            raise
+        return socket
+
+
+def reach(node: NodeRecord, host: str, keys: Keys | None) -> Reach | None:
+    """Choose how to reach a node: inproc within the process, ipc on this host, else tcp.
+
+    Returns:
+        None if it offers no address that this host can use.
+    """
+    for endpoint in node.endpoints:
+        if endpoint.transport == "ipc" and node.host == host:
+            if node.pid == os.getpid():
+                return Reach(
+                    Endpoint(
+                        "inproc",
+                        _inproc(node.node, node.pid, "lossy"),
+                        _inproc(node.node, node.pid, "strict"),
+                        endpoint.control,
+                        "",
+                    ),
+                    True,
+                    None,
+                )
+            return Reach(endpoint, True, None)
+    for endpoint in node.endpoints:
+        if endpoint.transport == "tcp":
+            if not endpoint.server_key:
+                return Reach(endpoint, False, None)
+            if keys is not None:
+                return Reach(
+                    endpoint, False, partial(apply_client, keys=keys, server_key=endpoint.server_key)
+                )
+    return None
+
+
+def _inproc(node: int, pid: int, role: str) -> str:
+    return f"inproc://cortex-{node:016x}-{pid}-{role}"
+
+
+def _bracket(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _outward_address() -> str:
+    """This host's address on the network: that of the interface by which packets would leave. Sends nothing."""
+    with sockets.socket(sockets.AF_INET, sockets.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+            return str(probe.getsockname()[0])
+        except OSError:
+            return "127.0.0.1"
+
+
+__all__ = ["Outlet", "Places", "Reach", "clock_offset_ns", "reach"]

@@ -1,0 +1,424 @@
+"""Publishing: one topic, one type, any number of subscribers, each with its own policy."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import zmq
+
+from cortex.codec import Codec
+from cortex.large import LargeSender, Reader, Slot
+from cortex.outlet import Backoff, Outlet, Outlets
+from cortex.stats import PublisherCounters
+from cortex.wire import BATCH, LARGE, MESSAGE, RECORD, TAIL, AttachKey, prefix
+
+logger = logging.getLogger(__name__)
+monotonic_ns = time.monotonic_ns
+
+T = TypeVar("T")
+
+INLINE_MAX = 16_384
+"""Bodies up to this size travel in the frame; measured by `cortex bench threshold`."""
+REFRESH_NS = 1_000_000
+READERS_MAX = 1024
+
+BURST_NS = 15_000
+"""Two messages closer than this are a burst."""
+BATCH_NS = 150_000
+"""Longest time that a message of a burst waits for others."""
+BATCH_COUNT = 64
+BATCH_BYTES = 128 * 1024
+
+
+class Closed(RuntimeError):
+    """The publisher, subscriber or node was closed."""
+
+
+class Publisher(Generic[T]):
+    """Sends messages of one type; made by `Node.publisher`. Every method may be called from any thread."""
+
+    def __init__(
+        self,
+        topic: str,
+        codec: Codec,
+        outlets: Outlets,
+        *,
+        latch: bool = False,
+        coalesce: bool = False,
+        inline_max: int = INLINE_MAX,
+        on_batch: Callable[[], None] | None = None,
+        on_close: Callable[[Publisher[T]], None] | None = None,
+    ) -> None:
+        self.topic = topic
+        self.codec = codec
+        self.source = secrets.randbits(64) or 1
+        self.latch = latch
+        self.counters = PublisherCounters()
+        stamped = codec.stamp_of is not None
+        self._type = codec.type
+        self._encode = codec.encode
+        self._stamp_of = codec.stamp_of
+        self._fingerprint = codec.fingerprint
+        self._inline_max = inline_max
+        self._head = prefix(MESSAGE, self.source, stamped=stamped)
+        self._batch_head = prefix(BATCH, self.source, stamped=stamped)
+        self._large_kind = prefix(LARGE, self.source, stamped=stamped)
+        self._outlets = outlets
+        self._lock = outlets.lock
+        self._large_lock = threading.Lock()
+        self._large = LargeSender(self.source, stamped=stamped, topic=topic, outlets=outlets)
+        self._readers: dict[bytes, Reader] = {}
+        self._lossy_sends: tuple[Callable[..., Any], ...] = ()
+        self._strict_outlets: tuple[Outlet, ...] = ()
+        self._sequence = 0
+        self._latched = b""
+        self._refresh_ns = 0
+        self._blocked = False
+        self._coalesce = coalesce
+        self._batch: list[bytes] = []
+        self._batch_sequence = 0
+        self._batch_bytes = 0
+        self._batch_start_ns = 0
+        self._last_ns = 0
+        self._on_batch = on_batch
+        self._on_close = on_close
+        self._closed = False
+        outlets.register(self.source, self)
+
+    def publish(self, message: T) -> bool:
+        """Send a message; what it refers to may be changed or freed afterwards.
+
+        Returns:
+            False if a reliable subscriber lost it, because it held up the publisher for longer than its
+            `timeout_s`; True otherwise, also if there is no subscriber.
+
+        Raises:
+            TypeError: The message is of another type.
+            ValueError: A field's value does not fit its type.
+            Closed: The publisher was closed.
+        """
+        if type(message) is not self._type:
+            raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
+        with self._lock:
+            now_ns = monotonic_ns()
+            if now_ns >= self._refresh_ns or self._blocked:
+                self._prepare(now_ns)
+            if not self._readers and not self.latch:
+                self._sequence += 1
+                self.counters.published += 1
+                return True
+            body = self._encode(message, self._inline_max)
+            if body is not None:
+                return self._publish_inline(
+                    body, 0 if self._stamp_of is None else self._stamp_of(message), now_ns
+                )
+        size = self.codec.size(message)
+        stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
+        with self._large_lock:
+            slot = self._acquire_slot(size)
+            if slot is None:
+                return False
+            try:
+                self.codec.encode_into(message, slot.buffer)
+            except BaseException:
+                with self._lock:
+                    self._large.abandon(slot)
+                raise
+            return self._publish_slot(slot, size, stamp_ns)
+
+    @contextmanager
+    def loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Iterator[Any]:
+        """Write a message where its readers will find it: the way to publish without a copy.
+
+        Args:
+            dtypes: The dtype of each array field that is declared as `any`.
+            **dims: The size of every named dimension of the type's arrays.
+
+        Yields:
+            A draft with the type's fields: arrays are writable views to fill, the others are to be set. It is
+            published when the block ends, and dropped if the block raises. Do not keep its arrays.
+
+        Raises:
+            RuntimeError: All slots are out on loan.
+        """
+        size = self.codec.draft_size(dims, dtypes)
+        inline = size <= self._inline_max
+        slot: Slot | None
+        if inline:
+            self._check_open()
+            slot = Slot(np.empty(size, np.uint8), None, 0)
+        else:
+            with self._large_lock:
+                slot = self._acquire_slot(size)
+            if slot is None:
+                raise RuntimeError(f"{self.topic}: every slot is out on loan; publish or drop one first")
+        try:
+            draft = self.codec.draft(slot.buffer, dims, dtypes)
+            yield draft
+            size = self.codec.finish(draft)
+        except BaseException:
+            with self._lock:
+                self._large.abandon(slot)
+            raise
+        stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
+        if inline:
+            with self._lock:
+                now_ns = monotonic_ns()
+                self._prepare(now_ns)
+                self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
+        else:
+            with self._large_lock:
+                self._publish_slot(slot, size, stamp_ns)
+
+    def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
+        """Send or collect a small message; the lock is held."""
+        size = len(body)
+        counters = self.counters
+        counters.published += 1
+        counters.bytes += size
+        if self._coalesce and not self.latch:
+            burst = now_ns - self._last_ns < BURST_NS
+            self._last_ns = now_ns
+            if burst or self._batch:
+                return self._collect(body, size, stamp_ns, now_ns)
+        sequence = self._sequence
+        self._sequence = sequence + 1
+        frame = self._head + TAIL.pack(self._fingerprint, sequence, stamp_ns, now_ns, size, 0) + body
+        if self.latch:
+            self._latched = frame
+        for send in self._lossy_sends:
+            send(frame, 1)  # DONTWAIT
+        return self._send_strict_all(frame) if self._strict_outlets else True
+
+    def _send_strict_all(self, frame: bytes) -> bool:
+        on_time = True
+        for outlet in self._strict_outlets:
+            try:
+                outlet.send(frame, 1)  # DONTWAIT
+            except zmq.Again:
+                on_time &= self._send_strict(outlet, frame, 0)
+        return on_time
+
+    def _send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
+        """Send, waiting for the slowest reliable reader; the lock is held, and let go while sleeping."""
+        if outlet.try_send(frame, flags):
+            return True
+        strict = [r.timeout_s for r in self._readers.values() if r.outlet is outlet]
+        backoff = Backoff(max(strict, default=0.0))
+        self._blocked = True
+        try:
+            while not outlet.try_send(frame, flags):
+                self._lock.release()
+                try:
+                    more = backoff.wait()
+                finally:
+                    self._lock.acquire()
+                self._check_open()
+                self._outlets.refresh()
+                if not more:
+                    if self.counters.timeouts == 0:
+                        logger.warning(
+                            "%s: a reliable subscriber did not keep up and lost a message", self.topic
+                        )
+                    self.counters.timeouts += 1
+                    outlet.send_anyway(frame, flags)
+                    return False
+        finally:
+            self._blocked = False
+        return True
+
+    def _collect(self, body: bytes, size: int, stamp_ns: int, now_ns: int) -> bool:
+        """Add a message of a burst to the batch, and send the batch when it is full or old; the lock is held."""
+        if not self._batch:
+            self._batch_sequence = self._sequence
+            self._batch_start_ns = now_ns
+            if self._on_batch is not None:
+                self._on_batch()
+        self._sequence += 1
+        self._batch.append(RECORD.pack(stamp_ns, now_ns, size, 0))
+        self._batch.append(body)
+        padding = -size % 8
+        if padding:
+            self._batch.append(bytes(padding))
+        self._batch_bytes += RECORD.size + size + padding
+        if (
+            self._sequence - self._batch_sequence >= BATCH_COUNT
+            or self._batch_bytes >= BATCH_BYTES
+            or now_ns - self._batch_start_ns >= BATCH_NS
+        ):
+            return self._flush()
+        return True
+
+    def _flush(self) -> bool:
+        """Send the batch; the lock is held."""
+        if not self._batch:
+            return True
+        records = b"".join(self._batch)
+        first = self._batch_sequence
+        tail = TAIL.pack(
+            self._fingerprint, first, 0, self._batch_start_ns, len(records), self._sequence - first
+        )
+        self._batch.clear()
+        self._batch_bytes = 0
+        frame = self._batch_head + tail + records
+        for send in self._lossy_sends:
+            send(frame, zmq.DONTWAIT)
+        return self._send_strict_all(frame)
+
+    def flush_old(self, now_ns: int) -> bool:
+        """Send a batch that has waited long enough; called by the node's flusher, which holds no lock.
+
+        Returns:
+            Whether a batch still waits.
+        """
+        with self._lock:
+            if self._batch and not self._blocked and now_ns - self._batch_start_ns >= BATCH_NS:
+                self._flush()
+            return bool(self._batch)
+
+    def flush(self) -> bool:
+        """Send what a coalescing publisher holds back; False if a reliable subscriber lost some of it."""
+        with self._lock:
+            return self._flush()
+
+    def _acquire_slot(self, size: int) -> Slot | None:
+        with self._lock:
+            self._prepare(monotonic_ns())
+            self._outlets.refresh()
+            slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
+            if slot is None:
+                self._sequence += 1
+                self.counters.published += 1
+                self.counters.skipped += 1
+            return slot
+
+    def _publish_slot(self, slot: Slot, size: int, stamp_ns: int) -> bool:
+        """Send what was written into a slot; the large lock is held."""
+        with self._lock:
+            self._prepare(monotonic_ns())
+            self._flush()
+            self._blocked = True
+            try:
+                on_time = self._large.await_strict(slot.ring)
+                self._check_open()
+            finally:
+                self._blocked = False
+            self._outlets.refresh()
+            now_ns = monotonic_ns()
+            sequence = self._sequence
+            self._sequence = sequence + 1
+            self.counters.published += 1
+            self.counters.bytes += size
+
+            def tail(aux: int) -> bytes:
+                return TAIL.pack(self._fingerprint, sequence, stamp_ns, now_ns, size, aux)
+
+            if self.latch:
+                self._latched = self._large_kind + tail(0) + slot.buffer[:size].tobytes()
+            sent, passed_over = self._large.send(slot, size, tail, sequence, self._send_strict)
+            self.counters.skipped += passed_over
+            if not on_time:
+                self.counters.timeouts += 1
+            return on_time and sent
+
+    def _prepare(self, now_ns: int) -> None:
+        """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
+        while self._blocked:
+            self._lock.release()
+            try:
+                time.sleep(100e-6)
+            finally:
+                self._lock.acquire()
+        self._check_open()
+        self._refresh_ns = now_ns + REFRESH_NS
+        self._outlets.refresh()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise Closed(f"the publisher of {self.topic} is closed")
+
+    def attach(self, outlet: Outlet, key: bytes, request: AttachKey) -> None:
+        """Take a reader in; called under the outlets' lock."""
+        if key in self._readers or self._closed:
+            return
+        if len(self._readers) >= READERS_MAX:
+            logger.warning("%s: more than %d subscribers, one is refused", self.topic, READERS_MAX)
+            return
+        reader = self._large.admit(key, request, outlet)
+        self._readers[key] = reader
+        self._route()
+        sequence = self._batch_sequence if self._batch else self._sequence
+        answer = self._large.answer(reader, sequence, self._latched)
+        if outlet.strict:
+            if not outlet.try_send(answer):
+                outlet.send_anyway(answer)
+        else:
+            outlet.send(answer, zmq.DONTWAIT)
+
+    def detach(self, outlet: Outlet, request: AttachKey) -> None:
+        """Let a reader go; called under the outlets' lock."""
+        for key, reader in self._readers.items():
+            if reader.request.reader == request.reader and reader.outlet is outlet:
+                del self._readers[key]
+                self._large.dismiss(reader)
+                self._route()
+                return
+
+    def _route(self) -> None:
+        outlets = {reader.outlet for reader in self._readers.values()}
+        self._lossy_sends = tuple(outlet.send for outlet in outlets if not outlet.strict)
+        self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
+
+    def tick(self) -> None:
+        """Free what the sockets have sent; called by the node now and then."""
+        if self._lock.acquire(blocking=False):
+            try:
+                if not self._closed:
+                    self._large.prune()
+            finally:
+                self._lock.release()
+
+    @property
+    def subscriber_count(self) -> int:
+        """Subscribers that are attached now."""
+        with self._lock:
+            if not self._outlets.closed:
+                self._outlets.refresh()
+            return len(self._readers)
+
+    def wait_for_subscribers(self, count: int = 1, timeout_s: float = 5.0) -> bool:
+        """Wait until so many subscribers are attached; False if they are not in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while self.subscriber_count < count:
+            self._check_open()
+            if time.monotonic() >= deadline_s:
+                return False
+            time.sleep(0.5e-3)
+        return True
+
+    def close(self) -> None:
+        """Send what is held back, and leave the topic."""
+        with self._lock:
+            if self._closed:
+                return
+            if not self._outlets.closed:
+                self._flush()
+            self._closed = True
+            self._readers.clear()
+            self._large.close()
+        self._outlets.unregister(self.source)
+        if self._on_close is not None:
+            self._on_close(self)
+
+    def __enter__(self) -> Publisher[T]:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,58 @@
+"""Publishing bodies that are encoded already: what replaying a recording needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+
+from cortex.schema import Schema
+from cortex.wire import BODY_LIMIT
+
+
+class RawMessage(NamedTuple):
+    """The body of a message, and its stamp if its type has one."""
+
+    body: bytes | np.ndarray
+    stamp_ns: int = 0
+
+
+class RawCodec:
+    """Stands for a type that is known by its schema only: bodies pass through as they are."""
+
+    type = RawMessage
+    fixed_size = None
+    record_dtype = None
+
+    def __init__(self, schema: Schema) -> None:
+        self.schema = schema
+        self.fingerprint = schema.fingerprint
+        stamped = any(f.name == "stamp_ns" and str(f.type).startswith(("int", "uint")) for f in schema.fields)
+        self.stamp_of = _stamp if stamped else None
+
+    def encode(self, message: RawMessage, limit: int) -> bytes | None:
+        """The body, unless it is larger than the limit."""
+        return bytes(message.body) if len(message.body) <= limit else None
+
+    def size(self, message: RawMessage) -> int:
+        """Bytes of the body."""
+        if len(message.body) > BODY_LIMIT:
+            raise ValueError(f"a body has at most {BODY_LIMIT} bytes, got {len(message.body)}")
+        return len(message.body)
+
+    def encode_into(self, message: RawMessage, buffer: Any) -> int:
+        """Copy the body."""
+        size = len(message.body)
+        np.copyto(np.frombuffer(buffer, np.uint8)[:size], np.frombuffer(message.body, np.uint8))
+        return size
+
+    def draft_size(
+        self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
+    ) -> NoReturn:
+        """Refuse: there are no fields to fill."""
+        raise TypeError("a raw publisher has nothing to loan")
+
+
+def _stamp(message: RawMessage) -> int:
+    return message.stamp_ns

@@ -1,0 +1,315 @@
+"""Services: one request, one reply, by a deadline; a server that is dead is an error in time, not a hang."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import zmq
+
+from cortex.codec import MalformedMessage, codec_of
+from cortex.context import new_socket
+from cortex.records import ServiceError
+from cortex.schema import fingerprint_of, schema_of
+from cortex.wire import (
+    CONTROL_LIMIT,
+    ERROR,
+    HEADER_SIZE,
+    REPLY,
+    REQUEST,
+    Header,
+    check_body,
+    pack_header,
+    unpack_header,
+)
+
+logger = logging.getLogger(__name__)
+
+Request = TypeVar("Request")
+Reply = TypeVar("Reply")
+
+PENDING_MAX = 256
+_UNAVAILABLE = {"unknown", "busy", "closed"}
+
+
+class ServiceTimeout(TimeoutError):
+    """No reply came in time."""
+
+
+class ServiceUnavailable(ConnectionError):
+    """Nobody offers the service, its server died during the call, or it has too much to do."""
+
+
+class ServiceFailed(RuntimeError):
+    """The server's handler raised, or did not understand the request; the text is the server's."""
+
+
+def service_number(name: str, request_type: type, reply_type: type) -> int:
+    """The number by which a service is called: name and both structures (WIRE.md, section 8)."""
+    parts = (name, schema_of(request_type).to_json(), schema_of(reply_type).to_json())
+    return fingerprint_of("\0".join(parts).encode())
+
+
+class Service(NamedTuple):
+    """A service that this process offers."""
+
+    name: str
+    number: int
+    request_type: type
+    reply_type: type
+    handler: Callable[[Any], Any]
+
+
+class Server:
+    """Answers the requests that come to a node. Handlers run one after another on the callback thread."""
+
+    def __init__(self, submit: Callable[[Callable[[], object]], None]) -> None:
+        self._submit = submit
+        self._lock = threading.Lock()
+        self._services: dict[int, Service] = {}
+        self._pending = 0
+        self.rejected = 0
+
+    def add(self, service: Service) -> None:
+        """Offer a service.
+
+        Raises:
+            ValueError: This node offers one of that name already.
+        """
+        with self._lock:
+            if any(other.name == service.name for other in self._services.values()):
+                raise ValueError(f"this node offers {service.name} already")
+            self._services[service.number] = service
+
+    def remove(self, service: Service) -> None:
+        """Offer it no more."""
+        with self._lock:
+            self._services.pop(service.number, None)
+
+    def services(self) -> list[Service]:
+        """What is offered now."""
+        with self._lock:
+            return list(self._services.values())
+
+    def handle(self, frame: bytes, reply: Callable[[bytes], None]) -> None:
+        """Take in a request; `reply` is called once, from any thread, with the frame that answers it.
+
+        Raises:
+            MalformedMessage: It is not a request.
+        """
+        header = unpack_header(frame)
+        if header.kind != REQUEST:
+            raise MalformedMessage(f"kind {header.kind!r} where {REQUEST!r} was expected")
+        check_body(header, len(frame))
+        deadline_ns = time.monotonic_ns() + max(header.publish_ns, 0)
+        with self._lock:
+            service = self._services.get(header.aux)
+            busy = self._pending >= PENDING_MAX
+            if service is not None and not busy:
+                self._pending += 1
+        if service is None:
+            reply(_error(header, "unknown", "this node does not offer the service"))
+        elif busy:
+            reply(_error(header, "busy", f"{PENDING_MAX} requests wait already"))
+        else:
+            self._submit(lambda: self._serve(service, header, frame, deadline_ns, reply))
+
+    def _serve(
+        self,
+        service: Service,
+        header: Header,
+        frame: bytes,
+        deadline_ns: int,
+        reply: Callable[[bytes], None],
+    ) -> None:
+        with self._lock:
+            self._pending -= 1
+        if time.monotonic_ns() > deadline_ns:
+            reply(_error(header, "late", "the request waited until its deadline"))
+            return
+        try:
+            request = codec_of(service.request_type).decode(frame, HEADER_SIZE, header.body_size)
+        except MalformedMessage as error:
+            reply(_error(header, "malformed", str(error)))
+            return
+        try:
+            answer = service.handler(request)
+            if type(answer) is not service.reply_type:
+                raise TypeError(
+                    f"the handler of {service.name} must return {service.reply_type.__name__}, "
+                    f"it returned {type(answer).__name__}"
+                )
+            body = codec_of(service.reply_type).encode(answer, CONTROL_LIMIT)
+            if body is None:
+                raise ValueError(f"the reply of {service.name} is over the limit of {CONTROL_LIMIT} bytes")
+        except Exception as error:
+            logger.exception("the handler of %s raised", service.name)
+            reply(_error(header, "failed", f"{type(error).__name__}: {error}"[:2000]))
+            return
+        fingerprint = schema_of(service.reply_type).fingerprint
+        reply(pack_header(header._replace(kind=REPLY, fingerprint=fingerprint, body_size=len(body))) + body)
+
+
+def _error(header: Header, kind: str, text: str) -> bytes:
+    codec = codec_of(ServiceError)
+    body = codec.encode(ServiceError(kind, text), CONTROL_LIMIT)
+    assert body is not None
+    return pack_header(header._replace(kind=ERROR, fingerprint=codec.fingerprint, body_size=len(body))) + body
+
+
+class Place(NamedTuple):
+    """Where a service is offered."""
+
+    node: int
+    address: str
+    local: bool
+    secure: Callable[[zmq.Socket[bytes]], None] | None
+
+
+class Client(Generic[Request, Reply]):
+    """Calls a service; made by `Node.client`. Calls from several threads follow one another."""
+
+    def __init__(
+        self,
+        name: str,
+        request_type: type[Request],
+        reply_type: type[Reply],
+        find: Callable[[], Place | None],
+    ) -> None:
+        self.name = name
+        self._request_type, self._reply_type = request_type, reply_type
+        self._number = service_number(name, request_type, reply_type)
+        self._find = find
+        self._lock = threading.Lock()
+        self._socket: zmq.Socket[bytes] | None = None
+        self._place: Place | None = None
+        self._source = secrets.randbits(64) or 1
+        self._calls = 0
+
+    def call(self, request: Request, timeout_s: float = 1.0) -> Reply:
+        """Send a request and wait for its reply.
+
+        Args:
+            request: What to ask.
+            timeout_s: Time for everything: finding the server, the call, waiting for another thread's call [s].
+
+        Raises:
+            ServiceTimeout: The server did not reply in time; whether it has acted is not known.
+            ServiceUnavailable: Nobody offers the service, or its server died.
+            ServiceFailed: The handler raised.
+            TypeMismatch: The service of this name has other types.
+            TypeError: The request is of another type.
+        """
+        if type(request) is not self._request_type:
+            raise TypeError(f"{self.name} takes {self._request_type.__name__}, got {type(request).__name__}")
+        body = codec_of(self._request_type).encode(request, CONTROL_LIMIT)
+        if body is None:
+            raise ValueError(f"the request to {self.name} is over the limit of {CONTROL_LIMIT} bytes")
+        deadline_s = time.monotonic() + timeout_s
+        if not self._lock.acquire(timeout=max(timeout_s, 0.0)):
+            raise ServiceTimeout(f"{self.name}: other calls took the {timeout_s} s")
+        try:
+            place = self._connect(deadline_s, timeout_s)
+            self._calls += 1
+            header = Header(
+                REQUEST,
+                self._source,
+                schema_of(self._request_type).fingerprint,
+                self._calls,
+                None,
+                int((deadline_s - time.monotonic()) * 1e9),
+                len(body),
+                self._number,
+            )
+            return self._exchange(place, pack_header(header) + body, deadline_s, timeout_s)
+        finally:
+            self._lock.release()
+
+    def available(self) -> bool:
+        """Whether somebody offers the service now."""
+        return self._find() is not None
+
+    def _connect(self, deadline_s: float, timeout_s: float) -> Place:
+        while (place := self._find()) is None:
+            if time.monotonic() >= deadline_s:
+                raise ServiceUnavailable(f"nobody offers {self.name} (waited {timeout_s} s)")
+            time.sleep(2e-3)
+        if self._socket is None or place != self._place:
+            self._disconnect()
+            socket = new_socket(zmq.DEALER, tcp=not place.local)
+            socket.linger = 0
+            try:
+                if place.secure is not None:
+                    place.secure(socket)
+                socket.connect(place.address)
+            except BaseException:
+                socket.close(0)
+                raise
+            self._socket, self._place = socket, place
+        return place
+
+    def _exchange(self, place: Place, frame: bytes, deadline_s: float, timeout_s: float) -> Reply:
+        socket = self._socket
+        assert socket is not None
+        socket.send(frame, zmq.DONTWAIT)
+        while True:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                self._disconnect()  # a reply that comes late finds nobody
+                raise ServiceTimeout(f"{self.name}: no reply within {timeout_s} s")
+            if not socket.poll(min(left_s, 0.05) * 1000.0):
+                now = self._find()
+                if now is None or now.node != place.node:
+                    self._disconnect()
+                    raise ServiceUnavailable(f"the server of {self.name} has gone")
+                continue
+            parts = socket.recv_multipart(zmq.DONTWAIT)
+            try:
+                reply = self._parse(parts)
+            except MalformedMessage as error:
+                raise ServiceFailed(f"{self.name}: a reply that makes no sense: {error}") from None
+            if reply is not None:
+                return reply
+
+    def _parse(self, parts: list[bytes]) -> Reply | None:
+        if len(parts) != 1:
+            raise MalformedMessage(f"a reply of {len(parts)} frames")
+        frame = parts[0]
+        header = unpack_header(frame)
+        check_body(header, len(frame))
+        if header.source != self._source or header.sequence != self._calls:
+            return None  # the answer to a call that was given up
+        if header.kind == REPLY:
+            codec = codec_of(self._reply_type)
+            if header.fingerprint != codec.fingerprint:
+                raise MalformedMessage(f"type {header.fingerprint:016x}")
+            reply: Reply = codec.decode(frame, HEADER_SIZE, header.body_size)
+            return reply
+        if header.kind != ERROR:
+            raise MalformedMessage(f"kind {header.kind!r}")
+        error = codec_of(ServiceError).decode(frame, HEADER_SIZE, header.body_size)
+        if error.kind == "late":
+            raise ServiceTimeout(f"{self.name}: {error.text}")
+        if error.kind in _UNAVAILABLE:
+            raise ServiceUnavailable(f"{self.name}: {error.text}")
+        raise ServiceFailed(f"{self.name}: {error.text}")
+
+    def _disconnect(self) -> None:
+        if self._socket is not None:
+            self._socket.close(0)
+            self._socket = None
+
+    def close(self) -> None:
+        """Disconnect."""
+        with self._lock:
+            self._disconnect()
+
+    def __enter__(self) -> Client[Request, Reply]:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

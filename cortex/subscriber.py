@@ -1,0 +1,569 @@
+"""Subscribing: a bounded queue per subscriber, read by a callback, a blocking iterator or asyncio.
+
+What each costs, measured with `cortex bench receive`: the three share one path, which reads the socket where
+the message is wanted; there is no thread between socket and user. A callback runs on the node's callback thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import zmq
+
+from cortex.codec import Codec, MalformedMessage
+from cortex.link import WHOLE_BATCH, Item, Link
+from cortex.policy import Policy
+from cortex.publisher import Closed
+from cortex.schema import Schema, TypeMismatch
+from cortex.stats import SubscriberCounters
+from cortex.wakeup import Wakeup
+from cortex.wire import HEADER_SIZE, RECORD, TAIL
+
+logger = logging.getLogger(__name__)
+monotonic_ns = time.monotonic_ns
+
+T = TypeVar("T")
+
+DRAIN_MAX = 64
+"""Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
+FRESH_NS = 1_000_000
+"""A queue that was filled longer ago is topped up before the next message is taken."""
+WAIT_MAX_S = 0.1
+LEAVING_NS = 2_000_000_000
+"""How long the connection to a publisher that has left is kept, for what is still on its way."""
+
+
+class Info(NamedTuple):
+    """What is known of a message besides its content."""
+
+    topic: str
+    source: int
+    """The publisher's number."""
+    sequence: int
+    stamp_ns: int | None
+    """The message's own time, if its type has one [ns]."""
+    publish_ns: int
+    """When it was published, on this host's CLOCK_MONOTONIC [ns]."""
+    latency_ns: int
+    """From `publish` to now [ns]; between hosts as good as their clocks agree."""
+    size: int
+    """Bytes of the body."""
+
+
+class Subscriber(Generic[T]):
+    """Receives the messages of a topic; made by `Node.subscriber`. Methods may be called from any thread."""
+
+    def __init__(
+        self,
+        topic: str,
+        codec: Codec | None,
+        policy: Policy,
+        *,
+        callback: Callable[[T], object] | None = None,
+        on_close: Callable[[Subscriber[T]], None] | None = None,
+    ) -> None:
+        self.topic = topic
+        self.codec = codec
+        self.policy = policy
+        self.callback = callback
+        self.counters = SubscriberCounters()
+        self.lock = threading.Lock()
+        self.wakeup = Wakeup()
+        self._links: list[Link] = []
+        self._leaving: dict[Link, int] = {}
+        self._queue: deque[Item] = deque()
+        self._problems: deque[Exception] = deque()
+        self._drained_ns = 0
+        self._exhausted = True
+        self._whole_batches = False
+        self._on_close = on_close
+        self._closed = False
+        self._async: _AsyncSide | None = None
+
+    def recv(self, timeout_s: float | None = None) -> T:
+        """Take the next message.
+
+        Args:
+            timeout_s: Longest wait [s]; None waits for ever.
+
+        Raises:
+            TimeoutError: None came in time.
+            TypeMismatch: A publisher of this topic sends another type; raised once for each.
+            Closed: The subscriber was closed.
+        """
+        return self._receive(timeout_s, self._decode)
+
+    def recv_with_info(self, timeout_s: float | None = None) -> tuple[T, Info]:
+        """Take the next message, and what is known of it; see `recv`."""
+        return self._receive(timeout_s, lambda item: (self._decode(item), self._info(item)))
+
+    def recv_raw(self, timeout_s: float | None = None) -> tuple[Info, bytes | np.ndarray, Schema]:
+        """Take the next message as the bytes of its body, with its structure; see `recv`."""
+
+        def raw(item: Item) -> tuple[Info, bytes | np.ndarray, Schema]:
+            buffer = self._buffer(item)
+            return (
+                self._info(item),
+                buffer[item.offset : item.offset + item.size],
+                item.link.schema(),
+            )
+
+        return self._receive(timeout_s, raw)
+
+    def recv_batch(self, timeout_s: float | None = None) -> np.ndarray:
+        """Take all messages that are there, at least one, as a structured array; for types of a fixed size.
+
+        Returns:
+            A read-only array with the type's fields; of a batch that a coalescing publisher sent, a view.
+
+        Raises:
+            TypeError: The type's size is not fixed.
+            TimeoutError, TypeMismatch, Closed: As `recv`.
+        """
+        if self.codec is None or self.codec.record_dtype is None:
+            raise TypeError(f"{self.topic}: only a type of fixed size can be received as an array")
+        self._whole_batches = True
+        with self.lock:
+            for link in self._links:
+                link.whole_batches = True
+        return self._receive(timeout_s, self._join, whole=True)
+
+    def __iter__(self) -> Iterator[T]:
+        """Messages as they come, until the subscriber is closed."""
+        while True:
+            try:
+                message = self.recv()
+            except Closed:
+                return
+            yield message
+
+    def __aiter__(self) -> AsyncIterator[T]:
+        """Messages as they come, on the running loop, until the subscriber is closed."""
+        return self._stream()
+
+    async def _stream(self) -> AsyncIterator[T]:
+        since_pause = 0
+        while True:
+            try:
+                item = self._take()
+                if item is None:
+                    since_pause = 0
+                    yield await self.recv_async()
+                    continue
+                message = self._open(item, self._decode)
+            except Closed:
+                return
+            if message is not _LOST:
+                yield message
+            since_pause += 1
+            if since_pause >= DRAIN_MAX:  # other tasks of the loop want to run, too
+                since_pause = 0
+                await asyncio.sleep(0)
+
+    async def recv_async(self, timeout_s: float | None = None) -> T:
+        """Take the next message without blocking the running loop; see `recv`."""
+        if self._async is None or self._async.loop is not asyncio.get_running_loop():
+            if self._async is not None:
+                self._async.stop()
+            self._async = _AsyncSide(self)
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            item = self._take()
+            if item is not None:
+                message: T = self._open(item, self._decode)
+                if message is not _LOST:
+                    return message
+                continue
+            left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
+            await self._async.wait(min(left_s, WAIT_MAX_S))
+
+    def _receive(self, timeout_s: float | None, use: Callable[[Item], Any], *, whole: bool = False) -> Any:
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            item = self._take(whole=whole)
+            if item is not None:
+                result = self._open(item, use)
+                if result is not _LOST:
+                    return result
+                continue
+            left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
+            self._wait(min(left_s, WAIT_MAX_S))
+
+    def _take(self, *, whole: bool = False) -> Item | None:
+        """The next item, or None if nothing is there now; a batch is taken apart unless wanted whole."""
+        queue = self._queue
+        with self.lock:
+            if self._closed:
+                raise Closed(f"the subscriber of {self.topic} is closed")
+            if self._problems:
+                raise self._problems.popleft()
+            if not queue or (
+                not self.policy.reliable
+                and (not self._exhausted or monotonic_ns() - self._drained_ns > FRESH_NS)
+            ):
+                self._drain()
+            if not queue:
+                return None
+            item = queue.popleft()
+            if item.offset == WHOLE_BATCH and not whole:
+                queue.extendleft(reversed(item.link.take_apart(item)))
+                item = queue.popleft()
+            self.counters.received += 1
+            return item
+
+    def _open(self, item: Item, use: Callable[[Item], Any]) -> Any:
+        """Apply `use`; a message that cannot be read is counted and `_LOST` returned."""
+        try:
+            return use(item)
+        except MalformedMessage as error:
+            with self.lock:
+                self.counters.received -= 1
+                item.link.reject(str(error))
+        except _Overwritten:
+            with self.lock:
+                self.counters.received -= 1
+                self.counters.lost += 1
+        return _LOST
+
+    def _buffer(self, item: Item) -> bytes | np.ndarray:
+        if item.buffer is not None:
+            return item.buffer
+        assert item.slot is not None
+        view, slot = item.slot
+        copy = view.snapshot(slot, item.sequence, item.size)
+        if copy is None:
+            raise _Overwritten
+        return copy
+
+    def _decode(self, item: Item) -> T:
+        message: T = item.link.codec.decode(self._buffer(item), item.offset, item.size)
+        return message
+
+    def _info(self, item: Item) -> Info:
+        publish_ns = item.publish_ns + item.link.clock_offset_ns
+        return Info(
+            self.topic,
+            item.link.source,
+            item.sequence,
+            item.stamp_ns if item.link.codec.stamp_of is not None else None,
+            publish_ns,
+            monotonic_ns() - publish_ns,
+            item.size,
+        )
+
+    def _join(self, item: Item) -> np.ndarray:
+        """The records of one batch, or of all single messages that wait, as one array."""
+        codec = item.link.codec
+        fixed, dtype = codec.fixed_size, codec.record_dtype
+        assert fixed is not None
+        assert dtype is not None
+        if item.offset == WHOLE_BATCH:
+            stride = RECORD.size + fixed + (-fixed % 8)
+            with self.lock:
+                self.counters.received += item.size - 1
+            return np.ndarray((item.size,), dtype, item.buffer, HEADER_SIZE + RECORD.size, (stride,))
+        bodies = [self._buffer(item)[item.offset : item.offset + item.size]]
+        with self.lock:
+            while self._queue and self._queue[0].offset != WHOLE_BATCH and self._queue[0].buffer is not None:
+                more = self._queue.popleft()
+                assert more.buffer is not None
+                bodies.append(more.buffer[more.offset : more.offset + more.size])
+                self.counters.received += 1
+        if any(len(body) != fixed for body in bodies):
+            raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
+        return np.frombuffer(b"".join(bodies), dtype)
+
+    def _drain(self) -> None:
+        """Read what has arrived into the queue; the lock is held."""
+        queue, depth = self._queue, self.policy.depth
+        reliable = self.policy.reliable
+        counters = self.counters
+        exhausted = True
+        now_ns = self._drained_ns = monotonic_ns()
+        for link in self._links:
+            receive, head, fingerprint = link.receive, link.message_head, link.codec.fingerprint
+            budget = depth - len(queue) if reliable else DRAIN_MAX
+            sampled = 8
+            while budget > 0:
+                budget -= 1
+                try:
+                    frame = receive(1)  # DONTWAIT
+                except zmq.Again:
+                    break
+                if frame[:16] != head:
+                    for item in link.handle(frame):
+                        self._enqueue(item)
+                    continue
+                if len(frame) < HEADER_SIZE:
+                    link.reject(f"a frame of {len(frame)} bytes")
+                    continue
+                actual, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
+                if actual != fingerprint or size != len(frame) - HEADER_SIZE:
+                    link.reject(f"a message of {len(frame)} bytes that says {size}, type {actual:016x}")
+                    continue
+                if sequence == link.expected:
+                    link.expected = sequence + 1
+                elif not link.advance(sequence):
+                    continue
+                sampled += 1
+                if (
+                    sampled >= 8
+                ):  # the first of a wake-up and every eighth: a histogram of all would cost 10 %
+                    sampled = 0
+                    latency_ns = monotonic_ns() - publish_ns - link.clock_offset_ns
+                    counters.latency[min(max(latency_ns, 0).bit_length(), 39)] += 1
+                if len(queue) >= depth and not reliable:
+                    self._evict()
+                queue.append(Item(link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None))
+            else:
+                exhausted = False
+        self._exhausted = exhausted
+        if self._leaving:
+            self._dismiss(now_ns)
+
+    def _enqueue(self, item: Item) -> None:
+        latency_ns = monotonic_ns() - item.publish_ns - item.link.clock_offset_ns
+        self.counters.latency[min(max(latency_ns, 0).bit_length(), 39)] += 1
+        if len(self._queue) >= self.policy.depth and not self.policy.reliable:
+            self._evict()
+        self._queue.append(item)
+
+    def _evict(self) -> None:
+        item = self._queue.popleft()
+        self.counters.overtaken += item.size if item.offset == WHOLE_BATCH else 1
+
+    def _wait(self, timeout_s: float) -> None:
+        """Sleep until a socket may have something, or `wakeup` is called."""
+        poll = select.poll()
+        with self.lock:
+            if self._closed or not self._exhausted:
+                return
+            poll.register(self.wakeup.fd, select.POLLIN)
+            for link in self._links:
+                poll.register(link.fd, select.POLLIN)
+        for fd, _ in poll.poll(timeout_s * 1000.0):
+            if fd == self.wakeup.fd:
+                self.wakeup.clear()
+
+    def dispatch(self) -> bool:
+        """Hand what has arrived to the callback; for the callback thread.
+
+        Returns:
+            Whether there may be more.
+        """
+        callback = self.callback
+        assert callback is not None
+        with self.lock:
+            if self._closed:
+                return False
+            problems, self._problems = self._problems, deque()
+            self._drain()
+            items = list(self._queue)
+            self._queue.clear()
+            self.counters.received += len(items)
+            more = not self._exhausted
+        for problem in problems:
+            logger.error("%s", problem)
+        for item in items:
+            try:
+                message = item.link.codec.decode(self._buffer(item), item.offset, item.size)
+            except (MalformedMessage, _Overwritten) as error:
+                message = self._open(item, _raiser(error))
+                continue
+            try:
+                callback(message)
+            except Exception:
+                logger.exception("%s: the callback raised", self.topic)
+            if self._closed:
+                return False
+        return more
+
+    @property
+    def must_read(self) -> bool:
+        """Whether the last look left something in a socket, which its descriptor may not show."""
+        return not self._exhausted and not self.policy.reliable
+
+    def fds(self) -> list[int]:
+        """File descriptors that become readable when a message may have come."""
+        with self.lock:
+            return [link.fd for link in self._links]
+
+    def top_up(self, now_ns: int) -> None:
+        """Read the sockets of a subscriber that nobody reads at the moment; for the node's control thread.
+
+        So the queue keeps the last messages, not the first that filled the sockets.
+        """
+        if now_ns - self._drained_ns > 20_000_000 and self.lock.acquire(blocking=False):
+            try:
+                if not self._closed:
+                    waiting = bool(self._queue)
+                    self._drain()
+                    arrived = not waiting and bool(self._queue)
+            finally:
+                self.lock.release()
+            if not self._closed and arrived:
+                self.wakeup.set()
+
+    def wait_for_publisher(self, timeout_s: float = 5.0) -> bool:
+        """Wait until a publisher has taken this subscriber in; False if none has in time."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            with self.lock:
+                if self._closed:
+                    raise Closed(f"the subscriber of {self.topic} is closed")
+                if len(self._queue) < self.policy.depth:
+                    self._drain()
+                if any(link.attached for link in self._links):
+                    return True
+            if time.monotonic() >= deadline_s:
+                return False
+            time.sleep(0.5e-3)
+
+    @property
+    def publisher_count(self) -> int:
+        """Publishers that have taken this subscriber in."""
+        with self.lock:
+            return sum(link.attached for link in self._links if link not in self._leaving)
+
+    def connect(self, link: Link) -> None:
+        """Add a publisher; for the node."""
+        with self.lock:
+            if self._closed:
+                link.close()
+                return
+            link.whole_batches = self._whole_batches
+            self._links.append(link)
+        self.wakeup.set()
+
+    def sources(self) -> set[int]:
+        """The publishers that are connected and have not left."""
+        with self.lock:
+            return {link.source for link in self._links if link not in self._leaving}
+
+    def forget(self, source: int) -> None:
+        """A publisher has left: read what is still on its way, then disconnect; for the node."""
+        with self.lock:
+            for link in self._links:
+                if link.source == source and link not in self._leaving:
+                    self._leaving[link] = monotonic_ns() + LEAVING_NS
+
+    def complain(self, problem: TypeMismatch) -> None:
+        """A publisher cannot be connected; the user hears of it at the next `recv`."""
+        with self.lock:
+            self.counters.rejected += 1
+            self._problems.append(problem)
+        self.wakeup.set()
+
+    def _dismiss(self, now_ns: int) -> None:
+        """Close connections whose time is over; the lock is held."""
+        for link, deadline_ns in list(self._leaving.items()):
+            if now_ns >= deadline_ns:
+                link.close()
+                self._links.remove(link)
+                del self._leaving[link]
+                self.wakeup.set()
+
+    def close(self) -> None:
+        """Stop receiving. Messages that the user still holds stay valid."""
+        with self.lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._queue.clear()
+            links, self._links = self._links, []
+            self._leaving.clear()
+        if self._async is not None:
+            self._async.stop()
+        for link in links:
+            link.close()
+        self.wakeup.set()
+        if self._on_close is not None:
+            self._on_close(self)
+
+    def __enter__(self) -> Subscriber[T]:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Lost:
+    """Stands for a message that could not be read."""
+
+
+_LOST: Any = _Lost()
+
+
+class _Overwritten(Exception):
+    """The slot was written again before it was read."""
+
+
+def _raiser(error: Exception) -> Callable[[Item], Any]:
+    def fail(_: Item) -> Any:
+        raise error
+
+    return fail
+
+
+class _AsyncSide:
+    """Wakes an asyncio loop when a socket may have something."""
+
+    def __init__(self, subscriber: Subscriber[Any]) -> None:
+        self.loop = asyncio.get_running_loop()
+        self._subscriber = subscriber
+        self._fds: set[int] = set()
+        self._waiter: asyncio.Future[None] | None = None
+
+    async def wait(self, timeout_s: float) -> None:
+        """Return when something may have come, or after the time."""
+        fds = {self._subscriber.wakeup.fd, *self._subscriber.fds()}
+        for fd in self._fds - fds:
+            self.loop.remove_reader(fd)
+        for fd in fds - self._fds:
+            self.loop.add_reader(fd, self._wake, fd)
+        self._fds = fds
+        self._waiter = self.loop.create_future()
+        timer = self.loop.call_later(timeout_s, self._resolve)
+        try:
+            await self._waiter
+        finally:
+            timer.cancel()
+            self._waiter = None
+
+    def _resolve(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+    def _wake(self, fd: int) -> None:
+        if fd == self._subscriber.wakeup.fd:
+            self._subscriber.wakeup.clear()
+        if self._waiter is None:
+            # Nobody waits now: a readable descriptor would spin the loop until somebody reads it.
+            self.loop.remove_reader(fd)
+            self._fds.discard(fd)
+        self._resolve()
+
+    def stop(self) -> None:
+        """Leave the loop."""
+
+        def leave() -> None:
+            for fd in self._fds:
+                self.loop.remove_reader(fd)
+            self._fds.clear()
+            self._resolve()
+
+        if self.loop.is_closed():
+            return
+        self.loop.call_soon_threadsafe(leave)
