@@ -424,10 +424,10 @@ class RingView:
         except OSError as error:
             _log.warning("ring %d: messages in use cannot be copied and will change: %s", self.ring_id, error)
         self._own[:] = bytes(self.slots)
-        if in_use:
-            head.detach()  # when their arrays die, the column may be another reader's
         self._table = self._own = self._headers = self._memory = memoryview(b"")
         self._delivered = []
+        if in_use:
+            head.detach()  # when their arrays die, the column may be another reader's
 
     def _in_use(self) -> list[int]:
         """Slots whose messages were delivered and not given back."""
