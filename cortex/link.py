@@ -31,6 +31,7 @@ from cortex.wire import (
     AttachKey,
     attach_key,
     batch_records,
+    message_head,
     parse_answer,
     prefix,
 )
@@ -88,7 +89,9 @@ class Link:
         self._policy = policy
         stamped = codec.stamp_of is not None
         self._stamped = stamped
-        self.message_head = prefix(MESSAGE, self.source, stamped=stamped)
+        self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
+        """The first 24 bytes of every plain message."""
+        self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,
             prefix(SLOT, self.source, stamped=stamped): self._on_slot,
@@ -109,7 +112,7 @@ class Link:
                 secure(self.socket)
             self.fd: int = self.socket.get(zmq.FD)
             self.socket.connect(address)
-            for head in (self.message_head, *list(self._handlers)[:3]):
+            for head in (self._message_prefix, *list(self._handlers)[:3]):
                 if head != self._slot_head or shared_memory:
                     self.socket.subscribe(head)
             self._key = b""
@@ -144,7 +147,9 @@ class Link:
         handler = self._handlers.get(frame[:16])
         try:
             if handler is None or len(frame) < HEADER_SIZE:
-                raise MalformedMessage("not a frame of this publisher")
+                raise MalformedMessage(
+                    f"a frame of {len(frame)} bytes: not of this publisher, or not of this type"
+                )
             return handler(frame)
         except MalformedMessage as error:
             self.reject(str(error))
@@ -275,7 +280,7 @@ class Link:
         return items
 
     def _latched(self, frame: bytes) -> list[Item]:
-        if len(frame) < HEADER_SIZE or frame[:16] not in (self.message_head, self._large_head):
+        if len(frame) < HEADER_SIZE or frame[:16] not in (self._message_prefix, self._large_head):
             raise MalformedMessage("a latched message that is none")
         fingerprint, sequence, stamp_ns, publish_ns, size, _ = TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)

@@ -17,7 +17,7 @@ from cortex.codec import Codec
 from cortex.large import LargeSender, Reader, Slot
 from cortex.outlet import Backoff, Outlet, Outlets
 from cortex.stats import PublisherCounters
-from cortex.wire import BATCH, LARGE, MESSAGE, RECORD, TAIL, AttachKey, prefix
+from cortex.wire import BATCH, LARGE, MESSAGE, RECORD, REST, TAIL, AttachKey, message_head, prefix
 
 logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
@@ -60,15 +60,18 @@ class Publisher(Generic[T]):
         self.codec = codec
         self.source = secrets.randbits(64) or 1
         self.latch = latch
-        self.counters = PublisherCounters()
+        self._bytes = 0
+        self._timeouts = 0
+        self._skipped = 0
         stamped = codec.stamp_of is not None
         self._type = codec.type
         self._encode = codec.encode
         self._stamp_of = codec.stamp_of
         self._fingerprint = codec.fingerprint
         self._inline_max = inline_max
-        self._head = prefix(MESSAGE, self.source, stamped=stamped)
-        self._batch_head = prefix(BATCH, self.source, stamped=stamped)
+        self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
+        self._batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
+        self._plain = not latch and not coalesce
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
@@ -112,13 +115,19 @@ class Publisher(Generic[T]):
                 self._prepare(now_ns)
             if not self._readers and not self.latch:
                 self._sequence += 1
-                self.counters.published += 1
                 return True
             body = self._encode(message, self._inline_max)
             if body is not None:
-                return self._publish_inline(
-                    body, 0 if self._stamp_of is None else self._stamp_of(message), now_ns
-                )
+                stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
+                if not self._plain:
+                    return self._publish_inline(body, stamp_ns, now_ns)
+                sequence, size = self._sequence, len(body)
+                self._sequence = sequence + 1
+                self._bytes += size
+                frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
+                for send in self._lossy_sends:
+                    send(frame, 1)  # DONTWAIT
+                return self._send_strict_all(frame) if self._strict_outlets else True
         size = self.codec.size(message)
         stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
         with self._large_lock:
@@ -180,9 +189,7 @@ class Publisher(Generic[T]):
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send or collect a small message; the lock is held."""
         size = len(body)
-        counters = self.counters
-        counters.published += 1
-        counters.bytes += size
+        self._bytes += size
         if self._coalesce and not self.latch:
             burst = now_ns - self._last_ns < BURST_NS
             self._last_ns = now_ns
@@ -190,7 +197,7 @@ class Publisher(Generic[T]):
                 return self._collect(body, size, stamp_ns, now_ns)
         sequence = self._sequence
         self._sequence = sequence + 1
-        frame = self._head + TAIL.pack(self._fingerprint, sequence, stamp_ns, now_ns, size, 0) + body
+        frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
         if self.latch:
             self._latched = frame
         for send in self._lossy_sends:
@@ -223,11 +230,11 @@ class Publisher(Generic[T]):
                 self._check_open()
                 self._outlets.refresh()
                 if not more:
-                    if self.counters.timeouts == 0:
+                    if self._timeouts == 0:
                         logger.warning(
                             "%s: a reliable subscriber did not keep up and lost a message", self.topic
                         )
-                    self.counters.timeouts += 1
+                    self._timeouts += 1
                     outlet.send_anyway(frame, flags)
                     return False
         finally:
@@ -262,12 +269,10 @@ class Publisher(Generic[T]):
             return True
         records = b"".join(self._batch)
         first = self._batch_sequence
-        tail = TAIL.pack(
-            self._fingerprint, first, 0, self._batch_start_ns, len(records), self._sequence - first
-        )
+        rest = REST.pack(first, 0, self._batch_start_ns, len(records), self._sequence - first)
         self._batch.clear()
         self._batch_bytes = 0
-        frame = self._batch_head + tail + records
+        frame = self._batch_head + rest + records
         for send in self._lossy_sends:
             send(frame, zmq.DONTWAIT)
         return self._send_strict_all(frame)
@@ -295,8 +300,7 @@ class Publisher(Generic[T]):
             slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
             if slot is None:
                 self._sequence += 1
-                self.counters.published += 1
-                self.counters.skipped += 1
+                self._skipped += 1
             return slot
 
     def _publish_slot(self, slot: Slot, size: int, stamp_ns: int) -> bool:
@@ -314,8 +318,7 @@ class Publisher(Generic[T]):
             now_ns = monotonic_ns()
             sequence = self._sequence
             self._sequence = sequence + 1
-            self.counters.published += 1
-            self.counters.bytes += size
+            self._bytes += size
 
             def tail(aux: int) -> bytes:
                 return TAIL.pack(self._fingerprint, sequence, stamp_ns, now_ns, size, aux)
@@ -323,9 +326,9 @@ class Publisher(Generic[T]):
             if self.latch:
                 self._latched = self._large_kind + tail(0) + slot.buffer[:size].tobytes()
             sent, passed_over = self._large.send(slot, size, tail, sequence, self._send_strict)
-            self.counters.skipped += passed_over
+            self._skipped += passed_over
             if not on_time:
-                self.counters.timeouts += 1
+                self._timeouts += 1
             return on_time and sent
 
     def _prepare(self, now_ns: int) -> None:
@@ -384,6 +387,12 @@ class Publisher(Generic[T]):
                     self._large.prune()
             finally:
                 self._lock.release()
+
+    @property
+    def counters(self) -> PublisherCounters:
+        """What has been published so far."""
+        with self._lock:
+            return PublisherCounters(self._sequence, self._bytes, self._timeouts, self._skipped)
 
     @property
     def subscriber_count(self) -> int:

@@ -25,6 +25,10 @@ _HEADER = struct.Struct("<3sBBBHQQQqqQQ")
 _PREFIX = struct.Struct("<3sBBBHQ")
 TAIL = struct.Struct("<QQqqQQ")
 """What follows the prefix: fingerprint, sequence, stamp_ns, publish_ns, body length, aux."""
+HEAD_SIZE = PREFIX_SIZE + 8
+"""Prefix and fingerprint: constant for the messages of one source."""
+REST = struct.Struct("<QqqQQ")
+"""What follows the head: sequence, stamp_ns, publish_ns, body length, aux."""
 RECORD = struct.Struct("<qqII")
 """Head of a batch's record: stamp_ns, publish_ns, body length, reserved."""
 MASK = struct.Struct("<Q")
@@ -49,6 +53,11 @@ class Header(NamedTuple):
 def prefix(kind: bytes, source: int, *, stamped: bool) -> bytes:
     """The first 16 bytes of a header: what a subscription matches."""
     return _PREFIX.pack(b"CTX", kind[0], VERSION, FLAG_STAMP if stamped else 0, HEADER_SIZE, source)
+
+
+def message_head(kind: bytes, source: int, fingerprint: int, *, stamped: bool) -> bytes:
+    """The first 24 bytes of a header: what the messages of one source have in common."""
+    return prefix(kind, source, stamped=stamped) + fingerprint.to_bytes(8, "little")
 
 
 def pack_header(header: Header) -> bytes:
