@@ -32,7 +32,7 @@ def _check_message(schema: Schema, cls: type, message: Any, where: str) -> None:
         raise TypeError(f"{where}: got {type(message).__name__}, expected {cls.__name__}")
     scope: dict[str, int] = {}
     shared = shared_names([field.type for field in schema.fields])
-    bindings = cls.__cortex_bindings__  # type: ignore[attr-defined]
+    bindings = cls.__cortex_bindings__
     for field, bound in zip(schema.fields, bindings, strict=True):
         _check(field.type, bound, getattr(message, field.name), f"{where}.{field.name}", scope, shared)
 

@@ -1,4 +1,4 @@
-"""The codec of a message type: message to body and back (WIRE.md, section 5), built once and fast from then on."""
+"""The codec of a message type: message to body and back (WIRE.md, section 5), built once for each type."""
 
 from __future__ import annotations
 

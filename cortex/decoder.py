@@ -1,4 +1,4 @@
-"""Bodies to messages: closures built once for each type, which check every offset, count and code they follow."""
+"""Bodies to messages: closures built once for each type, which check all offsets, counts and codes."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from cortex.layout import (
     SCALAR_CODES,
     array_dtype,
     block_size,
+    has_tail,
     leaves,
     measure,
     measure_fields,
@@ -28,7 +29,7 @@ from cortex.structure import new_message
 
 
 class MalformedMessage(ValueError):
-    """Bytes that are no body of the type; the only exception that decoding raises for what came over the wire."""
+    """Bytes that are no body of the type; the only exception that decoding raises for them."""
 
 
 DECODE_ERRORS = (ValueError, TypeError, LookupError, ArithmeticError, struct.error)
@@ -46,9 +47,11 @@ class Body:
         """Where the body begins in the buffer."""
         self.size = size
         self.left = left
-        """Bytes that items may still take up. Items never overlap in a body that an encoder wrote, so that their
-        sizes add up to less than the body's; without this bound, offsets that point to one place many times
-        would let a small body demand any amount of memory."""
+        """Bytes that items may still take up.
+
+        Items never overlap in a body that an encoder wrote: their sizes add up to less than the body's.
+        Without this bound, many offsets to one place would let a small body demand any amount of memory.
+        """
 
     def claim(self, offset: int, size: int) -> int:
         """Return where an item lies in the buffer."""
@@ -71,6 +74,7 @@ class Decoder:
     def __init__(self, schema: Schema, cls: type) -> None:
         self.schema = schema
         self.block = block_size(schema)
+        self._end = BODY_LIMIT if has_tail(schema) else self.block + 1
         self._unpack = reading_struct(schema, self.block).unpack_from
         self._get = _get_message(schema, cls, 0, 0)
 
@@ -81,9 +85,9 @@ class Decoder:
             size = available
         elif size > available:
             raise MalformedMessage(f"{self.schema.name}: body of {size} bytes, {available} are there")
-        if not self.block <= size < BODY_LIMIT:
+        if not self.block <= size < self._end:
             raise MalformedMessage(
-                f"{self.schema.name}: body of {size} bytes, at least {self.block} are needed"
+                f"{self.schema.name}: body of {size} bytes, allowed are {self.block} to {self._end - 1}"
             )
         try:
             numbers = self._unpack(buffer, offset)

@@ -1,4 +1,4 @@
-"""Messages to bodies: closures built once for each type, which put values into a block and arrays into a tail."""
+"""Messages to bodies: closures built once for each type, which put numbers into a block, arrays in a tail."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from enum import Enum
 from operator import attrgetter
-from typing import Any, TypeAlias, Union
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType
 from cortex.structure import is_tensor
 from cortex.tensors import to_numpy
 
-Part: TypeAlias = Union[bytes, NDArray[Any]]
+Part: TypeAlias = "bytes | NDArray[Any]"
 Scope: TypeAlias = "dict[str, int] | None"
 Put: TypeAlias = "Callable[[Any, list[Any], Tail, Scope], None]"
 """Appends the numbers of a value to a block, and what does not fit there to the tail."""
@@ -101,14 +101,14 @@ def join(parts: list[Part], tail: Tail) -> bytes:
     parts += tail.parts
     if tail.strided:
         parts = [part if isinstance(part, bytes) else part.tobytes() for part in parts]
-    return b"".join(parts)
+    return b"".join(parts)  # type: ignore[arg-type]  # contiguous arrays are buffers
 
 
 def write(parts: list[Part], buffer: NDArray[np.uint8], position: int = 0) -> int:
     """Copy parts into memory, arrays directly, and return where the last one ends."""
     small: list[bytes] = []
     start = position
-    view = memoryview(buffer)
+    view = buffer.data
     for part in parts:
         if isinstance(part, bytes):
             small.append(part)
@@ -139,9 +139,7 @@ def as_array(value: Any, dtype: np.dtype[Any] | None) -> NDArray[Any]:
         if value.dtype not in _CODE_OF_DTYPE:
             raise TypeError(f"dtype {value.dtype} is none of {', '.join(DTYPE_CODES)} in native byte order")
     elif value.dtype != dtype:
-        raise TypeError(
-            f"dtype {value.dtype}, expected {dtype}; convert it first, as with .astype(np.{dtype})"
-        )
+        raise TypeError(f"dtype {value.dtype}, expected {dtype}; convert it, as with .astype(np.{dtype})")
     return value
 
 

@@ -44,7 +44,9 @@ SCALAR_CODES = {
 }
 """Codes of the struct module; a bool is a byte, so that a 2 can be told from a 1."""
 
-DTYPES = tuple(np.dtype(np.dtype(name).newbyteorder("<").str) for name in DTYPE_NAMES)
+DTYPES: tuple[np.dtype[Any], ...] = tuple(
+    np.dtype(np.dtype(name).newbyteorder("<").str) for name in DTYPE_NAMES
+)
 """NumPy dtypes by their code on the wire."""
 DTYPE_CODES = {name: code for code, name in enumerate(DTYPE_NAMES)}
 
@@ -151,8 +153,8 @@ def writing_structs(kind: FieldType, size: int) -> list[tuple[struct.Struct, int
     """Return how to write a block of `size` bytes.
 
     Returns:
-        Structs, each with the number of values that it packs. Between two of them lies one large fixed array, as a value
-        of its own; smaller fixed arrays are packed as bytes.
+        Structs, each with the number of values that it packs. Between two of them lies one large fixed array,
+        as a value of its own; smaller fixed arrays are packed as bytes.
     """
     result = []
     pending: list[Leaf] = []
@@ -199,7 +201,7 @@ def record_dtype(kind: FieldType, size: int | None = None) -> np.dtype[Any]:
     An optional becomes a structure of `present` and `value`; an enum is its int32.
     """
     if isinstance(kind, str):
-        return np.dtype(np.dtype(kind).newbyteorder("<").str)
+        return DTYPES[DTYPE_CODES[kind]]
     if isinstance(kind, EnumType):
         return np.dtype("<i4")
     if isinstance(kind, ArrayType):

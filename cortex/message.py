@@ -6,8 +6,8 @@
         ranges: Annotated[Array["float32", "beams"], Unit("m", frame="lidar")]
         mode: Mode = Mode.FAST
 
-Fields are `bool`, `int` (int64), `float` (float64), the sized numbers of this module, `str`, `bytes`, enums of
-integers, `Array`, other messages, `list[T]` and `T | None`.
+Fields are `bool`, `int` (int64), `float` (float64), the sized numbers of this module, `str`, `bytes`, enums
+of integers, `Array`, other messages, `list[T]` and `T | None`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ __all__ = [
     "message",
 ]
 
-_T = TypeVar("_T", bound=type)
+_T = TypeVar("_T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,20 +77,17 @@ Float32 = Annotated[float, _Scalar("float32")]
 Float64 = Annotated[float, _Scalar("float64")]
 
 if TYPE_CHECKING:
-    from typing import Annotated as Array
-
     from typing_extensions import dataclass_transform
+
+    Array: Any  # strings in the brackets are no forward references; arrays and tensors are both welcome
 else:
 
     class Array:
         """Annotation of an array field: the dtype, then one size or name for each dimension.
 
-        `Array["float32", "n"]`, `Array["uint8", "height", "width", 3]`, `Array[np.float64, 3]`; `"any"` leaves the
-        dtype open. Dimensions of one name have one size within a message. With integers only, the array
-        lies in the fixed block of the message.
-
-        Type checkers read it as `Annotated`, so `Array[NDArray[np.float32], "n"]`, which means the same as the
-        first form, is the one that they understand fully.
+        `Array["float32", "n"]`, `Array["uint8", "height", "width", 3]`, `Array[np.float64, 3]`; `"any"`
+        leaves the dtype open. Dimensions of one name have one size within a message. With integers only,
+        the array lies in the fixed block of the message.
         """
 
         def __class_getitem__(cls, parameters: Any) -> Any:
@@ -103,24 +100,24 @@ else:
 
 @overload
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
-def message(cls: type[Any], /, *, name: str | None = ...) -> type[Any]: ...
+def message(cls: type[_T], /, *, name: str | None = ...) -> type[_T]: ...
 
 
 @overload
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
-def message(cls: None = ..., /, *, name: str | None = ...) -> Callable[[_T], _T]: ...
+def message(cls: None = ..., /, *, name: str | None = ...) -> Callable[[type[_T]], type[_T]]: ...
 
 
 def message(cls: Any = None, /, *, name: str | None = None) -> Any:
     """Make a class a message type: a frozen dataclass with slots, a schema and a fingerprint.
 
-    Messages compare by value, arrays included, and so are not hashable. `copy()` returns a deep copy with writable
-    arrays. Decoding does not run `__init__` or `__post_init__`.
+    Messages compare by value, arrays included, and so are not hashable. `copy()` returns a deep copy with
+    writable arrays. Decoding does not run `__init__` or `__post_init__`.
 
     Args:
         cls: Class with annotated fields.
-        name: Name of the type on the wire; the class name by default. It is part of the fingerprint, the module
-            is not.
+        name: Name of the type on the wire; the class name by default. It is part of the fingerprint, the
+            module is not.
 
     Raises:
         SchemaError: A field's annotation has no place in a message.
@@ -138,14 +135,14 @@ def is_message(value: object) -> bool:
     return "__cortex_schema__" in vars(kind)
 
 
-def _make_message(cls: type, name: str | None, scope: Mapping[str, Any]) -> type:
+def _make_message(cls: type, name: str | None, scope: Mapping[str, Any]) -> type[Any]:
     for key in inspect.get_annotations(cls):
         if isinstance(vars(cls).get(key), np.ndarray):  # dataclasses refuse the other mutable ones
             raise TypeError(
                 f"{cls.__name__}.{key}: a mutable default would be shared; use field(default_factory=...)"
             )
     hints = _resolve_hints(cls, scope)
-    decorated = dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)(cls)
+    decorated: type[Any] = dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)(cls)
     names = tuple(field.name for field in dataclasses.fields(decorated))
     if "copy" in names:
         raise SchemaError(f"{cls.__name__}.copy: the name is that of a method of every message")
@@ -176,27 +173,21 @@ def _resolve_hints(cls: type, scope: Mapping[str, Any]) -> dict[str, Any]:
         return typing.get_type_hints(cls, localns=dict(scope), include_extras=True)
     except NameError as error:
         raise SchemaError(
-            f"{cls.__name__}: an annotation cannot be resolved: {error}. A message cannot contain itself, and the "
-            "types of its fields must be defined before it"
+            f"{cls.__name__}: an annotation cannot be resolved: {error}. A message cannot contain itself, "
+            "and the types of its fields must be defined before it"
         ) from error
 
 
 def _dtype_name(dtype: Any) -> str:
     if isinstance(dtype, str) and dtype == ANY_DTYPE:
         return dtype
-    if typing.get_origin(dtype) is np.ndarray:  # NDArray[np.float32]
-        (dtype,) = typing.get_args(typing.get_args(dtype)[1])
-        if dtype is Any:
-            return ANY_DTYPE
     try:
         resolved = np.dtype(dtype)
     except TypeError as error:
         raise SchemaError(f"array dtype {dtype!r} is unknown") from error
     if not resolved.isnative:
-        raise SchemaError(
-            f"array dtype {dtype!r}: byte order is not part of a message, it is always little-endian"
-        )
-    return resolved.name
+        raise SchemaError(f"array dtype {dtype!r}: the byte order of messages is always little-endian")
+    return str(resolved.name)
 
 
 _Reading = tuple[FieldType, Any, "tuple[str, str] | None"]
@@ -225,8 +216,8 @@ def _read_hint(hint: Any, where: str) -> _Reading:
         if "__cortex_schema__" in vars(hint):
             return hint.__cortex_schema__, hint, None  # type: ignore[attr-defined]
     raise SchemaError(
-        f"{where}: {hint!r} cannot be a field; allowed are bool, int, float, sized numbers such as Int32, str, "
-        "bytes, enums of integers, Array[dtype, *shape], message types, list[T] and T | None"
+        f"{where}: {hint!r} cannot be a field; allowed are bool, int, float, sized numbers such as Int32, "
+        "str, bytes, enums of integers, Array[dtype, *shape], message types, list[T] and T | None"
     )
 
 

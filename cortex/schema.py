@@ -1,4 +1,4 @@
-"""Schemas: what a message is made of, as records, as canonical JSON and as a 64-bit fingerprint (WIRE.md, section 4)."""
+"""Schemas: the structure of messages as records, canonical JSON and fingerprint (WIRE.md, section 4)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from hashlib import blake2b
-from typing import Any, TypeAlias, Union
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -222,7 +222,7 @@ class Schema:
         return schema
 
 
-FieldType: TypeAlias = Union[str, EnumType, ArrayType, OptionalType, ListType, Schema]
+FieldType: TypeAlias = "str | EnumType | ArrayType | OptionalType | ListType | Schema"
 """What a field may hold: the name of a scalar type, "str", "bytes", or one of the records."""
 
 
@@ -298,7 +298,7 @@ def _describe_type(kind: FieldType) -> str:
 def _check_field_name(name: object, what: str) -> None:
     if not isinstance(name, str) or not _FIELD_NAME.fullmatch(name):
         raise SchemaError(
-            f"{what} name {name!r}, allowed are 1 to 64 of A-Z a-z 0-9 _, not starting with a digit or with __"
+            f"{what} name {name!r}, allowed are 1 to 64 of A-Z a-z 0-9 _, not starting with a digit or __"
         )
 
 
@@ -308,7 +308,7 @@ def _check_type_name(name: object) -> None:
 
 
 def _check_nested(kind: FieldType) -> None:
-    # A nested message without fields would occupy no byte, so a list of them could claim any amount of memory.
+    # A nested message without fields would occupy no byte: a list of them could claim any amount of memory.
     if isinstance(kind, Schema) and not kind.fields:
         raise SchemaError(f"{kind.name} has no fields; only the outermost message may be empty")
 
@@ -447,7 +447,7 @@ def attach_schema(message_type: type, schema: Schema, bindings: tuple[Any, ...])
 def _binding(kind: FieldType) -> Any:
     if isinstance(kind, EnumType):
         try:
-            created = Enum(kind.name, list(kind.values), module=__name__)
+            created: Any = Enum(kind.name, list(kind.values), module=__name__)  # type: ignore[misc]
         except (ValueError, TypeError, AttributeError) as error:
             raise SchemaError(f"enum {kind.name} cannot be an enum in Python: {error}") from error
         if [(name, member.value) for name, member in created.__members__.items()] != list(kind.values):

@@ -1,19 +1,21 @@
-"""Message classes as Python objects: frozen, slotted, compared by value, copied deeply; nothing of the wire."""
+"""Message classes as Python objects: frozen, slotted, compared by value, copied deeply."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
+
+_T = TypeVar("_T")
 
 _MAX_SHOWN_ITEMS = 8
 _MAX_SHOWN_TEXT = 64
 
 
-def make_class(name: str, field_names: Sequence[str], hints: Sequence[Any]) -> type:
+def make_class(name: str, field_names: Sequence[str], hints: Sequence[Any]) -> type[Any]:
     """Build a frozen class with slots for field names that came over the wire, without generating code.
 
     Args:
@@ -42,7 +44,7 @@ def make_class(name: str, field_names: Sequence[str], hints: Sequence[Any]) -> t
         "__getstate__": _get_state,
         "__setstate__": _set_state,
     }
-    created = dataclasses.dataclass(init=False, repr=False, eq=False)(type(name, (), namespace))
+    created: type[Any] = dataclasses.dataclass(init=False, repr=False, eq=False)(type(name, (), namespace))
     finish_class(created, names, shell_init)
     return created
 
@@ -50,8 +52,8 @@ def make_class(name: str, field_names: Sequence[str], hints: Sequence[Any]) -> t
 def finish_class(cls: type, names: tuple[str, ...], shell_init: Callable[..., None]) -> None:
     """Give a frozen slotted dataclass what every message has: equality, repr, `copy` and a shell.
 
-    The shell, `__cortex_shell__`, is a subclass of the same layout that may be written to. Filling a shell and then
-    changing its class is several times faster than `object.__setattr__` for each field of a frozen object.
+    The shell, `__cortex_shell__`, is a subclass of the same layout that may be written to. Filling a shell
+    and then changing its class is several times faster than `object.__setattr__` for each field.
 
     Args:
         cls: The class.
@@ -75,9 +77,9 @@ def finish_class(cls: type, names: tuple[str, ...], shell_init: Callable[..., No
     cls.__cortex_shell__ = type(cls.__name__, (cls,), namespace)  # type: ignore[attr-defined]
 
 
-def new_message(cls: Any, values: Sequence[Any]) -> Any:
+def new_message(cls: type[_T], values: Sequence[Any]) -> _T:
     """Build a message from the values of all its fields, without running `__init__` or `__post_init__`."""
-    message = cls.__cortex_shell__(*values)
+    message: _T = cls.__cortex_shell__(*values)  # type: ignore[attr-defined]
     message.__class__ = cls
     return message
 
@@ -88,9 +90,9 @@ def is_tensor(value: Any) -> bool:
     return torch is not None and isinstance(value, torch.Tensor)
 
 
-def copy_message(self: Any) -> Any:
-    """Return a deep copy that owns its arrays; they are writable and row-major."""
-    return new_message(type(self), [_copy_value(getattr(self, name)) for name in self.__cortex_names__])
+def copy_message(self: _T) -> _T:
+    """Return a deep copy of a message that owns its arrays; they are writable and row-major."""
+    return new_message(type(self), [_copy_value(getattr(self, name)) for name in _names_of(self)])
 
 
 def _copy_value(value: Any) -> Any:
@@ -98,17 +100,20 @@ def _copy_value(value: Any) -> Any:
         return np.array(value, order="C")
     if isinstance(value, (list, tuple)):
         return [_copy_value(item) for item in value]
-    if hasattr(type(value), "__cortex_names__"):
-        return copy_message(value)
     if is_tensor(value):
         return value.detach().clone()
-    return value
+    return copy_message(value) if hasattr(value, "__cortex_names__") else value
 
 
 def _equal(self: Any, other: object) -> Any:
     if type(other) is not type(self):
         return NotImplemented
-    return all(_same(getattr(self, name), getattr(other, name)) for name in self.__cortex_names__)
+    return all(_same(getattr(self, name), getattr(other, name)) for name in _names_of(self))
+
+
+def _names_of(message: Any) -> tuple[str, ...]:
+    names: tuple[str, ...] = message.__cortex_names__
+    return names
 
 
 def _same(left: Any, right: Any) -> bool:
@@ -155,9 +160,7 @@ def _match_arguments(
     given = dict(zip(names, args, strict=False))
     unknown = [key for key in kwargs if key not in names or key in given]
     if unknown:
-        raise TypeError(
-            f"{name}: arguments {unknown} are unknown or given twice, its fields are {list(names)}"
-        )
+        raise TypeError(f"{name}: arguments {unknown} are unknown or given twice, allowed are {list(names)}")
     given.update(kwargs)
     missing = [key for key in names if key not in given]
     if missing:

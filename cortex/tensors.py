@@ -16,8 +16,8 @@ def to_torch(array: NDArray[Any], *, copy: bool = True, device: Any = None) -> A
 
     Args:
         array: Array of a message; may be read-only.
-        copy: Whether the tensor owns its memory. Without a copy it shares memory with the array, which must be
-            writable, because torch knows no read-only tensors: `message.copy()` gives such arrays.
+        copy: Whether the tensor owns its memory. Without a copy it shares memory with the array, which must
+            be writable, because torch knows no read-only tensors: `message.copy()` gives such arrays.
         device: Where the tensor shall live, as `torch.Tensor.to` takes it. Another device than the CPU gets
             one transfer, and no copy before it.
 
