@@ -1,4 +1,4 @@
-"""Large messages of one publisher: written once into a slot, read there by local readers, sent from there to the others."""
+"""Large messages of one publisher: written once into a slot, read there by local readers, sent to the others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import zmq
 
-from cortex.outlet import Backoff, Outlet, Outlets
+from cortex.outlet import DONTWAIT, SNDMORE, Backoff, Outlet, Outlets
 from cortex.shm import Ring, ShmUnavailable
 from cortex.wire import (
     LARGE,
@@ -88,6 +88,29 @@ class LargeSender:
         self._pins: deque[_Pin] = deque()
         self._private_bytes = 0
         self._unavailable = False
+        # What follows from who reads and from the ring in use; see `_plan`.
+        self._shares = 1
+        self._ring: Ring | None = None
+        self._pin_quota = 0
+        self._grants: list[tuple[int, int, int]] = []
+        self._strict: list[tuple[Reader, int]] = []
+        self._slot_outlets: list[Outlet] = []
+        self._inline_outlets: list[Outlet] = []
+
+    def _plan(self) -> None:
+        """Work out what every message needs, when readers or the ring have changed."""
+        self._shares = max(1, len(self._columns) + bool(self._inline))
+        ring = self._ring = self._rings[-1] if self._rings else None
+        self._pin_quota = 0 if ring is None else max(1, (ring.slots - 1) // self._shares)
+
+        def quota(reader: Reader) -> int:
+            return min(self._pin_quota, reader.request.quota or self._pin_quota)
+
+        self._grants = [(column, 1 << column, quota(reader)) for column, reader in self._columns.items()]
+        readers = [*self._columns.values(), *self._inline]
+        self._strict = [(reader, quota(reader)) for reader in readers if reader.request.strict]
+        self._slot_outlets = list({reader.outlet for reader in self._columns.values()})
+        self._inline_outlets = list({reader.outlet for reader in self._inline})
 
     def admit(self, key: bytes, request: AttachKey, outlet: Outlet) -> Reader:
         """Take a reader in, with a column of the lease table if it can map memory."""
@@ -99,6 +122,7 @@ class LargeSender:
             self._inline.append(reader)
         else:
             self._columns[column] = reader
+        self._plan()
         return reader
 
     def dismiss(self, reader: Reader) -> None:
@@ -109,6 +133,7 @@ class LargeSender:
             del self._columns[reader.column]
             for ring in self._rings:
                 ring.free_column(reader.column)
+        self._plan()
 
     def answer(self, reader: Reader, sequence: int, latched: bytes) -> bytes:
         """The frame that tells a reader its column and the rings."""
@@ -148,11 +173,11 @@ class LargeSender:
         Returns:
             False if one could not within its time: it loses the message.
         """
-        timeout_s = max((r.timeout_s for r in self._strict_readers() if self._is_full(r, ring)), default=None)
-        if timeout_s is None:
+        full = [reader for reader, quota in self._strict if self._is_full(reader, quota, ring)]
+        if not full:
             return True
-        backoff = Backoff(timeout_s)
-        while any(self._is_full(reader, ring) for reader in self._strict_readers()):
+        backoff = Backoff(max(reader.timeout_s for reader in full))
+        while any(self._is_full(reader, quota, ring) for reader, quota in self._strict):
             self._outlets.lock.release()
             try:
                 more = backoff.wait()
@@ -188,23 +213,24 @@ class LargeSender:
         ring = slot.ring
         if ring is not None:
             mask = 0
-            for column, reader in self._columns.items():
-                if ring.has_room(column, self._quota(reader, ring)):
-                    mask |= 1 << column
+            for column, bit, quota in self._grants:
+                if ring.has_room(column, quota):
+                    mask |= bit
                 else:
                     passed_over = True
             ring.commit(slot.index, sequence, size, mask)
-            if self._columns:
+            if self._grants:
                 frame = self._slot_head + tail(ring.ring_id << 32 | slot.index) + MASK.pack(mask)
-                for outlet in {reader.outlet for reader in self._columns.values()}:
+                for outlet in self._slot_outlets:
                     if not outlet.strict:
-                        outlet.send(frame, zmq.DONTWAIT)
+                        outlet.send(frame, DONTWAIT)
                     elif not send_strict(outlet, frame, 0):
                         on_time = False
-        if self._inline or (ring is None and self._columns):
-            readers = self._inline if ring is not None else [*self._inline, *self._columns.values()]
-            for outlet in {reader.outlet for reader in readers}:
-                passed_over |= not self._send_large(outlet, slot, size, tail(0), send_strict)
+            outlets = self._inline_outlets
+        else:
+            outlets = list({*self._inline_outlets, *self._slot_outlets})
+        for outlet in outlets:
+            passed_over |= not self._send_large(outlet, slot, size, tail(0), send_strict)
         return on_time, passed_over
 
     def _send_large(
@@ -217,7 +243,7 @@ class LargeSender:
     ) -> bool:
         """Send header and body without a copy; False if too much waits to be sent already."""
         ring, body = slot.ring, slot.buffer[:size]
-        if ring is not None and self._pinned(ring) >= self._pin_quota(ring):
+        if ring is not None and self._pinned(ring) >= self._pin_quota:
             ring, body = None, body.copy()
         if ring is None:
             if self._private_bytes + size > max(PRIVATE_BYTES, 4 * size):
@@ -226,10 +252,10 @@ class LargeSender:
         head = self._large_head + tail
         on_time = True
         if outlet.strict:
-            on_time = send_strict(outlet, head, zmq.SNDMORE)
+            on_time = send_strict(outlet, head, SNDMORE)
         else:
-            outlet.send(head, zmq.DONTWAIT | zmq.SNDMORE)
-        tracker = outlet.send(memoryview(body), zmq.DONTWAIT, False, True)
+            outlet.send(head, DONTWAIT | SNDMORE)
+        tracker = outlet.send(memoryview(body), DONTWAIT, False, True)
         assert tracker is not None
         if ring is not None:
             ring.pin(slot.index)
@@ -237,7 +263,7 @@ class LargeSender:
         return on_time
 
     def prune(self) -> None:
-        """Let go of what the sockets have sent; the caller holds the lock."""
+        """Let go of what the sockets have sent, and of old rings; the caller holds the lock."""
         self._prune()
         while len(self._rings) > 1 and self._rings[0].idle:
             self._rings.pop(0).close()
@@ -252,25 +278,12 @@ class LargeSender:
             else:
                 self._private_bytes -= pin.size
 
-    def _strict_readers(self) -> list[Reader]:
-        return [r for r in [*self._columns.values(), *self._inline] if r.request.strict]
-
-    def _is_full(self, reader: Reader, ring: Ring | None) -> bool:
-        if reader.column is not None and ring is not None:
-            return not ring.has_room(reader.column, self._quota(reader, ring))
-        if ring is not None:
-            return self._pinned(ring) >= self._pin_quota(ring)
-        return self._private_bytes > PRIVATE_BYTES // 2
-
-    def _shares(self) -> int:
-        return max(1, len(self._columns) + bool(self._inline))
-
-    def _pin_quota(self, ring: Ring) -> int:
-        return max(1, (ring.slots - 1) // self._shares())
-
-    def _quota(self, reader: Reader, ring: Ring) -> int:
-        fair = self._pin_quota(ring)
-        return min(fair, reader.request.quota) if reader.request.quota else fair
+    def _is_full(self, reader: Reader, quota: int, ring: Ring | None) -> bool:
+        if ring is None:
+            return self._private_bytes > PRIVATE_BYTES // 2
+        if reader.column is not None:
+            return not ring.has_room(reader.column, quota)
+        return self._pinned(ring) >= self._pin_quota
 
     def _pinned(self, ring: Ring) -> int:
         return sum(pin.ring is ring for pin in self._pins)
@@ -278,11 +291,10 @@ class LargeSender:
     def _ring_for(self, size: int, sequence: int, *, exact: bool) -> Ring | None:
         if self._unavailable:
             return None
-        current = self._rings[-1] if self._rings else None
-        wanted = 2 * self._shares() + 2
-        page = mmap.PAGESIZE
+        current, wanted = self._ring, 2 * self._shares + 2
         if current is not None and current.slot_bytes >= size and current.slots >= wanted:
             return current
+        page = mmap.PAGESIZE
         slot_bytes = size if exact else size + size // 4
         if current is not None:
             slot_bytes = max(slot_bytes, current.slot_bytes)
@@ -303,10 +315,11 @@ class LargeSender:
         self._rings.append(ring)
         while len(self._rings) > RINGS_ALIVE:
             self._rings.pop(0).close()
+        self._plan()
         for reader in self._columns.values():
             frame = self.answer(reader, sequence, b"")
             if not reader.outlet.strict:
-                reader.outlet.send(frame, zmq.DONTWAIT)
+                reader.outlet.send(frame, DONTWAIT)
             elif not reader.outlet.try_send(frame):
                 reader.outlet.send_anyway(frame)
         return ring
@@ -316,3 +329,4 @@ class LargeSender:
         for ring in self._rings:
             ring.close()
         self._rings.clear()
+        self._plan()

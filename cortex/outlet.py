@@ -16,6 +16,8 @@ from cortex.wire import AttachKey, parse_attach_key
 
 logger = logging.getLogger(__name__)
 
+DONTWAIT, SNDMORE = int(zmq.DONTWAIT), int(zmq.SNDMORE)  # joined as enums they cost a microsecond
+
 
 class Attachable(Protocol):
     """What the outlets tell a publisher; called under the outlets' lock."""
@@ -49,7 +51,7 @@ class Outlet:
     def try_send(self, frame: bytes, flags: int = 0) -> bool:
         """Send one frame; False if a strict reader's queue is full."""
         try:
-            self.send(frame, zmq.DONTWAIT | flags)
+            self.send(frame, DONTWAIT | flags)
         except zmq.Again:
             return False
         return True
@@ -58,7 +60,7 @@ class Outlet:
         """Send one frame to all readers with room in their queues; the others lose it."""
         self.socket.setsockopt(zmq.XPUB_NODROP, 0)
         try:
-            self.send(frame, zmq.DONTWAIT | flags)
+            self.send(frame, DONTWAIT | flags)
         finally:
             self.socket.setsockopt(zmq.XPUB_NODROP, 1)
 
@@ -122,7 +124,7 @@ class Outlets:
         for outlet in self._outlets:
             while outlet.socket.get(zmq.EVENTS) & zmq.POLLIN:
                 try:
-                    event = outlet.socket.recv(zmq.DONTWAIT)
+                    event = outlet.socket.recv(DONTWAIT)
                 except zmq.Again:
                     break
                 self._handle(outlet, event)

@@ -15,7 +15,7 @@ import zmq
 
 from cortex.codec import Codec
 from cortex.large import LargeSender, Reader, Slot
-from cortex.outlet import Backoff, Outlet, Outlets
+from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
 from cortex.stats import PublisherCounters
 from cortex.wire import BATCH, LARGE, MESSAGE, RECORD, REST, TAIL, AttachKey, message_head, prefix
 
@@ -126,7 +126,7 @@ class Publisher(Generic[T]):
                 self._bytes += size
                 frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
                 for send in self._lossy_sends:
-                    send(frame, 1)  # DONTWAIT
+                    send(frame, DONTWAIT)
                 return self._send_strict_all(frame) if self._strict_outlets else True
         size = self.codec.size(message)
         stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
@@ -201,14 +201,14 @@ class Publisher(Generic[T]):
         if self.latch:
             self._latched = frame
         for send in self._lossy_sends:
-            send(frame, 1)  # DONTWAIT
+            send(frame, DONTWAIT)
         return self._send_strict_all(frame) if self._strict_outlets else True
 
     def _send_strict_all(self, frame: bytes) -> bool:
         on_time = True
         for outlet in self._strict_outlets:
             try:
-                outlet.send(frame, 1)  # DONTWAIT
+                outlet.send(frame, DONTWAIT)
             except zmq.Again:
                 on_time &= self._send_strict(outlet, frame, 0)
         return on_time
@@ -274,7 +274,7 @@ class Publisher(Generic[T]):
         self._batch_bytes = 0
         frame = self._batch_head + rest + records
         for send in self._lossy_sends:
-            send(frame, zmq.DONTWAIT)
+            send(frame, DONTWAIT)
         return self._send_strict_all(frame)
 
     def flush_old(self, now_ns: int) -> bool:
@@ -295,8 +295,9 @@ class Publisher(Generic[T]):
 
     def _acquire_slot(self, size: int) -> Slot | None:
         with self._lock:
-            self._prepare(monotonic_ns())
-            self._outlets.refresh()
+            now_ns = monotonic_ns()
+            if now_ns >= self._refresh_ns or self._blocked:
+                self._prepare(now_ns)
             slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
             if slot is None:
                 self._sequence += 1
@@ -306,16 +307,17 @@ class Publisher(Generic[T]):
     def _publish_slot(self, slot: Slot, size: int, stamp_ns: int) -> bool:
         """Send what was written into a slot; the large lock is held."""
         with self._lock:
-            self._prepare(monotonic_ns())
-            self._flush()
+            now_ns = monotonic_ns()
+            if now_ns >= self._refresh_ns or self._blocked:
+                self._prepare(now_ns)
+            if self._batch:
+                self._flush()
             self._blocked = True
             try:
                 on_time = self._large.await_strict(slot.ring)
                 self._check_open()
             finally:
                 self._blocked = False
-            self._outlets.refresh()
-            now_ns = monotonic_ns()
             sequence = self._sequence
             self._sequence = sequence + 1
             self._bytes += size
@@ -363,7 +365,7 @@ class Publisher(Generic[T]):
             if not outlet.try_send(answer):
                 outlet.send_anyway(answer)
         else:
-            outlet.send(answer, zmq.DONTWAIT)
+            outlet.send(answer, DONTWAIT)
 
     def detach(self, outlet: Outlet, request: AttachKey) -> None:
         """Let a reader go; called under the outlets' lock."""

@@ -205,8 +205,8 @@ class Subscriber(Generic[T]):
 
     def _take(self, *, whole: bool = False) -> Item | None:
         """The next item, or None if nothing is there now; a batch is taken apart unless wanted whole."""
-        queue = self._queue
         with self.lock:
+            queue = self._queue
             if self._closed:
                 raise Closed(f"the subscriber of {self.topic} is closed")
             if self._problems:
