@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cortex.checks import explain
 from cortex.decoder import Decoder, MalformedMessage
+from cortex.draft import Draft, Drafter
 from cortex.encoder import ENCODE_ERRORS, Encoder, Part, Tail, join, write
 from cortex.layout import has_tail, record_dtype
 from cortex.schema import schema_of
@@ -38,6 +39,7 @@ class Codec:
         for field in self.schema.fields:
             if field.name == "stamp_ns" and isinstance(field.type, str) and "int" in field.type:
                 self.stamp_of = attrgetter("stamp_ns")
+        self._drafter = Drafter(self.schema, message_type, self._encoder)
         self._decoder = Decoder(self.schema, message_type)
         self.decode = self._decoder.decode
 
@@ -65,7 +67,46 @@ class Codec:
         parts, tail = self._layout(message)
         if tail.end > len(buffer):
             raise ValueError(f"{self.schema.name}: body of {tail.end} bytes, the buffer has {len(buffer)}")
-        return write(parts + tail.parts, np.frombuffer(buffer, np.uint8))
+        write(parts + tail.parts, np.frombuffer(buffer, np.uint8))
+        return tail.end
+
+    def draft_size(
+        self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
+    ) -> int:
+        """Return how much memory `draft` needs [bytes]: what is known of the body, and 4 KiB for the rest.
+
+        Args:
+            dims: Sizes of named dimensions.
+            dtypes: For arrays of open dtype, the dtype by field name.
+
+        Raises:
+            ValueError: The type has no such dimension or array, or a size is out of range.
+        """
+        return self._drafter.size(dims, dtypes)
+
+    def draft(
+        self,
+        buffer: NDArray[np.uint8],
+        dims: Mapping[str, int] | None = None,
+        dtypes: Mapping[str, Any] | None = None,
+    ) -> Draft:
+        """Begin a message in writable memory; arrays whose size is known become views of it.
+
+        Args:
+            buffer: At least `draft_size` bytes; a larger one leaves more room for the other fields.
+            dims: As for `draft_size`.
+            dtypes: As for `draft_size`.
+        """
+        return self._drafter.draft(buffer, dims, dtypes)
+
+    def finish(self, draft: Draft) -> int:
+        """Complete a draft in its buffer and return the size of the body [bytes]. Its views become read-only.
+
+        Raises:
+            ValueError: A field without default is not set, or the fields that are no views do not fit.
+            TypeError: As `encode` does.
+        """
+        return self._drafter.finish(draft)
 
     def _layout(self, message: Any) -> tuple[list[Part], Tail]:
         try:

@@ -104,10 +104,10 @@ def join(parts: list[Part], tail: Tail) -> bytes:
     return b"".join(parts)  # type: ignore[arg-type]  # contiguous arrays are buffers
 
 
-def write(parts: list[Part], buffer: NDArray[np.uint8], position: int = 0) -> int:
-    """Copy parts into memory, arrays directly, and return where the last one ends."""
+def write(parts: list[Any], buffer: NDArray[np.uint8]) -> None:
+    """Copy parts into memory, arrays directly; an integer leaves as many bytes as they are."""
     small: list[bytes] = []
-    start = position
+    start = position = 0
     view = buffer.data
     for part in parts:
         if isinstance(part, bytes):
@@ -117,12 +117,14 @@ def write(parts: list[Part], buffer: NDArray[np.uint8], position: int = 0) -> in
         if small:
             view[start:position] = b"".join(small)
             small.clear()
+        if isinstance(part, int):
+            start = position = position + part
+            continue
         np.copyto(np.ndarray(part.shape, part.dtype, buffer, position), part)
         position += part.nbytes
         start = position
     if small:
         view[start:position] = b"".join(small)
-    return position
 
 
 def as_array(value: Any, dtype: np.dtype[Any] | None) -> NDArray[Any]:

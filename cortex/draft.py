@@ -1,0 +1,204 @@
+"""Messages that are written in place: their large arrays are views of the memory that will be sent."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortex.checks import explain
+from cortex.encoder import ENCODE_ERRORS, Encoder, Tail, shared_names, write
+from cortex.layout import (
+    DTYPE_CODES,
+    DTYPES,
+    LARGE_ARRAY_BYTES,
+    array_dtype,
+    measure_fields,
+)
+from cortex.schema import ArrayType, Schema
+from cortex.structure import new_message
+
+RESERVE_BYTES = 4096
+"""Room that a draft has for strings, lists and arrays of unknown size."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where a variable array of a draft lies."""
+
+    offset: int
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
+class Draft:
+    """A message being written, with one attribute for each field.
+
+    Fixed arrays, and variable ones whose dimensions were given, are writable views: `draft.data[:] = ...`.
+    Assigning to them copies into the view. Other fields are assigned as usual.
+    """
+
+    __slots__ = ("__buffer", "__places", "__values", "__views")
+
+    def __init__(self, buffer: NDArray[np.uint8], names: tuple[str, ...], places: dict[str, _Place]) -> None:
+        hidden = {"buffer": buffer, "places": places, "values": dict.fromkeys(names, _UNSET), "views": {}}
+        for key, value in hidden.items():
+            object.__setattr__(self, f"_Draft__{key}", value)
+
+    def __getattr__(self, name: str) -> Any:
+        value = self.__views.get(name, self.__values.get(name, _UNSET))
+        if value is _UNSET:
+            known = "is not set yet" if name in self.__values else f"is none of {', '.join(self.__values)}"
+            raise AttributeError(f"field {name} {known}")
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in self.__views:
+            view = self.__views[name]
+            if np.shape(value) != view.shape:
+                raise ValueError(f"{name}: shape {list(np.shape(value))}, expected {list(view.shape)}")
+            np.copyto(view, value, casting="equiv")
+        elif name in self.__values:
+            self.__values[name] = value
+        else:
+            raise AttributeError(f"field {name} is none of {', '.join(self.__values)}")
+
+
+_UNSET: Any = object()
+
+
+class Drafter:
+    """Makes and finishes the drafts of one type."""
+
+    def __init__(self, schema: Schema, cls: type, encoder: Encoder) -> None:
+        self._schema = schema
+        self._cls = cls
+        self._encoder = encoder
+        self._names = tuple(field.name for field in schema.fields)
+        self._shared = shared_names([field.type for field in schema.fields])
+        offsets = measure_fields(schema)[0]
+        arrays = [
+            (field.name, field.type, offset)
+            for field, offset in zip(schema.fields, offsets, strict=True)
+            if isinstance(field.type, ArrayType)
+        ]
+        self._fixed = [(name, kind, offset) for name, kind, offset in arrays if kind.is_fixed]
+        self._variable = [(name, kind) for name, kind, _ in arrays if not kind.is_fixed]
+        self._defaults = {field.name: field for field in dataclasses.fields(cls)}
+
+    def size(self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None) -> int:
+        """Return how much memory a draft needs [bytes]."""
+        _, tail = self._place(dims, dtypes)
+        return tail.end + RESERVE_BYTES
+
+    def draft(
+        self, buffer: NDArray[np.uint8], dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
+    ) -> Draft:
+        """Return a draft in writable memory."""
+        places, tail = self._place(dims, dtypes)
+        if tail.end > len(buffer):
+            raise ValueError(f"{self._schema.name}: draft of {tail.end} bytes, the buffer has {len(buffer)}")
+        draft = Draft(buffer, self._names, places)
+        views = draft._Draft__views
+        for name, kind, offset in self._fixed:
+            views[name] = np.ndarray(kind.shape, array_dtype(kind), buffer, offset)  # type: ignore[arg-type]
+        for name, place in places.items():
+            views[name] = np.ndarray(place.shape, place.dtype, buffer, place.offset)
+        return draft
+
+    def finish(self, draft: Draft) -> int:
+        """Write what is not yet in its place and return the size of the body; the views become read-only."""
+        buffer, places = draft._Draft__buffer, draft._Draft__places
+        views = draft._Draft__views
+        message: Any = new_message(self._cls, [self._value_of(draft, name) for name in self._names])
+        try:
+            parts, tail = self._layout(message, places)
+        except ENCODE_ERRORS as error:
+            raise explain(self._schema, self._cls, message, error) from error
+        if tail.end > len(buffer):
+            raise ValueError(
+                f"{self._schema.name}: the fields {self._unplaced(places)} need {tail.end - len(buffer)} bytes "
+                f"more than the {RESERVE_BYTES} in reserve; give the dimensions of arrays to the loan, or "
+                "publish the message without one"
+            )
+        in_place = {id(view) for view in views.values()}
+        write([part.nbytes if id(part) in in_place else part for part in parts + tail.parts], buffer)
+        for view in views.values():
+            view.flags.writeable = False
+        return tail.end
+
+    def _layout(self, message: Any, places: dict[str, _Place]) -> tuple[list[Any], Tail]:
+        values: list[Any] = []
+        tail = Tail(self._encoder.block)
+        for place in places.values():
+            _reserve(tail, place.shape, place.dtype)
+        scope: dict[str, int] = {}
+        for name, put in zip(self._names, self._encoder.put_fields, strict=True):
+            if name not in places:
+                put(getattr(message, name), values, tail, scope)
+                continue
+            place = places[name]
+            kind = dict(self._variable)[name]
+            for size, dimension in zip(place.shape, kind.shape, strict=True):
+                if dimension in self._shared and scope.setdefault(str(dimension), size) != size:
+                    raise ValueError
+            values += (place.offset, len(place.shape) << 8 | DTYPES.index(place.dtype), *place.shape)
+        return self._encoder.finish(values, tail), tail
+
+    def _value_of(self, draft: Draft, name: str) -> Any:
+        views, values = draft._Draft__views, draft._Draft__values
+        value = views.get(name, values[name])
+        if value is not _UNSET:
+            return value
+        field = self._defaults[name]
+        if field.default is not dataclasses.MISSING:
+            return field.default
+        if field.default_factory is not dataclasses.MISSING:
+            return field.default_factory()
+        raise ValueError(f"{self._schema.name}.{name} was not set and has no default")
+
+    def _unplaced(self, places: dict[str, _Place]) -> list[str]:
+        fixed = {name for name, _, _ in self._fixed}
+        return [name for name in self._names if name not in places and name not in fixed]
+
+    def _place(
+        self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
+    ) -> tuple[dict[str, _Place], Tail]:
+        dims, dtypes = dims or {}, dtypes or {}
+        self._check_arguments(dims, dtypes)
+        tail = Tail(self._encoder.block)
+        places = {}
+        for name, kind in self._variable:
+            shape = [dims.get(size) if isinstance(size, str) else size for size in kind.shape]
+            dtype = dtypes.get(name) if kind.dtype == "any" else array_dtype(kind)
+            if dtype is None or None in shape:
+                continue
+            known = tuple(int(size) for size in shape if size is not None)
+            places[name] = _Place(_reserve(tail, known, np.dtype(dtype)), known, np.dtype(dtype))
+        return places, tail
+
+    def _check_arguments(self, dims: Mapping[str, int], dtypes: Mapping[str, Any]) -> None:
+        names = {size for _, kind in self._variable for size in kind.shape if isinstance(size, str)}
+        for name, size in dims.items():
+            if name not in names:
+                raise ValueError(
+                    f"{self._schema.name} has no dimension {name}, its arrays have {sorted(names)}"
+                )
+            if not 0 <= size < 2**32:
+                raise ValueError(f"dimension {name} is {size}, allowed are 0 to 2^32 - 1")
+        for name, dtype in dtypes.items():
+            if name not in {field for field, kind in self._variable if kind.dtype == "any"}:
+                raise ValueError(f"{self._schema.name} has no array {name} of open dtype")
+            if np.dtype(dtype) not in DTYPES:
+                raise ValueError(f"{name}: dtype {dtype} is none of {', '.join(DTYPE_CODES)}")
+
+
+def _reserve(tail: Tail, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Keep room in the tail for an array that is written in place, and return its offset."""
+    size = dtype.itemsize
+    for dimension in shape:
+        size *= dimension
+    return tail.add(size, size, 63 if size >= LARGE_ARRAY_BYTES else 7) if size else 0
