@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cortex.codec import MalformedMessage
+    from cortex.context import Closed
     from cortex.message import (
         Array,
         Float32,
@@ -30,11 +31,11 @@ if TYPE_CHECKING:
     from cortex.publisher import Publisher
     from cortex.schema import TypeMismatch
     from cortex.service import ServiceFailed, ServiceTimeout, ServiceUnavailable
-    from cortex.subscriber import Closed, Info, Subscriber
+    from cortex.subscriber import Info, Subscriber
 
 _HOME = {
     "Array": "message",
-    "Closed": "subscriber",
+    "Closed": "context",
     "Float32": "message",
     "Float64": "message",
     "Info": "subscriber",

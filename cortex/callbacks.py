@@ -1,7 +1,7 @@
-"""The node's callback thread: it runs the callbacks of subscribers and the handlers of services, nothing else.
+"""The node's callback thread: it runs the callbacks of subscribers and the handlers of services.
 
-A callback that takes long delays other callbacks of its node, but neither heartbeats nor discovery, which have a
-thread of their own.
+A callback that takes long delays other callbacks of its node, but neither heartbeats nor discovery, which have
+a thread of their own.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class CallbackThread:
         self._wakeup.set()
 
     def remove(self, subscriber: Subscriber[Any]) -> None:
-        """Run it no more; if called from another thread, no call is under way afterwards unless it takes over 1 s."""
+        """Run it no more; a call that is under way still ends."""
         with self._lock:
             if subscriber in self._subscribers:
                 self._subscribers.remove(subscriber)

@@ -18,6 +18,10 @@ HEARTBEAT_MS = 500
 MAX_SOCKETS = 8192
 
 
+class Closed(RuntimeError):
+    """The publisher, subscriber or node was closed."""
+
+
 def context() -> zmq.Context[zmq.Socket[bytes]]:
     """The one context of this process: peers in one process meet over inproc. A forked child gets its own."""
     global _context, _owner

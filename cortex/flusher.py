@@ -6,7 +6,8 @@ import threading
 import time
 from typing import Any
 
-from cortex.publisher import BATCH_NS, Closed, Publisher
+from cortex.context import Closed
+from cortex.publisher import BATCH_NS, Publisher
 
 
 class Flusher:

@@ -255,7 +255,7 @@ class LargeSender:
             on_time = send_strict(outlet, head, SNDMORE)
         else:
             outlet.send(head, DONTWAIT | SNDMORE)
-        tracker = outlet.send(memoryview(body), DONTWAIT, False, True)
+        tracker = outlet.send(body.data, DONTWAIT, False, True)
         assert tracker is not None
         if ring is not None:
             ring.pin(slot.index)

@@ -45,8 +45,8 @@ WHOLE_BATCH = -1
 class Item(NamedTuple):
     """A message that has arrived and waits: where its body is.
 
-    A leased slot is the buffer itself, so that dropping the item gives the slot back. An offset of `WHOLE_BATCH`
-    marks a batch that was not taken apart; its size is then the number of messages.
+    A leased slot is the buffer itself, so that dropping the item gives the slot back. An offset of
+    `WHOLE_BATCH` marks a batch that was not taken apart; its size is then the number of messages.
     """
 
     link: Link
@@ -110,7 +110,7 @@ class Link:
         try:
             if secure is not None:
                 secure(self.socket)
-            self.fd: int = self.socket.get(zmq.FD)
+            self.fd = int(self.socket.get(zmq.FD))
             self.socket.connect(address)
             for head in (self._message_prefix, *list(self._handlers)[:3]):
                 if head != self._slot_head or shared_memory:
@@ -206,7 +206,7 @@ class Link:
             if self._large_subscribed or sequence < self.expected:
                 return []  # it comes, or came, as a large message
             if view is None or self._policy.reliable:
-                # Left out on purpose: the publisher held us to our share. The gap is counted with the next one.
+                # Left out on purpose: the publisher held us to our share. The next one shows the gap.
                 return []
             self.advance(sequence)
             return [Item(self, None, 0, size, sequence, stamp_ns, publish_ns, (view, slot))]
@@ -301,7 +301,7 @@ class Link:
     def close(self) -> None:
         """Disconnect. Messages that the user still holds stay valid.
 
-        The end of the socket tells the publisher that it may write to our slots again, so the rings close first.
+        The end of the socket tells the publisher that it may write to our slots again: the rings close first.
         """
         for ring in self._rings.values():
             ring.close()

@@ -21,7 +21,7 @@ import zmq
 
 from cortex.callbacks import CallbackThread
 from cortex.codec import MalformedMessage, codec_of
-from cortex.context import context
+from cortex.context import Closed, context
 from cortex.discovery import Directory
 from cortex.flusher import Flusher
 from cortex.host import domain_id, host_id
@@ -29,7 +29,7 @@ from cortex.link import Link
 from cortex.outlet import Outlets
 from cortex.places import Places, clock_offset_ns, reach
 from cortex.policy import Policy, keep_last
-from cortex.publisher import INLINE_MAX, Closed, Publisher
+from cortex.publisher import INLINE_MAX, Publisher
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import (
     NodeRecord,
@@ -41,7 +41,7 @@ from cortex.records import (
     SubscriberRecord,
     SubscriberStats,
 )
-from cortex.registry import control_types
+from cortex.control import control_types
 from cortex.schema import Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
 from cortex.security import Keys
 from cortex.service import Client, Place, Server, Service, service_number
@@ -57,8 +57,8 @@ T = TypeVar("T")
 Request = TypeVar("Request")
 Reply = TypeVar("Reply")
 
-TICK_S = 0.02
-TICK_BUSY_S = 0.002
+TICK_MS = 20
+TICK_BUSY_MS = 2
 BUSY_NS = 300_000_000
 """For so long after a change ticks are short, so that new peers meet quickly."""
 CLOCK_STEP_NS = 5_000_000
@@ -298,7 +298,7 @@ class Node:
         with place.open() as socket:
             socket.send(control_frame(StatsRequest(self.id)), zmq.DONTWAIT)
             while (left_s := deadline_s - time.monotonic()) > 0.0:
-                if socket.poll(left_s * 1000.0):
+                if socket.poll(max(1, int(left_s * 1000.0))):
                     with contextlib.suppress(MalformedMessage):
                         reply, _ = parse_control(socket.recv(zmq.DONTWAIT), types)
                         return cast(StatsReply, reply)
@@ -576,7 +576,7 @@ class Node:
         for socket in (*routers, *sockets):
             poller.register(socket, zmq.POLLIN)
         busy = time.monotonic_ns() < self._busy_until_ns
-        ready = dict(poller.poll((TICK_BUSY_S if busy else TICK_S) * 1000.0))
+        ready = dict(poller.poll(TICK_BUSY_MS if busy else TICK_MS))
         if self._wakeup.fd in ready:
             self._wakeup.clear()
         for socket in routers:

@@ -35,8 +35,8 @@ class Attachable(Protocol):
 class Outlet:
     """One XPUB socket.
 
-    A strict outlet refuses a message for which some reader's queue is full (back-pressure); a lossy one drops it
-    for that reader, which sees the gap in the sequence.
+    A strict outlet refuses a message for which some reader's queue is full (back-pressure); a lossy one drops
+    it for that reader, which sees the gap in the sequence.
     """
 
     socket: zmq.Socket[bytes]
@@ -122,7 +122,7 @@ class Outlets:
     def refresh(self) -> None:
         """Read who has come and gone; the caller holds the lock."""
         for outlet in self._outlets:
-            while outlet.socket.get(zmq.EVENTS) & zmq.POLLIN:
+            while int(outlet.socket.get(zmq.EVENTS)) & zmq.POLLIN:
                 try:
                     event = outlet.socket.recv(DONTWAIT)
                 except zmq.Again:

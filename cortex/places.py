@@ -26,7 +26,7 @@ def clock_offset_ns() -> int:
 
 
 class Places:
-    """The sockets by which a node is reached: two XPUB and a ROUTER on this host, and again on tcp if it listens.
+    """The sockets by which a node is reached: two XPUB and a ROUTER on this host, and on tcp if it listens.
 
     Args:
         domain: The node's domain.
@@ -88,7 +88,7 @@ class Places:
         seen = listen if listen not in ("0.0.0.0", "::", "*") else _outward_address()
 
         def reachable(socket: zmq.Socket[bytes]) -> str:
-            port = socket.last_endpoint.decode().rstrip("\0").rpartition(":")[2]
+            port = bytes(socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0").rpartition(":")[2]
             return f"tcp://{_bracket(seen)}:{port}"
 
         self.endpoints.append(
@@ -185,7 +185,7 @@ def _bracket(host: str) -> str:
 
 
 def _outward_address() -> str:
-    """This host's address on the network: that of the interface by which packets would leave. Sends nothing."""
+    """This host's address on the network: that of the interface packets would leave by. Sends nothing."""
     with sockets.socket(sockets.AF_INET, sockets.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

@@ -14,7 +14,7 @@ class Policy:
     reliable: bool
     """Whether a full queue holds up the publisher; otherwise the oldest message gives way and is counted."""
     timeout_s: float
-    """Longest time that a full queue holds up one `publish` [s]; then the message is lost here, and counted."""
+    """Longest time that a full queue holds up one `publish` [s]; then the message is lost, and counted."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.depth <= 65_536:
@@ -41,7 +41,7 @@ def latest() -> Policy:
 def reliable(depth: int = 64, timeout_s: float = 1.0) -> Policy:
     """Every message: a full queue holds up the publisher, at most `timeout_s` for one message.
 
-    After that the message is lost for this subscriber, counted on both sides, and the publisher goes on. Besides
-    `depth` messages in the subscriber, the sockets between the two hold a bounded number more.
+    After that the message is lost for this subscriber, counted on both sides, and the publisher goes on.
+    Besides `depth` messages in the subscriber, the sockets between the two hold a bounded number more.
     """
     return Policy(depth=depth, reliable=True, timeout_s=timeout_s)

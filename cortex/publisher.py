@@ -14,6 +14,7 @@ import numpy as np
 import zmq
 
 from cortex.codec import Codec
+from cortex.context import Closed
 from cortex.large import LargeSender, Reader, Slot
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
 from cortex.stats import PublisherCounters
@@ -35,10 +36,6 @@ BATCH_NS = 150_000
 """Longest time that a message of a burst waits for others."""
 BATCH_COUNT = 64
 BATCH_BYTES = 128 * 1024
-
-
-class Closed(RuntimeError):
-    """The publisher, subscriber or node was closed."""
 
 
 class Publisher(Generic[T]):
@@ -242,7 +239,7 @@ class Publisher(Generic[T]):
         return True
 
     def _collect(self, body: bytes, size: int, stamp_ns: int, now_ns: int) -> bool:
-        """Add a message of a burst to the batch, and send the batch when it is full or old; the lock is held."""
+        """Add a message of a burst to the batch, and send that when it is full or old; the lock is held."""
         if not self._batch:
             self._batch_sequence = self._sequence
             self._batch_start_ns = now_ns

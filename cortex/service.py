@@ -195,7 +195,7 @@ class Client(Generic[Request, Reply]):
 
         Args:
             request: What to ask.
-            timeout_s: Time for everything: finding the server, the call, waiting for another thread's call [s].
+            timeout_s: Time for everything: finding the server, other threads' calls, the call [s].
 
         Raises:
             ServiceTimeout: The server did not reply in time; whether it has acted is not known.
@@ -261,7 +261,7 @@ class Client(Generic[Request, Reply]):
             if left_s <= 0.0:
                 self._disconnect()  # a reply that comes late finds nobody
                 raise ServiceTimeout(f"{self.name}: no reply within {timeout_s} s")
-            if not socket.poll(min(left_s, 0.05) * 1000.0):
+            if not socket.poll(max(1, int(min(left_s, 0.05) * 1000.0))):
                 now = self._find()
                 if now is None or now.node != place.node:
                     self._disconnect()

@@ -1,7 +1,8 @@
 """Subscribing: a bounded queue per subscriber, read by a callback, a blocking iterator or asyncio.
 
 What each costs, measured with `cortex bench receive`: the three share one path, which reads the socket where
-the message is wanted; there is no thread between socket and user. A callback runs on the node's callback thread.
+the message is wanted; there is no thread between socket and user. A callback runs on the node's callback
+thread.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ import numpy as np
 import zmq
 
 from cortex.codec import Codec, MalformedMessage
+from cortex.context import Closed
 from cortex.link import WHOLE_BATCH, Item, Link
 from cortex.policy import Policy
-from cortex.publisher import Closed
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import BUCKETS, SubscriberCounters
 from cortex.wakeup import Wakeup
@@ -101,11 +102,13 @@ class Subscriber(Generic[T]):
             TypeMismatch: A publisher of this topic sends another type; raised once for each.
             Closed: The subscriber was closed.
         """
-        return self._receive(timeout_s, self._decode)
+        message: T = self._receive(timeout_s, self._decode)
+        return message
 
     def recv_with_info(self, timeout_s: float | None = None) -> tuple[T, Info]:
         """Take the next message, and what is known of it; see `recv`."""
-        return self._receive(timeout_s, lambda item: (self._decode(item), self._info(item)))
+        pair: tuple[T, Info] = self._receive(timeout_s, lambda item: (self._decode(item), self._info(item)))
+        return pair
 
     def recv_raw(self, timeout_s: float | None = None) -> tuple[Info, bytes | np.ndarray, Schema]:
         """Take the next message as the bytes of its body, with its structure; see `recv`."""
@@ -118,7 +121,8 @@ class Subscriber(Generic[T]):
                 item.link.schema(),
             )
 
-        return self._receive(timeout_s, raw)
+        found: tuple[Info, bytes | np.ndarray, Schema] = self._receive(timeout_s, raw)
+        return found
 
     def recv_batch(self, timeout_s: float | None = None) -> np.ndarray:
         """Take all messages that are there, at least one, as a structured array; for types of a fixed size.
@@ -136,7 +140,8 @@ class Subscriber(Generic[T]):
         with self.lock:
             for link in self._links:
                 link.whole_batches = True
-        return self._receive(timeout_s, self._join, whole=True)
+        records: np.ndarray = self._receive(timeout_s, self._join, whole=True)
+        return records
 
     def __iter__(self) -> Iterator[T]:
         """Messages as they come, until the subscriber is closed."""
@@ -275,8 +280,11 @@ class Subscriber(Generic[T]):
             stride = RECORD.size + fixed + (-fixed % 8)
             with self.lock:
                 self.counters.received += item.size - 1
-            return np.ndarray((item.size,), dtype, item.buffer, HEADER_SIZE + RECORD.size, (stride,))
-        bodies = [self._buffer(item)[item.offset : item.offset + item.size]]
+            records: np.ndarray = np.ndarray(
+                (item.size,), dtype, item.buffer, HEADER_SIZE + RECORD.size, (stride,)
+            )
+            return records
+        bodies: list[Any] = [self._buffer(item)[item.offset : item.offset + item.size]]
         with self.lock:
             while self._queue and self._queue[0].offset != WHOLE_BATCH and self._queue[0].buffer is not None:
                 more = self._queue.popleft()
@@ -381,7 +389,7 @@ class Subscriber(Generic[T]):
         return messages
 
     def _time(self, publish_ns: int, link: Link) -> None:
-        """Add to the histogram; of plain messages the first of a wake-up and every eighth: all would cost 10 %."""
+        """Add to the histogram: of plain messages the first of a wake-up and every eighth (all cost 10 %)."""
         latency_ns = monotonic_ns() - publish_ns - link.clock_offset_ns
         self.counters.latency[min(max(latency_ns, 0).bit_length(), BUCKETS - 1)] += 1
 
