@@ -1,7 +1,7 @@
 """The node's callback thread: it runs the callbacks of subscribers and the handlers of services.
 
-A callback that takes long delays other callbacks of its node, but neither heartbeats nor discovery, which have
-a thread of their own.
+A callback that takes long delays other callbacks of its node, but neither heartbeats nor discovery, which
+have a thread of their own.
 """
 
 from __future__ import annotations

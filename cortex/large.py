@@ -1,4 +1,4 @@
-"""Large messages of one publisher: written once into a slot, read there by local readers, sent to the others."""
+"""Large messages of one publisher: written once into a slot, read there by local readers, sent to others."""
 
 from __future__ import annotations
 

@@ -22,6 +22,7 @@ import zmq
 from cortex.callbacks import CallbackThread
 from cortex.codec import MalformedMessage, codec_of
 from cortex.context import Closed, context
+from cortex.control import control_types
 from cortex.discovery import Directory
 from cortex.flusher import Flusher
 from cortex.host import domain_id, host_id
@@ -41,7 +42,6 @@ from cortex.records import (
     SubscriberRecord,
     SubscriberStats,
 )
-from cortex.control import control_types
 from cortex.schema import Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
 from cortex.security import Keys
 from cortex.service import Client, Place, Server, Service, service_number

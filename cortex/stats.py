@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 BUCKETS = 40
-"""Bucket k counts latencies in [2^(k-1), 2^k) ns; bucket 0 those below 1 ns, the last all over 4.6 minutes."""
+"""Bucket k counts latencies in [2^(k-1), 2^k) ns; bucket 0 those below 1 ns, the last all over 9 minutes."""
 
 
 @dataclass(slots=True)

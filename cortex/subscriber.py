@@ -340,8 +340,8 @@ class Subscriber(Generic[T]):
     def _drain_decoded(self) -> list[T]:
         """As `_drain`, for an empty queue that cannot overflow: plain messages are decoded on the spot.
 
-        This is where a stream of small messages spends its time. A message of another kind goes to the queue, and
-        what follows it waits in the socket, so that the order is kept.
+        This is where a stream of small messages spends its time. A message of another kind goes to the queue,
+        and what follows it waits in the socket, so that the order is kept.
         """
         messages: list[T] = []
         take = messages.append
