@@ -119,25 +119,18 @@ class Ring:
                     slot = 0
                 if self._busy[slot]:
                     continue
-                columns = self._granted[slot]
-                if columns:
-                    row = self._rows[slot]
-                    for column in columns:
-                        if row[column]:
-                            break
-                    else:
-                        for column in columns:
-                            self._held[column].discard(slot)
-                        columns = self._granted[slot] = ()
-                    if columns:
-                        continue
-                self._last = slot
-                self._busy[slot] = 1
-                state = self._state[slot] = self._state[slot] + 1
-                self._headers[slot * HEADER_WORDS] = state
-                if not STORES_IN_ORDER:
-                    fence()
-                return slot
+                row = self._rows[slot]
+                for column in self._granted[slot]:
+                    if row[column]:
+                        break
+                else:
+                    self._last = slot
+                    self._busy[slot] = 1
+                    state = self._state[slot] = self._state[slot] + 1
+                    self._headers[slot * HEADER_WORDS] = state
+                    if not STORES_IN_ORDER:
+                        fence()
+                    return slot
         return -1
 
     def buffer(self, slot: int) -> Bytes:
@@ -173,17 +166,15 @@ class Ring:
                 for column in columns:
                     row[column] = 1
                     held[column].add(slot)
-                self._granted[slot] = columns
+            self._granted[slot] = columns
             self._busy[slot] -= 1
 
     def abandon(self, slot: int) -> None:
         """Give back a slot from `acquire` that will not be committed, as when a message cannot be encoded."""
         with self._lock:
             state = self._writing(slot)
-            self._headers[slot * HEADER_WORDS + _SEQUENCE] = (
-                _NO_SEQUENCE  # what was there is overwritten in part
-            )
-            self._headers[slot * HEADER_WORDS + _SIZE] = 0
+            # What was there is overwritten in part: nobody may copy it.
+            self._headers[slot * HEADER_WORDS + _SEQUENCE] = _NO_SEQUENCE
             if not STORES_IN_ORDER:
                 fence()
             self._headers[slot * HEADER_WORDS] = self._state[slot] = state + 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import logging
 import mmap
@@ -253,6 +254,17 @@ def test_more_than_there_is():
     """16 TiB: refused before the kernel would have to find them."""
     with pytest.raises(ShmUnavailable, match="are available"):
         Ring(1, 0, slots=4096, slot_bytes=2**32)
+
+
+def test_pages_that_are_missing_are_noticed_at_once(monkeypatch: pytest.MonkeyPatch):
+    def full(fd: int, offset: int, size: int) -> None:
+        assert (offset, size) == (0, os.fstat(fd).st_size)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(ShmUnavailable, match="No space left") as caught:
+        Ring(1, 0, slots=4, slot_bytes=4096)
+    assert caught.value.errno == errno.ENOSPC
 
 
 @pytest.mark.parametrize(
