@@ -35,7 +35,7 @@ def make_control_socket(context: zmq.Context[Any], kind: int, *, tcp: bool) -> z
     socket.setsockopt(zmq.RECONNECT_IVL, 20)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, 0 if not tcp else 500)
     if tcp:
-        socket.setsockopt(zmq.IPV6, 1)
+        socket.ipv6 = kind == zmq.DEALER  # who binds decides by its address
         socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 4 * HEARTBEAT_MS)
         socket.setsockopt(zmq.HEARTBEAT_TTL, 4 * HEARTBEAT_MS)

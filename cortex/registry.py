@@ -14,6 +14,7 @@ confirmed within one lease.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import logging
 import os
 import secrets
@@ -136,10 +137,14 @@ class Registry:
         self._bytes = 0
         self._logged: set[object] = set()
         self._stopping = False
-        taken = lock or FileLock.acquire(self._directory / REGISTRY_LOCK)
+        path = self._directory / REGISTRY_LOCK
+        taken = lock or FileLock.acquire(path)
         if taken is None:
-            raise RegistryRunning(f"a registry already serves domain {domain} in {self._directory}")
+            who = path.read_text(encoding="ascii", errors="replace").strip() or "being started"
+            raise RegistryRunning(f"a registry (process {who}) serves domain {domain} in {self._directory}")
         self._lock = taken
+        os.ftruncate(taken.descriptor, 0)
+        os.pwrite(taken.descriptor, f"{os.getpid()}\n".encode(), 0)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._authenticator: Authenticator | None = None
         self._sockets: list[zmq.Socket[Any]] = []
@@ -162,6 +167,7 @@ class Registry:
         if listen is not None:
             remote = make_control_socket(self._context, zmq.ROUTER, tcp=True)
             self._sockets.append(remote)
+            remote.ipv6 = "[" in listen  # else the address would read [::ffff:127.0.0.1]
             if keys is not None:
                 self._authenticator = Authenticator.acquire(self._context)
                 apply_server(remote, keys)
@@ -206,9 +212,9 @@ class Registry:
             socket.close()
         if self._authenticator is not None:
             self._authenticator.release()
-        # libzmq removes the socket's path in its own thread: only `term` says that it has, and the path must
-        # not vanish under the registry that gets the lock next.
-        self._context.term()
+        self._context.term()  # from here on nothing of ours can touch the path, which the next registry makes
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(self._directory / REGISTRY_SOCKET)
         self._lock.close()
 
     def _drain(self, socket: zmq.Socket[Any], now_ns: int) -> None:
@@ -404,9 +410,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: registry.stop())
-    logger.info(
-        "registry of domain %d serves%s", domain, f", also on {registry.address}" if registry.address else ""
-    )
+    logger.info("the registry of domain %d serves, on tcp: %s", domain, registry.address)
     try:
         registry.run()
     finally:

@@ -215,18 +215,14 @@ class Authenticator:
         self._users = 0
         self._domains: dict[str, Keys] = {}
         self._logged: set[bytes] = set()
-        self._stop = _plain_socket(context, zmq.PAIR)
-        stopped = _plain_socket(context, zmq.PAIR)
-        zap = _plain_socket(context, zmq.REP)
+        zap: zmq.Socket[Any] = context.socket(zmq.REP, socket_class=zmq.Socket)
+        zap.linger = 0
         try:
-            address = f"inproc://cortex.zap.{id(self):x}"
-            self._stop.bind(address)
-            stopped.connect(address)
             _bind_zap(zap)
         except zmq.ZMQError:
-            for socket in (self._stop, stopped, zap):
-                socket.close()
+            zap.close()
             raise
+        stopped, self._stop = os.pipe()
         self._thread = threading.Thread(target=self._run, args=(zap, stopped), name="cortex-zap", daemon=True)
         self._thread.start()
 
@@ -262,10 +258,10 @@ class Authenticator:
             for context, running in list(self._running.items()):
                 if running is self:
                     del self._running[context]
-            with contextlib.suppress(zmq.ZMQError):  # the context may be gone, and the thread with it
-                self._stop.send(b"", zmq.NOBLOCK)
+            with contextlib.suppress(BrokenPipeError):  # the context may be gone, and the thread with it
+                os.write(self._stop, b"\0")
             self._thread.join(timeout=5.0)
-            self._stop.close()
+            os.close(self._stop)
 
     def domain_of(self, keys: Keys) -> str:
         """Return the ZAP domain in which these keys decide."""
@@ -277,7 +273,7 @@ class Authenticator:
             self._domains[domain] = keys
             return domain
 
-    def _run(self, zap: zmq.Socket[Any], stopped: zmq.Socket[Any]) -> None:
+    def _run(self, zap: zmq.Socket[Any], stopped: int) -> None:
         poller = zmq.Poller()
         poller.register(zap, zmq.POLLIN)
         poller.register(stopped, zmq.POLLIN)
@@ -292,7 +288,7 @@ class Authenticator:
             pass
         finally:
             zap.close()
-            stopped.close()
+            os.close(stopped)
 
     def _decide(self, request: list[bytes]) -> list[bytes]:
         version, number, domain, address, _, mechanism, *credentials = request + [b""] * (6 - len(request))
@@ -313,12 +309,6 @@ class Authenticator:
             if allowed:
                 return [b"1.0", number, b"200", b"OK", key, b""]
         return [b"1.0", number, b"400", b"not authorised", b"", b""]
-
-
-def _plain_socket(context: zmq.Context[Any], kind: int) -> zmq.Socket[Any]:
-    socket: zmq.Socket[Any] = context.socket(kind, socket_class=zmq.Socket)
-    socket.linger = 0
-    return socket
 
 
 def _bind_zap(socket: zmq.Socket[Any]) -> None:

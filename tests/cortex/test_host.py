@@ -1,0 +1,235 @@
+"""The runtime directory and the files of nodes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cortex.host import (
+    SOCKET_PATH_MAX,
+    FileLock,
+    NodeFiles,
+    domain_id,
+    host_id,
+    runtime_base,
+    runtime_dir,
+    sweep,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def base(tmp_path, monkeypatch):
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path / "run"))
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize(("text", "expected"), [(None, 0), ("0", 0), ("232", 232), ("007", 7)])
+def test_domain_comes_from_the_environment(monkeypatch, text, expected):
+    monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
+    if text is not None:
+        monkeypatch.setenv("CORTEX_DOMAIN", text)
+    assert domain_id() == expected
+    assert domain_id(5) == 5
+
+
+@pytest.mark.parametrize("text", ["", "-1", "233", "1.0", "x", "²"])
+def test_a_wrong_domain_is_refused_by_name(monkeypatch, text):
+    monkeypatch.setenv("CORTEX_DOMAIN", text)
+    with pytest.raises(ValueError, match="CORTEX_DOMAIN must be an integer from 0 to 232"):
+        domain_id()
+
+
+@pytest.mark.parametrize("domain", [-1, 233, True, 1.0])
+def test_a_wrong_domain_argument_is_refused(domain):
+    with pytest.raises(ValueError, match="domain must be"):
+        domain_id(domain)
+
+
+def test_runtime_directory_is_private(base):
+    old = os.umask(0)
+    try:
+        directory = runtime_dir(3)
+    finally:
+        os.umask(old)
+    assert directory == base / "3"
+    assert (base.stat().st_mode & 0o777, directory.stat().st_mode & 0o777) == (0o700, 0o700)
+
+
+def test_runtime_base_prefers_the_session_if_it_is_ours(monkeypatch, tmp_path):
+    monkeypatch.delenv("CORTEX_RUNTIME_DIR")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert runtime_base() == tmp_path / "cortex"
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "absent"))
+    assert runtime_base() == Path(f"/tmp/cortex-{os.getuid()}")
+
+
+def test_a_directory_that_others_may_enter_is_refused(base):
+    base.mkdir(mode=0o700)
+    (base / "0").mkdir()
+    (base / "0").chmod(0o750)
+    with pytest.raises(PermissionError, match="0750"):
+        runtime_dir(0)
+
+
+def test_a_link_is_refused(base, tmp_path):
+    base.mkdir(mode=0o700)
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    (base / "0").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(PermissionError, match="not a link"):
+        runtime_dir(0)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a directory away")
+def test_the_directory_of_another_user_is_refused(base):
+    base.mkdir(mode=0o700)
+    os.chown(base, 12345, -1)
+    with pytest.raises(PermissionError, match="belongs to user 12345"):
+        runtime_dir(0)
+
+
+def test_a_path_too_long_for_a_socket_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path / ("x" * 100)))
+    with pytest.raises(ValueError, match="set CORTEX_RUNTIME_DIR to a shorter one"):
+        runtime_dir(0)
+    assert not (tmp_path / ("x" * 100)).exists()
+
+
+def test_the_longest_directory_leaves_room_for_every_role(monkeypatch):
+    longest = "/tmp/" + "y" * (SOCKET_PATH_MAX - 29 - 1 - len("/tmp/") - len("/232"))
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", longest)
+    try:
+        files = NodeFiles(232, 1)
+        assert len(os.fsencode(files.path("x" * 12))) == SOCKET_PATH_MAX
+        files.close()
+    finally:
+        os.rmdir(f"{longest}/232")
+        os.rmdir(longest)
+
+
+def test_host_id_is_the_same_in_another_process(base):
+    runtime_dir(0)
+    command = [sys.executable, "-c", "from cortex.host import host_id; print(host_id())"]
+    assert subprocess.check_output(command, cwd=ROOT, text=True).strip() == host_id()
+
+
+def test_host_id_differs_where_sockets_cannot_be_shared(base, monkeypatch, tmp_path):
+    runtime_dir(0)
+    here = host_id()
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path / "other"))
+    assert host_id() != here
+
+
+def test_a_lock_has_one_holder_at_a_time(tmp_path):
+    first = FileLock.acquire(tmp_path / "lock")
+    assert first is not None
+    assert FileLock.acquire(tmp_path / "lock") is None
+    first.close()
+    second = FileLock.acquire(tmp_path / "lock")
+    assert second is not None
+    second.close(remove=True)
+    second.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def _sit_until_killed(ready):
+    ready.set()
+    signal.pause()
+
+
+def test_a_forked_child_does_not_keep_the_lock(tmp_path):
+    """A child that outlives us must not make us look alive."""
+    lock = FileLock.acquire(tmp_path / "lock")
+    context = multiprocessing.get_context("fork")
+    ready = context.Event()
+    child = context.Process(target=_sit_until_killed, args=(ready,))
+    child.start()
+    try:
+        assert ready.wait(10)
+        lock.close()
+        again = FileLock.acquire(tmp_path / "lock")
+        assert again is not None
+        again.close()
+    finally:
+        child.kill()
+        child.join()
+
+
+def test_a_node_leaves_nothing_behind():
+    files = NodeFiles(0, 0xABC)
+    files.path("lossy").touch()
+    assert files.endpoint("lossy") == f"ipc://{files.directory}/0000000000000abc.lossy"
+    files.close()
+    files.close()
+    assert list(files.directory.iterdir()) == []
+
+
+def test_a_number_is_not_given_twice():
+    files = NodeFiles(0, 7)
+    with pytest.raises(FileExistsError, match="0000000000000007"):
+        NodeFiles(0, 7)
+    files.close()
+
+
+@pytest.mark.parametrize("role", ["", "Lossy", "a.b", "../x", "lock", "x" * 13])
+def test_a_role_that_would_leave_the_scheme_is_refused(role):
+    files = NodeFiles(0, 7)
+    try:
+        with pytest.raises(ValueError, match="role must be"):
+            files.path(role)
+    finally:
+        files.close()
+
+
+_HOLD = """
+import signal, sys
+from cortex.host import NodeFiles
+files = NodeFiles(0, int(sys.argv[1]))
+for role in ("lossy", "strict", "control"):
+    files.path(role).touch()
+print("ready", flush=True)
+signal.pause()
+"""
+
+
+def test_sweep_removes_the_files_of_killed_nodes_only():
+    living = NodeFiles(0, 1)
+    living.path("lossy").touch()
+    command = [sys.executable, "-c", _HOLD]
+    killed = subprocess.Popen([*command, "2"], cwd=ROOT, stdout=subprocess.PIPE)
+    stopped = subprocess.Popen([*command, "3"], cwd=ROOT, stdout=subprocess.PIPE)
+    foreign = living.directory / "notes.txt"
+    foreign.touch()
+    try:
+        assert killed.stdout.readline() == stopped.stdout.readline() == b"ready\n"
+        (living.directory / f"{4:016x}.lossy").touch()  # the lock of its node was lost
+        stopped.send_signal(signal.SIGSTOP)
+        killed.kill()
+        killed.wait()
+        assert sorted(sweep(living.directory)) == [2, 4]
+        left = {path.name for path in living.directory.iterdir()}
+        assert left == {
+            "notes.txt",
+            f"{1:016x}.lock",
+            f"{1:016x}.lossy",
+            *(f"{3:016x}.{role}" for role in ("lock", "lossy", "strict", "control")),
+        }
+    finally:
+        for process in (killed, stopped):
+            process.kill()
+            process.communicate()
+        living.close()
+
+
+def test_a_new_node_sweeps_what_it_finds(base):
+    directory = runtime_dir(0)
+    (directory / f"{9:016x}.lossy").touch()
+    NodeFiles(0, 1).close()
+    assert list(directory.iterdir()) == []
