@@ -1,0 +1,170 @@
+"""The tables that people read, and the CSV."""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import os
+import platform
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import TextIO
+
+import zmq
+
+from cortex.bench.cases import METRICS, Case
+from cortex.bench.measure import CaseResult, Outcome, Spread, Verdict
+
+WIDTH = 110
+_LABELS = ("case", "contestant", "payload_bytes")
+_COUNTS = ("sent", "received", "lost", "misordered", "corrupt")
+_PEERS = ("numpy", "eclipse-zenoh", "iceoryx2", "lcm")
+
+
+def header() -> list[str]:
+    """Return what the figures depend on: date, machine, versions, load."""
+    versions = [
+        f"Python {platform.python_version()}",
+        f"pyzmq {zmq.pyzmq_version()}",
+        f"libzmq {zmq.zmq_version()}",
+    ]
+    for name in _PEERS:
+        try:
+            versions.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            versions.append(f"{name} not installed")
+    load = " ".join(f"{value:.2f}" for value in os.getloadavg())
+    return [
+        f"cortex bench, {datetime.now().astimezone():%Y-%m-%d %H:%M %Z}",
+        f"{os.cpu_count()} cores, {_processor()}, {platform.system()} {platform.release()}, load {load}",
+        ", ".join(versions),
+    ]
+
+
+def case_lines(result: CaseResult) -> Iterator[str]:
+    """Yield the block of one case: what each contestant did, then the case's bars."""
+    case = result.case
+    yield f"{case.name}: {case.title}"
+    yield f"  message: {case.message}; payload {4 * case.floats:,} B"
+    for outcome in result.outcomes.values():
+        yield from _outcome_lines(case, outcome)
+    for verdict in result.verdicts():
+        yield _clip(f"  => {_measured(verdict):>13}  {_what(verdict)}; bar {_bound(verdict)}: {verdict.word}")
+
+
+def summary_lines(results: list[CaseResult]) -> Iterator[str]:
+    """Yield the table of all bars."""
+    verdicts = [(result.case.name, verdict) for result in results for verdict in result.verdicts()]
+    if not verdicts:
+        return
+    yield f"{'case':<17}{'what':<49}{'measured':>13}  {'bar':<14}verdict"
+    yield "-" * WIDTH
+    for name, verdict in verdicts:
+        word = verdict.word.partition(" (")[0]  # the reason stands in the case's own block
+        yield f"{name:<17}{_what(verdict)[:48]:<49}{_measured(verdict):>13}  {_bound(verdict):<14}{word}"
+    words = [verdict.word for _, verdict in verdicts]
+    yield "-" * WIDTH
+    met, missed = words.count("met"), sum(word.startswith("missed") for word in words)
+    yield f"{met} met, {missed} missed, {len(words) - met - missed} not measured"
+
+
+def write_csv(path: Path, results: list[CaseResult]) -> None:
+    """Write one line per case, contestant and metric, the single repetitions included."""
+    with path.open("w", newline="") as file:
+        _write_rows(file, results)
+
+
+def _write_rows(file: TextIO, results: list[CaseResult]) -> None:
+    writer = csv.writer(file)
+    writer.writerow(
+        [*_LABELS, "metric", "unit", "median", "half_range", "repetitions", *_COUNTS, "error", "values"]
+    )
+    for result in results:
+        for outcome in result.outcomes.values():
+            for metric in result.case.metrics:
+                values = outcome.values(metric)
+                spread = Spread.of(values)
+                if spread is None and not (outcome.absent or outcome.errors):
+                    continue
+                writer.writerow(
+                    [
+                        result.case.name,
+                        outcome.contestant.name,
+                        4 * result.case.floats,
+                        metric,
+                        METRICS[metric].unit,
+                        "" if spread is None else f"{spread.median:.6g}",
+                        "" if spread is None else f"{spread.half_range:.6g}",
+                        len(values),
+                        *(
+                            outcome.total(count)
+                            for count in ("sent", "received", "lost", "misordered", "corrupt")
+                        ),
+                        outcome.absent or "; ".join(outcome.errors),
+                        " ".join(f"{value:.6g}" for value in values),
+                    ]
+                )
+
+
+def _outcome_lines(case: Case, outcome: Outcome) -> Iterator[str]:
+    cells = []
+    for metric in case.metrics:
+        spread = Spread.of(outcome.values(metric))
+        if spread is not None:
+            text = "" if metric == "rate" else f"{METRICS[metric].text} "
+            cells.append(f"{text}{_figure(spread, METRICS[metric].unit)}")
+    if outcome.absent:
+        cells.append(outcome.absent)
+    elif outcome.errors:
+        cells.append(f"{len(outcome.errors)} of {len(outcome.repetitions)} failed: {outcome.errors[0]}")
+    if outcome.faults:
+        cells.append(outcome.faults)
+    yield _clip(f"  {outcome.contestant.name:<26}{'   '.join(cells)}")
+
+
+def _figure(spread: Spread, unit: str) -> str:
+    percent = 100.0 * spread.half_range / spread.median if spread.median else 0.0
+    return f"{_number(spread.median):>9} {unit:<3}± {percent:2.0f} %"
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+def _what(verdict: Verdict) -> str:
+    bar = verdict.bar
+    if not bar.against:
+        return f"{bar.who}, {METRICS[bar.metric].text}"
+    rival = verdict.against or bar.against[0]
+    metric = "" if bar.metric == "rate" else f", {METRICS[bar.metric].text}"
+    return f"{bar.who} / {rival}{metric}"
+
+
+def _measured(verdict: Verdict) -> str:
+    spread = verdict.measured
+    if spread is None:
+        return "-"
+    if verdict.bar.against:
+        return f"{spread.median:.2f} ± {spread.half_range:.2f}"
+    return f"{_number(spread.median)} {METRICS[verdict.bar.metric].unit}".strip()
+
+
+def _bound(verdict: Verdict) -> str:
+    bar = verdict.bar
+    unit = "" if bar.against else f" {METRICS[bar.metric].unit}"
+    return f"{bar.wanted} {_number(bar.bound)}{unit}".rstrip()
+
+
+def _clip(line: str) -> str:
+    line = line.rstrip()
+    return line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
