@@ -63,37 +63,38 @@ class CallbackThread:
             self._thread.start()
 
     def _run(self) -> None:
-        busy = False
+        poll, owners = self._watch()
+        busy: list[Subscriber[Any]] = []
         while not self._closed:
-            with self._lock:
-                subscribers = list(self._subscribers)
-            if not busy and not self._jobs:
-                ready = self._wait(subscribers)
-                subscribers = [s for s in subscribers if s in ready] or subscribers
-            busy = False
+            ready, changed = busy, False
+            for fd, _ in poll.poll(0 if busy else WAIT_MAX_S * 1000.0):
+                subscriber = owners.get(fd)
+                if subscriber is None:
+                    self._wakeup.clear()
+                    changed = True
+                    continue
+                if fd == subscriber.wakeup.fd:
+                    subscriber.wakeup.clear()
+                    changed = True
+                if subscriber not in ready:
+                    ready.append(subscriber)
             while self._jobs:
                 self._call(self._jobs.popleft())
-            for subscriber in subscribers:
-                busy |= subscriber.dispatch()
+            busy = [subscriber for subscriber in ready if subscriber.dispatch()]
+            if changed:
+                poll, owners = self._watch()
 
-    def _wait(self, subscribers: list[Subscriber[Any]]) -> set[Subscriber[Any]]:
-        """Sleep until a socket may have something; returns whose it is, nothing if we were woken."""
+    def _watch(self) -> tuple[select.poll, dict[int, Subscriber[Any]]]:
+        """What to poll: our own descriptor, and those of all sockets by subscriber."""
+        with self._lock:
+            subscribers = list(self._subscribers)
         poll, owners = select.poll(), {}
         poll.register(self._wakeup.fd, select.POLLIN)
         for subscriber in subscribers:
             for fd in (subscriber.wakeup.fd, *subscriber.fds()):
                 poll.register(fd, select.POLLIN)
                 owners[fd] = subscriber
-        ready = set()
-        for fd, _ in poll.poll(WAIT_MAX_S * 1000.0):
-            if fd == self._wakeup.fd:
-                self._wakeup.clear()
-                continue
-            owner = owners[fd]
-            ready.add(owner)
-            if fd == owner.wakeup.fd:
-                owner.wakeup.clear()
-        return ready
+        return poll, owners
 
     def _call(self, job: Callable[[], object]) -> None:
         try:

@@ -31,12 +31,15 @@ from cortex.wire import HEAD_SIZE, HEADER_SIZE, RECORD, REST
 logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
 unpack_rest = REST.unpack_from
+DONTWAIT = int(zmq.DONTWAIT)
 make = tuple.__new__  # a named tuple's own constructor takes twice as long
 
 T = TypeVar("T")
 
 DRAIN_MAX = 64
 """Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
+DRAIN_LOSSY_MAX = 4096
+"""Where only the last messages count, all that has arrived is read: more than a socket holds."""
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
 WAIT_MAX_S = 0.1
@@ -86,10 +89,12 @@ class Subscriber(Generic[T]):
         self._problems: deque[Exception] = deque()
         self._drained_ns = 0
         self._exhausted = True
+        self._hot = False
         self._whole_batches = False
         self._on_close = on_close
         self._closed = False
         self._async: _AsyncSide | None = None
+        self._poll: select.poll | None = None
 
     def recv(self, timeout_s: float | None = None) -> T:
         """Take the next message.
@@ -216,11 +221,14 @@ class Subscriber(Generic[T]):
                 raise Closed(f"the subscriber of {self.topic} is closed")
             if self._problems:
                 raise self._problems.popleft()
-            if not queue or (
-                not self.policy.reliable
-                and (not self._exhausted or monotonic_ns() - self._drained_ns > FRESH_NS)
+            if not self.policy.reliable and (
+                self.policy.depth < DRAIN_MAX
+                or not self._exhausted
+                or monotonic_ns() - self._drained_ns > FRESH_NS
             ):
                 self._drain()
+            elif not queue:
+                self._receive_one()
             if not queue:
                 return None
             item = queue.popleft()
@@ -295,47 +303,59 @@ class Subscriber(Generic[T]):
             raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
         return np.frombuffer(b"".join(bodies), dtype)
 
+    def _receive_one(self) -> None:
+        """Read one frame into the queue if there is one; the lock is held.
+
+        Finding a socket empty costs more than reading a message: that is done after one is handed out.
+        """
+        self._exhausted = True
+        for link in self._links:
+            try:
+                frame = link.receive(DONTWAIT)
+            except zmq.Again:
+                continue
+            self._exhausted = False
+            self._accept(link, frame, timed=True)
+            if self._queue:
+                return
+
     def _drain(self) -> None:
         """Read what has arrived into the queue; the lock is held."""
-        queue, depth, reliable = self._queue, self.policy.depth, self.policy.reliable
         exhausted = True
         self._drained_ns = monotonic_ns()
         for link in self._links:
-            receive, head = link.receive, link.message_head
-            budget = depth - len(queue) if reliable else DRAIN_MAX
-            untimed = 0
-            while budget > 0:
-                budget -= 1
+            receive = link.receive
+            budget = self.policy.depth - len(self._queue) if self.policy.reliable else DRAIN_LOSSY_MAX
+            for count in range(budget):
                 try:
-                    frame = receive(1)  # DONTWAIT
+                    frame = receive(DONTWAIT)
                 except zmq.Again:
                     break
-                if frame[:HEAD_SIZE] != head or len(frame) < HEADER_SIZE:
-                    for item in link.handle(frame):
-                        self._time(item.publish_ns, link)
-                        self._enqueue(item)
-                    continue
-                sequence, stamp_ns, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
-                if size != len(frame) - HEADER_SIZE:
-                    link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
-                    continue
-                if sequence == link.expected:
-                    link.expected = sequence + 1
-                elif not link.advance(sequence):
-                    continue
-                if not untimed:
-                    self._time(publish_ns, link)
-                untimed = (untimed + 1) & 7
-                if len(queue) >= depth and not reliable:
-                    self._evict()
-                queue.append(
-                    make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None))
-                )
+                self._accept(link, frame, timed=count & 7 == 0)
             else:
                 exhausted = False
         self._exhausted = exhausted
         if self._leaving:
             self._dismiss(self._drained_ns)
+
+    def _accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
+        """Put the message of a frame into the queue; the lock is held."""
+        if frame[:HEAD_SIZE] != link.message_head or len(frame) < HEADER_SIZE:
+            for item in link.handle(frame):
+                self._time(item.publish_ns, link)
+                self._enqueue(item)
+            return
+        sequence, stamp_ns, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
+        if size != len(frame) - HEADER_SIZE:
+            link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
+            return
+        if sequence == link.expected:
+            link.expected = sequence + 1
+        elif not link.advance(sequence):
+            return
+        if timed:
+            self._time(publish_ns, link)
+        self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
 
     def _drain_decoded(self) -> list[T]:
         """As `_drain`, for an empty queue that cannot overflow: plain messages are decoded on the spot.
@@ -352,7 +372,7 @@ class Subscriber(Generic[T]):
             untimed = 0
             for _ in range(min(self.policy.depth, DRAIN_MAX)):
                 try:
-                    frame = receive(1)  # DONTWAIT
+                    frame = receive(DONTWAIT)
                 except zmq.Again:
                     break
                 if frame[:HEAD_SIZE] != head or len(frame) < HEADER_SIZE:
@@ -404,16 +424,23 @@ class Subscriber(Generic[T]):
 
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
-        poll = select.poll()
         with self.lock:
             if self._closed or not self._exhausted:
                 return
-            poll.register(self.wakeup.fd, select.POLLIN)
-            for link in self._links:
-                poll.register(link.fd, select.POLLIN)
+            poll = self._poll or self._new_poll()
+            self._poll = None  # one thread at a time may use it
         for fd, _ in poll.poll(timeout_s * 1000.0):
             if fd == self.wakeup.fd:
                 self.wakeup.clear()
+                return
+        self._poll = poll
+
+    def _new_poll(self) -> select.poll:
+        poll = select.poll()
+        poll.register(self.wakeup.fd, select.POLLIN)
+        for link in self._links:
+            poll.register(link.fd, select.POLLIN)
+        return poll
 
     def dispatch(self) -> bool:
         """Hand what has arrived to the callback; for the callback thread.
@@ -423,20 +450,25 @@ class Subscriber(Generic[T]):
         """
         callback = self.callback
         assert callback is not None
+        in_place = self.policy.reliable or self.policy.depth >= DRAIN_MAX
         messages: list[T] = []
         items: deque[Item] = deque()
         with self.lock:
             if self._closed:
                 return False
             problems, self._problems = self._problems, deque()
-            if not self._queue and (self.policy.reliable or self.policy.depth >= DRAIN_MAX):
-                messages = self._drain_decoded()
-            else:
+            if not in_place:
                 self._drain()
+            elif not self._queue:
+                if self._hot:
+                    messages = self._drain_decoded()
+                else:
+                    self._receive_one()
             if self._queue:
                 items, self._queue = self._queue, items
             self.counters.received += len(messages) + len(items)
-            more = not self._exhausted
+            # After a single message more are read together, until the socket is found empty.
+            self._hot = more = not self._exhausted
         for problem in problems:
             logger.error("%s", problem)
         for message in messages:
@@ -508,6 +540,7 @@ class Subscriber(Generic[T]):
                 return
             link.whole_batches = self._whole_batches
             self._links.append(link)
+            self._poll = None
         self.wakeup.set()
 
     def sources(self) -> set[int]:
@@ -536,6 +569,7 @@ class Subscriber(Generic[T]):
                 link.close()
                 self._links.remove(link)
                 del self._leaving[link]
+                self._poll = None
                 self.wakeup.set()
 
     def close(self) -> None:
