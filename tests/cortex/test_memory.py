@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import gc
 import logging
 import mmap
 import os
@@ -32,8 +33,8 @@ HEADER = struct.pack("<8sIIQIIQQQQQ", *FIELDS)
 SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
-def our_memory() -> tuple[int, int]:
-    """How many rings this process has mapped, and how many descriptors of rings it has open."""
+def our_memory() -> tuple[int, int, list[str]]:
+    """How many rings this process has mapped and how many it has open, and files that should not be."""
     maps = Path("/proc/self/maps").read_text()
     links = []
     for fd in os.listdir("/proc/self/fd"):
@@ -41,15 +42,17 @@ def our_memory() -> tuple[int, int]:
             links.append(os.readlink(f"/proc/self/fd/{fd}"))
         except FileNotFoundError:  # that of the listing itself
             continue
-    return maps.count("/memfd:cortex-"), sum(link.startswith("/memfd:cortex-") for link in links)
+    files = [name for name in os.listdir("/dev/shm") if "cortex" in name]  # others may use it meanwhile
+    return maps.count("/memfd:cortex-"), sum(link.startswith("/memfd:cortex-") for link in links), files
 
 
 @pytest.fixture(autouse=True)
 def nothing_left() -> Iterator[None]:
     """No test leaves memory or a file behind."""
-    before = our_memory(), sorted(os.listdir("/dev/shm"))
+    gc.collect()  # what other tests left in cycles
+    before = our_memory()
     yield
-    assert (our_memory(), sorted(os.listdir("/dev/shm"))) == before
+    assert our_memory() == before
 
 
 @pytest.fixture
