@@ -31,10 +31,6 @@ __all__ = [
     "serve",
 ]
 
-_TOPIC = "/bench/flood"
-_PING = "/bench/ping"
-_PONG = "/bench/pong"
-
 
 def sender(job: Job) -> Sender:
     """Make a node with one publisher; options: ``fixed``, ``coalesce``, ``loan``, ``inline_max``, ``tcp``."""
@@ -46,7 +42,7 @@ class _Sender:
         self.address: Mapping[str, Any] = {}
         self._node = _listening_node("bench_publisher", job)
         kind = _type(job)
-        self._publisher = self._node.publisher(_TOPIC, kind, **_publisher_options(job))
+        self._publisher = self._node.publisher(_topic(job), kind, **_publisher_options(job))
         self.send = self._loaning(job) if job.options.get("loan") else self._publishing(kind)
         self._refused = 0
 
@@ -94,7 +90,7 @@ def receive(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
         if how == "callback":
             _by_callback(node, job, policy, tally, done)
         else:
-            _BY[how](node.subscriber(_TOPIC, _type(job), policy=policy), tally, job)
+            _BY[how](node.subscriber(_topic(job), _type(job), policy=policy), tally, job)
         return tally.report()
     finally:
         node.close()
@@ -106,7 +102,7 @@ def _by_callback(node: Node, job: Job, policy: Any, tally: Tally, done: threadin
     def on_message(sample: Any) -> None:
         handle(sample.stamp_ns, sample.data)
 
-    node.subscriber(_TOPIC, _type(job), on_message, policy=policy)
+    node.subscriber(_topic(job), _type(job), on_message, policy=policy)
     # The runner kills a child that waits for ever; this wait only has to be longer than any flood.
     done.wait(job.seconds + 600.0)
 
@@ -174,10 +170,12 @@ class Client:
         self.address: Mapping[str, Any] = {}
         self._node = _listening_node("bench_client", job)
         self._type = _type(job)
-        self._publish = self._node.publisher(_PING, self._type, **_publisher_options(job)).publish
+        self._publish = self._node.publisher(
+            _topic(job, "ping"), self._type, **_publisher_options(job)
+        ).publish
         self._payload = make_payloads(job.floats)[0]
         self._recv = self._node.subscriber(
-            _PONG, Sample, policy=reliable(depth=64, timeout_s=PATIENCE_S)
+            _topic(job, "pong"), Sample, policy=reliable(depth=64, timeout_s=PATIENCE_S)
         ).recv
 
     def ping(self, sequence: int, data: Floats, timeout_s: float) -> bool:
@@ -201,7 +199,7 @@ def serve(job: Job) -> None:
     """Answer each message from the callback that gets it."""
     done = threading.Event()
     node = _connecting_node("bench_server", job)
-    publish = node.publisher(_PONG, Sample).publish
+    publish = node.publisher(_topic(job, "pong"), Sample).publish
     answer = make_payloads(PONG_FLOATS)[0]
 
     def on_ping(sample: Any) -> None:
@@ -210,7 +208,7 @@ def serve(job: Job) -> None:
         else:
             publish(Sample(sample.stamp_ns, answer))
 
-    node.subscriber(_PING, _type(job), on_ping, policy=_reliable(job))
+    node.subscriber(_topic(job, "ping"), _type(job), on_ping, policy=_reliable(job))
     done.wait(job.seconds + 600.0)
     node.close()
 
@@ -224,7 +222,7 @@ class _ReadingSender:
     def __init__(self, job: Job) -> None:
         self.address: Mapping[str, Any] = {}
         self._node = _listening_node("bench_publisher", job)
-        self._publish = self._node.publisher(_TOPIC, Reading).publish
+        self._publish = self._node.publisher(_topic(job), Reading).publish
 
     def send(self, sequence: int, data: Floats) -> None:
         self._publish(Reading(time.monotonic_ns(), sequence, data))
@@ -250,10 +248,10 @@ def receive_latest(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
                 if ages.done:
                     done.set()
 
-            node.subscriber(_TOPIC, Reading, on_reading, policy=policy)
+            node.subscriber(_topic(job), Reading, on_reading, policy=policy)
             done.wait(job.seconds + 600.0)
         else:
-            subscriber = node.subscriber(_TOPIC, Reading, policy=policy)
+            subscriber = node.subscriber(_topic(job), Reading, policy=policy)
             while not ages.done:
                 reading = subscriber.recv(timeout_s=PATIENCE_S)
                 ages.use(reading.sequence, reading.stamp_ns)
@@ -264,7 +262,7 @@ def receive_latest(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
 
 def receive_cpp(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
     """Run the C++ subscriber, which prints one line when it is connected and one when the flood is over."""
-    command = [str(binary()), _TOPIC, str(job.floats), str(job.depth)]
+    command = [str(binary()), _topic(job), str(job.floats), str(job.depth)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -274,6 +272,11 @@ def receive_cpp(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
                 report: dict[str, Any] = json.loads(line)
                 return report
     raise RuntimeError(f"the C++ subscriber ended with status {process.returncode} and no result")
+
+
+def _topic(job: Job, role: str = "flood") -> str:
+    """Name a topic of this repetition's own: the last one's nodes may still be known."""
+    return f"/bench/{job.folder.name or 'here'}/{role}"
 
 
 def _reliable(job: Job) -> Policy:
