@@ -1,0 +1,462 @@
+// SPDX-License-Identifier: Apache-2.0
+// A node's view of the others: what it hears from the registry and from static peers (cortex/registry.py describes
+// the protocol). It belongs to the node's thread.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <functional>
+#include <map>
+#include <memory>
+#include <optional>
+#include <set>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "cortex/codec.hpp"
+#include "cortex/records.hpp"
+#include "cortex/runtime.hpp"
+#include "cortex/socket.hpp"
+#include "cortex/wire.hpp"
+
+namespace cortex::detail {
+
+constexpr std::int64_t heartbeat_ns = 250'000'000;
+constexpr std::int64_t lease_ns = 1'000'000'000;
+constexpr std::int64_t answer_ns = 300'000'000;  // a `Hello` that was not answered for so long is sent again
+constexpr std::int64_t stall_ns = 300'000'000;   // a loop that stood still for so long must not judge who was silent
+
+template <class T>
+zmq::message_t control_frame(const T& message, std::uint64_t sequence = 0) {
+  const std::size_t size = encoded_size(message);
+  zmq::message_t frame(wire::header_size + size);
+  auto* out = static_cast<std::uint8_t*>(frame.data());
+  wire::write_header(out, {'C', 0, 0, Codec<T>::fingerprint, sequence, 0, 0, size, 0});
+  encode_into(message, {out + wire::header_size, size});
+  return frame;
+}
+
+struct ControlFrame {
+  wire::Header header;
+  Span<const std::uint8_t> body;
+
+  template <class T>
+  bool is() const noexcept {
+    return header.fingerprint == Codec<T>::fingerprint;
+  }
+  template <class T>
+  T as() const {
+    return decode<T>(body);
+  }
+};
+
+inline ControlFrame parse_control(Span<const std::uint8_t> frame) {
+  ControlFrame result;
+  result.header = wire::read_header(frame);
+  if (result.header.kind != 'C') throw MalformedMessage("not a control frame");
+  result.body = wire::body_of(result.header, frame, wire::control_limit);
+  return result;
+}
+
+inline bool is_topic(const std::string& topic) noexcept {
+  if (topic.empty() || topic.size() > 200 || topic.front() != '/' || topic.back() == '/') return false;
+  char before = ' ';
+  for (const char c : topic) {
+    const bool word = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_';
+    if (!word && (c != '/' || before == '/')) return false;
+    before = c;
+  }
+  return true;
+}
+
+class Directory {
+ public:
+  using Nodes = std::map<std::uint64_t, records::NodeRecord>;
+
+  Directory(zmq::context_t& context, std::function<records::NodeRecord()> record, std::string registry,
+            const std::vector<std::string>& peers, std::shared_ptr<net::Complaints> complaints)
+      : record_(std::move(record)), complaints_(std::move(complaints)) {
+    own_ = next_record();
+    if (!registry.empty()) connect(context, registry, true);
+    for (const auto& peer : peers) connect(context, peer, false);
+  }
+
+  std::vector<zmq::socket_t*> sockets() {
+    std::vector<zmq::socket_t*> result;
+    for (auto& link : links_) result.push_back(&link->socket);
+    return result;
+  }
+
+  const Nodes& nodes() const noexcept { return nodes_; }
+  std::uint64_t rejected() const noexcept { return rejected_; }
+  bool connected() const {
+    return std::all_of(links_.begin(), links_.end(), [](const auto& link) { return link->welcomed; });
+  }
+  // Whether `nodes` has changed since the last call.
+  bool take_changed() noexcept { return std::exchange(changed_, false); }
+
+  // This node's record has changed; the next `tick` says so.
+  void announce() noexcept { dirty_ = true; }
+
+  std::int64_t deadline_ns() const {
+    std::int64_t deadline = tick_ns_ + heartbeat_ns;
+    for (const auto& link : links_) deadline = std::min(deadline, link->next_ns);
+    return dirty_ ? tick_ns_ : deadline;
+  }
+
+  void tick() {
+    const std::int64_t now_ns = monotonic_ns();
+    if (tick_ns_ != 0 && now_ns - tick_ns_ > stall_ns) forgive(now_ns - tick_ns_);
+    tick_ns_ = now_ns;
+    for (auto& link : links_) receive(*link, now_ns);
+    if (dirty_) {
+      own_ = next_record();
+      for (auto& link : links_) {
+        if (link->welcomed) say_hello(*link, now_ns, false);
+      }
+    }
+    for (auto& link : links_) {
+      if (now_ns >= link->next_ns) beat(*link, now_ns);
+      expire(*link, now_ns);
+    }
+    for (auto entry = inbound_.begin(); entry != inbound_.end();) {
+      if (now_ns - entry->second > lease_ns) {
+        drop(nullptr, entry->first);
+        entry = inbound_.erase(entry);
+      } else {
+        ++entry;
+      }
+    }
+  }
+
+  // Answers a control frame that came to this node's own ROUTER: nodes may have it as static peer.
+  std::optional<zmq::message_t> answer(const ControlFrame& frame) {
+    const std::int64_t now_ns = monotonic_ns();
+    if (frame.is<records::Describe>()) return control_frame(records::Changed{0, own_}, frame.header.sequence);
+    if (frame.is<records::Hello>()) {
+      const auto hello = frame.as<records::Hello>();
+      check(hello.record);
+      if (inbound_.count(hello.record.node) == 0 && inbound_.size() >= 1024) {
+        return control_frame(records::Refused{hello.record.node, "this node has 1024 peers already"});
+      }
+      inbound_[hello.record.node] = now_ns;
+      put(nullptr, hello.record);
+      return control_frame(records::Changed{0, own_});
+    }
+    if (frame.is<records::Heartbeat>()) {
+      const auto heartbeat = frame.as<records::Heartbeat>();
+      const auto known = inbound_.find(heartbeat.node);
+      std::uint64_t held = 0;
+      if (known != inbound_.end()) {
+        known->second = now_ns;
+        held = known_[heartbeat.node][nullptr].revision;
+      }
+      if (heartbeat.held != own_.revision) return control_frame(records::Changed{0, own_});
+      return control_frame(records::Alive{own_.node, 0, held});
+    }
+    if (frame.is<records::Leave>()) {
+      const auto leave = frame.as<records::Leave>();
+      inbound_.erase(leave.node);
+      drop(nullptr, leave.node);
+      for (auto& link : links_) {
+        if (!link->registry) drop(link.get(), leave.node);
+      }
+      return std::nullopt;
+    }
+    throw MalformedMessage("an unexpected control message");
+  }
+
+  void leave() {
+    for (auto& link : links_) {
+      if (link->welcomed) try_send(link->socket, control_frame(records::Leave{own_.node}));
+    }
+  }
+
+ private:
+  // A connection to the registry or to a static peer.
+  struct Link {
+    std::string address;
+    zmq::socket_t socket;
+    bool registry = false;
+    std::int64_t next_ns = 0;   // when to send the next heartbeat or `Hello`
+    std::int64_t heard_ns = 0;  // when the other side was last heard
+    std::int64_t wait_ns = first_wait_ns;
+    std::int64_t quiet_ns = 0;  // until when an `Alive` is no reason for a further `Hello`
+    bool asked = false;
+    bool welcomed = false;
+    std::uint64_t epoch = 0;
+    std::uint64_t version = 0;
+    std::set<std::uint64_t> nodes;
+    std::map<std::uint64_t, std::uint64_t> missing;  // revisions that `Welcome` named and that have not come yet
+    std::map<std::uint64_t, std::int64_t> doubted;   // when to drop nodes that the registry did not name
+  };
+
+  static constexpr std::int64_t first_wait_ns = 2'000'000;
+  static constexpr std::int64_t last_wait_ns = 50'000'000;
+
+  static bool try_send(zmq::socket_t& socket, zmq::message_t frame) {
+    return socket.send(std::move(frame), zmq::send_flags::dontwait).has_value();
+  }
+
+  void connect(zmq::context_t& context, const std::string& address, bool registry) {
+    if (address.rfind("tcp://", 0) != 0 && address.rfind("ipc://", 0) != 0) {
+      throw std::invalid_argument("a registry or peer must be a tcp:// or ipc:// address, got '" + address + "'");
+    }
+    auto link = std::make_unique<Link>();
+    link->address = address;
+    link->registry = registry;
+    link->socket = net::make_socket(context, zmq::socket_type::dealer, net::is_tcp(address), 4096, 200);
+    link->socket.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(wire::control_limit + wire::header_size));
+    // Nothing may queue for a peer that is not there: a `send` that fails tells us so at once.
+    link->socket.set(zmq::sockopt::immediate, true);
+    link->socket.connect(address);
+    link->heard_ns = monotonic_ns();
+    links_.push_back(std::move(link));
+  }
+
+  records::NodeRecord next_record() {
+    dirty_ = false;
+    records::NodeRecord record = record_();
+    record.revision = ++revision_;
+    return record;
+  }
+
+  static void check(const records::NodeRecord& record) {
+    bool good = record.node != 0 && record.revision != 0;
+    for (const auto& publisher : record.publishers) good = good && publisher.source != 0 && is_topic(publisher.topic);
+    for (const auto& subscriber : record.subscribers) good = good && is_topic(subscriber.topic);
+    for (const auto& service : record.services) good = good && is_topic(service.name);
+    for (const auto& endpoint : record.endpoints) {
+      for (const auto* address : {&endpoint.lossy, &endpoint.strict, &endpoint.control}) {
+        good = good && (address->empty() || address->rfind(endpoint.transport + "://", 0) == 0);
+      }
+    }
+    if (!good) throw MalformedMessage("a record that no node would send");
+  }
+
+  // Sending
+
+  void beat(Link& link, std::int64_t now_ns) {
+    if (!link.welcomed) return say_hello(link, now_ns, true);
+    std::uint64_t held = 0;
+    if (!link.registry) {
+      for (const auto node : link.nodes) held = std::max(held, known_[node][&link].revision);
+    }
+    if (!try_send(link.socket, control_frame(records::Heartbeat{own_.node, own_.revision, held}))) {
+      return lose(link, now_ns);
+    }
+    link.next_ns = now_ns + heartbeat_ns;
+    warn_of_silence(link, now_ns);
+  }
+
+  void say_hello(Link& link, std::int64_t now_ns, bool snapshot) {
+    if (!try_send(link.socket, control_frame(records::Hello{snapshot, own_}))) return lose(link, now_ns);
+    link.wait_ns = link.asked ? std::min(2 * link.wait_ns, lease_ns) : answer_ns;
+    link.asked = true;
+    link.quiet_ns = now_ns + answer_ns;
+    link.next_ns = now_ns + (link.welcomed ? heartbeat_ns : link.wait_ns);
+  }
+
+  // The connection is gone. What was known through it stays, until its lease says otherwise.
+  void lose(Link& link, std::int64_t now_ns) {
+    if (link.welcomed || link.asked) link.wait_ns = first_wait_ns;
+    link.welcomed = link.asked = false;
+    link.next_ns = now_ns + link.wait_ns;
+    link.wait_ns = std::min(2 * link.wait_ns, last_wait_ns);
+    warn_of_silence(link, now_ns);
+  }
+
+  void warn_of_silence(const Link& link, std::int64_t now_ns) {
+    if (now_ns - link.heard_ns > 3 * lease_ns) {
+      complaints_->once("silent " + link.address, std::string("no answer of the ") +
+                                                      (link.registry ? "registry" : "peer") + " at " + link.address +
+                                                      "; is it running? Trying on.");
+    }
+  }
+
+  // Receiving
+
+  void receive(Link& link, std::int64_t now_ns) {
+    zmq::message_t frame;
+    for (int budget = 256; budget > 0 && link.socket.recv(frame, zmq::recv_flags::dontwait); --budget) {
+      try {
+        if (frame.more()) {
+          net::drop_parts(link.socket);
+          throw MalformedMessage("several frames where one was expected");
+        }
+        on_frame(link, parse_control(net::bytes(frame)), now_ns);
+      } catch (const MalformedMessage& error) {
+        ++rejected_;
+        complaints_->once("control " + link.address, "rejected a frame of " + link.address + ": " + error.what());
+      }
+    }
+  }
+
+  void on_frame(Link& link, const ControlFrame& frame, std::int64_t now_ns) {
+    link.heard_ns = now_ns;
+    if (frame.is<records::Welcome>()) {
+      on_welcome(link, frame.as<records::Welcome>(), now_ns);
+    } else if (frame.is<records::Alive>()) {
+      on_alive(link, frame.as<records::Alive>(), now_ns);
+    } else if (frame.is<records::Changed>()) {
+      on_changed(link, frame.as<records::Changed>(), now_ns);
+    } else if (frame.is<records::Gone>()) {
+      const auto gone = frame.as<records::Gone>();
+      count(link, gone.version);
+      link.missing.erase(gone.node);
+      link.doubted.erase(gone.node);
+      drop(&link, gone.node);
+    } else if (frame.is<records::Refused>()) {
+      complaints_->once("refused " + link.address,
+                        link.address + " refuses this node: " + frame.as<records::Refused>().reason);
+      link.wait_ns = lease_ns;
+      link.quiet_ns = now_ns + lease_ns;
+      if (!link.welcomed) link.next_ns = link.quiet_ns;
+    } else {
+      throw MalformedMessage("an unexpected control message");
+    }
+  }
+
+  void greet(Link& link, std::int64_t now_ns) {
+    if (!link.welcomed) link.next_ns = now_ns + heartbeat_ns;
+    link.welcomed = true;
+    link.asked = false;
+    link.quiet_ns = 0;
+  }
+
+  void on_welcome(Link& link, const records::Welcome& welcome, std::int64_t now_ns) {
+    if (!link.registry || welcome.nodes.size() != welcome.revisions.size()) {
+      throw MalformedMessage("a welcome of a peer, or with lists of different lengths");
+    }
+    greet(link, now_ns);
+    link.epoch = welcome.epoch;
+    link.version = welcome.version;
+    link.missing.clear();
+    std::set<std::uint64_t> named;
+    for (std::size_t index = 0; index < welcome.nodes.size(); ++index) {
+      const std::uint64_t node = welcome.nodes[index];
+      if (node == own_.node) continue;
+      named.insert(node);
+      if (link.nodes.count(node) == 0 || known_[node][&link].revision != welcome.revisions[index]) {
+        link.missing[node] = welcome.revisions[index];
+      }
+    }
+    // A registry that was just started does not know everybody yet: one lease of grace.
+    std::map<std::uint64_t, std::int64_t> doubted;
+    for (const auto node : link.nodes) {
+      if (named.count(node) != 0) continue;
+      const auto since = link.doubted.find(node);
+      doubted[node] = since != link.doubted.end() ? since->second : now_ns + lease_ns;
+    }
+    link.doubted = std::move(doubted);
+  }
+
+  void on_alive(Link& link, const records::Alive& alive, std::int64_t now_ns) {
+    if (!link.welcomed || now_ns < link.quiet_ns) return;  // the answer to our last `Hello` says more
+    if (link.registry) {
+      if (alive.epoch != link.epoch || alive.version != link.version || !link.missing.empty()) {
+        return say_hello(link, now_ns, true);
+      }
+    } else if (link.nodes.count(alive.epoch) == 0 && alive.epoch != own_.node) {
+      link.welcomed = false;
+      link.next_ns = now_ns;
+      return;
+    }
+    if (alive.held != own_.revision) say_hello(link, now_ns, false);
+  }
+
+  void on_changed(Link& link, records::Changed changed, std::int64_t now_ns) {
+    check(changed.record);
+    const std::uint64_t node = changed.record.node;
+    if (link.registry) {
+      count(link, changed.version);
+      link.missing.erase(node);
+      link.doubted.erase(node);
+    } else {
+      greet(link, now_ns);
+      const std::set<std::uint64_t> before = link.nodes;
+      for (const auto other : before) {  // another node may have taken over this address
+        if (other != node) drop(&link, other);
+      }
+    }
+    put(&link, std::move(changed.record));
+  }
+
+  static void count(Link& link, std::uint64_t version) noexcept {
+    if (link.welcomed && version == link.version + 1) link.version = version;
+  }
+
+  // What is known
+
+  void forgive(std::int64_t stood_ns) {
+    for (auto& link : links_) {
+      link->heard_ns += stood_ns;
+      for (auto& doubt : link->doubted) doubt.second += stood_ns;
+    }
+    for (auto& entry : inbound_) entry.second += stood_ns;
+  }
+
+  void expire(Link& link, std::int64_t now_ns) {
+    std::vector<std::uint64_t> gone;
+    if (link.registry) {
+      if (!link.welcomed) return;  // without a registry nobody is removed
+      for (const auto& [node, at_ns] : link.doubted) {
+        if (now_ns > at_ns) gone.push_back(node);
+      }
+    } else if (now_ns - link.heard_ns > lease_ns) {
+      gone.assign(link.nodes.begin(), link.nodes.end());
+    }
+    for (const auto node : gone) {
+      link.doubted.erase(node);
+      drop(&link, node);
+    }
+  }
+
+  // One holder's records come in order, so its last one counts; of several holders' the newest. Null: inbound.
+  void put(Link* holder, records::NodeRecord record) {
+    const std::uint64_t node = record.node;
+    if (node == own_.node) return;
+    known_[node][holder] = std::move(record);
+    if (holder != nullptr) holder->nodes.insert(node);
+    choose(node);
+  }
+
+  void drop(Link* holder, std::uint64_t node) {
+    if (holder != nullptr) holder->nodes.erase(node);
+    const auto known = known_.find(node);
+    if (known != known_.end() && known->second.erase(holder) > 0) choose(node);
+  }
+
+  void choose(std::uint64_t node) {
+    const auto& holders = known_[node];
+    if (holders.empty()) {
+      known_.erase(node);
+      changed_ = nodes_.erase(node) > 0 || changed_;
+      return;
+    }
+    const auto newest = std::max_element(holders.begin(), holders.end(), [](const auto& a, const auto& b) {
+      return a.second.revision < b.second.revision;
+    });
+    const auto before = nodes_.find(node);
+    if (before == nodes_.end() || before->second.revision != newest->second.revision) {
+      nodes_[node] = newest->second;
+      changed_ = true;
+    }
+  }
+
+  std::function<records::NodeRecord()> record_;
+  std::shared_ptr<net::Complaints> complaints_;
+  std::vector<std::unique_ptr<Link>> links_;
+  records::NodeRecord own_;
+  std::uint64_t revision_ = 0;
+  bool dirty_ = false;
+  bool changed_ = false;
+  std::uint64_t rejected_ = 0;
+  std::int64_t tick_ns_ = 0;
+  Nodes nodes_;
+  std::map<std::uint64_t, std::map<Link*, records::NodeRecord>> known_;
+  std::map<std::uint64_t, std::int64_t> inbound_;
+};
+
+}  // namespace cortex::detail

@@ -1,0 +1,340 @@
+// SPDX-License-Identifier: Apache-2.0
+// Subscribing: a bounded queue that is read where the message is wanted; no thread between socket and user.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <deque>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#include "cortex/codec.hpp"
+#include "cortex/link.hpp"
+#include "cortex/policy.hpp"
+#include "cortex/socket.hpp"
+
+namespace cortex {
+
+// A publisher of the topic sends another type; the text shows both schemas.
+class TypeMismatch : public std::runtime_error {
+ public:
+  using std::runtime_error::runtime_error;
+};
+
+// What is known of a message besides its content.
+struct Info {
+  std::uint64_t source = 0;
+  std::uint64_t sequence = 0;
+  std::optional<std::int64_t> stamp_ns;  // the message's own time, if its type has one
+  std::int64_t publish_ns = 0;           // when it was published, on this host's CLOCK_MONOTONIC
+  std::size_t size = 0;                  // bytes of the body
+};
+
+// A received message. Its arrays look into the frame, or into the publisher's slot, which is given back when this
+// object goes; a copy of the message, or of one of its arrays, owns its items and may stay.
+template <class T>
+class Received {
+ public:
+  Received(Received&&) noexcept = default;
+  Received& operator=(Received&& other) noexcept {
+    message_ = std::move(other.message_);  // before what its arrays look into
+    info_ = other.info_;
+    frame_ = std::move(other.frame_);
+    owner_ = std::move(other.owner_);
+    return *this;
+  }
+  Received(const Received&) = delete;
+  Received& operator=(const Received&) = delete;
+
+  const T& operator*() const noexcept { return message_; }
+  const T* operator->() const noexcept { return &message_; }
+  const Info& info() const noexcept { return info_; }
+
+ private:
+  template <class>
+  friend class Subscription;
+  Received() = default;
+
+  zmq::message_t frame_;
+  std::shared_ptr<const void> owner_;
+  Info info_;
+  T message_{};
+};
+
+namespace detail {
+
+// A publisher that a subscription should be connected to.
+struct Source {
+  std::uint64_t source = 0;
+  std::uint64_t fingerprint = 0;
+  std::string schema;
+  std::string address;
+  bool local = false;
+  std::int64_t clock_offset_ns = 0;
+};
+
+class SubscriptionCore {
+ public:
+  SubscriptionCore(std::string topic, std::string type_name, std::string schema, TypeId type, Policy policy,
+                   std::shared_ptr<net::Complaints> complaints)
+      : topic_(std::move(topic)),
+        type_name_(std::move(type_name)),
+        schema_(std::move(schema)),
+        type_(type),
+        policy_(policy),
+        complaints_(std::move(complaints)) {}
+  ~SubscriptionCore() { close(); }
+
+  const std::string& topic() const noexcept { return topic_; }
+  const std::string& type_name() const noexcept { return type_name_; }
+  std::uint64_t fingerprint() const noexcept { return type_.fingerprint; }
+  const Policy& policy() const noexcept { return policy_; }
+
+  // Connects to what is there and takes leave of what is gone; for the node's thread.
+  void match(zmq::context_t& context, const std::vector<Source>& sources) {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (closed_) return;
+    for (auto& link : links_) {
+      const bool there = std::any_of(sources.begin(), sources.end(),
+                                     [&](const Source& source) { return source.source == link->source(); });
+      link->leaving_ns = there ? 0 : link->leaving_ns != 0 ? link->leaving_ns : monotonic_ns();
+    }
+    for (const auto& source : sources) {
+      if (std::any_of(links_.begin(), links_.end(),
+                      [&](const auto& link) { return link->source() == source.source; })) {
+        continue;
+      }
+      if (source.fingerprint != type_.fingerprint) {
+        complain(source);
+        continue;
+      }
+      links_.push_back(std::make_unique<Link>(context, source.address, source.source, type_, policy_, source.local,
+                                              source.clock_offset_ns, counters_, complaints_));
+    }
+    waker_.set();
+  }
+
+  // Reads the sockets of a subscription that nobody reads at the moment, so that the queue keeps the last messages
+  // and not the first that filled the sockets; closes the links of publishers that left.
+  void tend(std::int64_t now_ns) {
+    if (now_ns - drained_ns_.load(std::memory_order_relaxed) < tend_ns) return;
+    const std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
+    if (!lock.owns_lock() || closed_) return;
+    const bool waiting = !queue_.empty();
+    drain();
+    links_.erase(std::remove_if(links_.begin(), links_.end(),
+                                [&](const auto& link) {
+                                  return link->leaving_ns != 0 && now_ns - link->leaving_ns > leaving_ns;
+                                }),
+                 links_.end());
+    if (!waiting && !queue_.empty()) waker_.set();
+  }
+
+  // The next message, or nothing by the deadline or once closed. Throws TypeMismatch.
+  std::optional<Item> take(std::int64_t deadline_ns) {
+    while (true) {
+      std::vector<pollfd> fds;
+      {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (closed_) return std::nullopt;
+        if (!problems_.empty()) {
+          const TypeMismatch problem = std::move(problems_.front());
+          problems_.pop_front();
+          throw problem;
+        }
+        if (queue_.empty() || (!policy_.is_reliable && (!exhausted_ || policy_.depth < fresh_depth))) drain();
+        if (!queue_.empty()) {
+          std::optional<Item> item(std::move(queue_.front()));
+          queue_.pop_front();
+          ++counters_->received;
+          return item;
+        }
+        if (!exhausted_) continue;
+        fds.push_back({waker_.fd(), POLLIN, 0});
+        for (const auto& link : links_) fds.push_back({link->fd(), POLLIN, 0});
+      }
+      const std::int64_t left_ns = deadline_ns - monotonic_ns();
+      if (left_ns <= 0) return std::nullopt;
+      // Another thread's call on a socket may swallow its event, hence the bound.
+      const auto wait_ms = static_cast<int>(std::min<std::int64_t>((left_ns + 999'999) / 1'000'000, 100));
+      ::poll(fds.data(), fds.size(), wait_ms);
+      if ((fds[0].revents & POLLIN) != 0) waker_.clear();
+    }
+  }
+
+  // Copies a message that is not leased to us; false if its slot was written again meanwhile.
+  static bool fetch(Item& item) {
+    if (item.unleased == nullptr) return true;
+    auto copy = std::make_shared<std::vector<std::uint8_t>>(item.body.size());
+    if (!item.unleased->copy(item.slot, item.sequence, copy->size(), copy->data())) return false;
+    item.body = {copy->data(), copy->size()};
+    item.owner = std::move(copy);
+    return true;
+  }
+
+  void count_lost() {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    --counters_->received;
+    ++counters_->lost;
+  }
+  void count_rejected(std::uint64_t source, const std::string& reason) {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    --counters_->received;
+    for (const auto& link : links_) {
+      if (link->source() == source) return link->reject(reason);
+    }
+    ++counters_->rejected;
+  }
+
+  SubscriberCounters counters() const {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    return *counters_;
+  }
+
+  std::size_t publisher_count() {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (queue_.size() < policy_.depth) drain();  // their answers may wait among the messages
+    return static_cast<std::size_t>(std::count_if(links_.begin(), links_.end(), [](const auto& link) {
+      return link->attached() && link->leaving_ns == 0;
+    }));
+  }
+
+  bool closed() const {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    return closed_;
+  }
+
+  void close() {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      closed_ = true;
+      queue_.clear();
+      links_.clear();
+    }
+    waker_.set();
+  }
+
+ private:
+  static constexpr std::size_t drain_max = 64;
+  static constexpr std::size_t fresh_depth = 16;  // shorter queues are topped up before every message
+  static constexpr std::int64_t tend_ns = 20'000'000;
+  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way
+
+  void drain() {
+    drained_ns_.store(monotonic_ns(), std::memory_order_relaxed);
+    exhausted_ = true;
+    for (auto& link : links_) {
+      if (policy_.is_reliable) {
+        if (queue_.size() >= policy_.depth) break;
+        exhausted_ &= link->drain(queue_, policy_.depth - queue_.size());
+        continue;
+      }
+      // The newest is wanted: read on, but not for ever.
+      for (int rounds = policy_.depth < fresh_depth ? 16 : 1; rounds > 0; --rounds) {
+        const bool empty = link->drain(queue_, drain_max);
+        while (queue_.size() > policy_.depth) {
+          queue_.pop_front();
+          ++counters_->overtaken;
+        }
+        if (empty) break;
+        if (rounds == 1) exhausted_ = false;
+      }
+    }
+  }
+
+  void complain(const Source& source) {
+    if (std::find(mismatched_.begin(), mismatched_.end(), source.source) != mismatched_.end()) return;
+    if (mismatched_.size() >= 256) mismatched_.pop_front();
+    mismatched_.push_back(source.source);
+    ++counters_->rejected;
+    if (problems_.size() >= 16) problems_.pop_front();
+    problems_.emplace_back("a publisher of " + topic_ + " sends another type than is subscribed\nexpected: " + schema_ +
+                           "\nactual: " + source.schema);
+  }
+
+  const std::string topic_;
+  const std::string type_name_;
+  const std::string schema_;
+  const TypeId type_;
+  const Policy policy_;
+  std::shared_ptr<net::Complaints> complaints_;
+  mutable std::mutex mutex_;
+  net::Waker waker_;
+  std::shared_ptr<SubscriberCounters> counters_ = std::make_shared<SubscriberCounters>();
+  std::deque<Item> queue_;
+  std::vector<std::unique_ptr<Link>> links_;
+  std::deque<TypeMismatch> problems_;
+  std::deque<std::uint64_t> mismatched_;
+  std::atomic<std::int64_t> drained_ns_{0};
+  bool exhausted_ = true;
+  bool closed_ = false;
+};
+
+inline std::int64_t deadline(std::chrono::nanoseconds timeout) {
+  const std::int64_t now_ns = monotonic_ns();
+  const std::int64_t most = std::numeric_limits<std::int64_t>::max() - now_ns;
+  return now_ns + std::min<std::int64_t>(std::max<std::int64_t>(timeout.count(), 0), most);
+}
+
+}  // namespace detail
+
+// Receives the messages of a topic; made by `Node::subscribe`. Calls may come from any thread. It ends with its last
+// copy; after the end of its node, or `close`, `receive` returns nothing at once.
+template <class T>
+class Subscription {
+ public:
+  // The next message, or nothing if none came in time. Throws TypeMismatch, once for each publisher of another type.
+  std::optional<Received<T>> receive(std::chrono::nanoseconds timeout) {
+    const std::int64_t deadline_ns = detail::deadline(timeout);
+    while (auto item = core_->take(deadline_ns)) {
+      if (!detail::SubscriptionCore::fetch(*item)) {
+        core_->count_lost();
+        continue;
+      }
+      std::optional<Received<T>> result(Received<T>{});
+      try {
+        decode_into(item->body, result->message_);
+      } catch (const MalformedMessage& error) {
+        core_->count_rejected(item->source, error.what());
+        continue;
+      }
+      result->info_ = {item->source, item->sequence, std::nullopt, item->publish_ns, item->body.size()};
+      if constexpr (Codec<T>::stamped) result->info_.stamp_ns = item->stamp_ns;
+      result->frame_ = std::move(item->frame);
+      result->owner_ = std::move(item->owner);
+      return result;
+    }
+    return std::nullopt;
+  }
+
+  // Waits until a publisher has taken this subscription in.
+  bool wait_for_publisher(std::chrono::nanoseconds timeout) {
+    const std::int64_t deadline_ns = detail::deadline(timeout);
+    while (core_->publisher_count() == 0) {
+      if (core_->closed() || monotonic_ns() >= deadline_ns) return false;
+      std::this_thread::sleep_for(std::chrono::microseconds(500));
+    }
+    return true;
+  }
+
+  std::size_t publisher_count() { return core_->publisher_count(); }
+  SubscriberCounters counters() const { return core_->counters(); }
+  const std::string& topic() const noexcept { return core_->topic(); }
+  bool closed() const { return core_->closed(); }
+  void close() { core_->close(); }
+
+ private:
+  friend class Node;
+  explicit Subscription(std::shared_ptr<detail::SubscriptionCore> core) : core_(std::move(core)) {}
+  std::shared_ptr<detail::SubscriptionCore> core_;
+};
+
+}  // namespace cortex

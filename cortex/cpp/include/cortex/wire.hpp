@@ -1,0 +1,244 @@
+// SPDX-License-Identifier: Apache-2.0
+// The frames of WIRE.md: header, kinds, batches, attaching. Everything is little-endian.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "cortex/array.hpp"
+
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "cortex reads and writes little-endian memory in place: big-endian machines are not supported"
+#endif
+
+namespace cortex {
+
+// Bytes that are not what they claim to be. Receivers count it and go on.
+class MalformedMessage : public std::runtime_error {
+ public:
+  using std::runtime_error::runtime_error;
+};
+
+namespace wire {
+
+constexpr std::uint8_t version = 1;
+constexpr std::size_t header_size = 64;
+constexpr std::size_t prefix_size = 16;  // of a header: what a ZeroMQ subscription matches
+constexpr std::size_t key_size = 32;     // of an attach key
+constexpr std::uint8_t flag_stamp = 1;
+constexpr std::uint64_t body_limit = std::uint64_t{1} << 30;
+constexpr std::uint64_t control_limit = 16u << 20;
+constexpr std::uint32_t no_column = 0xFFFFFFFFu;
+constexpr std::uint32_t column_count = 64;
+constexpr std::size_t record_head = 24;
+constexpr std::uint32_t rings_alive = 4;
+
+template <class T>
+T load(const std::uint8_t* from) noexcept {
+  T value;
+  std::memcpy(&value, from, sizeof value);
+  return value;
+}
+
+template <class T>
+void store(std::uint8_t* to, T value) noexcept {
+  std::memcpy(to, &value, sizeof value);
+}
+
+constexpr std::uint64_t round_up(std::uint64_t value, std::uint64_t alignment) noexcept {
+  return (value + alignment - 1) / alignment * alignment;
+}
+
+struct Header {
+  char kind = 'M';
+  std::uint8_t flags = 0;
+  std::uint64_t source = 0;
+  std::uint64_t fingerprint = 0;
+  std::uint64_t sequence = 0;
+  std::int64_t stamp_ns = 0;  // meaningful if flags has flag_stamp
+  std::int64_t publish_ns = 0;
+  std::uint64_t body_size = 0;
+  std::uint64_t aux = 0;
+};
+
+inline void write_prefix(std::uint8_t* out, char kind, std::uint8_t flags, std::uint64_t source) noexcept {
+  out[0] = 'C';
+  out[1] = 'T';
+  out[2] = 'X';
+  out[3] = static_cast<std::uint8_t>(kind);
+  out[4] = version;
+  out[5] = flags;
+  store<std::uint16_t>(out + 6, header_size);
+  store(out + 8, source);
+}
+
+inline void write_header(std::uint8_t* out, const Header& header) noexcept {
+  write_prefix(out, header.kind, header.flags, header.source);
+  store(out + 16, header.fingerprint);
+  store(out + 24, header.sequence);
+  store(out + 32, header.stamp_ns);
+  store(out + 40, header.publish_ns);
+  store(out + 48, header.body_size);
+  store(out + 56, header.aux);
+}
+
+inline Header read_header(Span<const std::uint8_t> frame) {
+  if (frame.size() < header_size) {
+    throw MalformedMessage("a frame of " + std::to_string(frame.size()) + " bytes is shorter than a header of 64");
+  }
+  const std::uint8_t* at = frame.data();
+  if (at[0] != 'C' || at[1] != 'T' || at[2] != 'X' || at[4] != version || (at[5] & ~flag_stamp) != 0 ||
+      load<std::uint16_t>(at + 6) != header_size) {
+    throw MalformedMessage("not a frame of Cortex 1: wrong magic, version, flags or header length");
+  }
+  Header header;
+  header.kind = static_cast<char>(at[3]);
+  header.flags = at[5];
+  header.source = load<std::uint64_t>(at + 8);
+  header.fingerprint = load<std::uint64_t>(at + 16);
+  header.sequence = load<std::uint64_t>(at + 24);
+  header.stamp_ns = load<std::int64_t>(at + 32);
+  header.publish_ns = load<std::int64_t>(at + 40);
+  header.body_size = load<std::uint64_t>(at + 48);
+  header.aux = load<std::uint64_t>(at + 56);
+  return header;
+}
+
+// A single frame holds exactly its header and its body, and no more than the limit.
+inline Span<const std::uint8_t> body_of(const Header& header, Span<const std::uint8_t> frame, std::uint64_t limit) {
+  if (header.body_size > limit || header.body_size != frame.size() - header_size) {
+    throw MalformedMessage("a frame of " + std::to_string(frame.size()) + " bytes says that its body has " +
+                           std::to_string(header.body_size) + " (limit " + std::to_string(limit) + ")");
+  }
+  return {frame.data() + header_size, static_cast<std::size_t>(header.body_size)};
+}
+
+// One message of a batch.
+struct Record {
+  std::int64_t stamp_ns = 0;
+  std::int64_t publish_ns = 0;
+  Span<const std::uint8_t> body;
+};
+
+// The records of a batch, which must fill the frame exactly.
+inline std::vector<Record> batch_records(const Header& header, Span<const std::uint8_t> frame) {
+  const auto malformed = [](const char* what) { throw MalformedMessage(std::string("a batch ") + what); };
+  if (header.aux > (frame.size() - header_size) / record_head) malformed("cannot hold its records");
+  if (header.sequence + header.aux < header.sequence) malformed("wraps its sequence number");
+  std::vector<Record> records;
+  records.reserve(static_cast<std::size_t>(header.aux));
+  std::size_t offset = header_size;
+  for (std::uint64_t index = 0; index < header.aux; ++index) {
+    if (frame.size() - offset < record_head) malformed("ends within the head of a record");
+    const std::uint8_t* at = frame.data() + offset;
+    const std::size_t size = load<std::uint32_t>(at + 16);
+    offset += record_head;
+    if (load<std::uint32_t>(at + 20) != 0 || round_up(size, 8) > frame.size() - offset) {
+      malformed("has a record that does not fit");
+    }
+    records.push_back({load<std::int64_t>(at), load<std::int64_t>(at + 8), {frame.data() + offset, size}});
+    offset += static_cast<std::size_t>(round_up(size, 8));
+  }
+  if (offset != frame.size()) malformed("has bytes after its last record");
+  return records;
+}
+
+// What a reader asks for when it attaches to a publisher.
+struct AttachKey {
+  std::uint64_t source = 0;
+  std::uint64_t reader = 0;
+  bool shared_memory = false;
+  bool strict = false;
+  std::uint8_t quota = 0;
+  std::uint32_t timeout_ms = 0;
+};
+
+inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
+  std::string bytes(key_size, '\0');
+  auto* out = reinterpret_cast<std::uint8_t*>(bytes.data());
+  write_prefix(out, 'A', flags, key.source);
+  store(out + 16, key.reader);
+  store(out + 24, static_cast<std::uint64_t>(key.shared_memory ? 1 : 0) | (key.strict ? 2u : 0u) |
+                      static_cast<std::uint64_t>(key.quota) << 8 | static_cast<std::uint64_t>(key.timeout_ms) << 32);
+  return bytes;
+}
+
+// True and the key, if the subscription is one.
+inline bool read_key(Span<const std::uint8_t> bytes, AttachKey& key) noexcept {
+  if (bytes.size() != key_size || std::memcmp(bytes.data(), "CTXA", 4) != 0) return false;
+  const auto options = load<std::uint64_t>(bytes.data() + 24);
+  key.source = load<std::uint64_t>(bytes.data() + 8);
+  key.reader = load<std::uint64_t>(bytes.data() + 16);
+  key.shared_memory = (options & 1) != 0;
+  key.strict = (options & 2) != 0;
+  key.quota = static_cast<std::uint8_t>(options >> 8);
+  key.timeout_ms = static_cast<std::uint32_t>(options >> 32);
+  return true;
+}
+
+struct RingPlace {
+  std::uint32_t ring = 0;
+  std::uint32_t slots = 0;
+  std::uint64_t slot_bytes = 0;
+  std::uint32_t pid = 0;
+  std::int32_t fd = -1;
+};
+
+struct AttachAnswer {
+  std::uint64_t sequence = 0;
+  std::uint32_t column = no_column;
+  std::vector<RingPlace> rings;
+  Span<const std::uint8_t> latched;
+};
+
+inline std::string pack_answer(const std::string& key, const AttachAnswer& answer) {
+  std::string frame(header_size + 32 * answer.rings.size(), '\0');
+  std::memcpy(frame.data(), key.data(), key_size);
+  auto* out = reinterpret_cast<std::uint8_t*>(frame.data()) + key_size;
+  store(out, answer.sequence);
+  store(out + 8, answer.column);
+  store(out + 12, static_cast<std::uint32_t>(answer.rings.size()));
+  store(out + 16, static_cast<std::uint64_t>(answer.latched.size()));
+  out += 32;
+  for (const auto& ring : answer.rings) {
+    store(out, ring.ring);
+    store(out + 4, ring.slots);
+    store(out + 8, ring.slot_bytes);
+    store(out + 16, ring.pid);
+    store(out + 20, ring.fd);
+    out += 32;
+  }
+  frame.append(reinterpret_cast<const char*>(answer.latched.data()), answer.latched.size());
+  return frame;
+}
+
+inline AttachAnswer read_answer(Span<const std::uint8_t> frame) {
+  if (frame.size() < header_size) throw MalformedMessage("an attach answer is too short");
+  const std::uint8_t* at = frame.data() + key_size;
+  AttachAnswer answer;
+  answer.sequence = load<std::uint64_t>(at);
+  answer.column = load<std::uint32_t>(at + 8);
+  const auto rings = load<std::uint32_t>(at + 12);
+  const auto latched = load<std::uint64_t>(at + 16);
+  if (rings > rings_alive || latched > body_limit + header_size ||
+      frame.size() != header_size + 32u * rings + latched) {
+    throw MalformedMessage("an attach answer cannot hold its rings and its latched message");
+  }
+  if (answer.column != no_column && answer.column >= column_count) {
+    throw MalformedMessage("column " + std::to_string(answer.column) + " is not below 64");
+  }
+  at += 32;
+  for (std::uint32_t index = 0; index < rings; ++index, at += 32) {
+    answer.rings.push_back({load<std::uint32_t>(at), load<std::uint32_t>(at + 4), load<std::uint64_t>(at + 8),
+                            load<std::uint32_t>(at + 16), load<std::int32_t>(at + 20)});
+  }
+  answer.latched = {at, static_cast<std::size_t>(latched)};
+  return answer;
+}
+
+}  // namespace wire
+}  // namespace cortex

@@ -1,0 +1,349 @@
+"""C++ structs for message types: what `cortex cpp module:Scan > scan.hpp` writes.
+
+The header has one plain struct for each message and enum, and beside it a `cortex::Codec` with the type's
+schema, fingerprint and the code that reads and writes its body. Offsets are computed here, so that the C++
+compiler sees constants. A header may be included together with others that hold the same types.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from cortex.cppbody import BodyWriter, Code, is_large, literal, place
+from cortex.layout import (
+    has_tail,
+    measure,
+    measure_fields,
+)
+from cortex.schema import (
+    ANY_DTYPE,
+    ArrayType,
+    EnumType,
+    Field,
+    FieldType,
+    ListType,
+    OptionalType,
+    Schema,
+    fingerprint_of,
+    schema_of,
+)
+
+_SCALARS = {
+    "bool": "bool",
+    "float32": "float",
+    "float64": "double",
+    "str": "std::string",
+    "bytes": "cortex::Array<std::uint8_t>",
+} | {f"{sign}int{bits}": f"std::{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)}
+_ITEMS = _SCALARS | {
+    "bool": "cortex::Bool",
+    "float16": "cortex::Half",
+    "complex64": "std::complex<float>",
+    "complex128": "std::complex<double>",
+}
+
+_RESERVED_WORDS = """
+alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class
+co_await co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype
+default delete do double dynamic_cast else enum explicit export extern false float for friend goto if inline
+int long mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected public
+register reinterpret_cast requires return short signed sizeof static static_assert static_cast struct switch
+template this thread_local throw true try typedef typeid typename union unsigned using virtual void volatile
+wchar_t while xor xor_eq NULL EOF TRUE FALSE INFINITY NAN OVERFLOW UNDERFLOW DOMAIN SING PLOSS TLOSS HUGE
+BUFSIZ RAND_MAX assert errno stdin stdout stderr unix linux i386 major minor makedev signals slots emit
+"""
+"""Keywords, and macros of the C library, of compilers and of Qt that turn up as names of fields."""
+_RESERVED = frozenset(_RESERVED_WORDS.split())
+
+
+def generate(types: Sequence[type | Schema], *, namespace: str | None = None) -> str:
+    """Write the C++ header for message types and all that they contain.
+
+    Args:
+        types: Message classes or schemas.
+        namespace: C++ namespace of every struct, such as `robot::messages`. By default it is what stands
+            before the last part of a type's name: `robot/Scan` becomes `robot::Scan`, `Scan` is in none.
+
+    Raises:
+        ValueError: No types, a namespace that is none, or two different types of one C++ name.
+        TypeError: A class that is no message.
+    """
+    if not types:
+        raise ValueError("types must hold at least one message type")
+    if namespace is not None and not re.fullmatch(r"[A-Za-z_]\w*(::[A-Za-z_]\w*)*", namespace, re.ASCII):
+        raise ValueError(f"namespace must be names joined by '::', got {namespace!r}")
+    generator = _Generator(namespace)
+    for item in types:
+        generator.message(item if isinstance(item, Schema) else schema_of(item))
+    names = ", ".join(block.name for block in generator.blocks)
+    return "\n".join(
+        [
+            f"// Written by `cortex cpp`; do not edit. Types: {names}.",
+            "#pragma once",
+            "",
+            "#include <array>",
+            "#include <complex>",
+            "#include <cstddef>",
+            "#include <cstdint>",
+            "#include <limits>",
+            "#include <optional>",
+            "#include <stdexcept>",
+            "#include <string>",
+            "#include <string_view>",
+            "#include <utility>",
+            "#include <vector>",
+            "",
+            "#include <cortex/codec.hpp>",
+            "",
+            *(line for block in generator.blocks for line in block.guarded()),
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class _Block:
+    """The text of one struct or enum; `key` tells equal ones from others of the same name."""
+
+    name: str
+    key: str
+    lines: tuple[str, ...]
+
+    def guarded(self) -> Iterator[str]:
+        macro = f"CORTEX_TYPE_{re.sub(r'[^A-Za-z0-9]+', '_', self.name)}_{self.key}"
+        yield f"#ifndef {macro}"
+        yield f"#define {macro}"
+        yield from self.lines
+        yield f"#endif  // {macro}"
+        yield ""
+
+
+@dataclass(frozen=True)
+class _Member:
+    """A field of a struct: its C++ name and type, and its place in the block."""
+
+    name: str
+    cpp: str
+    field: Field
+    offset: int
+
+
+class _Generator:
+    """Collects blocks in an order in which each knows those that it uses."""
+
+    def __init__(self, namespace: str | None) -> None:
+        self._namespace = namespace
+        self.blocks: list[_Block] = []
+        self._body = BodyWriter(self.cpp)
+
+    def _qualified(self, name: str) -> tuple[str, str, str]:
+        """Namespace, identifier, and both together, of a type's name."""
+        parts = [_identifier(part) for part in re.split(r"[./]+", name.strip("./"))]
+        namespace = self._namespace if self._namespace is not None else "::".join(parts[:-1])
+        return namespace, parts[-1], f"{namespace}::{parts[-1]}" if namespace else parts[-1]
+
+    def _add(self, name: str, key: str, lines: Sequence[str]) -> None:
+        self.blocks.append(_Block(name, key, tuple(lines)))
+
+    def _is_known(self, name: str, key: str) -> bool:
+        known = next((block for block in self.blocks if block.name == name), None)
+        if known is not None and known.key != key:
+            raise ValueError(f"two different types would both be {name} in C++; generate them apart")
+        return known is not None
+
+    def cpp(self, kind: FieldType) -> str:
+        """The C++ type of a field."""
+        if isinstance(kind, str):
+            return _SCALARS[kind]
+        if isinstance(kind, EnumType):
+            return self.enumeration(kind)
+        if isinstance(kind, ArrayType):
+            return _array(kind)
+        if isinstance(kind, OptionalType):
+            return f"std::optional<{self.cpp(kind.item)}>"
+        if isinstance(kind, ListType):
+            return f"std::vector<{self.cpp(kind.item)}>"
+        return self.message(kind)
+
+    def enumeration(self, kind: EnumType) -> str:
+        """Make the enum, return its C++ name."""
+        namespace, name, qualified = self._qualified(kind.name)
+        key = f"{fingerprint_of(repr(kind).encode()):016X}"
+        if self._is_known(qualified, key):
+            return f"::{qualified}"
+        members: dict[str, int] = {}
+        for member, value in kind.values:
+            members[_identifier(member, members)] = value
+        lines = [
+            *_open(namespace),
+            f"enum class {name} : std::int32_t {{",
+            *(f"  {member} = {_int32(value)}," for member, value in members.items()),
+            "};",
+            *_close(namespace),
+            "namespace cortex {",
+            "template <>",
+            f"struct EnumCodec<::{qualified}> {{",
+            f"  static constexpr std::string_view name = {literal(kind.name)};",
+            "  static constexpr bool known(std::int32_t number) noexcept {",
+            "    switch (number) {",
+            *(f"      case {_int32(number)}:" for number in sorted(set(members.values()))),
+            "        return true;",
+            "      default:",
+            "        return false;",
+            "    }",
+            "  }",
+            "};",
+            "}  // namespace cortex",
+        ]
+        self._add(qualified, key, lines)
+        return f"::{qualified}"
+
+    def message(self, schema: Schema) -> str:
+        """Make the struct and its codec, return its C++ name."""
+        namespace, name, qualified = self._qualified(schema.name)
+        key = f"{schema.fingerprint:016X}"
+        if self._is_known(qualified, key):
+            return f"::{qualified}"
+        members: list[_Member] = []
+        for item, offset in zip(schema.fields, measure_fields(schema)[0], strict=True):
+            taken = [name, *(member.name for member in members)]
+            members.append(_Member(_identifier(item.name, taken), self.cpp(item.type), item, offset))
+        lines = [
+            *_open(namespace),
+            *_struct(name, members),
+            *_close(namespace),
+            *self._codec(schema, f"::{qualified}", members),
+        ]
+        self._add(qualified, key, lines)
+        return f"::{qualified}"
+
+    def _codec(self, schema: Schema, cpp: str, members: list[_Member]) -> list[str]:
+        _, size, alignment = measure_fields(schema)
+        read, write, draft = Code("MalformedMessage"), Code("std::invalid_argument"), Code("")
+        used = 0
+        for member in members:
+            where = literal(f"{schema.name}.{member.field.name}")
+            at = _plus("at", member.offset)
+            self._body.read(read, member.field.type, f"out.{member.name}", at, where, 2)
+            if member.offset > used:
+                write.lines.append(f"    sink.zero({_plus('at', used)}, {member.offset - used});")
+            self._body.write(write, member.field.type, f"message.{member.name}", at, where, 2)
+            place(draft, member.field.type, f"out.{member.name}", member.offset)
+            used = member.offset + measure(member.field.type)[0]
+        if size > used:
+            write.lines.append(f"    sink.zero({_plus('at', used)}, {size - used});")
+        stamp = next((m for m in members if m.field.name == "stamp_ns" and _is_integer(m.field.type)), None)
+        unused = "" if stamp else "[[maybe_unused]] "
+        stamp_code = f"static_cast<std::int64_t>(message.{stamp.name})" if stamp else "0"
+        return [
+            "namespace cortex {",
+            "template <>",
+            f"struct Codec<{cpp}> {{",
+            f"  static constexpr std::string_view name = {literal(schema.name)};",
+            f"  static constexpr std::uint64_t fingerprint = 0x{schema.fingerprint:016X}u;",
+            "  static constexpr std::string_view schema =",
+            *_string_lines(schema.to_json()),
+            f"  static constexpr std::size_t block = {size};",
+            f"  static constexpr std::size_t alignment = {alignment};",
+            f"  static constexpr bool fixed = {_truth(not has_tail(schema))};",
+            f"  static constexpr bool stamped = {_truth(stamp is not None)};",
+            "",
+            f"  static std::int64_t stamp({unused}const {cpp}& message) noexcept {{",
+            f"    return {stamp_code};",
+            "  }",
+            "",
+            *_function("decode", ["Reader& reader", "std::size_t at", f"{cpp}& out"], read),
+            "",
+            "  template <class Sink>",
+            *_function("encode", ["Sink& sink", "std::size_t at", f"const {cpp}& message"], write),
+            "",
+            *_function("draft", ["Placer& placer", f"{cpp}& out"], draft),
+            "};",
+            "}  // namespace cortex",
+        ]
+
+
+def _function(name: str, parameters: Sequence[str], code: Code) -> list[str]:
+    unused = "" if code.lines else "[[maybe_unused]] "
+    marked = ", ".join(unused + parameter for parameter in parameters)
+    return [f"  static void {name}({marked}) {{", *code.whole("    "), "  }"]
+
+
+def _struct(name: str, members: list[_Member]) -> Iterator[str]:
+    yield f"struct {name} {{"
+    for member in members:
+        notes = []
+        if isinstance(member.field.type, ArrayType):
+            notes.append(f"[{', '.join(map(str, member.field.type.shape))}]")
+        if member.field.unit:
+            notes.append(_comment(member.field.unit))
+        if member.field.frame:
+            notes.append(f"frame {_comment(member.field.frame)}")
+        yield f"  {member.cpp} {member.name}{{}};" + (f"  // {', '.join(notes)}" if notes else "")
+    equal = " && ".join(f"a.{member.name} == b.{member.name}" for member in members) or "true"
+    unused = "" if members else "[[maybe_unused]] "
+    if members:
+        yield ""
+    yield f"  friend bool operator==({unused}const {name}& a, {unused}const {name}& b) {{"
+    yield f"    return {equal};"
+    yield "  }"
+    yield f"  friend bool operator!=(const {name}& a, const {name}& b) {{ return !(a == b); }}"
+    yield "};"
+
+
+def _array(kind: ArrayType) -> str:
+    """The C++ type of an array: small ones of a fixed shape are values, the others may look into a frame."""
+    rank = len(kind.shape)
+    if kind.dtype == ANY_DTYPE:
+        return f"cortex::AnyArray<{rank}>"
+    cpp = _ITEMS[kind.dtype]
+    if not kind.is_fixed or is_large(kind):
+        return f"cortex::Array<{cpp}, {rank}>"
+    for extent in reversed(kind.shape or (1,)):
+        cpp = f"std::array<{cpp}, {extent}>"
+    return cpp
+
+
+def _is_integer(kind: FieldType) -> bool:
+    return isinstance(kind, str) and "int" in kind
+
+
+def _identifier(name: str, taken: Sequence[str] | dict[str, int] = ()) -> str:
+    safe = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    if not safe or safe[0].isdigit():
+        safe = "_" + safe
+    while safe in _RESERVED or safe in taken:
+        safe += "_"
+    return safe
+
+
+def _comment(text: str) -> str:
+    """A unit or frame, made fit for a comment of one line."""
+    return re.sub(r"[^\x20-\x7e\u00a0-\u1fff\u2030-\uffff]|\\", " ", text)
+
+
+def _string_lines(text: str) -> Iterator[str]:
+    pieces = [text[start : start + 90] for start in range(0, len(text), 90)]
+    for index, piece in enumerate(pieces):
+        yield f"      {literal(piece)}{';' if index == len(pieces) - 1 else ''}"
+
+
+def _open(namespace: str) -> list[str]:
+    return [f"namespace {namespace} {{"] if namespace else []
+
+
+def _close(namespace: str) -> list[str]:
+    return [f"}}  // namespace {namespace}"] if namespace else []
+
+
+def _plus(at: str, offset: int) -> str:
+    return f"{at} + {offset}" if offset else at
+
+
+def _int32(value: int) -> str:
+    return "std::numeric_limits<std::int32_t>::min()" if value == -(2**31) else str(value)
+
+
+def _truth(value: bool) -> str:
+    return "true" if value else "false"
