@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cortex.bench.cases import CASES, Case, choose
 from cortex.bench.measure import CaseResult, Settings, private_folder, run_case
-from cortex.bench.report import case_lines, header, summary_lines, write_csv
+from cortex.bench.report import case_lines, header, summary_lines, threshold_lines, write_csv
 
 _QUICK_SECONDS = 0.05
 _QUICK_REPEATS = 2
@@ -76,7 +76,9 @@ def _run_all(cases: list[Case], settings: Settings) -> list[CaseResult]:
         _progress("")
         print("\n".join(case_lines(result)), end="\n\n", flush=True)
         results.append(result)
-    print("\n".join(summary_lines(results)))
+    for table in (threshold_lines(results), summary_lines(results)):
+        if text := "\n".join(table):
+            print(text, end="\n\n")
     return results
 
 

@@ -18,7 +18,7 @@ from cortex.bench.job import PATIENCE_S, PONG_FLOATS, Job, Sender
 from cortex.bench.samples import FIXED, Reading, Sample
 from cortex.bench.tally import END, Finished, Floats, Tally, make_payloads
 from cortex.node import Node
-from cortex.policy import Policy, keep_last, latest, reliable
+from cortex.policy import Policy, latest, reliable
 
 __all__ = [
     "client",
@@ -235,9 +235,8 @@ class _ReadingSender:
 
 
 def receive_latest(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
-    """Use messages under `latest()`, or `keep_last(64)` if option ``queue`` is set; return their ages."""
+    """Use messages under `latest()`, from `recv` or in a callback (option ``how``); return their ages."""
     ages = Ages(job, connected)
-    policy = keep_last(64) if job.options.get("queue") else latest()
     node = _connecting_node("bench_subscriber", job)
     try:
         if job.options.get("how") == "callback":
@@ -248,10 +247,10 @@ def receive_latest(job: Job, connected: Callable[[], None]) -> dict[str, Any]:
                 if ages.done:
                     done.set()
 
-            node.subscriber(_topic(job), Reading, on_reading, policy=policy)
+            node.subscriber(_topic(job), Reading, on_reading, policy=latest())
             done.wait(job.seconds + 600.0)
         else:
-            subscriber = node.subscriber(_topic(job), Reading, policy=policy)
+            subscriber = node.subscriber(_topic(job), Reading, policy=latest())
             while not ages.done:
                 reading = subscriber.recv(timeout_s=PATIENCE_S)
                 ages.use(reading.sequence, reading.stamp_ns)

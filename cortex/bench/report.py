@@ -69,6 +69,40 @@ def summary_lines(results: list[CaseResult]) -> Iterator[str]:
     yield f"{met} met, {missed} missed, {len(words) - met - missed} not measured"
 
 
+def threshold_lines(results: list[CaseResult]) -> Iterator[str]:
+    """Yield the sweep of sizes that `inline_max` is chosen by; nothing if it was not measured."""
+    sweep = {
+        4 * r.case.floats: _inline_and_shared(r) for r in results if r.case.name.startswith("threshold-")
+    }
+    if not sweep:
+        return
+    yield f"{'payload':>10}{'inline':>12}{'shared':>12}  shared / inline, rate   round trip p50"
+    wins: list[int] = []
+    for size, figures in sweep.items():
+        if any(value is None for value in figures):
+            yield f"{size:>10,}  not measured"
+            continue
+        inline, shared, inline_us, shared_us = (value or 0.0 for value in figures)
+        ratio, rtt_ratio = shared / inline, shared_us / inline_us
+        yield f"{size:>10,}{inline:>10,.0f}/s{shared:>10,.0f}/s{ratio:>18.2f}{rtt_ratio:>17.2f}"
+        wins = [*wins, size] if ratio >= 1.0 else []
+    yield (
+        f"shared memory carries more messages from {wins[0]:,} B on"
+        if wins
+        else "inline carries more throughout"
+    )
+
+
+def _inline_and_shared(result: CaseResult) -> list[float | None]:
+    """Return the rates inline and shared, then the medians of their round trips."""
+    names = [contestant.name for contestant in result.case.contestants]
+    figures: list[float | None] = []
+    for name, metric in zip(names, ("rate", "rate", "rtt_p50_us", "rtt_p50_us"), strict=True):
+        spread = Spread.of(result.outcomes[name].values(metric))
+        figures.append(None if spread is None else spread.median)
+    return figures
+
+
 def write_csv(path: Path, results: list[CaseResult]) -> None:
     """Write one line per case, contestant and metric, the single repetitions included."""
     with path.open("w", newline="") as file:

@@ -19,7 +19,7 @@ from cortex.bench.children import Channel, Child, ChildFailed
 from cortex.bench.command import main
 from cortex.bench.copies import make_ring, slots_of
 from cortex.bench.measure import CaseResult, Outcome, Settings, Spread, judge, run_case
-from cortex.bench.report import WIDTH, case_lines, header, summary_lines, write_csv
+from cortex.bench.report import WIDTH, case_lines, header, summary_lines, threshold_lines, write_csv
 from cortex.bench.tally import END, WARM, Finished, Tally, make_payloads
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -301,6 +301,29 @@ def test_summary_says_met_or_missed_and_counts():
     text = "\n".join(summary_lines(results()))
     assert "0.90 ± 0.00" in text
     assert "1 met, 1 missed, 0 not measured" in text
+
+
+def sweep(*ratios: float) -> list[CaseResult]:
+    """Return results of the first threshold cases: shared memory so many times as fast as inline."""
+    found = []
+    for case, ratio in zip(choose(["threshold"]), ratios, strict=False):
+        names = [contestant.name for contestant in case.contestants]
+        reports = ({"rate": 100.0}, {"rate": 100.0 * ratio}, {"rtt_p50_us": 50.0}, {"rtt_p50_us": 60.0})
+        outcomes = {name: outcome(name, report) for name, report in zip(names, reports, strict=True)}
+        found.append(CaseResult(case, outcomes))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("ratios", "words"),
+    [
+        ((0.8, 0.9, 1.1, 1.2), "from 4,096 B on"),
+        ((0.8, 1.1, 0.9, 1.2), "from 8,192 B on"),  # one lucky size in between does not count
+        ((1.1, 0.9), "inline carries more throughout"),
+    ],
+)
+def test_threshold_is_where_shared_memory_stays_ahead(ratios: tuple[float, ...], words: str):
+    assert words in "\n".join(threshold_lines(sweep(*ratios)))
 
 
 def test_csv_holds_every_repetition(tmp_path: Path):
