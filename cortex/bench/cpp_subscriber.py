@@ -9,6 +9,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from cortex.bench.samples import Sample
+from cortex.cppgen import generate
+
 _SOURCE = Path(__file__).with_name("subscriber.cpp")
 _INCLUDE = Path(__file__).parents[1] / "cpp" / "include"
 _BUILD_S = 120.0
@@ -30,18 +33,11 @@ def binary() -> Path:
 
 @functools.cache
 def build_error() -> str:
-    """Build the program; return the compiler's first complaint, or nothing."""
-    command = [
-        "g++",
-        "-std=c++17",
-        "-O2",
-        f"-I{_INCLUDE}",
-        str(_SOURCE),
-        "-o",
-        str(binary()),
-        "-lzmq",
-        "-pthread",
-    ]
+    """Generate the header and build the program; return the first complaint of either, or nothing."""
+    folder = binary().parent
+    (folder / "sample.hpp").write_text(generate([Sample]))
+    command = ["g++", "-std=c++17", "-O2", f"-I{_INCLUDE}", f"-I{folder}", str(_SOURCE)]
+    command += ["-o", str(binary()), "-lzmq", "-pthread"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_BUILD_S, check=False)
     except subprocess.TimeoutExpired:
