@@ -13,15 +13,45 @@ from numpy.typing import NDArray
 from cortex.checks import explain
 from cortex.decoder import Decoder, MalformedMessage
 from cortex.draft import Draft, Drafter
-from cortex.encoder import ENCODE_ERRORS, Encoder, Part, Tail, join, write
+from cortex.encoder import ENCODE_ERRORS, Encoder, join, write
+from cortex.fast import Layout, is_flat, make_decode, make_encode, make_layout
 from cortex.layout import has_tail, record_dtype
 from cortex.schema import schema_of
 
-__all__ = ["Codec", "MalformedMessage", "codec_of"]
+__all__ = ["Codec", "MalformedMessage", "Plan", "codec_of"]
+
+
+_SMALL_BODY_BYTES = 8192
+"""Up to this size a body is written faster by joining its parts first."""
+
+
+class Plan:
+    """A message, ready to be written."""
+
+    __slots__ = ("parts", "size")
+
+    def __init__(self, parts: list[Any], size: int) -> None:
+        self.parts = parts
+        self.size = size
+        """Bytes of the body."""
+
+    def write(self, buffer: memoryview | NDArray[np.uint8]) -> int:
+        """Write the body to writable memory, arrays with one copy, and return its size [bytes].
+
+        Raises:
+            ValueError: The memory is too small.
+        """
+        if self.size > len(buffer):
+            raise ValueError(f"a body of {self.size} bytes does not fit into a buffer of {len(buffer)}")
+        if self.size <= _SMALL_BODY_BYTES:
+            memoryview(buffer)[: self.size] = join(self.parts)  # type: ignore[arg-type]  # an array is a buffer
+        else:
+            write(self.parts, buffer if isinstance(buffer, np.ndarray) else np.frombuffer(buffer, np.uint8))
+        return self.size
 
 
 class Codec:
-    """Encodes and decodes messages of one type. All methods may be called from several threads."""
+    """Encodes and decodes messages of one type; threads may share it."""
 
     def __init__(self, message_type: type) -> None:
         self.type = message_type
@@ -39,23 +69,57 @@ class Codec:
         for field in self.schema.fields:
             if field.name == "stamp_ns" and isinstance(field.type, str) and "int" in field.type:
                 self.stamp_of = attrgetter("stamp_ns")
-        self._drafter = Drafter(self.schema, message_type, self._encoder)
-        self._decoder = Decoder(self.schema, message_type)
-        self.decode = self._decoder.decode
-
-    def encode(self, message: Any, limit: int) -> bytes | None:
-        """Return the body of a message, or None if it would be larger than `limit` bytes.
+        encoder, decoder = self._encoder, Decoder(self.schema, message_type)
+        self._layout: Layout = encoder.layout
+        self.encode: Callable[[Any, int], bytes | None] = self._encode
+        """Message and limit to the body, or None if it would be larger than `limit` bytes.
 
         Raises:
             TypeError: A value, or an array's dtype, is not of the field's type.
             ValueError: A value is out of range, or an array has the wrong shape.
         """
-        parts, tail = self._layout(message)
-        return None if tail.end > limit else join(parts, tail)
+        self.decode: Callable[..., Any] = decoder.decode
+        """Buffer, offset = 0 and size = None to the message.
+
+        The buffer is `bytes` or a read-only array of bytes. The message keeps it: arrays are views of it.
+
+        Raises:
+            MalformedMessage: The bytes are no body of the type.
+        """
+        if is_flat(self.schema):
+            self._layout = make_layout(self.schema, message_type)
+            self.encode = make_encode(self.schema, message_type, self._encode) or self._encode
+            self.decode = make_decode(self.schema, message_type, decoder.decode)
+        self._has_short_encode = self.encode != self._encode
+        self._drafter = Drafter(self.schema, message_type, encoder)
+
+    def plan(self, message: Any) -> Plan:
+        """Lay out a message once, to learn its size and then write it; it raises as `encode` does.
+
+        The plan refers to the arrays of the message, which must not change until it is written.
+        """
+        try:
+            return Plan(*self._layout(message))
+        except ENCODE_ERRORS:
+            pass
+        try:
+            return Plan(*self._encoder.layout(message))
+        except ENCODE_ERRORS as error:
+            raise explain(self.schema, self.type, message, error) from error
+
+    def prepare(self, message: Any, limit: int) -> bytes | Plan:
+        """Return the body of a message, or its plan if it would be larger than `limit` bytes.
+
+        It raises as `encode` does, and does the work of `encode` and `plan` once.
+        """
+        if self._has_short_encode:
+            return self.encode(message, limit) or self.plan(message)
+        plan = self.plan(message)
+        return plan if plan.size > limit else join(plan.parts)
 
     def size(self, message: Any) -> int:
-        """Return the size of the body [bytes]. Raises as `encode` does."""
-        return self._layout(message)[1].end
+        """Return the size of the body [bytes]. It raises as `encode` does."""
+        return self.plan(message).size
 
     def encode_into(self, message: Any, buffer: memoryview | NDArray[np.uint8]) -> int:
         """Write the body to writable memory and return its size [bytes].
@@ -64,11 +128,11 @@ class Codec:
             ValueError: The memory is too small, or as `encode` does.
             TypeError: As `encode` does.
         """
-        parts, tail = self._layout(message)
-        if tail.end > len(buffer):
-            raise ValueError(f"{self.schema.name}: body of {tail.end} bytes, the buffer has {len(buffer)}")
-        write(parts + tail.parts, np.frombuffer(buffer, np.uint8))
-        return tail.end
+        return self.plan(message).write(buffer)
+
+    def _encode(self, message: Any, limit: int) -> bytes | None:
+        plan = self.plan(message)
+        return None if plan.size > limit else join(plan.parts)
 
     def draft_size(
         self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
@@ -107,12 +171,6 @@ class Codec:
             TypeError: As `encode` does.
         """
         return self._drafter.finish(draft)
-
-    def _layout(self, message: Any) -> tuple[list[Part], Tail]:
-        try:
-            return self._encoder.layout(message)
-        except ENCODE_ERRORS as error:
-            raise explain(self.schema, self.type, message, error) from error
 
 
 _codecs: dict[type, Codec] = {}

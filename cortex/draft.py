@@ -115,22 +115,22 @@ class Drafter:
         views = draft._Draft__views
         message: Any = new_message(self._cls, [self._value_of(draft, name) for name in self._names])
         try:
-            parts, tail = self._layout(message, places)
+            parts, end = self._layout(message, places)
         except ENCODE_ERRORS as error:
             raise explain(self._schema, self._cls, message, error) from error
-        if tail.end > len(buffer):
+        if end > len(buffer):
             raise ValueError(
-                f"{self._schema.name}: the fields {self._unplaced(places)} need {tail.end - len(buffer)} bytes "
+                f"{self._schema.name}: the fields {self._unplaced(places)} need {end - len(buffer)} bytes "
                 f"more than the {RESERVE_BYTES} in reserve; give the dimensions of arrays to the loan, or "
                 "publish the message without one"
             )
         in_place = {id(view) for view in views.values()}
-        write([part.nbytes if id(part) in in_place else part for part in parts + tail.parts], buffer)
+        write([part.nbytes if id(part) in in_place else part for part in parts], buffer)
         for view in views.values():
             view.flags.writeable = False
-        return tail.end
+        return end
 
-    def _layout(self, message: Any, places: dict[str, _Place]) -> tuple[list[Any], Tail]:
+    def _layout(self, message: Any, places: dict[str, _Place]) -> tuple[list[Any], int]:
         values: list[Any] = []
         tail = Tail(self._encoder.block)
         for place in places.values():
@@ -146,7 +146,7 @@ class Drafter:
                 if dimension in self._shared and scope.setdefault(str(dimension), size) != size:
                     raise ValueError
             values += (place.offset, len(place.shape) << 8 | DTYPES.index(place.dtype), *place.shape)
-        return self._encoder.finish(values, tail), tail
+        return self._encoder.finish(values, tail), tail.end
 
     def _value_of(self, draft: Draft, name: str) -> Any:
         views, values = draft._Draft__views, draft._Draft__values

@@ -36,31 +36,31 @@ Put: TypeAlias = "Callable[[Any, list[Any], Tail, Scope], None]"
 """Appends the numbers of a value to a block, and what does not fit there to the tail."""
 
 ENCODE_ERRORS = (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, struct.error)
-"""What a wrong value may raise on the fast path; `checks.explain` then finds out which it was."""
+"""What a wrong value may raise; `checks.explain` then finds out which it was."""
 
-_PADS = [bytes(count) for count in range(64)]
-_TRUTH = {False: 0, True: 1}
-_CODE_OF_DTYPE = {dtype: code for code, dtype in enumerate(DTYPES)}
+_SMALL_BYTES = 4096
+"""Up to this size an array is copied faster as bytes."""
+PADS = [bytes(count) for count in range(64)]
+TRUTH_TO_BYTE = {False: 0, True: 1}
+CODE_OF_DTYPE = {dtype: code for code, dtype in enumerate(DTYPES)}
 
 
 class Tail:
     """What follows the fixed block: parts in order, each padded to its place."""
 
-    __slots__ = ("end", "parts", "strided")
+    __slots__ = ("end", "parts")
 
     def __init__(self, end: int) -> None:
         self.end = end
         """Where the next item may begin, counted from the start of the body."""
         self.parts: list[Any] = []
-        self.strided = False
-        """Whether an array among the parts is not contiguous."""
 
     def add(self, part: Any, size: int, mask: int) -> int:
         """Append an item at a multiple of mask + 1 and return its offset."""
         end = self.end
         start = (end + mask) & ~mask
         if start != end:
-            self.parts.append(_PADS[start - end])
+            self.parts.append(PADS[start - end])
         self.parts.append(part)
         self.end = start + size
         return start
@@ -68,8 +68,6 @@ class Tail:
     def add_array(self, array: NDArray[Any]) -> int:
         """Append a non-empty array and return its offset."""
         size = array.nbytes
-        if not array.flags.c_contiguous:
-            self.strided = True
         return self.add(array, size, 63 if size >= LARGE_ARRAY_BYTES else 7)
 
 
@@ -82,26 +80,26 @@ class Encoder:
         self._put = _put_message(schema, cls)
         self._pack = pack_block(schema, self.block)
 
-    def layout(self, message: Any) -> tuple[list[Part], Tail]:
-        """Return the parts of the block and the tail; its `end` is the size of the body."""
+    def layout(self, message: Any) -> tuple[list[Part], int]:
+        """Return the parts of the body and its size. It raises `ENCODE_ERRORS`."""
         values: list[Any] = []
         tail = Tail(self.block)
         self._put(message, values, tail, None)
-        return self.finish(values, tail), tail
+        return self.finish(values, tail), tail.end
 
     def finish(self, values: list[Any], tail: Tail) -> list[Part]:
-        """Return the parts of the block from its values, once the tail is complete."""
+        """Return the parts of the body from the numbers of its block and the complete tail."""
         if tail.end >= BODY_LIMIT:
             raise ValueError(f"the body would have {tail.end} bytes, it must be shorter than 2^32")
-        return self._pack(values)
+        return self._pack(values) + tail.parts
 
 
-def join(parts: list[Part], tail: Tail) -> bytes:
-    """Return parts of block and tail as one body."""
-    parts += tail.parts
-    if tail.strided:
-        parts = [part if isinstance(part, bytes) else part.tobytes() for part in parts]
-    return b"".join(parts)  # type: ignore[arg-type]  # contiguous arrays are buffers
+def join(parts: list[Any]) -> bytes:
+    """Return parts as one body."""
+    try:
+        return b"".join(parts)
+    except TypeError:  # an array is not contiguous
+        return b"".join(part if isinstance(part, bytes) else part.tobytes() for part in parts)
 
 
 def write(parts: list[Any], buffer: NDArray[np.uint8]) -> None:
@@ -110,6 +108,8 @@ def write(parts: list[Any], buffer: NDArray[np.uint8]) -> None:
     start = position = 0
     view = buffer.data
     for part in parts:
+        if isinstance(part, np.ndarray) and part.nbytes <= _SMALL_BYTES:
+            part = part.tobytes()
         if isinstance(part, bytes):
             small.append(part)
             position += len(part)
@@ -138,7 +138,7 @@ def as_array(value: Any, dtype: np.dtype[Any] | None) -> NDArray[Any]:
     if not isinstance(value, np.ndarray):
         raise TypeError(f"expected an array, got {type(value).__name__}")
     if dtype is None:
-        if value.dtype not in _CODE_OF_DTYPE:
+        if value.dtype not in CODE_OF_DTYPE:
             raise TypeError(f"dtype {value.dtype} is none of {', '.join(DTYPE_CODES)} in native byte order")
     elif value.dtype != dtype:
         raise TypeError(f"dtype {value.dtype}, expected {dtype}; convert it, as with .astype(np.{dtype})")
@@ -210,7 +210,7 @@ def _put_number(value: Any, values: list[Any], tail: Tail, scope: Scope) -> None
 
 
 def _put_bool(value: Any, values: list[Any], tail: Tail, scope: Scope) -> None:
-    values.append(_TRUTH[value])
+    values.append(TRUTH_TO_BYTE[value])
 
 
 def _put_str(value: Any, values: list[Any], tail: Tail, scope: Scope) -> None:
@@ -245,8 +245,6 @@ def _put_fixed_array(kind: ArrayType) -> Put:
         if value.shape != shape:
             raise ValueError
         if is_large:
-            if not value.flags.c_contiguous:
-                tail.strided = True
             values.append(value)
         else:
             values.append(value.tobytes())
@@ -265,7 +263,7 @@ def _put_array(kind: ArrayType, shared: frozenset[str]) -> Put:
         code = head
         if dtype is None:
             value = as_array(value, None)
-            code += _CODE_OF_DTYPE[value.dtype]
+            code += CODE_OF_DTYPE[value.dtype]
         elif value.dtype is not dtype:
             value = as_array(value, dtype)
         shape = value.shape
