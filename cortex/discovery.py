@@ -248,7 +248,7 @@ class Directory:
         Raises:
             MalformedMessage: If the frame is something else. It is not counted here.
         """
-        message, _ = parse_control(frame, self._answer_types)
+        message, header = parse_control(frame, self._answer_types)
         now_ns = time.monotonic_ns()
         reply: Any = None
         if isinstance(message, Hello):
@@ -277,7 +277,7 @@ class Directory:
         else:
             reply = Changed(0, self._own)
         self._flush()
-        return None if reply is None else control_frame(reply)
+        return None if reply is None else control_frame(reply, header.sequence)
 
     def close(self) -> None:
         """Take leave, and close the sockets."""

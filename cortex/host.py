@@ -243,6 +243,17 @@ class NodeFiles:
             self._lock.close(remove=True)
 
 
+def node_lives(directory: Path, node: int) -> bool:
+    """Tell whether a process holds the files of a node; a node of another host has none here."""
+    path = directory / f"{node:016x}.lock"
+    if not path.exists():
+        return False
+    lock = FileLock.acquire(path)
+    if lock is not None:
+        lock.close(remove=True)
+    return lock is None
+
+
 def sweep(directory: Path) -> list[int]:
     """Remove the files of nodes that are dead, and return the nodes' numbers.
 

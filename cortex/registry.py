@@ -7,6 +7,9 @@ the registry has not its newest record, says `Hello` again. So nothing needs an 
 registry that was killed is whole again after one heartbeat of each node. Nodes speak the same words to each
 other directly when there is no registry (`Directory.answer`).
 
+A node whose process on this host lives is given more time than a lease, so that a long call in C, which stops
+its heartbeats, cuts no stream. A process that is dead is known by its lock, and gone after one lease.
+
 A registry that vanishes takes nobody with it: nodes keep what they know, and drop what a new registry has not
 confirmed within one lease.
 """
@@ -39,7 +42,16 @@ from cortex.control import (
     control_types,
     make_control_socket,
 )
-from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, FileLock, domain_id, runtime_dir, sweep
+from cortex.host import (
+    REGISTRY_LOCK,
+    REGISTRY_LOG,
+    REGISTRY_SOCKET,
+    FileLock,
+    domain_id,
+    node_lives,
+    runtime_dir,
+    sweep,
+)
 from cortex.records import (
     Alive,
     Changed,
@@ -57,6 +69,8 @@ from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
 
+STALLED_S = 10.0
+"""How long a silent node is kept if its process on this host lives: it may be stopped or very busy [s]."""
 LINGER_S = 2.0
 """How long an embedded registry outlives its last node [s]."""
 
@@ -100,6 +114,7 @@ class Registry:
         lock: The domain's lock, if the process that started us took it already.
         nodes_max: Most nodes; others are refused.
         record_bytes_max: Largest record; larger ones are refused.
+        stalled_s: How long a node may be silent while its process on this host lives [s].
 
     Raises:
         RegistryRunning: If another registry serves the domain.
@@ -116,6 +131,7 @@ class Registry:
         lock: FileLock | None = None,
         nodes_max: int = NODES_MAX,
         record_bytes_max: int = RECORD_BYTES_MAX,
+        stalled_s: float = STALLED_S,
     ):
         if listen is not None:
             if not listen.startswith("tcp://"):
@@ -131,11 +147,13 @@ class Registry:
         """The tcp address that it listens on, with its port."""
         self._directory = runtime_dir(domain)
         self._limits = (nodes_max, record_bytes_max)
+        self._stalled_ns = int(stalled_s * 1e9)
         self._linger_ns = None if linger_s is None else int(linger_s * 1e9)
         self._entries: dict[int, _Entry] = {}
         self._routes: dict[Route, int] = {}
         self._bytes = 0
         self._logged: set[object] = set()
+        self._sequence = 0
         self._stopping = False
         path = self._directory / REGISTRY_LOCK
         taken = lock or FileLock.acquire(path)
@@ -227,7 +245,8 @@ class Registry:
             try:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
-                message, _header = parse_control(frames[0], self._types)
+                message, header = parse_control(frames[0], self._types)
+                self._sequence = header.sequence
                 self._handlers[type(message)](message, len(frames[0]), route, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1
@@ -245,8 +264,8 @@ class Registry:
         reason = self._reason_to_refuse(record, size, route, entry)
         if reason:
             self.refused += 1
-            self._log_once((record.node, reason), "refused node %s: %s", record.name[:200], reason)
-            self._send(route, control_frame(Refused(record.node, reason)))
+            self._log_once((route, reason), "refused node %s: %s", record.name[:200], reason)
+            self._reply(route, Refused(record.node, reason))
             return
         # What comes on one connection is in order; what comes on another may be older than what we have.
         if entry is None or record.revision > entry.revision or _differs(record, entry, route):
@@ -257,7 +276,7 @@ class Registry:
             self._routes[route] = record.node
         entries = self._entries.values()
         nodes, revisions = [e.node for e in entries], [e.revision for e in entries]
-        self._send(route, control_frame(Welcome(self.epoch, self.version, nodes, revisions)))
+        self._reply(route, Welcome(self.epoch, self.version, nodes, revisions))
         if hello.snapshot:
             for other in entries:
                 if other.node != record.node:
@@ -293,7 +312,7 @@ class Registry:
         held = 0
         if entry is not None and entry.route == route:
             entry.seen_ns, held = now_ns, entry.revision
-        self._send(route, control_frame(Alive(self.epoch, self.version, held)))
+        self._reply(route, Alive(self.epoch, self.version, held))
 
     def _on_leave(self, leave: Leave, size: int, route: Route, now_ns: int) -> None:
         entry = self._entries.get(leave.node)
@@ -301,7 +320,12 @@ class Registry:
             self._remove(entry, "left")
 
     def _expire(self, now_ns: int) -> None:
-        expired = [entry for entry in self._entries.values() if now_ns - entry.seen_ns > LEASE_NS]
+        expired = [
+            entry
+            for entry in self._entries.values()
+            if (silent_ns := now_ns - entry.seen_ns) > LEASE_NS
+            and (silent_ns > self._stalled_ns or not node_lives(self._directory, entry.node))
+        ]
         for entry in expired:
             self._remove(entry, "its lease has run out")
         if expired:
@@ -322,6 +346,9 @@ class Registry:
         for entry in self._entries.values():
             if entry.node != except_node:
                 self._send(entry.route, frame)
+
+    def _reply(self, route: Route, message: Any) -> None:
+        self._send(route, control_frame(message, self._sequence))
 
     def _send(self, route: Route, frame: bytes) -> None:
         socket, identity = route
