@@ -1,0 +1,266 @@
+"""A process with a node, for tests: `python peer.py ROLE ARGUMENTS`, commanded by lines of JSON.
+
+The message types here are those of the tests, too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import select
+import sys
+import time
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import cortex
+from cortex import Array, Node, Policy, UInt32
+from cortex.message import message
+
+
+@message
+class Number:
+    """Of fixed size."""
+
+    stamp_ns: int
+    value: int
+
+
+@message
+class Scan:
+    stamp_ns: int
+    ranges: Array["float32", "n"]
+
+
+@message
+class Block:
+    """Says itself whether it is whole."""
+
+    number: int
+    check: UInt32
+    data: Array["uint8", "n"]
+
+
+@message(name="Number")
+class OtherNumber:
+    """Another version of `Number`."""
+
+    stamp_ns: int
+    value: float
+
+
+def make_block(number: int, size: int) -> Block:
+    """A block whose content depends on its number."""
+    data = np.arange(number, number + size, dtype=np.uint64).astype(np.uint8)
+    return Block(number, zlib.crc32(data), data)
+
+
+def is_whole(block: Block) -> bool:
+    """Whether the content of a block is what it was made with."""
+    return zlib.crc32(block.data) == block.check
+
+
+TYPES = {kind.__name__: kind for kind in (Number, Scan, Block, OtherNumber)}
+
+
+def make(kind: type, number: int, size: int) -> Any:
+    """A message of one of the types with a number in it."""
+    if kind is Block:
+        return make_block(number, size)
+    if kind is Scan:
+        return Scan(number, np.full(size // 4, number, np.float32))
+    return kind(number, number)
+
+
+def number_of(received: Any) -> int:
+    """The number that `make` was given."""
+    return received.number if isinstance(received, Block) else received.stamp_ns
+
+
+def policy_of(words: list[Any]) -> Policy:
+    """A policy from its name and arguments."""
+    return getattr(cortex, words[0])(**(words[1] if len(words) > 1 else {}))
+
+
+def say(**words: Any) -> None:
+    sys.stdout.write(json.dumps(words) + "\n")
+    sys.stdout.flush()
+
+
+def asked() -> bool:
+    """Whether there is a line to read, or no line will come."""
+    return bool(select.select([sys.stdin], [], [], 0.0)[0])
+
+
+class Peer:
+    """Does what it is told, line by line."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.publishers: dict[str, Any] = {}
+        self.subscribers: dict[str, Any] = {}
+        self.kept: list[Any] = []
+
+    def publisher(self, topic: str, type: str, **options: Any) -> dict[str, Any]:
+        self.publishers[topic] = self.node.publisher(topic, TYPES[type], **options)
+        return {}
+
+    def subscriber(self, topic: str, type: str | None, policy: list[Any]) -> dict[str, Any]:
+        kind = None if type is None else TYPES[type]
+        self.subscribers[topic] = self.node.subscriber(topic, kind, policy=policy_of(policy))
+        return {}
+
+    def await_subscribers(self, topic: str, count: int = 1) -> dict[str, Any]:
+        return {"ok": self.publishers[topic].wait_for_subscribers(count, 10.0)}
+
+    def await_publisher(self, topic: str) -> dict[str, Any]:
+        return {"ok": self.subscribers[topic].wait_for_publisher(10.0)}
+
+    def publish(self, topic: str, count: int, start: int = 0, size: int = 0, rate_hz: float = 0.0) -> dict[str, Any]:
+        """Publish numbered messages; says how many were delivered, and the longest time that one took."""
+        publisher = self.publishers[topic]
+        delivered, longest_s, begin_s = 0, 0.0, time.monotonic()
+        for k in range(count):
+            if rate_hz:
+                while time.monotonic() < begin_s + k / rate_hz:
+                    time.sleep(100e-6)
+            made = make(publisher.codec.type, start + k, size)
+            before_s = time.monotonic()
+            delivered += publisher.publish(made)
+            longest_s = max(longest_s, time.monotonic() - before_s)
+        publisher.flush()
+        return {"delivered": delivered, "longest_s": longest_s, "took_s": time.monotonic() - begin_s}
+
+    def receive(self, topic: str, until: int, timeout_s: float = 10.0, keep: bool = False) -> dict[str, Any]:
+        """Receive until a number has come; says what came."""
+        subscriber = self.subscribers[topic]
+        count, last, ordered, whole = 0, -1, True, True
+        first = None
+        deadline_s = time.monotonic() + timeout_s
+        while last < until:
+            try:
+                got = subscriber.recv(deadline_s - time.monotonic())
+            except TimeoutError:
+                break
+            number = number_of(got)
+            first = number if first is None else first
+            ordered &= number > last
+            whole &= not isinstance(got, Block) or is_whole(got)
+            count, last = count + 1, number
+            if keep:
+                self.kept.append(got)
+        return {"count": count, "first": first, "last": last, "ordered": ordered, "whole": whole}
+
+    def counters(self, topic: str) -> dict[str, Any]:
+        found = (self.subscribers.get(topic) or self.publishers[topic]).counters
+        return {name: getattr(found, name) for name in found.__slots__}
+
+    def kept_are_whole(self) -> dict[str, Any]:
+        return {"ok": all(is_whole(block) for block in self.kept), "count": len(self.kept)}
+
+    def drop(self) -> dict[str, Any]:
+        self.kept.clear()
+        return {}
+
+    def close(self, topic: str) -> dict[str, Any]:
+        (self.subscribers.pop(topic, None) or self.publishers.pop(topic)).close()
+        return {}
+
+    def serve(self, name: str) -> dict[str, Any]:
+        """Offer a service that doubles a number, after as many milliseconds as its stamp says."""
+
+        def double(request: Number) -> Number:
+            time.sleep(request.stamp_ns * 1e-3)
+            if request.value < 0:
+                raise ValueError(f"{request.value} is negative")
+            return Number(os.getpid(), 2 * request.value)
+
+        self.node.service(name, Number, Number, double)
+        return {}
+
+    def memory(self) -> dict[str, Any]:
+        """Resident memory now, and what a ring may use is part of it."""
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return {"bytes": int(file.read().split()[1]) * resource.getpagesize()}
+
+
+def as_peer(name: str = "peer", host: str = "", limit_file_bytes: int | None = None, **options: Any) -> None:
+    """Does what it is told until its input ends."""
+    if host:
+        import cortex.node
+
+        cortex.node.host_id = lambda: host
+    if limit_file_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit_file_bytes, limit_file_bytes))
+    if "keys" in options:
+        from pathlib import Path
+
+        from cortex.security import load_keys
+
+        options["keys"] = load_keys(Path(options["keys"]))
+    with Node(name, **options) as node:
+        peer = Peer(node)
+        control = next(e.control for e in node.nodes()[0].endpoints[::-1])
+        say(node=node.id, control=control)
+        for line in sys.stdin:
+            words = json.loads(line)
+            say(**getattr(peer, words.pop("do"))(**words))
+
+
+def as_endless_publisher(topic: str, sizes: list[int], rate_hz: float) -> None:
+    """Publishes blocks, of these sizes in turn, until its input ends; says what was published when asked."""
+    with Node("endless publisher") as node, node.publisher(topic, Block) as publisher:
+        say(pid=os.getpid())
+        blocks = [make_block(0, size) for size in sizes]
+        number = 0
+        next_s = time.monotonic()
+        while True:
+            while asked():
+                if not sys.stdin.readline():
+                    return
+                say(published=number)
+            block = blocks[number % len(blocks)]
+            publisher.publish(Block(number, block.check, block.data))
+            number += 1
+            next_s += 1.0 / rate_hz
+            time.sleep(max(next_s - time.monotonic(), 0.0))
+
+
+def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0) -> None:
+    """Receives and checks blocks until its input ends; says what has come when asked."""
+    kept: list[Block] = []
+    with Node("endless subscriber") as node, node.subscriber(topic, Block, policy=policy_of(policy)) as sub:
+        say(pid=os.getpid())
+        torn = count = 0
+        while True:
+            while asked():
+                if not sys.stdin.readline():
+                    return
+                torn += sum(not is_whole(block) for block in kept)
+                found = sub.counters
+                say(count=count, torn=torn, lost=found.lost, overtaken=found.overtaken, rejected=found.rejected)
+            try:
+                block = sub.recv(0.02)
+            except TimeoutError:
+                continue
+            count += 1
+            torn += not is_whole(block)
+            kept.append(block)
+            del kept[: len(kept) - keep]
+
+
+def main() -> None:
+    roles: dict[str, Callable[..., None]] = {
+        "peer": as_peer,
+        "endless_publisher": as_endless_publisher,
+        "endless_subscriber": as_endless_subscriber,
+    }
+    roles[sys.argv[1]](**json.loads(sys.argv[2]))
+
+
+if __name__ == "__main__":
+    main()

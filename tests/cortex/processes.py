@@ -1,0 +1,152 @@
+"""Waiting with a deadline, and the processes that tests of nodes start.
+
+`peer.py` has what such a process can do; both sides speak lines of JSON over its standard streams.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+PEER = Path(__file__).with_name("peer.py")
+SOON_S = 15.0
+"""Deadline of what takes milliseconds, on a machine that does a lot besides."""
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = SOON_S, *, every_s: float = 2e-3) -> Any:
+    """Wait until a condition holds, and return what it returned."""
+    deadline = time.monotonic() + timeout_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "the condition did not come true in time"
+        time.sleep(every_s)
+    return value
+
+
+class Child:
+    """A process of `peer.py`."""
+
+    def __init__(self, role: str, *, prefix: Sequence[str] = (), env: dict[str, str] | None = None, **arguments: Any):
+        self._started = time.monotonic()
+        self.role = role
+        self.process = subprocess.Popen(
+            [*prefix, sys.executable, str(PEER), role, json.dumps(arguments)],
+            env={**os.environ, "PYTHONPATH": str(ROOT), **(env or {})},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+        )
+        self._rest = b""
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def say(self, **words: Any) -> None:
+        """Send it a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(words).encode() + b"\n")
+
+    def hear(self, timeout_s: float = SOON_S) -> dict[str, Any]:
+        """The next line that it prints."""
+        assert self.process.stdout is not None
+        deadline = time.monotonic() + timeout_s
+        while b"\n" not in self._rest:
+            left_s = max(deadline - time.monotonic(), 0.0)
+            if not select.select([self.process.stdout], [], [], left_s)[0]:
+                raise AssertionError(f"the process {self.role!r} is silent")
+            chunk = os.read(self.process.stdout.fileno(), 65536)
+            if not chunk:
+                raise AssertionError(f"the process {self.role!r} has ended: {self.errors()}")
+            self._rest += chunk
+        line, self._rest = self._rest.split(b"\n", 1)
+        heard: dict[str, Any] = json.loads(line)
+        return heard
+
+    def ask(self, timeout_s: float = SOON_S, **words: Any) -> dict[str, Any]:
+        """Send it a line and wait for its answer."""
+        self.say(**words)
+        return self.hear(timeout_s)
+
+    def errors(self) -> str:
+        """What it has written to its standard error so far; all of it once it has ended."""
+        assert self.process.stderr is not None
+        text = b""
+        while select.select([self.process.stderr], [], [], 0.0)[0]:
+            chunk = os.read(self.process.stderr.fileno(), 65536)
+            if not chunk:
+                break
+            text += chunk
+        return text.decode()
+
+    def kill(self) -> None:
+        """SIGKILL, and wait until it is dead."""
+        self.process.kill()
+        assert self.process.wait(SOON_S) == -signal.SIGKILL
+
+    @contextlib.contextmanager
+    def stopped(self) -> Any:
+        """SIGSTOP for the time of the block."""
+        self.process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: self._state() in "T")
+        try:
+            yield
+        finally:
+            self.process.send_signal(signal.SIGCONT)
+
+    def _state(self) -> str:
+        text = Path(f"/proc/{self.pid}/stat").read_text()
+        return text.rpartition(")")[2].split()[0]
+
+    def finish(self, timeout_s: float = SOON_S) -> None:
+        """Close its input, and expect that it ends well."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        code = self.process.wait(timeout_s)
+        assert code == 0, f"the process {self.role!r} ended with {code}: {self.errors()}"
+
+    def end(self) -> None:
+        """Get rid of it, whatever state it is in."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.kill()
+        self.process.wait(SOON_S)
+        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+
+
+def processes_with(text: str) -> list[int]:
+    """Processes, other than this one, whose environment contains a text."""
+    found = []
+    for entry in os.scandir("/proc"):
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                environment = Path(entry.path, "environ").read_bytes()
+            except OSError:
+                continue
+            if text.encode() in environment:
+                found.append(int(entry.name))
+    return found
+
+
+def shared_mappings() -> list[str]:
+    """Rings that this process has mapped or open."""
+    maps = [line for line in Path("/proc/self/maps").read_text().splitlines() if "memfd:cortex-" in line]
+    for entry in os.scandir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            target = os.readlink(entry.path)
+            if "memfd:cortex-" in target:
+                maps.append(target)
+    return maps

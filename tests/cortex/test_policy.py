@@ -1,0 +1,266 @@
+"""What each policy promises when messages come faster than they are taken."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import time
+
+import numpy as np
+import pytest
+from peer import Number, Scan
+from processes import wait_for
+
+from cortex import keep_last, latest, reliable
+
+MANY = 1_000_000 if os.environ.get("CORTEX_LONG_TESTS") else 100_000
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+def connected(node, policy, **options):
+    """A publisher and a subscriber of one node."""
+    publisher = node.publisher("/numbers", Number, **options)
+    subscriber = node.subscriber("/numbers", Number, policy=policy)
+    assert publisher.wait_for_subscribers()
+    assert subscriber.wait_for_publisher()
+    return publisher, subscriber
+
+
+def take_all(subscriber):
+    """What is there now."""
+    taken = []
+    while True:
+        try:
+            taken.append(subscriber.recv(0.0).value)
+        except TimeoutError:
+            return taken
+
+
+# Values
+
+
+@pytest.mark.parametrize("depth", [0, -1, 65_537])
+@pytest.mark.parametrize("make", [keep_last, reliable])
+def test_depth_has_bounds(make, depth):
+    with pytest.raises(ValueError, match=f"1 to 65536, got {depth}"):
+        make(depth)
+
+
+@pytest.mark.parametrize("timeout_s", [-1.0, float("nan"), float("inf"), 5e6])
+def test_a_timeout_has_bounds(timeout_s):
+    with pytest.raises(ValueError, match="timeout_s must be 0 to"):
+        reliable(timeout_s=timeout_s)
+
+
+def test_policies_say_what_they_are():
+    assert str(keep_last(3)) == "keep_last(3)"
+    assert str(latest()) == "latest()"
+    assert str(reliable(8, 0.5)) == "reliable(depth=8, timeout_s=0.5)"
+    assert latest() == keep_last(1)
+    assert reliable(8) != keep_last(8)
+
+
+# keep_last and latest
+
+
+@pytest.mark.parametrize("depth", [1, 5, 64, 100])
+def test_keep_last_hands_out_exactly_the_last(node, depth):
+    """Whatever was published while nobody looked; the others were overtaken, none was lost."""
+    publisher, subscriber = connected(node, keep_last(depth))
+    for value in range(700):
+        publisher.publish(Number(0, value))
+    assert take_all(subscriber) == list(range(700 - depth, 700))
+    counters = subscriber.counters
+    assert (counters.received, counters.overtaken, counters.lost) == (depth, 700 - depth, 0)
+
+
+def test_fewer_messages_than_the_depth_all_come(node):
+    publisher, subscriber = connected(node, keep_last(64))
+    for value in range(64):
+        publisher.publish(Number(0, value))
+    assert take_all(subscriber) == list(range(64))
+    assert subscriber.counters.overtaken == 0
+
+
+def test_latest_gives_the_newest_at_once(node):
+    """Each time that it is asked, however many have come since."""
+    publisher, subscriber = connected(node, latest())
+    value = 0
+    for burst in (1, 2, 63, 64, 65, 500, 1):
+        for _ in range(burst):
+            publisher.publish(Number(0, value))
+            value += 1
+        assert subscriber.recv(1.0).value == value - 1
+    assert take_all(subscriber) == []
+
+
+@pytest.mark.parametrize("policy", [latest(), keep_last(10)], ids=str)
+def test_the_newest_after_a_long_absence(make_node, start_child, policy):
+    """A reader that was away for 20 000 messages, more than the sockets hold, finds the last ones."""
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/numbers", type="Number")
+    subscriber = make_node().subscriber("/numbers", Number, policy=policy)
+    assert subscriber.wait_for_publisher(10.0)
+    child.ask(do="publish", topic="/numbers", count=20_000, rate_hz=20_000)
+    depth, counters = policy.depth, subscriber.counters
+    wait_for(lambda: counters.overtaken + counters.lost == 20_000 - depth)
+    assert [subscriber.recv(1.0).value for _ in range(depth)] == list(range(20_000 - depth, 20_000))
+    assert counters.received == depth
+
+
+def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
+    """Age of the datum: with 5 ms of work for each message at 2 kHz, what is read was published just now."""
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/numbers", type="Number")
+    subscriber = make_node().subscriber("/numbers", Number, policy=latest())
+    assert subscriber.wait_for_publisher(10.0)
+    child.say(do="publish", topic="/numbers", count=2000, rate_hz=2000)
+    ages_s, value = [], 0
+    while value < 1900:
+        message, info = subscriber.recv_with_info(5.0)
+        value = message.value
+        ages_s.append(info.latency_ns * 1e-9)
+        busy_until = time.monotonic() + 5e-3
+        while time.monotonic() < busy_until:
+            pass
+    child.hear()
+    assert np.median(ages_s) < 2e-3  # the period is 0.5 ms; 5 ms would be the one before the work
+    counters = subscriber.counters
+    assert counters.lost == 0
+    assert counters.overtaken > 1000
+
+
+# reliable
+
+
+def test_every_message_of_a_reliable_stream_comes_in_order(make_node, start_child):
+    """Received + lost == sent, and lost 0, whatever the pace of the two."""
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="subscriber", topic="/numbers", type="Number", policy=["reliable", {"depth": 16, "timeout_s": 20.0}])
+    publisher = make_node().publisher("/numbers", Number)
+    assert publisher.wait_for_subscribers(1, 10.0)
+    child.say(do="receive", topic="/numbers", until=MANY - 1, timeout_s=120.0)
+    assert all([publisher.publish(Number(value, value)) for value in range(MANY)])
+    received = child.hear(120.0)
+    assert received == {"count": MANY, "first": 0, "last": MANY - 1, "ordered": True, "whole": True}
+    counters = child.ask(do="counters", topic="/numbers")
+    assert (counters["received"], counters["lost"], counters["overtaken"]) == (MANY, 0, 0)
+    assert publisher.counters.timeouts == 0
+
+
+def test_back_pressure_has_an_end(node):
+    """The publisher is held up for the time allowed, not longer; both sides count what is lost."""
+    publisher, subscriber = connected(node, reliable(depth=4, timeout_s=0.05))
+    delivered, took_s = [], []
+    while len(delivered) < 20 or all(delivered[-4:]):
+        assert len(delivered) < 100_000
+        begin = time.monotonic()
+        delivered.append(publisher.publish(Number(0, len(delivered))))
+        took_s.append(time.monotonic() - begin)
+    first = delivered.index(False)
+    assert first > 4
+    assert 0.045 < took_s[first] < 1.0
+    while len(delivered) < first + 4:  # it goes on, and does not believe that these arrive
+        delivered.append(publisher.publish(Number(0, len(delivered))))
+    assert not any(delivered[first:])
+    assert [subscriber.recv(1.0).value for _ in range(first)] == list(range(first))
+
+    def resumed():
+        delivered.append(publisher.publish(Number(0, len(delivered))))
+        with contextlib.suppress(TimeoutError):
+            return subscriber.recv(0.0).value
+
+    value = wait_for(resumed)
+    lost = value - first  # all of them, and only they
+    wait_for(lambda: publisher.publish(Number(0, len(delivered))))
+    counters = subscriber.counters
+    assert (counters.received, counters.lost) == (first + 1, lost)
+    assert publisher.counters.timeouts >= lost
+
+
+def test_back_pressure_of_large_messages(node):
+    """A reader that keeps its views holds up the publisher, and no longer than allowed."""
+    publisher = node.publisher("/scans", Scan)
+    subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=2, timeout_s=0.05))
+    assert publisher.wait_for_subscribers()
+    ranges = np.zeros(100_000, np.float32)
+    delivered = []
+    while all(delivered) or len(delivered) < 3:
+        assert len(delivered) < 1000
+        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    begin = time.monotonic()
+    delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    assert not delivered[-1]
+    assert 0.045 < time.monotonic() - begin < 1.0
+    received = [subscriber.recv(1.0).stamp_ns for _ in range(sum(delivered))]
+    assert received == [number for number, came in enumerate(delivered) if came]
+    assert publisher.publish(Scan(-1, ranges))
+    assert subscriber.recv(1.0).stamp_ns == -1
+    assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
+
+
+def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
+    publisher, subscriber = connected(node, reliable(depth=4, timeout_s=10.0))
+    received = []
+
+    def take(message):
+        time.sleep(20e-6)
+        received.append(message.value)
+
+    other = node.subscriber("/numbers", Number, take, policy=reliable(depth=2, timeout_s=10.0))
+    assert publisher.wait_for_subscribers(2)
+    subscriber.close()
+    assert all([publisher.publish(Number(0, value)) for value in range(5000)])
+    wait_for(lambda: len(received) == 5000)
+    assert received == list(range(5000))
+    assert other.counters.lost == 0
+
+
+def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_child):
+    """On one topic: the first is stopped, the second gets everything, the publisher waits for neither."""
+    stopped, steady = start_child("peer", name="stopped"), start_child("peer", name="steady")
+    for child, policy in ((stopped, ["keep_last", {"depth": 10}]), (steady, ["reliable", {"timeout_s": 20.0}])):
+        child.hear()
+        child.ask(do="subscriber", topic="/numbers", type="Number", policy=policy)
+    publisher = make_node().publisher("/numbers", Number)
+    assert publisher.wait_for_subscribers(2, 10.0)
+    count = 20_000
+    with stopped.stopped():
+        steady.say(do="receive", topic="/numbers", until=count - 1, timeout_s=30.0)
+        begin = time.monotonic()
+        assert all([publisher.publish(Number(value, value)) for value in range(count)])
+        assert time.monotonic() - begin < 10.0
+        assert steady.hear(30.0)["count"] == count
+    stopped.say(do="receive", topic="/numbers", until=count)
+    sent = count
+    while not select.select([stopped.process.stdout], [], [], 1e-3)[0]:  # it hears of new ones when it has read old ones
+        assert publisher.publish(Number(sent, sent))
+        sent += 1
+        assert sent < count + 10_000
+    last = stopped.hear()
+    assert last["last"] >= count
+    assert last["ordered"]
+    counters = stopped.ask(do="counters", topic="/numbers")
+    assert last["last"] + 1 <= counters["received"] + counters["overtaken"] + counters["lost"] <= sent
+    assert counters["lost"] > 0
+
+
+def test_a_topic_that_is_held_up_does_not_hold_up_another(node):
+    publisher, subscriber = connected(node, reliable(depth=1, timeout_s=0.0))
+    while publisher.publish(Number(0, 0)):
+        pass
+    free = node.publisher("/free", Number)
+    taken = node.subscriber("/free", Number, policy=reliable())
+    assert free.wait_for_subscribers()
+    for value in range(200):
+        assert free.publish(Number(0, value))
+        assert taken.recv(1.0).value == value
+    assert subscriber.counters.received == 0
