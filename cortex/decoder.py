@@ -244,13 +244,26 @@ def _get_list(kind: ListType, bound: Any, index: int) -> Get:
 def _get_message(schema: Schema, cls: type, index: int, offset: int) -> Get:
     shared = shared_names([field.type for field in schema.fields])
     bindings = cls.__cortex_bindings__  # type: ignore[attr-defined]
-    gets = []
+    steps: list[tuple[int, int, Get | None]] = []
     for field, bound, place in zip(schema.fields, bindings, measure_fields(schema)[0], strict=True):
-        gets.append(make_get(field.type, bound, shared, index, offset + place))
-        index += sum(1 for leaf in leaves(field.type) if leaf.code)
+        end = index + sum(1 for leaf in leaves(field.type) if leaf.code)
+        if isinstance(field.type, str) and field.type in SCALAR_CODES and field.type != "bool":
+            if steps and steps[-1][2] is None:  # a run of plain numbers is taken at once
+                steps[-1] = (steps[-1][0], end, None)
+            else:
+                steps.append((index, end, None))
+        else:
+            steps.append((index, end, make_get(field.type, bound, shared, index, offset + place)))
+        index = end
 
     def get(numbers: Sequence[Any], at: int, body: Body, scope: Scope) -> Any:
         scope = {} if shared else None
-        return new_message(cls, [get_field(numbers, at, body, scope) for get_field in gets])
+        values: list[Any] = []
+        for first, last, get_field in steps:
+            if get_field is None:
+                values += numbers[first:last]
+            else:
+                values.append(get_field(numbers, at, body, scope))
+        return new_message(cls, values)
 
     return get
