@@ -8,6 +8,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+# Not on demand: once the module `cortex.message` is loaded, it would stand where the decorator belongs.
+from cortex.message import message
+
 if TYPE_CHECKING:
     from cortex.codec import MalformedMessage
     from cortex.context import Closed
@@ -24,7 +27,6 @@ if TYPE_CHECKING:
         UInt32,
         UInt64,
         Unit,
-        message,
     )
     from cortex.node import Node
     from cortex.policy import Policy, keep_last, latest, reliable
@@ -59,7 +61,6 @@ _HOME = {
     "Unit": "message",
     "keep_last": "policy",
     "latest": "policy",
-    "message": "message",
     "reliable": "policy",
 }
 

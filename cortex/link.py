@@ -34,6 +34,7 @@ from cortex.wire import (
     message_head,
     parse_answer,
     prefix,
+    resume_key,
 )
 
 logger = logging.getLogger(__name__)
@@ -123,9 +124,10 @@ class Link:
 
     def _ask(self, *, shared_memory: bool) -> None:
         policy = self._policy
+        self._reader = secrets.randbits(64) or 1
         key = AttachKey(
             self.source,
-            secrets.randbits(64) or 1,
+            self._reader,
             shared_memory,
             policy.reliable,
             min(policy.depth + 2, 255),
@@ -166,11 +168,14 @@ class Link:
         """Account for the numbers up to these; False if they have been seen before."""
         if sequence < self.expected:
             return False
-        if self.expected >= 0:
+        if 0 <= self.expected < sequence:
             self.counters.lost += sequence - self.expected
-            if sequence > self.expected:
-                for ring in self._rings.values():
-                    ring.heal(sequence)
+            for ring in self._rings.values():
+                ring.heal(sequence)
+            if self._policy.reliable:
+                key = resume_key(self.source, self._reader, stamped=self._stamped)
+                self.socket.subscribe(key)
+                self.socket.unsubscribe(key)
         self.expected = sequence + count
         return True
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import zmq
 
 from cortex.context import new_socket
-from cortex.wire import AttachKey, parse_attach_key
+from cortex.wire import AttachKey, parse_attach_key, parse_resume_key
 
 logger = logging.getLogger(__name__)
 
@@ -28,6 +28,10 @@ class Attachable(Protocol):
 
     def detach(self, outlet: Outlet, request: AttachKey) -> None:
         """A reader has left or died."""
+        ...
+
+    def resume(self, outlet: Outlet) -> None:
+        """A reliable reader that was too late has seen what it lost, and reads again."""
         ...
 
 
@@ -142,6 +146,9 @@ class Outlets:
         key = event[1:]
         request = parse_attach_key(key)
         if request is None:
+            resumed = self._publishers.get(parse_resume_key(key) or 0)
+            if resumed is not None and event[0] == 1:
+                resumed.resume(outlet)
             return
         publisher = self._publishers.get(request.source)
         if publisher is None:

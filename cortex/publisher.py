@@ -80,6 +80,8 @@ class Publisher(Generic[T]):
         self._sequence = 0
         self._latched = b""
         self._refresh_ns = 0
+        self._late: set[Outlet] = set()
+        """Strict outlets on which a reader was too late: libzmq sends it nothing until it has caught up."""
         self._blocked = False
         self._coalesce = coalesce
         self._batch: list[bytes] = []
@@ -97,7 +99,8 @@ class Publisher(Generic[T]):
 
         Returns:
             False if a reliable subscriber lost it, because it held up the publisher for longer than its
-            `timeout_s`; True otherwise, also if there is no subscriber.
+            `timeout_s`; True otherwise, also if there is no subscriber. A subscriber that was too late once
+            holds up no further messages, and loses them, until it has read about half of what waits for it.
 
         Raises:
             TypeError: The message is of another type.
@@ -202,12 +205,14 @@ class Publisher(Generic[T]):
         return self._send_strict_all(frame) if self._strict_outlets else True
 
     def _send_strict_all(self, frame: bytes) -> bool:
-        on_time = True
+        on_time = not self._late
         for outlet in self._strict_outlets:
             try:
                 outlet.send(frame, DONTWAIT)
             except zmq.Again:
                 on_time &= self._send_strict(outlet, frame, 0)
+        if not on_time:
+            self._timeouts += 1
         return on_time
 
     def _send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
@@ -227,11 +232,11 @@ class Publisher(Generic[T]):
                 self._check_open()
                 self._outlets.refresh()
                 if not more:
-                    if self._timeouts == 0:
+                    if not self._timeouts:
                         logger.warning(
                             "%s: a reliable subscriber did not keep up and lost a message", self.topic
                         )
-                    self._timeouts += 1
+                    self._late.add(outlet)
                     outlet.send_anyway(frame, flags)
                     return False
         finally:
@@ -326,9 +331,9 @@ class Publisher(Generic[T]):
                 self._latched = self._large_kind + tail(0) + slot.buffer[:size].tobytes()
             sent, passed_over = self._large.send(slot, size, tail, sequence, self._send_strict)
             self._skipped += passed_over
-            if not on_time:
-                self._timeouts += 1
-            return on_time and sent
+            on_time = on_time and sent and not self._late
+            self._timeouts += not on_time
+            return on_time
 
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
@@ -370,8 +375,13 @@ class Publisher(Generic[T]):
             if reader.request.reader == request.reader and reader.outlet is outlet:
                 del self._readers[key]
                 self._large.dismiss(reader)
+                self._late.discard(outlet)
                 self._route()
                 return
+
+    def resume(self, outlet: Outlet) -> None:
+        """A reader that was too late has caught up; called under the outlets' lock."""
+        self._late.discard(outlet)
 
     def _route(self) -> None:
         outlets = {reader.outlet for reader in self._readers.values()}

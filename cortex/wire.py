@@ -13,7 +13,7 @@ HEADER_SIZE = 64
 PREFIX_SIZE = 16
 """Bytes of a header that ZeroMQ subscriptions match: magic, kind, version, flags, header length, source."""
 
-MESSAGE, LARGE, SLOT, BATCH, ATTACH = b"M", b"L", b"S", b"B", b"A"
+MESSAGE, LARGE, SLOT, BATCH, ATTACH, RESUME = b"M", b"L", b"S", b"B", b"A", b"R"
 CONTROL, REQUEST, REPLY, ERROR = b"C", b"Q", b"P", b"E"
 
 FLAG_STAMP = 1
@@ -228,6 +228,18 @@ def parse_attach_key(data: bytes) -> AttachKey | None:
     return AttachKey(
         source, reader, bool(options & 1), bool(options & 2), (options >> 8) & 0xFF, options >> 32
     )
+
+
+def resume_key(source: int, reader: int, *, stamped: bool) -> bytes:
+    """What a reliable reader subscribes to for a moment when it has seen a gap and reads again."""
+    return prefix(RESUME, source, stamped=stamped) + reader.to_bytes(8, "little")
+
+
+def parse_resume_key(data: bytes) -> int | None:
+    """The source of a resume key; None if the subscription is something else."""
+    if len(data) != HEAD_SIZE or data[:4] != b"CTX" + RESUME:
+        return None
+    return int.from_bytes(data[8:16], "little")
 
 
 def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:
