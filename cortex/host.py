@@ -15,6 +15,7 @@ import stat
 import threading
 import time
 from pathlib import Path
+from typing import ClassVar
 
 SOCKET_PATH_MAX = 107
 """Longest path of a unix socket in bytes: `sun_path` less its terminating zero."""
@@ -124,8 +125,8 @@ class FileLock:
     A forked child does not keep the lock: its copy of the descriptor is closed at the fork.
     """
 
-    _open: set[int] = set()  # noqa: RUF012 - one set for the process, guarded by the lock below
-    _guard = threading.Lock()
+    _held: ClassVar[set[FileLock]] = set()
+    _guard: ClassVar[threading.Lock] = threading.Lock()
 
     def __init__(self, path: Path, descriptor: int):
         self.path = path
@@ -137,8 +138,8 @@ class FileLock:
         while True:
             with cls._guard:  # a fork waits for this, so that no child gets a descriptor it does not know of
                 descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-                cls._open.add(descriptor)
-            lock = cls(path, descriptor)
+                lock = cls(path, descriptor)
+                cls._held.add(lock)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 current = os.stat(path)
@@ -157,9 +158,10 @@ class FileLock:
         """Take over a lock that the process which started us holds, by the descriptor it left us."""
         os.set_inheritable(descriptor, False)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if it is not the lock after all
+        lock = cls(path, descriptor)
         with cls._guard:
-            cls._open.add(descriptor)
-        return cls(path, descriptor)
+            cls._held.add(lock)
+        return lock
 
     @property
     def descriptor(self) -> int:
@@ -177,17 +179,17 @@ class FileLock:
 
     def _close_descriptor(self) -> None:
         with self._guard:
-            descriptor, self._descriptor = self._descriptor, -1
-            if descriptor in self._open:
-                self._open.discard(descriptor)
-                os.close(descriptor)
+            if self in self._held:
+                self._held.discard(self)
+                os.close(self._descriptor)
+                self._descriptor = -1
 
     @classmethod
     def _after_fork_in_child(cls) -> None:
-        for descriptor in cls._open:
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
-        cls._open.clear()
+        for lock in cls._held:
+            os.close(lock._descriptor)
+            lock._descriptor = -1
+        cls._held.clear()
         cls._guard.release()
 
 

@@ -17,6 +17,7 @@ from cortex.host import (
     NodeFiles,
     domain_id,
     host_id,
+    node_lives,
     runtime_base,
     runtime_dir,
     sweep,
@@ -144,6 +145,7 @@ def _sit_until_killed(ready):
     signal.pause()
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
 def test_a_forked_child_does_not_keep_the_lock(tmp_path):
     """A child that outlives us must not make us look alive."""
     lock = FileLock.acquire(tmp_path / "lock")
@@ -169,6 +171,19 @@ def test_a_node_leaves_nothing_behind():
     files.close()
     files.close()
     assert list(files.directory.iterdir()) == []
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # threads of other libraries
+def test_a_forked_child_removes_nothing_of_its_parent():
+    files = NodeFiles(0, 8)
+    files.path("lossy").touch()
+    child = multiprocessing.get_context("fork").Process(target=files.close)
+    child.start()
+    child.join(10)
+    assert child.exitcode == 0
+    assert files.path("lossy").exists()
+    assert sweep(files.directory) == []  # and it lives still
+    files.close()
 
 
 def test_a_number_is_not_given_twice():
@@ -197,6 +212,17 @@ for role in ("lossy", "strict", "control"):
 print("ready", flush=True)
 signal.pause()
 """
+
+
+def test_a_node_lives_while_its_lock_is_held():
+    files = NodeFiles(0, 6)
+    assert node_lives(files.directory, 6)
+    assert not node_lives(files.directory, 7)
+    files.close()
+    assert not node_lives(files.directory, 6)
+    (files.directory / f"{6:016x}.lock").touch()  # what a killed one leaves
+    assert not node_lives(files.directory, 6)
+    assert list(files.directory.iterdir()) == []
 
 
 def test_sweep_removes_the_files_of_killed_nodes_only():
