@@ -6,7 +6,7 @@ import json
 import sys
 from typing import Any
 
-from cortex import records
+from cortex import messages, records
 from cortex.codec import codec_of
 from cortex.message import is_message
 from cortex.schema import schema_of
@@ -46,10 +46,9 @@ def damage(body: bytes, bad: Malformed) -> bytes:
 
 
 def types() -> list[dict[str, str]]:
-    """Return name, schema and fingerprint of the control messages."""
-    schemas = [
-        schema_of(item) for item in vars(records).values() if isinstance(item, type) and is_message(item)
-    ]
+    """Return name, schema and fingerprint of the standard and the control messages."""
+    found = [item for module in (messages, records) for item in vars(module).values()]
+    schemas = [schema_of(item) for item in found if isinstance(item, type) and is_message(item)]
     return [
         {"name": schema.name, "fingerprint": f"{schema.fingerprint:016x}", "schema": schema.to_json()}
         for schema in sorted(schemas, key=lambda schema: schema.name)
