@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import secrets
 from collections.abc import Callable
 from typing import NamedTuple
@@ -40,6 +41,9 @@ from cortex.wire import (
 logger = logging.getLogger(__name__)
 
 QUEUE_MAX = 1000
+JUMP_MAX = 1 << 32
+"""A sequence that is further ahead than this is not believed: after it every other would count as seen."""
+_NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
 WHOLE_BATCH = -1
 
 
@@ -139,7 +143,7 @@ class Link:
     def reject(self, reason: str) -> None:
         """Count a bad frame; say so once for each kind of reason."""
         self.counters.rejected += 1
-        text = reason.split(":")[0][:40]
+        text = _NUMBERS.sub("#", reason)
         if text not in self._complained and len(self._complained) < 16:
             self._complained.add(text)
             logger.warning("%s: rejected a frame of %s: %s", self.record.topic, self.address, reason)
@@ -165,8 +169,11 @@ class Link:
             self.socket.recv(zmq.DONTWAIT)
 
     def advance(self, sequence: int, count: int = 1) -> bool:
-        """Account for the numbers up to these; False if they have been seen before."""
+        """Account for the numbers up to these; False if they have been seen before, or cannot be."""
         if sequence < self.expected:
+            return False
+        if sequence - self.expected > JUMP_MAX and self.expected >= 0:
+            self.reject(f"sequence {sequence} after {self.expected}")
             return False
         if 0 <= self.expected < sequence:
             self.counters.lost += sequence - self.expected
