@@ -142,14 +142,10 @@ class FileLock:
                 cls._held.add(lock)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                current = os.stat(path)
-            except (BlockingIOError, FileNotFoundError) as error:
+            except BlockingIOError:
                 lock._close_descriptor()
-                if isinstance(error, BlockingIOError):
-                    return None
-                continue
-            held = os.fstat(descriptor)
-            if (held.st_dev, held.st_ino) == (current.st_dev, current.st_ino):
+                return None
+            if lock.intact:
                 return lock
             lock._close_descriptor()  # the file was removed between our two steps: it is the lock no more
 
@@ -167,6 +163,16 @@ class FileLock:
     def descriptor(self) -> int:
         """The file descriptor, to hand over to a process that is being started; -1 when closed."""
         return self._descriptor
+
+    @property
+    def intact(self) -> bool:
+        """Whether the file is still there; if somebody has removed it, others can take the lock anew."""
+        try:
+            current = os.stat(self.path)
+        except FileNotFoundError:
+            return False
+        held = os.fstat(self._descriptor)
+        return (held.st_dev, held.st_ino) == (current.st_dev, current.st_ino)
 
     def close(self, *, remove: bool = False) -> None:
         """Let go of the lock (unless a process it was handed to has it), and remove the file if asked to."""

@@ -215,6 +215,9 @@ class Registry:
                 for entry in self._entries.values():
                     entry.seen_ns += turn_ns - before_ns
                 busy_ns += turn_ns - before_ns
+            if not self._lock.intact:
+                logger.warning("%s was removed: another registry takes over", self._lock.path)
+                break
             for socket, _ in ready:
                 self._drain(socket, turn_ns)
             self._expire(turn_ns)
@@ -231,8 +234,9 @@ class Registry:
         if self._authenticator is not None:
             self._authenticator.release()
         self._context.term()  # from here on nothing of ours can touch the path, which the next registry makes
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(self._directory / REGISTRY_SOCKET)
+        if self._lock.intact:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(self._directory / REGISTRY_SOCKET)
         self._lock.close()
 
     def _drain(self, socket: zmq.Socket[Any], now_ns: int) -> None:

@@ -336,6 +336,22 @@ def test_a_killed_registry_is_replaced_within_a_second(make):
         assert took_s < 1.0
 
 
+def test_a_registry_whose_files_were_removed_makes_way(make):
+    """By a cleaner of /tmp, say: else newcomers would start a second one, and the domain would be split."""
+    nodes = [make("one"), make("two")]
+    drive(nodes, lambda: nodes[0].names == ["two"] and nodes[1].names == ["one"])
+    old = registry_pid()
+    for name in (REGISTRY_LOCK, REGISTRY_SOCKET):
+        (runtime_dir(0) / name).unlink()
+    drive(
+        nodes, lambda: registry_pid() not in (None, old) and all(node.directory.connected for node in nodes)
+    )
+    nodes.append(make("newcomer"))
+    drive(nodes, lambda: all(len(node.directory.nodes) == 2 for node in nodes))
+    wait_for(lambda: not Path(f"/proc/{old}").exists())
+    assert not any(node.ever_lost for node in nodes)
+
+
 def test_who_died_with_the_registry_is_dropped_after_a_lease(make):
     """The new registry has never heard of it."""
     one, two, dead = make("one"), make("two"), make("dead")
