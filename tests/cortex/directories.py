@@ -1,0 +1,271 @@
+"""Nodes, registries and frames for the tests of discovery."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import random
+import secrets
+import selectors
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import zmq
+
+from cortex.control import LEASE_NS, control_types, make_control_socket
+from cortex.discovery import Directory
+from cortex.host import REGISTRY_LOCK, REGISTRY_SOCKET, FileLock, runtime_dir
+from cortex.records import (
+    Alive,
+    Changed,
+    Describe,
+    Gone,
+    Heartbeat,
+    Hello,
+    Leave,
+    NodeRecord,
+    PublisherRecord,
+    Refused,
+    Welcome,
+)
+from cortex.registry import Registry
+from cortex.wire import parse_control
+
+ROOT = Path(__file__).resolve().parents[2]
+NODE = Path(__file__).with_name("discovery_node.py")
+SOON_S = 10.0
+"""Deadline of things that take milliseconds, on a machine that does a lot besides."""
+LEASE_S = LEASE_NS / 1e9
+
+
+def private_runtime(monkeypatch) -> Iterator[Path]:
+    """A runtime directory for the test; whatever serves in it is ended with it."""
+    path = Path(tempfile.mkdtemp(prefix="cortex-test-"))
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(path))
+    yield path
+    pid = registry_pid()
+    if pid is not None:
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: registry_pid() is None)
+    shutil.rmtree(path)
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = SOON_S) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "the condition did not come true in time"
+        time.sleep(0.005)
+
+
+def registry_pid(domain: int = 0) -> int | None:
+    """The process that holds the registry's lock, if any does."""
+    path = runtime_dir(domain) / REGISTRY_LOCK
+    lock = FileLock.acquire(path)
+    if lock is not None:
+        lock.close()
+        return None
+    text = path.read_text()
+    return int(text) if text else None
+
+
+def make_record(name: str, **changes) -> NodeRecord:
+    node = secrets.randbits(64) | 1
+    return dataclasses.replace(NodeRecord(node, name, "host", 1, 1, 0, [], [], [], []), **changes)
+
+
+def publisher(topic: str, schema: str = "{}") -> PublisherRecord:
+    return PublisherRecord(topic, 1, "T", 2, schema, False)
+
+
+class Node:
+    """A directory, and a ROUTER that answers as a node's does; driven by `drive` in the test's thread."""
+
+    def __init__(self, context, name, *, router=False, **options):
+        self.record = make_record(name)
+        self.changes: list[frozenset[int]] = []
+        self.ever_lost: set[int] = set()
+        self.directory = Directory(
+            context,
+            domain=0,
+            record=lambda: self.record,
+            on_change=self._on_change,
+            **options,
+        )
+        self.router = context.socket(zmq.ROUTER) if router else None
+        self.address = ""
+        if self.router is not None:
+            self.router.bind("tcp://127.0.0.1:*")
+            self.address = self.router.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def _on_change(self, changed):
+        self.changes.append(changed)
+        self.ever_lost |= {node for node in changed if node not in self.directory.nodes}
+
+    @property
+    def id(self):
+        return self.record.node
+
+    @property
+    def names(self):
+        return sorted(record.name for record in self.directory.nodes.values())
+
+    def close(self):
+        self.directory.close()
+        if self.router is not None:
+            self.router.close()
+
+
+def drive(nodes, condition, timeout_s=SOON_S):
+    """Let the nodes work until a condition holds."""
+    poller = zmq.Poller()
+    owner = {}
+    for node in nodes:
+        for socket in [*node.directory.sockets(), *([node.router] if node.router else [])]:
+            poller.register(socket, zmq.POLLIN)
+            owner[socket] = node
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, [(n.record.name, n.names, n.directory.connected) for n in nodes]
+        next_ns = min((node.directory.deadline_ns for node in nodes), default=0)
+        wait_ms = (next_ns - time.monotonic_ns()) // 1_000_000
+        for socket, _ in poller.poll(min(max(wait_ms, 0), 20)):
+            node = owner[socket]
+            if socket is node.router:
+                identity, frame = socket.recv_multipart()
+                answer = node.directory.answer(frame)
+                if answer is not None:
+                    socket.send_multipart([identity, answer])
+            else:
+                node.directory.handle(socket)
+        for node in nodes:
+            node.directory.tick()
+
+
+def drive_for(nodes, seconds):
+    end = time.monotonic() + seconds
+    drive(nodes, lambda: time.monotonic() >= end, seconds + SOON_S)
+
+
+@contextlib.contextmanager
+def node_maker(context):
+    """Makes nodes, and closes them."""
+    with contextlib.ExitStack() as stack:
+
+        def make_node(name, **options):
+            node = Node(context, name, **options)
+            stack.callback(node.close)
+            return node
+
+        yield make_node
+
+
+@contextlib.contextmanager
+def serving(**options):
+    """A registry in a thread."""
+    registry = Registry(0, **options)
+    thread = threading.Thread(target=registry.run)
+    thread.start()
+    try:
+        yield registry
+    finally:
+        registry.stop()
+        thread.join(10)
+        assert not thread.is_alive()
+        registry.close()
+
+
+@contextlib.contextmanager
+def node_process(name, **options):
+    """A node in a process of its own."""
+    arguments = [sys.executable, str(NODE), json.dumps({"name": name, **options})]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    pipe = subprocess.PIPE
+    # No buffer: what lies in one, `select` does not see.
+    process = subprocess.Popen(arguments, env=environment, stdin=pipe, stdout=pipe, bufsize=0)
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGCONT)
+        process.stdin.close()
+        try:
+            process.wait(10)
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+
+
+def read_until(process, condition, timeout_s=SOON_S):
+    """Read what a node process prints until a line satisfies the condition, and return it."""
+    deadline = time.monotonic() + timeout_s
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        while selector.select(max(deadline - time.monotonic(), 0)):
+            line = process.stdout.readline()
+            assert line, "the node has ended"
+            seen = json.loads(line)
+            if "names" in seen and condition(seen):
+                return seen
+    raise AssertionError("the node did not print what was expected in time")
+
+
+def dealer(context):
+    socket = context.socket(zmq.DEALER)
+    socket.connect(f"ipc://{runtime_dir(0) / REGISTRY_SOCKET}")
+    return socket
+
+
+TYPES = control_types(Alive, Changed, Describe, Gone, Heartbeat, Hello, Leave, Refused, Welcome)
+
+
+def receive(socket, timeout_ms=5000):
+    assert socket.poll(timeout_ms), "no answer"
+    return parse_control(socket.recv(), TYPES)[0]
+
+
+def mutate(frame: bytes, random: random.Random) -> bytes:
+    data = bytearray(frame)
+    for _ in range(random.randint(1, 4)):
+        position = random.randrange(len(data))
+        kind = random.randrange(5)
+        if kind == 0:
+            data[position] ^= 1 << random.randrange(8)
+        elif kind == 1:
+            data[position] = random.choice((0, 1, 0x7F, 0x80, 0xFF))
+        elif kind == 2:
+            del data[position:]
+        elif kind == 3:
+            data[position:position] = random.randbytes(random.randint(1, 16))
+        else:
+            start = max(position - 4, 0)
+            data[start : start + 4] = random.choice((b"\xff" * 4, b"\0" * 4, b"\0\0\0\x80"))
+        if not data:
+            return b""
+    return bytes(data)
+
+
+def answers_unknown(socket):
+    """Whether the registry has answered the heartbeat of a node that it does not know."""
+    with contextlib.suppress(zmq.Again):
+        while True:
+            frame = socket.recv(zmq.NOBLOCK)
+            message = parse_control(frame, TYPES)[0]
+            if isinstance(message, Alive) and message.held == 0:
+                return True
+    return False
+
+
+def fake_registry(context):
+    socket = make_control_socket(context, zmq.ROUTER, tcp=False)
+    socket.bind(f"ipc://{runtime_dir(0) / REGISTRY_SOCKET}")
+    return socket
