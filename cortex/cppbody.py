@@ -133,20 +133,24 @@ def _check_dimensions(code: Code, kind: ArrayType, value: str, where: str, pad: 
             code.lines.append(f"{pad}dimension_{extent}({actual}, {where});")
 
 
-def place(code: Code, kind: FieldType, value: str, offset: int) -> None:
+def place(code: Code, name: str, kind: FieldType, value: str, offset: int) -> None:
     """Lines that give a loan's array its place."""
-    if not isinstance(kind, ArrayType) or kind.dtype == ANY_DTYPE:
+    if not isinstance(kind, ArrayType):
         return
-    if not kind.is_fixed:
-        extents = ", ".join(
-            f"Placer::Extent{{nullptr, {extent}u}}"
-            if isinstance(extent, int)
-            else f"Placer::Extent{{{literal(extent)}, 0}}"
-            for extent in kind.shape
-        )
+    if kind.is_fixed:
+        if is_large(kind):
+            code.lines.append(f"    placer.fixed({offset}, {value}, {_shape(kind)});")
+        return
+    extents = ", ".join(
+        f"Placer::Extent{{nullptr, {extent}u}}"
+        if isinstance(extent, int)
+        else f"Placer::Extent{{{literal(extent)}, 0}}"
+        for extent in kind.shape
+    )
+    if kind.dtype == ANY_DTYPE:
+        code.lines.append(f"    placer.any({literal(name)}, {value}, {{{extents}}});")
+    else:
         code.lines.append(f"    placer.array({value}, {{{extents}}});")
-    elif is_large(kind):
-        code.lines.append(f"    placer.fixed({offset}, {value}, {_shape(kind)});")
 
 
 def _call(kind: str | ArrayType) -> str:

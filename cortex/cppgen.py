@@ -229,7 +229,7 @@ class _Generator:
             if member.offset > used:
                 write.lines.append(f"    sink.zero({_plus('at', used)}, {member.offset - used});")
             self._body.write(write, member.field.type, f"message.{member.name}", at, where, 2)
-            place(draft, member.field.type, f"out.{member.name}", member.offset)
+            place(draft, member.field.name, member.field.type, f"out.{member.name}", member.offset)
             used = member.offset + measure(member.field.type)[0]
         if size > used:
             write.lines.append(f"    sink.zero({_plus('at', used)}, {size - used});")
@@ -281,7 +281,7 @@ def _struct(name: str, members: list[_Member]) -> Iterator[str]:
         if member.field.frame:
             notes.append(f"frame {_comment(member.field.frame)}")
         yield f"  {member.cpp} {member.name}{{}};" + (f"  // {', '.join(notes)}" if notes else "")
-    equal = " && ".join(f"a.{member.name} == b.{member.name}" for member in members) or "true"
+    equal = " &&\n           ".join(f"a.{member.name} == b.{member.name}" for member in members) or "true"
     unused = "" if members else "[[maybe_unused]] "
     if members:
         yield ""
@@ -320,7 +320,8 @@ def _identifier(name: str, taken: Sequence[str] | dict[str, int] = ()) -> str:
 
 def _comment(text: str) -> str:
     """A unit or frame, made fit for a comment of one line."""
-    return re.sub(r"[^\x20-\x7e\u00a0-\u1fff\u2030-\uffff]|\\", " ", text)
+    plain = re.sub(r"[^\x20-\x7e\u00a0-\u1fff\u2030-\uffff]|\\", " ", text)
+    return plain.replace("??", "? ?")  # a trigraph
 
 
 def _string_lines(text: str) -> Iterator[str]:

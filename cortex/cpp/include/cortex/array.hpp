@@ -287,6 +287,13 @@ class AnyArray {
     return {reinterpret_cast<const T*>(bytes_.data()), bytes_.size() / sizeof(T)};
   }
 
+  // The items, to be changed; as `Array::writable`.
+  template <class T>
+  Span<T> writable() {
+    as<T>();
+    return {reinterpret_cast<T*>(bytes_.writable().data()), bytes_.size() / sizeof(T)};
+  }
+
   friend bool operator==(const AnyArray& a, const AnyArray& b) noexcept {
     return a.dtype_ == b.dtype_ && a.shape_ == b.shape_ && a.bytes_ == b.bytes_;
   }

@@ -85,10 +85,11 @@ class Link {
       const bool more = frame.more();
       try {
         accept(frame, queue);
+        if (more && net::drop_parts(socket_) > 0) reject("parts after the end of a message");
       } catch (const std::exception& error) {  // MalformedMessage, or no memory for what it says
         reject(error.what());
+        if (more) net::drop_parts(socket_);
       }
-      if (more) counters_->rejected += net::drop_parts(socket_);
     }
     return false;
   }

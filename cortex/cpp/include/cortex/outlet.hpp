@@ -165,16 +165,18 @@ class PublisherCore {
     Lock lock(outlets_->mutex);
     prepare(lock, true);
     const std::shared_ptr<Ring> ring = ring_for(size);
-    if (ring == nullptr) {
-      auto memory = std::make_shared<std::vector<std::uint8_t>>(size);
-      return {{memory->data(), size}, nullptr, -1, std::move(memory)};
-    }
+    if (ring == nullptr) return private_slot(size);
     const int index = ring->acquire();
     if (index >= 0) return {ring->buffer(index), ring, index, nullptr};
     ++sequence_;
     ++counters_.published;
     ++counters_.skipped;
     return {};
+  }
+
+  static Slot private_slot(std::size_t size) {
+    auto memory = std::make_shared<std::vector<std::uint8_t>>(size);
+    return {{memory->data(), size}, nullptr, -1, std::move(memory)};
   }
 
   void abandon(const Slot& slot) noexcept {

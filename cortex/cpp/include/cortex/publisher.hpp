@@ -60,16 +60,18 @@ class Loan {
   friend class Publisher;
   static constexpr std::size_t reserve = 4096;
 
-  Loan(std::shared_ptr<detail::PublisherCore> core, const Dimensions& dimensions) : core_(std::move(core)) {
-    Placer measure({}, block_of<T>(), dimensions);
+  Loan(std::shared_ptr<detail::PublisherCore> core, const Dimensions& dimensions, const Dtypes& dtypes)
+      : core_(std::move(core)) {
+    Placer measure({}, block_of<T>(), dimensions, dtypes);
     Codec<T>::draft(measure, message_);
     tail_ = measure.size();
-    slot_ = core_->acquire(tail_ + reserve);
+    const std::size_t size = tail_ + reserve;
+    slot_ = size <= core_->inline_max() ? core_->private_slot(size) : core_->acquire(size);
     if (slot_.buffer.data() == nullptr) {
       core_.reset();
       throw std::runtime_error("every slot is out on loan; publish or drop one first");
     }
-    Placer place(slot_.buffer, block_of<T>(), dimensions);
+    Placer place(slot_.buffer, block_of<T>(), dimensions, dtypes);
     Codec<T>::draft(place, message_);
   }
 
@@ -106,10 +108,11 @@ class Publisher {
     return core_->publish_slot(slot, size, Codec<T>::stamp(message));
   }
 
-  // Borrows memory for a message of these dimensions, such as {{"height", 480}, {"width", 640}}.
-  Loan<T> loan(const Dimensions& dimensions = {}) {
+  // Borrows memory for a message of these dimensions, such as {{"height", 480}, {"width", 640}}; an array that may
+  // have any type of items is placed if its field is given one, such as {{"data", cortex::Dtype::uint8}}.
+  Loan<T> loan(const Dimensions& dimensions = {}, const Dtypes& dtypes = {}) {
     const std::lock_guard<std::mutex> lock(core_->large_mutex);
-    return Loan<T>(core_, dimensions);
+    return Loan<T>(core_, dimensions, dtypes);
   }
 
   bool wait_for_subscribers(std::size_t count, std::chrono::nanoseconds timeout) {

@@ -27,7 +27,12 @@ struct PublisherRecord {
   bool latch{};
 
   friend bool operator==(const PublisherRecord& a, const PublisherRecord& b) {
-    return a.topic == b.topic && a.source == b.source && a.type_name == b.type_name && a.fingerprint == b.fingerprint && a.schema == b.schema && a.latch == b.latch;
+    return a.topic == b.topic &&
+           a.source == b.source &&
+           a.type_name == b.type_name &&
+           a.fingerprint == b.fingerprint &&
+           a.schema == b.schema &&
+           a.latch == b.latch;
   }
   friend bool operator!=(const PublisherRecord& a, const PublisherRecord& b) { return !(a == b); }
 };
@@ -88,7 +93,10 @@ struct SubscriberRecord {
   std::string policy{};
 
   friend bool operator==(const SubscriberRecord& a, const SubscriberRecord& b) {
-    return a.topic == b.topic && a.type_name == b.type_name && a.fingerprint == b.fingerprint && a.policy == b.policy;
+    return a.topic == b.topic &&
+           a.type_name == b.type_name &&
+           a.fingerprint == b.fingerprint &&
+           a.policy == b.policy;
   }
   friend bool operator!=(const SubscriberRecord& a, const SubscriberRecord& b) { return !(a == b); }
 };
@@ -142,7 +150,10 @@ struct ServiceRecord {
   std::string reply_schema{};
 
   friend bool operator==(const ServiceRecord& a, const ServiceRecord& b) {
-    return a.name == b.name && a.service == b.service && a.request_schema == b.request_schema && a.reply_schema == b.reply_schema;
+    return a.name == b.name &&
+           a.service == b.service &&
+           a.request_schema == b.request_schema &&
+           a.reply_schema == b.reply_schema;
   }
   friend bool operator!=(const ServiceRecord& a, const ServiceRecord& b) { return !(a == b); }
 };
@@ -197,7 +208,11 @@ struct Endpoint {
   std::string server_key{};
 
   friend bool operator==(const Endpoint& a, const Endpoint& b) {
-    return a.transport == b.transport && a.lossy == b.lossy && a.strict == b.strict && a.control == b.control && a.server_key == b.server_key;
+    return a.transport == b.transport &&
+           a.lossy == b.lossy &&
+           a.strict == b.strict &&
+           a.control == b.control &&
+           a.server_key == b.server_key;
   }
   friend bool operator!=(const Endpoint& a, const Endpoint& b) { return !(a == b); }
 };
@@ -260,7 +275,16 @@ struct NodeRecord {
   std::vector<::cortex::records::ServiceRecord> services{};
 
   friend bool operator==(const NodeRecord& a, const NodeRecord& b) {
-    return a.node == b.node && a.name == b.name && a.host == b.host && a.pid == b.pid && a.revision == b.revision && a.clock_offset_ns == b.clock_offset_ns && a.endpoints == b.endpoints && a.publishers == b.publishers && a.subscribers == b.subscribers && a.services == b.services;
+    return a.node == b.node &&
+           a.name == b.name &&
+           a.host == b.host &&
+           a.pid == b.pid &&
+           a.revision == b.revision &&
+           a.clock_offset_ns == b.clock_offset_ns &&
+           a.endpoints == b.endpoints &&
+           a.publishers == b.publishers &&
+           a.subscribers == b.subscribers &&
+           a.services == b.services;
   }
   friend bool operator!=(const NodeRecord& a, const NodeRecord& b) { return !(a == b); }
 };
@@ -407,7 +431,8 @@ struct Hello {
   ::cortex::records::NodeRecord record{};
 
   friend bool operator==(const Hello& a, const Hello& b) {
-    return a.snapshot == b.snapshot && a.record == b.record;
+    return a.snapshot == b.snapshot &&
+           a.record == b.record;
   }
   friend bool operator!=(const Hello& a, const Hello& b) { return !(a == b); }
 };
@@ -477,7 +502,9 @@ struct Heartbeat {
   std::uint64_t held{};
 
   friend bool operator==(const Heartbeat& a, const Heartbeat& b) {
-    return a.node == b.node && a.revision == b.revision && a.held == b.held;
+    return a.node == b.node &&
+           a.revision == b.revision &&
+           a.held == b.held;
   }
   friend bool operator!=(const Heartbeat& a, const Heartbeat& b) { return !(a == b); }
 };
@@ -528,7 +555,9 @@ struct Alive {
   std::uint64_t held{};
 
   friend bool operator==(const Alive& a, const Alive& b) {
-    return a.epoch == b.epoch && a.version == b.version && a.held == b.held;
+    return a.epoch == b.epoch &&
+           a.version == b.version &&
+           a.held == b.held;
   }
   friend bool operator!=(const Alive& a, const Alive& b) { return !(a == b); }
 };
@@ -580,7 +609,10 @@ struct Welcome {
   std::vector<std::uint64_t> revisions{};
 
   friend bool operator==(const Welcome& a, const Welcome& b) {
-    return a.epoch == b.epoch && a.version == b.version && a.nodes == b.nodes && a.revisions == b.revisions;
+    return a.epoch == b.epoch &&
+           a.version == b.version &&
+           a.nodes == b.nodes &&
+           a.revisions == b.revisions;
   }
   friend bool operator!=(const Welcome& a, const Welcome& b) { return !(a == b); }
 };
@@ -665,7 +697,8 @@ struct Changed {
   ::cortex::records::NodeRecord record{};
 
   friend bool operator==(const Changed& a, const Changed& b) {
-    return a.version == b.version && a.record == b.record;
+    return a.version == b.version &&
+           a.record == b.record;
   }
   friend bool operator!=(const Changed& a, const Changed& b) { return !(a == b); }
 };
@@ -734,7 +767,9 @@ struct Gone {
   std::string reason{};
 
   friend bool operator==(const Gone& a, const Gone& b) {
-    return a.version == b.version && a.node == b.node && a.reason == b.reason;
+    return a.version == b.version &&
+           a.node == b.node &&
+           a.reason == b.reason;
   }
   friend bool operator!=(const Gone& a, const Gone& b) { return !(a == b); }
 };
@@ -784,7 +819,8 @@ struct Refused {
   std::string reason{};
 
   friend bool operator==(const Refused& a, const Refused& b) {
-    return a.node == b.node && a.reason == b.reason;
+    return a.node == b.node &&
+           a.reason == b.reason;
   }
   friend bool operator!=(const Refused& a, const Refused& b) { return !(a == b); }
 };
@@ -922,7 +958,13 @@ struct PublisherStats {
   std::uint64_t skipped{};
 
   friend bool operator==(const PublisherStats& a, const PublisherStats& b) {
-    return a.topic == b.topic && a.source == b.source && a.subscribers == b.subscribers && a.published == b.published && a.bytes == b.bytes && a.timeouts == b.timeouts && a.skipped == b.skipped;
+    return a.topic == b.topic &&
+           a.source == b.source &&
+           a.subscribers == b.subscribers &&
+           a.published == b.published &&
+           a.bytes == b.bytes &&
+           a.timeouts == b.timeouts &&
+           a.skipped == b.skipped;
   }
   friend bool operator!=(const PublisherStats& a, const PublisherStats& b) { return !(a == b); }
 };
@@ -988,7 +1030,13 @@ struct SubscriberStats {
   std::array<std::uint64_t, 40> latency_counts{};  // [40]
 
   friend bool operator==(const SubscriberStats& a, const SubscriberStats& b) {
-    return a.topic == b.topic && a.policy == b.policy && a.received == b.received && a.lost == b.lost && a.rejected == b.rejected && a.overtaken == b.overtaken && a.latency_counts == b.latency_counts;
+    return a.topic == b.topic &&
+           a.policy == b.policy &&
+           a.received == b.received &&
+           a.lost == b.lost &&
+           a.rejected == b.rejected &&
+           a.overtaken == b.overtaken &&
+           a.latency_counts == b.latency_counts;
   }
   friend bool operator!=(const SubscriberStats& a, const SubscriberStats& b) { return !(a == b); }
 };
@@ -1095,7 +1143,10 @@ struct StatsReply {
   std::uint64_t rejected{};
 
   friend bool operator==(const StatsReply& a, const StatsReply& b) {
-    return a.node == b.node && a.publishers == b.publishers && a.subscribers == b.subscribers && a.rejected == b.rejected;
+    return a.node == b.node &&
+           a.publishers == b.publishers &&
+           a.subscribers == b.subscribers &&
+           a.rejected == b.rejected;
   }
   friend bool operator!=(const StatsReply& a, const StatsReply& b) { return !(a == b); }
 };
@@ -1190,7 +1241,8 @@ struct ServiceError {
   std::string text{};
 
   friend bool operator==(const ServiceError& a, const ServiceError& b) {
-    return a.kind == b.kind && a.text == b.text;
+    return a.kind == b.kind &&
+           a.text == b.text;
   }
   friend bool operator!=(const ServiceError& a, const ServiceError& b) { return !(a == b); }
 };

@@ -6,6 +6,7 @@
 #include <cerrno>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
 #include <cstring>
 #include <memory>
 #include <mutex>
@@ -126,8 +127,7 @@ class Mapping {
 class Ring {
  public:
   Ring(std::uint64_t source, std::uint32_t number, std::uint32_t slots, std::uint64_t slot_bytes)
-      : source_(source),
-        number_(number),
+      : number_(number),
         slots_(slots),
         slot_bytes_(wire::round_up(slot_bytes, ring::page)),
         layout_(ring::layout(slots, slot_bytes_)),
@@ -140,7 +140,9 @@ class Ring {
       throw std::invalid_argument("a ring of " + std::to_string(slots) + " slots of " + std::to_string(slot_bytes) +
                                   " bytes is not possible");
     }
-    fd_ = ring::Descriptor(::memfd_create("cortex", MFD_CLOEXEC | MFD_ALLOW_SEALING));
+    char name[64];
+    std::snprintf(name, sizeof name, "cortex-%016llx-%u", static_cast<unsigned long long>(source), number);
+    fd_ = ring::Descriptor(::memfd_create(name, MFD_CLOEXEC | MFD_ALLOW_SEALING));
     if (fd_.get() < 0) ring::unavailable("memfd_create");
     const auto total = static_cast<off_t>(layout_.total);
     // The pages are taken now: one that is missing is an error here, instead of SIGBUS later.
@@ -270,7 +272,6 @@ class Ring {
     return granted_[slot] == 0;
   }
 
-  std::uint64_t source_;
   std::uint32_t number_;
   std::uint32_t slots_;
   std::uint64_t slot_bytes_;

@@ -1,0 +1,144 @@
+// SPDX-License-Identifier: Apache-2.0
+// A process with a node, for the tests with Python: `peer ROLE ...`. It ends when its standard input does.
+#include <atomic>
+#include <chrono>
+#include <cstdlib>
+#include <deque>
+#include <iostream>
+#include <string>
+#include <thread>
+
+#include <cortex/node.hpp>
+
+#include "peer_messages.hpp"
+
+using namespace std::chrono_literals;
+
+namespace {
+
+std::atomic<bool> ended{false};
+
+cortex::Policy policy_of(const std::string& text) {
+  if (text == "reliable") return cortex::reliable(64, 10s);
+  if (text == "latest") return cortex::latest();
+  return cortex::keep_last(static_cast<std::size_t>(std::stoi(text)));
+}
+
+// Sends every message back that comes.
+void echo(cortex::Node& node) {
+  auto out = node.advertise<Rich>("/from_cpp");
+  auto in = node.subscribe<Rich>("/to_cpp", cortex::reliable(8, 10s));
+  std::cout << "ready" << std::endl;
+  while (!ended) {
+    if (auto message = in.receive(50ms)) out.publish(**message);
+  }
+}
+
+// Publishes pictures by loan; pixel k of picture n is n + k.
+void loan(cortex::Node& node, int count, std::uint32_t height) {
+  auto pictures = node.advertise<test::Picture>("/picture");
+  std::cout << "ready" << std::endl;
+  if (!pictures.wait_for_subscribers(1, 10s)) std::exit(2);
+  for (int number = 0; number < count; ++number) {
+    auto picture = pictures.loan({{"height", height}, {"width", 64}}, {{"depth", cortex::Dtype::float32}});
+    picture->stamp_ns = number;
+    picture->name = "picture " + std::to_string(number);
+    auto pixels = picture->pixels.writable();
+    for (std::size_t k = 0; k < pixels.size(); ++k) {
+      pixels[k] = static_cast<std::uint8_t>(static_cast<std::size_t>(number) + k);
+    }
+    for (auto& depth : picture->depth.writable<float>()) depth = static_cast<float>(number);
+    if (!picture.publish()) std::exit(3);
+  }
+  while (!ended) std::this_thread::sleep_for(5ms);
+}
+
+void publish(cortex::Node& node, const std::string& topic, int count, std::uint32_t size, bool latch) {
+  cortex::PublisherOptions options;
+  options.latch = latch;
+  auto scans = node.advertise<Scan>(topic, options);
+  std::cout << "ready" << std::endl;
+  if (!latch && !scans.wait_for_subscribers(1, 10s)) std::exit(2);
+  for (int number = 0; number < count; ++number) {
+    Scan scan;
+    scan.stamp_ns = number;
+    scan.ranges = cortex::Array<float>::zeros({size});
+    for (auto& range : scan.ranges.writable()) range = static_cast<float>(number);
+    scans.publish(scan);
+  }
+  while (!ended) std::this_thread::sleep_for(5ms);
+}
+
+// Receives until a scan with stamp -1, holding the last `hold` messages, and says what came.
+void count(cortex::Node& node, const std::string& topic, const std::string& policy, int pause_us, std::size_t hold) {
+  auto scans = node.subscribe<Scan>(topic, policy_of(policy));
+  std::cout << "ready" << std::endl;
+  std::deque<cortex::Received<Scan>> held;
+  std::int64_t last = -1;
+  int received = 0;
+  int wrong = 0;
+  while (!ended) {
+    std::optional<cortex::Received<Scan>> scan;
+    try {
+      scan = scans.receive(50ms);
+    } catch (const cortex::TypeMismatch& error) {
+      std::cout << "mismatch " << error.what() << std::endl;
+      continue;
+    }
+    if (!scan) continue;
+    if ((*scan)->stamp_ns == -1) break;
+    ++received;
+    if ((*scan)->stamp_ns <= last) ++wrong;
+    last = (*scan)->stamp_ns;
+    for (const float range : (*scan)->ranges) {
+      if (range != static_cast<float>(last)) ++wrong;
+    }
+    if (hold > 0) {
+      held.push_back(std::move(*scan));
+      if (held.size() > hold) held.pop_front();
+      for (const auto& old : held) {
+        if (!old->ranges.empty() && old->ranges[0] != static_cast<float>(old->stamp_ns)) ++wrong;
+      }
+    }
+    if (pause_us > 0) std::this_thread::sleep_for(std::chrono::microseconds(pause_us));
+  }
+  const auto counters = scans.counters();
+  std::cout << "{\"received\": " << received << ", \"wrong\": " << wrong << ", \"lost\": " << counters.lost
+            << ", \"rejected\": " << counters.rejected << ", \"overtaken\": " << counters.overtaken << "}" << std::endl;
+  scans.close();
+  for (const auto& old : held) {  // still there, though the publisher may write to the slots again
+    if (!old->ranges.empty() && old->ranges[0] != static_cast<float>(old->stamp_ns)) std::exit(4);
+  }
+  while (!ended) std::this_thread::sleep_for(5ms);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  const auto argument = [&](int index) { return std::string(index < argc ? argv[index] : "0"); };
+  cortex::Options options;
+  if (const char* peers = std::getenv("CORTEX_TEST_PEER")) {
+    options.registry = "off";
+    options.peers = {peers};
+  }
+  cortex::Node node{"cpp", options};
+  std::thread input([] {
+    std::string line;
+    while (std::getline(std::cin, line)) {
+    }
+    ended = true;
+  });
+  if (!node.wait_for_registry(10s)) return 1;
+  const std::string role = argument(1);
+  if (role == "echo") echo(node);
+  if (role == "loan") loan(node, std::stoi(argument(2)), static_cast<std::uint32_t>(std::stoi(argument(3))));
+  if (role == "publish") {
+    publish(node, argument(2), std::stoi(argument(3)), static_cast<std::uint32_t>(std::stoi(argument(4))),
+            argument(5) == "latch");
+  }
+  if (role == "count") {
+    count(node, argument(2), argument(3), std::stoi(argument(4)), static_cast<std::size_t>(std::stoi(argument(5))));
+  }
+  input.join();
+  return 0;
+}

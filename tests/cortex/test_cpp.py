@@ -1,0 +1,570 @@
+"""The C++ client: bodies, rings, and everything that passes between it and Python."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cpp_messages
+import numpy as np
+import pytest
+import zmq
+from cpp_messages import Mode, OtherScan, Picture, Point, Rich, Scan
+from processes import shared_mappings, wait_for
+
+import cortex.messages
+from cortex import records, wire
+from cortex.codec import codec_of
+from cortex.cppgen import generate
+from cortex.host import host_id
+from cortex.message import is_message
+from cortex.node import Node
+from cortex.policy import keep_last, reliable
+from cortex.registry import ensure_registry
+from cortex.schema import Schema, TypeMismatch, schema_of
+from cortex.vectors import load_vectors
+
+CPP = Path(__file__).parents[2] / "cortex" / "cpp"
+MUTATIONS = 3000
+
+
+def _missing() -> str:
+    for tool in ("cmake", "g++"):
+        if shutil.which(tool) is None:
+            return f"no {tool}"
+    for header in ("zmq.h", "zmq.hpp"):
+        if not any((Path(root) / header).exists() for root in ("/usr/include", "/usr/local/include")):
+            return f"no {header}: apt install libzmq3-dev cppzmq-dev"
+    return ""
+
+
+pytestmark = pytest.mark.skipif(bool(_missing()), reason=f"the C++ client cannot be built here: {_missing()}")
+
+
+def _vector_types() -> list[Schema]:
+    return [Schema.from_json(vector["schema"]) for vector in load_vectors().values()]
+
+
+def _short(schema: Schema) -> str:
+    return schema.name.rpartition("/")[2]
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of the test programs and examples, built once, with all warnings as errors."""
+    build = tmp_path_factory.mktemp("cpp")
+    headers = build / "headers"
+    headers.mkdir()
+    schemas = _vector_types()
+    table = " ".join(f"X({_short(schema)})" for schema in schemas)
+    (headers / "vectors.hpp").write_text(f"{generate(schemas)}\n#define CORTEX_TYPES(X) {table}\n")
+    (headers / "peer_messages.hpp").write_text(generate([Rich, Picture, Scan]))
+    for command in (
+        ["cmake", "-S", CPP, "-B", build, f"-DCORTEX_TEST_HEADERS={headers}", "-DCORTEX_EXAMPLES=ON"],
+        ["cmake", "--build", build, "-j2"],
+        ["cmake", "--install", build, "--prefix", build / "installed"],
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=False)
+        assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    return build
+
+
+class Peer:
+    """A running `peer` program."""
+
+    def __init__(self, command: Sequence[object]) -> None:
+        self.process = subprocess.Popen(
+            [str(part) for part in command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.line() == "ready"
+
+    def line(self) -> str:
+        """The next line that it prints; empty if it ends."""
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().rstrip("\n")
+
+    def end(self) -> str:
+        """Close its input, wait, and return what it wrote to standard error."""
+        try:
+            _, errors = self.process.communicate(timeout=20.0)
+        finally:
+            self.process.kill()
+            self.process.wait()
+        assert self.process.returncode in (0, -9), (self.process.returncode, errors)
+        return errors
+
+
+@pytest.fixture
+def start(programs: Path, runtime: Path) -> Iterator[Callable[..., Peer]]:
+    """Starts `peer` in a role, with a registry for it to find, and ends it."""
+    ensure_registry(0)
+    with contextlib.ExitStack() as stack:
+
+        def run(*arguments: object) -> Peer:
+            peer = Peer([programs / "peer", *arguments])
+            stack.callback(peer.end)
+            return peer
+
+        yield run
+
+
+def test_vectors_and_damaged_bodies(programs: Path) -> None:
+    """Good bodies return as the same bytes, bad ones are rejected, damaged ones do no harm (ASan, UBSan)."""
+    lines = []
+    for vector in load_vectors().values():
+        name = _short(Schema.from_json(vector["schema"]))
+        lines += [f"{name} good {case['body']}" for case in vector["cases"]]
+        lines += [f"{name} bad {case['body']}" for case in vector["malformed"]]
+    done = subprocess.run(
+        [programs / "codec_test", str(MUTATIONS)],
+        input="\n".join(lines) + "\n",
+        capture_output=True,
+        text=True,
+        timeout=120.0,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.startswith(f"{len(lines)} bodies, ")
+
+
+def test_ring_between_threads(programs: Path) -> None:
+    """Under the thread sanitizer: nothing is torn, lost or written while somebody looks at it."""
+    done = subprocess.run([programs / "ring_test"], capture_output=True, text=True, timeout=60.0, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
+
+
+def test_installed_package_has_all_headers(programs: Path) -> None:
+    installed = {path.name for path in (programs / "installed/include/cortex").iterdir()}
+    assert installed == {path.name for path in (CPP / "include/cortex").iterdir()}
+    assert list((programs / "installed").glob("lib*/**/cortexConfig.cmake"))
+
+
+def test_shipped_headers_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control messages, the standard and the example ones are as the generator writes them today."""
+    control = [item for item in vars(records).values() if isinstance(item, type) and is_message(item)]
+    shipped = CPP / "include/cortex"
+    assert (shipped / "records.hpp").read_text() == generate(control, namespace="cortex::records")
+    standard = [getattr(cortex.messages, name) for name in cortex.messages.__all__]
+    assert (CPP / "include/cortex/messages.hpp").read_text() == generate(
+        standard, namespace="cortex::messages"
+    )
+    spec = importlib.util.spec_from_file_location("example_scan", CPP / "examples/scan.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "example_scan", module)
+    spec.loader.exec_module(module)
+    assert (CPP / "examples/scan.hpp").read_text() == generate([module.Scan, module.Cmd])
+
+
+def _point(number: int) -> Point:
+    return Point(number / 4, f"point {number} " + "ü" * number, np.arange(number, dtype=np.float64))
+
+
+def _rich(number: int, height: int, width: int) -> Rich:
+    rng = np.random.default_rng(number)
+    return Rich(
+        stamp_ns=number,
+        truth=number % 2 == 1,
+        tiny=-128,
+        small=65535,
+        middle=-(2**31),
+        large=2**64 - 1,
+        real=-0.1,
+        text="grüß 🚀" * number,
+        data=bytes(range(256)) * (number % 3),
+        mode=Mode.ACTIVE,
+        class_=-(2**63),
+        default=255,
+        point=_point(3),
+        maybe=None if number % 2 else 1e300,
+        maybe_point=_point(number) if number % 2 else None,
+        maybe_mode=Mode.NULL if number % 2 else None,
+        numbers=list(range(-number, number)),
+        truths=[True, False] * number,
+        words=["", "a", "long enough to leave the object of std::string"] * number,
+        points=[_point(k) for k in range(number)],
+        modes=[Mode.IDLE, Mode.ACTIVE] * number,
+        ragged=[np.arange(k, dtype=np.uint32) for k in range(number)],
+        pose=rng.standard_normal((3, 4)),
+        flags=np.array([True, False, True, True, False]),
+        plane=rng.standard_normal((16, 32)).astype(np.float32),
+        image=rng.integers(0, 255, (height, width, 3), np.uint8),
+        depth=rng.standard_normal((height, width)).astype(np.float16),
+        waves=rng.standard_normal(number) + 1j,
+        anything=rng.integers(-9, 9, (number, 2)).astype((np.int16, np.float64, np.complex64)[number % 3]),
+    )
+
+
+def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """Python -> C++ -> Python, small in frames and large in slots of shared memory, both ways."""
+    start("echo")
+    node = make_node()
+    out = node.publisher("/to_cpp", Rich)
+    back = node.subscriber("/from_cpp", Rich, policy=reliable(8))
+    assert out.wait_for_subscribers(1, 10.0)
+    assert back.wait_for_publisher(10.0)
+    for number, (height, width) in enumerate([(0, 5), (2, 3), (4, 4), (120, 160), (7, 1), (480, 640)]):
+        message = _rich(number, height, width)
+        assert out.publish(message)
+        assert back.recv(10.0) == message
+    assert (back.counters.lost, back.counters.rejected) == (0, 0)
+
+
+def test_loans_arrive_as_views_of_shared_memory(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """C++ writes into its ring, Python looks at it there; small loans travel in frames."""
+    node = make_node()
+    for height in (2, 600):
+        pictures = node.subscriber("/picture", Picture, policy=reliable(8))
+        peer = start("loan", 50, height)
+        for number in range(50):
+            picture = pictures.recv(10.0)
+            assert picture.stamp_ns == number
+            assert picture.name == f"picture {number}"
+            expected = np.arange(number, number + 64 * height, dtype=np.uint64).astype(np.uint8)
+            assert np.array_equal(picture.pixels.ravel(), expected)
+            assert np.array_equal(picture.depth, np.full((height, 64), number, np.float32))
+            assert bool(shared_mappings()) == (height == 600)
+            del picture
+        assert (pictures.counters.lost, pictures.counters.rejected) == (0, 0)
+        peer.end()
+        pictures.close()
+
+
+@pytest.mark.parametrize(("size", "coalesce"), [(10, False), (10, True), (20_000, False)])
+def test_reliable_flood_arrives_whole(
+    start: Callable[..., Peer], make_node: Callable[..., Node], size: int, coalesce: bool
+) -> None:
+    """Frames, batches and slots: every message of a flood from Python arrives once and in order."""
+    node = make_node()
+    scans = node.publisher("/scan", Scan, coalesce=coalesce)
+    peer = start("count", "/scan", "reliable", 0, 3)
+    assert scans.wait_for_subscribers(1, 10.0)
+    for number in range(3000):
+        assert scans.publish(Scan(number, np.full(size, number, np.float32)))
+    assert scans.publish(Scan(-1, np.zeros(0, np.float32)))
+    scans.flush()
+    assert json.loads(peer.line()) == {"received": 3000, "wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
+
+
+@pytest.mark.parametrize(("policy", "size"), [("4", 10), ("4", 20_000), ("latest", 10), ("latest", 20_000)])
+def test_slow_reader_knows_what_it_missed(
+    start: Callable[..., Peer], make_node: Callable[..., Node], policy: str, size: int
+) -> None:
+    """Received, overtaken and lost messages add up to those that were sent; the last one arrives."""
+    node = make_node()
+    scans = node.publisher("/scan", Scan)
+    peer = start("count", "/scan", policy, 500, 0)
+    assert scans.wait_for_subscribers(1, 10.0)
+    for number in range(2000):
+        assert scans.publish(Scan(number, np.full(size, number, np.float32)))
+    scans.publish(Scan(-1, np.zeros(0, np.float32)))
+    result = json.loads(peer.line())
+    assert (result["wrong"], result["rejected"]) == (0, 0)
+    assert 0 < result["received"] < 2000
+    assert result["received"] + result["lost"] + result["overtaken"] == 2000
+
+
+def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    node = make_node()
+    for size in (10, 20_000):
+        scans = node.subscriber("/scan", Scan, policy=reliable(64))
+        peer = start("publish", "/scan", 3000, size)
+        for number in range(3000):
+            scan = scans.recv(10.0)
+            assert (scan.stamp_ns, scan.ranges.size, scan.ranges[-1]) == (number, size, number)
+        assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
+        peer.end()
+        scans.close()
+
+
+def test_slow_python_reader_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """A C++ publisher is not held up by a reader that keeps the last messages and holds on to some."""
+    node = make_node()
+    scans = node.subscriber("/scan", Scan, policy=keep_last(4))
+    start("publish", "/scan", 1000, 20_000)
+    held = [scans.recv(10.0)]
+    while held[-1].stamp_ns < 999:
+        held = [*held[-3:], scans.recv(10.0)]
+        assert all(float(scan.ranges[7]) == scan.stamp_ns for scan in held)
+    stats = scans.counters
+    assert stats.received + stats.lost + stats.overtaken == 1000
+    assert stats.rejected == 0
+
+
+@pytest.mark.parametrize("size", [10, 20_000])
+def test_latched_message_from_cpp(
+    start: Callable[..., Peer], make_node: Callable[..., Node], size: int
+) -> None:
+    peer = start("publish", "/map", 3, size, "latch")
+    node = make_node()
+    wait_for(lambda: any(topic.topic == "/map" for topic in node.topics()))
+    cpp = next(record for record in node.nodes() if record.name == "cpp")
+    wait_for(lambda: node.ask_stats(cpp.node).publishers[0].published == 3)
+    late = node.subscriber("/map", Scan)
+    assert late.recv(10.0).stamp_ns == 2
+    assert peer.process.poll() is None
+
+
+def test_latched_message_to_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    scans = make_node().publisher("/scan", Scan, latch=True)
+    scans.publish(Scan(5, np.full(20_000, 5, np.float32)))
+    peer = start("count", "/scan", "4", 0, 0)
+    assert scans.wait_for_subscribers(1, 10.0)
+    scans.publish(Scan(-1, np.zeros(0, np.float32)))
+    assert json.loads(peer.line()) == {"received": 1, "wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
+
+
+def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """Each side sees both structures, and goes on."""
+    node = make_node()
+    others = node.publisher("/scan", OtherScan)
+    peer = start("count", "/scan", "latest", 0, 0)
+    assert peer.line() == "mismatch a publisher of /scan sends another type than is subscribed"
+    assert peer.line() == f"expected: {schema_of(Scan).to_json()}"
+    assert peer.line() == f"actual: {schema_of(OtherScan).to_json()}"
+    others.close()
+    scans = node.publisher("/scan", Scan)
+    assert scans.wait_for_subscribers(1, 10.0)
+    scans.publish(Scan(-1, np.zeros(0, np.float32)))
+    assert json.loads(peer.line())["received"] == 0
+    start("publish", "/other", 10, 10, "latch")
+    wrong = node.subscriber("/other", OtherScan)
+    with pytest.raises(TypeMismatch, match="expected: Scan"):
+        wrong.recv(10.0)
+
+
+def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    node = make_node()
+    scans = node.subscriber("/scan", Scan, policy=reliable(64))
+    start("publish", "/scan", 10, 10)
+    start("count", "/scan", "reliable", 0, 0)
+    for _ in range(10):
+        scans.recv(10.0)
+    replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
+    (published,) = [publisher for reply in replies for publisher in reply.publishers]
+    (subscribed,) = [subscriber for reply in replies for subscriber in reply.subscribers]
+    assert (published.topic, published.published, published.timeouts) == ("/scan", 10, 0)
+    assert published.bytes == 10 * (24 + 40)  # the fixed block and ten floats
+    assert (subscribed.topic, subscribed.policy) == ("/scan", "reliable(depth=64, timeout_s=10)")
+
+
+def test_killed_cpp_reader_frees_its_slots(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """A reliable reader that dies with leases does not hold up the publisher longer than its death takes."""
+    scans = make_node().publisher("/scan", Scan)
+    peer = start("count", "/scan", "reliable", 2000, 3)
+    assert scans.wait_for_subscribers(1, 10.0)
+    for number in range(20):
+        assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
+    peer.process.kill()
+    wait_for(lambda: scans.subscriber_count == 0)
+    began_s = time.monotonic()
+    for number in range(100):
+        assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
+    assert time.monotonic() - began_s < 5.0  # its patience of 10 s is not used up
+
+
+def test_killed_cpp_publisher_leaves_no_trace(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    node = make_node()
+    scans = node.subscriber("/scan", Scan, policy=reliable(64))
+    peer = start("publish", "/scan", 10, 20_000)
+    held = [scans.recv(10.0) for _ in range(3)]
+    peer.process.kill()
+    wait_for(lambda: not any(record.name == "cpp" for record in node.nodes()))
+    assert [int(scan.ranges[0]) for scan in held] == [0, 1, 2]  # what was received stays
+
+
+def test_new_registry_learns_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """A node that was there before the registry is known to those that come after it."""
+    peer = start("publish", "/scan", 10, 10)
+    domain = Path(os.environ["CORTEX_RUNTIME_DIR"]) / "0"
+    os.kill(int((domain / "registry.lock").read_text()), 9)
+    node = make_node()  # starts another one
+    assert node.subscriber("/scan", Scan).recv(10.0).stamp_ns == 0
+    assert peer.process.poll() is None
+
+
+def test_static_peer_without_registry(
+    programs: Path, make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make_node(registry="off")
+    scans = node.publisher("/scan", Scan)
+    monkeypatch.setenv("CORTEX_TEST_PEER", node.nodes()[0].endpoints[0].control)
+    peer = Peer([programs / "peer", "count", "/scan", "reliable", 0, 0])
+    assert scans.wait_for_subscribers(1, 10.0)
+    scans.publish(Scan(-1, np.zeros(0, np.float32)))
+    assert json.loads(peer.line())["received"] == 0
+    peer.end()
+
+
+class Impostor:
+    """A node that speaks through raw sockets, so that it can say anything."""
+
+    SOURCE = 77
+
+    def __init__(self, directory: Path) -> None:
+        self.context = zmq.Context()
+        self.router = self.context.socket(zmq.ROUTER)
+        self.xpub = self.context.socket(zmq.XPUB)
+        self.control = f"ipc://{directory}/control"
+        data = f"ipc://{directory}/data"
+        self.router.bind(self.control)
+        self.xpub.bind(data)
+        endpoint = records.Endpoint("ipc", data, data, self.control, "")
+        schema = schema_of(Scan)
+        publisher = records.PublisherRecord(
+            "/scan", self.SOURCE, schema.name, schema.fingerprint, schema.to_json(), False
+        )
+        record = records.NodeRecord(5, "impostor", host_id(), 1, 1, 0, [endpoint], [publisher], [], [])
+        self.record = wire.control_frame(records.Changed(0, record))
+        self.stopping = False
+        self.thread = threading.Thread(target=self._answer)
+        self.thread.start()
+
+    def _answer(self) -> None:
+        """Say who we are, between frames of nonsense, to whoever asks."""
+        while not self.stopping:
+            if not self.router.poll(20):
+                continue
+            identity, *_ = self.router.recv_multipart()
+            for frame in (b"", b"CTX", self.record[:-3], self.record, b"\xff" * 200):
+                self.router.send_multipart([identity, frame])
+
+    def await_key(self) -> bytes:
+        """The attach key of the subscriber."""
+        while True:
+            assert self.xpub.poll(10_000)
+            event = self.xpub.recv()
+            if event[:5] == b"\x01CTXA":
+                return bytes(event[1:])
+
+    def close(self) -> None:
+        self.stopping = True
+        self.thread.join()
+        self.context.destroy(linger=0)
+
+
+def _frame(
+    kind: bytes, sequence: int, body: bytes, *, size: int | None = None, aux: int = 0, **change: Any
+) -> bytes:
+    header = wire.Header(
+        kind,
+        Impostor.SOURCE,
+        schema_of(Scan).fingerprint,
+        sequence,
+        0,
+        0,
+        len(body) if size is None else size,
+        aux,
+    )
+    return wire.pack_header(header._replace(**change)) + body
+
+
+def _bad_frames(good: bytes, key: bytes) -> Iterator[list[bytes]]:
+    """Frames of every kind that a subscriber must reject; all of them match its subscriptions."""
+    head = good[:16]
+    yield [head]
+    yield [good[:63]]
+    yield [good[:-1]]
+    yield [good + b"x"]
+    yield [_frame(b"M", 9, good[64:], fingerprint=1)]
+    yield [_frame(b"M", 9, good[64:], size=2**63)]
+    yield [_frame(b"L", 9, b"", size=40)]
+    yield [_frame(b"L", 9, b"", size=41), good[64:]]
+    yield [_frame(b"L", 9, b"", size=2**40), good[64:]]
+    record = wire.RECORD.pack(0, 0, len(good) - 64, 0) + good[64:]
+    record += bytes(-len(record) % 8)
+    yield [_frame(b"B", 9, record, aux=0)]
+    yield [_frame(b"B", 9, record, aux=2)]
+    yield [_frame(b"B", 9, record, aux=2**64 - 1)]
+    yield [_frame(b"B", 2**64 - 1, record, aux=1)]
+    yield [_frame(b"B", 9, record[:-8], aux=1)]
+    yield [_frame(b"B", 9, wire.RECORD.pack(0, 0, 2**32 - 1, 0), aux=1)]
+    yield [_frame(b"S", 9, bytes(7), size=40)]
+    yield [key + bytes(31)]
+    yield [key + wire._ANSWER.pack(0, 64, 0, 0, 0)]
+    yield [key + wire._ANSWER.pack(0, 0, 2**32 - 1, 0, 0)]
+    yield [key + wire._ANSWER.pack(0, 0, 0, 2**64 - 1, 0)]
+
+
+def test_lies_are_rejected(
+    programs: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A subscriber counts every frame that is wrong and reads those between; a false ring does no harm."""
+    impostor = Impostor(runtime)
+    try:
+        monkeypatch.setenv("CORTEX_TEST_PEER", impostor.control)
+        peer = Peer([programs / "peer", "count", "/scan", "8", 0, 0])
+        key = impostor.await_key()
+        body = codec_of(Scan).encode(Scan(0, np.zeros(4, np.float32)), 1000)
+        assert body is not None
+        good = _frame(b"M", 0, body)
+        bad = list(_bad_frames(good, key))
+        for frames in bad:
+            impostor.xpub.send_multipart(frames)
+        malformed = _frame(b"M", 0, body[:8] + b"\xff" * 8 + body[16:])
+        impostor.xpub.send(malformed)
+        impostor.xpub.send(_frame(b"M", 1, body))
+        # A ring that is another process's standard input makes it ask again, without shared memory.
+        place = wire.RingPlace(1, 4, 4096, os.getpid(), 0)
+        impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(2, 3, (place,), b"")))
+        second = impostor.await_key()
+        assert second[16:24] != key[16:24]
+        assert not second[24] & 1
+        impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(2, None, (), b"")))
+        impostor.xpub.send_multipart([_frame(b"L", 2, b"", size=len(body)), body])
+        end = codec_of(Scan).encode(Scan(-1, np.zeros(0, np.float32)), 1000)
+        assert end is not None
+        impostor.xpub.send(_frame(b"M", 5, end))
+        result = json.loads(peer.line())
+        assert result["received"] + result["wrong"] >= 1
+        assert result["rejected"] == len(bad) + 1
+        assert result["lost"] == 2  # numbers 3 and 4
+        assert "cannot share memory" in peer.end()
+    finally:
+        impostor.close()
+    shutil.rmtree(runtime, ignore_errors=True)
+    runtime.mkdir(mode=0o700)
+
+
+def test_example_reads_the_other(programs: Path, runtime: Path) -> None:
+    """The two example programs meet through a registry."""
+    ensure_registry(0)
+    listener = subprocess.Popen([programs / "listener", "5"], stdout=subprocess.PIPE, text=True)
+    lidar = subprocess.Popen([programs / "lidar", "60"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert listener.communicate(timeout=20.0)[0] == "steered by 5 scans\n"
+        assert lidar.communicate(timeout=20.0)[0] == "published 60 scans\n"
+    finally:
+        for process in (listener, lidar):
+            process.kill()
+            process.communicate()
+
+
+def test_generated_values_are_replaced_whole() -> None:
+    """A rich message differs where one field differs: what the echo test compares is not vacuous."""
+    message = _rich(3, 2, 2)
+    assert message == _rich(3, 2, 2)
+    assert message != replace(message, words=["other"])
+    assert cpp_messages.Rich is Rich
