@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import select
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -30,19 +31,36 @@ class CallbackThread:
         self._wakeup = Wakeup()
         self._thread: threading.Thread | None = None
         self._closed = False
+        self._changed = False
+        self._serving = False
+        self._running: Subscriber[Any] | None = None
+        self._alone: Subscriber[Any] | None = None
 
     def add(self, subscriber: Subscriber[Any]) -> None:
         """Run a subscriber's callback from now on."""
         with self._lock:
             self._subscribers.append(subscriber)
             self._start()
-        self._wakeup.set()
+        self._notify()
 
     def remove(self, subscriber: Subscriber[Any]) -> None:
-        """Run it no more; a call that is under way still ends."""
+        """Run it no more; waits up to a second for a call that is under way, unless called from there."""
         with self._lock:
             if subscriber in self._subscribers:
                 self._subscribers.remove(subscriber)
+        self._notify()
+        deadline_s = time.monotonic() + 1.0
+        while self._running is subscriber and not self.is_current and time.monotonic() < deadline_s:
+            time.sleep(0.5e-3)
+
+    def serve(self) -> None:
+        """Jobs will come that must not wait."""
+        with self._lock:
+            self._serving = True
+        self._notify()
+
+    def _notify(self) -> None:
+        self._changed = True
         self._wakeup.set()
 
     def submit(self, job: Callable[[], object]) -> None:
@@ -50,7 +68,7 @@ class CallbackThread:
         self._jobs.append(job)
         with self._lock:
             self._start()
-        self._wakeup.set()
+        self._notify()
 
     @property
     def is_current(self) -> bool:
@@ -66,28 +84,40 @@ class CallbackThread:
         poll, owners = self._watch()
         busy: list[Subscriber[Any]] = []
         while not self._closed:
-            ready, changed = busy, False
+            while self._jobs:
+                self._call(self._jobs.popleft())
+            if self._changed:
+                poll, owners = self._watch()
+            alone = self._alone
+            if alone is not None and alone.has_one_socket and self._dispatch(alone, block=True):
+                continue
+            ready = busy
             for fd, _ in poll.poll(0 if busy else WAIT_MAX_S * 1000.0):
                 subscriber = owners.get(fd)
                 if subscriber is None:
                     self._wakeup.clear()
-                    changed = True
                     continue
                 if fd == subscriber.wakeup.fd:
                     subscriber.wakeup.clear()
-                    changed = True
+                    self._changed = True
                 if subscriber not in ready:
                     ready.append(subscriber)
-            while self._jobs:
-                self._call(self._jobs.popleft())
-            busy = [subscriber for subscriber in ready if subscriber.dispatch()]
-            if changed:
-                poll, owners = self._watch()
+            busy = [subscriber for subscriber in ready if self._dispatch(subscriber)]
+
+    def _dispatch(self, subscriber: Subscriber[Any], *, block: bool = False) -> bool:
+        self._running = subscriber
+        try:
+            return subscriber.dispatch(block=block)
+        finally:
+            self._running = None
 
     def _watch(self) -> tuple[select.poll, dict[int, Subscriber[Any]]]:
         """What to poll: our own descriptor, and those of all sockets by subscriber."""
+        self._changed = False  # before looking: what changes meanwhile sets it again
         with self._lock:
             subscribers = list(self._subscribers)
+            # Waiting in the only socket is quicker than polling, but a service's request would not wake us.
+            self._alone = subscribers[0] if len(subscribers) == 1 and not self._serving else None
         poll, owners = select.poll(), {}
         poll.register(self._wakeup.fd, select.POLLIN)
         for subscriber in subscribers:
@@ -107,7 +137,7 @@ class CallbackThread:
         with self._lock:
             self._closed = True
             thread = self._thread
-        self._wakeup.set()
+        self._notify()
         if thread is None or thread is threading.current_thread():
             return True
         thread.join(timeout_s)

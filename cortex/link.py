@@ -41,6 +41,8 @@ from cortex.wire import (
 logger = logging.getLogger(__name__)
 
 QUEUE_MAX = 1000
+BLOCK_MS = 20
+"""Longest time that `receive(0)` waits."""
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
@@ -51,7 +53,7 @@ class Item(NamedTuple):
     """A message that has arrived and waits: where its body is.
 
     A leased slot is the buffer itself, so that dropping the item gives the slot back. An offset of
-    `WHOLE_BATCH` marks a batch that was not taken apart; its size is then the number of messages.
+    `WHOLE_BATCH` marks the records of a batch that was not taken apart; the size is then their number.
     """
 
     link: Link
@@ -111,6 +113,7 @@ class Link:
         self.socket = new_socket(
             zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
         )
+        self.socket.rcvtimeo = BLOCK_MS
         self.receive: Callable[..., bytes] = super(zmq.Socket, self.socket).recv
         try:
             if secure is not None:
@@ -242,7 +245,7 @@ class Link:
                 raise MalformedMessage(f"a batch of {size} bytes cannot hold {count} records of {stride}")
             if not self.advance(first, count):
                 return []
-            return [Item(self, frame, WHOLE_BATCH, count, first, 0, publish_ns, None)]
+            return [Item(self, frame[HEADER_SIZE:], WHOLE_BATCH, count, first, 0, publish_ns, None)]
         records = self._records(frame, first, count)
         return records if self.advance(first, count) else []
 
@@ -254,8 +257,23 @@ class Link:
 
     def take_apart(self, item: Item) -> list[Item]:
         """The messages of a whole batch."""
+        assert self.codec.fixed_size is not None
         assert isinstance(item.buffer, bytes)
-        return self._records(item.buffer, item.sequence, item.size)
+        size, stride = self.codec.fixed_size, len(item.buffer) // item.size
+        items = []
+        for k in range(item.size):
+            stamp_ns, publish_ns, _, _ = RECORD.unpack_from(item.buffer, k * stride)
+            offset = k * stride + RECORD.size
+            items.append(Item(self, item.buffer, offset, size, item.sequence + k, stamp_ns, publish_ns, None))
+        return items
+
+    def cut(self, item: Item, count: int) -> Item:
+        """A whole batch without its first messages."""
+        assert isinstance(item.buffer, bytes)
+        stride = len(item.buffer) // item.size
+        return item._replace(
+            buffer=item.buffer[count * stride :], size=item.size - count, sequence=item.sequence + count
+        )
 
     def _on_answer(self, frame: bytes) -> list[Item]:
         if frame[: len(self._key)] != self._key:

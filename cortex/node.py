@@ -118,7 +118,6 @@ class Node:
         self._outlets = Outlets()
         self._publishers: list[Publisher[Any]] = []
         self._subscribers: list[Subscriber[Any]] = []
-        self._mismatched: set[tuple[int, int]] = set()
         self._callbacks = CallbackThread(name)
         self._flusher = Flusher(name)
         self._server = Server(self._callbacks.submit)
@@ -244,6 +243,7 @@ class Node:
         number = service_number(check_topic(name), request_type, reply_type)
         service = Service(name, number, request_type, reply_type, handler)
         self._server.add(service)
+        self._callbacks.serve()
         self._announce()
 
         def withdraw() -> None:
@@ -451,6 +451,7 @@ class Node:
             for publisher in node.publishers
             if publisher.topic == subscriber.topic
         }
+        subscriber.refused &= wanted.keys()
         present = subscriber.sources()
         for source in present - wanted.keys():
             subscriber.forget(source)
@@ -458,8 +459,7 @@ class Node:
             self._connect(subscriber, *wanted[source])
 
     def _connect(self, subscriber: Subscriber[Any], node: NodeRecord, publisher: PublisherRecord) -> None:
-        key = (id(subscriber), publisher.source)
-        if key in self._mismatched:
+        if publisher.source in subscriber.refused:
             return
         try:
             schema = Schema.from_json(publisher.schema)
@@ -467,11 +467,11 @@ class Node:
                 raise SchemaError("its fingerprint is another")
             codec = subscriber.codec or codec_of(type_from_schema(schema))
         except SchemaError as error:
-            self._mismatched.add(key)
+            subscriber.refused.add(publisher.source)
             logger.warning("%s of %s: unreadable schema: %s", publisher.topic, node.name, error)
             return
         if codec.fingerprint != publisher.fingerprint:
-            self._mismatched.add(key)
+            subscriber.refused.add(publisher.source)
             what = (
                 f"{publisher.topic}: node {node.name!r} publishes another type than this subscriber expects"
             )
@@ -495,7 +495,7 @@ class Node:
                 secure=place.secure,
             )
         except (zmq.ZMQError, PermissionError) as error:
-            self._mismatched.add(key)
+            subscriber.refused.add(publisher.source)
             logger.warning("%s of %s: cannot connect: %s", publisher.topic, node.name, error)
             return
         subscriber.connect(link)
@@ -605,6 +605,7 @@ class Node:
     def _top_up(self, subscribers: list[Subscriber[Any]], now_ns: int) -> None:
         poll, owners = select.poll(), {}
         for subscriber in subscribers:
+            subscriber.dismiss(now_ns)
             if subscriber.must_read:
                 subscriber.top_up(now_ns)
             for fd in subscriber.fds():

@@ -429,7 +429,9 @@ class Publisher(Generic[T]):
             if not self._outlets.closed:
                 self._flush()
             self._closed = True
+            self._refresh_ns = 0  # so that `publish` looks
             self._readers.clear()
+            self._route()
             self._large.close()
         self._outlets.unregister(self.source)
         if self._on_close is not None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import select
-import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -21,10 +20,12 @@ import zmq
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
-from cortex.link import WHOLE_BATCH, Item, Link
+from cortex.link import BLOCK_MS, WHOLE_BATCH, Item, Link
+from cortex.loop_reader import LoopReader
 from cortex.policy import Policy
 from cortex.schema import Schema, TypeMismatch
 from cortex.stats import BUCKETS, SubscriberCounters
+from cortex.turn import Turn
 from cortex.wakeup import Wakeup
 from cortex.wire import HEAD_SIZE, HEADER_SIZE, RECORD, REST
 
@@ -40,9 +41,12 @@ DRAIN_MAX = 64
 """Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
 DRAIN_LOSSY_MAX = 4096
 """Where only the last messages count, all that has arrived is read: more than a socket holds."""
+BACKLOG_NS = 10_000
+"""A message that is received within this time was there before we asked."""
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
 WAIT_MAX_S = 0.1
+BLOCK_S = BLOCK_MS * 1e-3
 LEAVING_NS = 2_000_000_000
 """How long the connection to a publisher that has left is kept, for what is still on its way."""
 
@@ -81,7 +85,8 @@ class Subscriber(Generic[T]):
         self.policy = policy
         self.callback = callback
         self.counters = SubscriberCounters()
-        self.lock = threading.Lock()
+        self._turn = Turn()
+        self._lock = self._turn.lock
         self.wakeup = Wakeup()
         self._links: list[Link] = []
         self._leaving: dict[Link, int] = {}
@@ -93,7 +98,11 @@ class Subscriber(Generic[T]):
         self._whole_batches = False
         self._on_close = on_close
         self._closed = False
-        self._async: _AsyncSide | None = None
+        self._reader: LoopReader | None = None
+        self._generation = 0
+        self._first = 0
+        self.refused: set[int] = set()
+        """Publishers that this subscriber cannot be connected to; kept by the node."""
         self._poll: select.poll | None = None
 
     def recv(self, timeout_s: float | None = None) -> T:
@@ -142,7 +151,7 @@ class Subscriber(Generic[T]):
         if self.codec is None or self.codec.record_dtype is None:
             raise TypeError(f"{self.topic}: only a type of fixed size can be received as an array")
         self._whole_batches = True
-        with self.lock:
+        with self._turn:
             for link in self._links:
                 link.whole_batches = True
         records: np.ndarray = self._receive(timeout_s, self._join, whole=True)
@@ -182,10 +191,11 @@ class Subscriber(Generic[T]):
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`."""
-        if self._async is None or self._async.loop is not asyncio.get_running_loop():
-            if self._async is not None:
-                self._async.stop()
-            self._async = _AsyncSide(self)
+        reader = self._reader
+        if reader is None or reader.loop is not asyncio.get_running_loop():
+            if reader is not None:
+                reader.stop()
+            reader = self._reader = LoopReader(self._watched, self._on_wake)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             item = self._take()
@@ -197,25 +207,40 @@ class Subscriber(Generic[T]):
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
-            await self._async.wait(min(left_s, WAIT_MAX_S))
+            await reader.wait(min(left_s, WAIT_MAX_S))
+
+    def _watched(self) -> tuple[int, list[int]]:
+        with self._turn:
+            return self._generation, [self.wakeup.fd, *(link.fd for link in self._links)]
+
+    def _on_wake(self, fd: int) -> None:
+        if fd == self.wakeup.fd:
+            self.wakeup.clear()
 
     def _receive(self, timeout_s: float | None, use: Callable[[Item], Any], *, whole: bool = False) -> Any:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        left_s = WAIT_MAX_S if timeout_s is None else timeout_s
         while True:
-            item = self._take(whole=whole)
+            item = self._take(whole=whole, block=left_s >= BLOCK_S)
             if item is not None:
                 result = self._open(item, use)
                 if result is not _LOST:
                     return result
                 continue
-            left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
-            if left_s <= 0.0:
-                raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
+            if deadline_s is not None:
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0.0:
+                    raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
             self._wait(min(left_s, WAIT_MAX_S))
 
-    def _take(self, *, whole: bool = False) -> Item | None:
-        """The next item, or None if nothing is there now; a batch is taken apart unless wanted whole."""
-        with self.lock:
+    def _take(self, *, whole: bool = False, block: bool = False) -> Item | None:
+        """The next item, or None if nothing is there.
+
+        Args:
+            whole: Leave a batch in one piece.
+            block: Wait up to `BLOCK_S` for a message if there is one socket only.
+        """
+        with self._lock:
             queue = self._queue
             if self._closed:
                 raise Closed(f"the subscriber of {self.topic} is closed")
@@ -227,8 +252,10 @@ class Subscriber(Generic[T]):
                 or monotonic_ns() - self._drained_ns > FRESH_NS
             ):
                 self._drain()
-            elif not queue:
-                self._receive_one()
+            if not queue and whole:
+                self._drain()
+            if not queue:
+                self._receive_one(block=block)
             if not queue:
                 return None
             item = queue.popleft()
@@ -243,11 +270,11 @@ class Subscriber(Generic[T]):
         try:
             return use(item)
         except MalformedMessage as error:
-            with self.lock:
+            with self._turn:
                 self.counters.received -= 1
                 item.link.reject(str(error))
         except _Overwritten:
-            with self.lock:
+            with self._turn:
                 self.counters.received -= 1
                 self.counters.lost += 1
         return _LOST
@@ -286,14 +313,12 @@ class Subscriber(Generic[T]):
         assert dtype is not None
         if item.offset == WHOLE_BATCH:
             stride = RECORD.size + fixed + (-fixed % 8)
-            with self.lock:
+            with self._turn:
                 self.counters.received += item.size - 1
-            records: np.ndarray = np.ndarray(
-                (item.size,), dtype, item.buffer, HEADER_SIZE + RECORD.size, (stride,)
-            )
+            records: np.ndarray = np.ndarray((item.size,), dtype, item.buffer, RECORD.size, (stride,))
             return records
         bodies: list[Any] = [self._buffer(item)[item.offset : item.offset + item.size]]
-        with self.lock:
+        with self._turn:
             while self._queue and self._queue[0].offset != WHOLE_BATCH and self._queue[0].buffer is not None:
                 more = self._queue.popleft()
                 assert more.buffer is not None
@@ -303,15 +328,18 @@ class Subscriber(Generic[T]):
             raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
         return np.frombuffer(b"".join(bodies), dtype)
 
-    def _receive_one(self) -> None:
-        """Read one frame into the queue if there is one; the lock is held.
+    def _receive_one(self, *, block: bool = False) -> None:
+        """Read one frame into the queue; the lock is held.
 
         Finding a socket empty costs more than reading a message: that is done after one is handed out.
+        Waiting in the socket itself costs half of what waiting for its descriptor does.
         """
+        links = self._links
+        flags = 0 if block and len(links) == 1 and not self._turn.asked else DONTWAIT
         self._exhausted = True
-        for link in self._links:
+        for link in links if len(links) == 1 else self._rotated():
             try:
-                frame = link.receive(DONTWAIT)
+                frame = link.receive(flags)
             except zmq.Again:
                 continue
             self._exhausted = False
@@ -319,13 +347,24 @@ class Subscriber(Generic[T]):
             if self._queue:
                 return
 
+    def _rotated(self) -> list[Link]:
+        """The links, a different one first each time, so that no publisher starves another."""
+        links = self._links
+        if len(links) > 1:
+            self._first = (self._first + 1) % len(links)
+            return links[self._first :] + links[: self._first]
+        return links
+
     def _drain(self) -> None:
         """Read what has arrived into the queue; the lock is held."""
         exhausted = True
         self._drained_ns = monotonic_ns()
-        for link in self._links:
+        links = self._rotated()
+        for index, link in enumerate(links):
             receive = link.receive
-            budget = self.policy.depth - len(self._queue) if self.policy.reliable else DRAIN_LOSSY_MAX
+            budget = DRAIN_LOSSY_MAX
+            if self.policy.reliable:
+                budget = -(-(self.policy.depth - len(self._queue)) // (len(links) - index))
             for count in range(budget):
                 try:
                     frame = receive(DONTWAIT)
@@ -335,8 +374,6 @@ class Subscriber(Generic[T]):
             else:
                 exhausted = False
         self._exhausted = exhausted
-        if self._leaving:
-            self._dismiss(self._drained_ns)
 
     def _accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
         """Put the message of a frame into the queue; the lock is held."""
@@ -367,7 +404,7 @@ class Subscriber(Generic[T]):
         take = messages.append
         exhausted = True
         self._drained_ns = monotonic_ns()
-        for link in self._links:
+        for link in self._rotated():
             receive, head, decode = link.receive, link.message_head, link.codec.decode
             untimed = 0
             for _ in range(min(self.policy.depth, DRAIN_MAX)):
@@ -404,8 +441,6 @@ class Subscriber(Generic[T]):
                 exhausted = False
                 break
         self._exhausted = exhausted
-        if self._leaving:
-            self._dismiss(self._drained_ns)
         return messages
 
     def _time(self, publish_ns: int, link: Link) -> None:
@@ -414,17 +449,27 @@ class Subscriber(Generic[T]):
         self.counters.latency[min(max(latency_ns, 0).bit_length(), BUCKETS - 1)] += 1
 
     def _enqueue(self, item: Item) -> None:
-        if len(self._queue) >= self.policy.depth and not self.policy.reliable:
-            self._evict()
-        self._queue.append(item)
-
-    def _evict(self) -> None:
-        item = self._queue.popleft()
-        self.counters.overtaken += item.size if item.offset == WHOLE_BATCH else 1
+        queue, depth = self._queue, self.policy.depth
+        queue.append(item)
+        if self.policy.reliable:
+            return
+        if not self._whole_batches:
+            if len(queue) > depth:
+                queue.popleft()
+                self.counters.overtaken += 1
+            return
+        surplus = sum(_count(waiting) for waiting in queue) - depth
+        while surplus > 0:
+            oldest = queue.popleft()
+            dropped = min(_count(oldest), surplus)
+            if dropped < _count(oldest):
+                queue.appendleft(oldest.link.cut(oldest, dropped))
+            self.counters.overtaken += dropped
+            surplus -= dropped
 
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
-        with self.lock:
+        with self._turn:
             if self._closed or not self._exhausted:
                 return
             poll = self._poll or self._new_poll()
@@ -442,48 +487,61 @@ class Subscriber(Generic[T]):
             poll.register(link.fd, select.POLLIN)
         return poll
 
-    def dispatch(self) -> bool:
+    def dispatch(self, *, block: bool = False) -> bool:
         """Hand what has arrived to the callback; for the callback thread.
 
+        Args:
+            block: Wait up to `BLOCK_S` for a message if there is one socket only.
+
         Returns:
-            Whether there may be more.
+            Whether there may be more; after blocking, whether anything came.
         """
-        callback = self.callback
-        assert callback is not None
-        in_place = self.policy.reliable or self.policy.depth >= DRAIN_MAX
         messages: list[T] = []
         items: deque[Item] = deque()
-        with self.lock:
+        with self._lock:
             if self._closed:
                 return False
             problems, self._problems = self._problems, deque()
-            if not in_place:
-                self._drain()
-            elif not self._queue:
-                if self._hot:
+            if self.policy.reliable or self.policy.depth >= DRAIN_MAX:
+                if self._hot and not self._queue:
                     messages = self._drain_decoded()
-                else:
-                    self._receive_one()
+                    self._hot = not self._exhausted
+                elif not self._queue:
+                    asked_ns = monotonic_ns()
+                    self._receive_one(block=block)
+                    # A message that waited for us is rarely the last: the next are read together.
+                    self._hot = bool(self._queue) and monotonic_ns() - asked_ns < BACKLOG_NS
+            else:
+                if block and not self._queue:
+                    self._receive_one(block=True)
+                self._drain()
             if self._queue:
                 items, self._queue = self._queue, items
-            self.counters.received += len(messages) + len(items)
-            # After a single message more are read together, until the socket is found empty.
-            self._hot = more = not self._exhausted
+            received = len(messages) + len(items)
+            self.counters.received += received
+            more = not self._exhausted or (block and received > 0)
         for problem in problems:
             logger.error("%s", problem)
         for message in messages:
-            try:
-                callback(message)
-            except Exception:
-                logger.exception("%s: the callback raised", self.topic)
-        while items:  # each gives back its slot as soon as its callback is done
+            self._call(message)
+        while items and not self._closed:  # each gives back its slot as soon as its callback is done
             message = self._open(items.popleft(), self._decode)
             if message is not _LOST:
-                try:
-                    callback(message)
-                except Exception:
-                    logger.exception("%s: the callback raised", self.topic)
+                self._call(message)
         return more
+
+    def _call(self, message: T) -> None:
+        assert self.callback is not None
+        try:
+            if not self._closed:
+                self.callback(message)
+        except Exception:
+            logger.exception("%s: the callback raised", self.topic)
+
+    @property
+    def has_one_socket(self) -> bool:
+        """Whether `dispatch` can block."""
+        return len(self._links) == 1
 
     @property
     def must_read(self) -> bool:
@@ -492,7 +550,7 @@ class Subscriber(Generic[T]):
 
     def fds(self) -> list[int]:
         """File descriptors that become readable when a message may have come."""
-        with self.lock:
+        with self._turn:
             return [link.fd for link in self._links]
 
     def top_up(self, now_ns: int) -> None:
@@ -500,14 +558,14 @@ class Subscriber(Generic[T]):
 
         So the queue keeps the last messages, not the first that filled the sockets.
         """
-        if now_ns - self._drained_ns > 20_000_000 and self.lock.acquire(blocking=False):
+        if now_ns - self._drained_ns > 20_000_000 and self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
                     waiting = bool(self._queue)
                     self._drain()
                     arrived = not waiting and bool(self._queue)
             finally:
-                self.lock.release()
+                self._lock.release()
             if not self._closed and arrived:
                 self.wakeup.set()
 
@@ -515,7 +573,7 @@ class Subscriber(Generic[T]):
         """Wait until a publisher has taken this subscriber in; False if none has in time."""
         deadline_s = time.monotonic() + timeout_s
         while True:
-            with self.lock:
+            with self._turn:
                 if self._closed:
                     raise Closed(f"the subscriber of {self.topic} is closed")
                 if len(self._queue) < self.policy.depth:
@@ -529,38 +587,51 @@ class Subscriber(Generic[T]):
     @property
     def publisher_count(self) -> int:
         """Publishers that have taken this subscriber in."""
-        with self.lock:
+        with self._turn:
             return sum(link.attached for link in self._links if link not in self._leaving)
 
     def connect(self, link: Link) -> None:
         """Add a publisher; for the node."""
-        with self.lock:
+        with self._turn:
             if self._closed:
                 link.close()
                 return
             link.whole_batches = self._whole_batches
             self._links.append(link)
-            self._poll = None
-        self.wakeup.set()
+            self._links_changed()
 
     def sources(self) -> set[int]:
         """The publishers that are connected and have not left."""
-        with self.lock:
+        with self._turn:
             return {link.source for link in self._links if link not in self._leaving}
 
     def forget(self, source: int) -> None:
         """A publisher has left: read what is still on its way, then disconnect; for the node."""
-        with self.lock:
+        with self._turn:
             for link in self._links:
                 if link.source == source and link not in self._leaving:
                     self._leaving[link] = monotonic_ns() + LEAVING_NS
 
     def complain(self, problem: TypeMismatch) -> None:
         """A publisher cannot be connected; the user hears of it at the next `recv`."""
-        with self.lock:
+        with self._turn:
             self.counters.rejected += 1
             self._problems.append(problem)
         self.wakeup.set()
+
+    def _links_changed(self) -> None:
+        self._poll = None
+        self._generation += 1
+        self.wakeup.set()
+
+    def dismiss(self, now_ns: int) -> None:
+        """Close the connections to publishers that have left long enough ago; for the node."""
+        if self._leaving and self._lock.acquire(blocking=False):
+            try:
+                if not self._closed:
+                    self._dismiss(now_ns)
+            finally:
+                self._lock.release()
 
     def _dismiss(self, now_ns: int) -> None:
         """Close connections whose time is over; the lock is held."""
@@ -569,20 +640,19 @@ class Subscriber(Generic[T]):
                 link.close()
                 self._links.remove(link)
                 del self._leaving[link]
-                self._poll = None
-                self.wakeup.set()
+                self._links_changed()
 
     def close(self) -> None:
         """Stop receiving. Messages that the user still holds stay valid."""
-        with self.lock:
+        with self._turn:
             if self._closed:
                 return
             self._closed = True
             self._queue.clear()
             links, self._links = self._links, []
             self._leaving.clear()
-        if self._async is not None:
-            self._async.stop()
+        if self._reader is not None:
+            self._reader.stop()
         for link in links:
             link.close()
         self.wakeup.set()
@@ -596,6 +666,11 @@ class Subscriber(Generic[T]):
         self.close()
 
 
+def _count(item: Item) -> int:
+    """Messages of an item."""
+    return item.size if item.offset == WHOLE_BATCH else 1
+
+
 class _Lost:
     """Stands for a message that could not be read."""
 
@@ -605,55 +680,3 @@ _LOST: Any = _Lost()
 
 class _Overwritten(Exception):
     """The slot was written again before it was read."""
-
-
-class _AsyncSide:
-    """Wakes an asyncio loop when a socket may have something."""
-
-    def __init__(self, subscriber: Subscriber[Any]) -> None:
-        self.loop = asyncio.get_running_loop()
-        self._subscriber = subscriber
-        self._fds: set[int] = set()
-        self._waiter: asyncio.Future[None] | None = None
-
-    async def wait(self, timeout_s: float) -> None:
-        """Return when something may have come, or after the time."""
-        fds = {self._subscriber.wakeup.fd, *self._subscriber.fds()}
-        for fd in self._fds - fds:
-            self.loop.remove_reader(fd)
-        for fd in fds - self._fds:
-            self.loop.add_reader(fd, self._wake, fd)
-        self._fds = fds
-        self._waiter = self.loop.create_future()
-        timer = self.loop.call_later(timeout_s, self._resolve)
-        try:
-            await self._waiter
-        finally:
-            timer.cancel()
-            self._waiter = None
-
-    def _resolve(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
-
-    def _wake(self, fd: int) -> None:
-        if fd == self._subscriber.wakeup.fd:
-            self._subscriber.wakeup.clear()
-        if self._waiter is None:
-            # Nobody waits now: a readable descriptor would spin the loop until somebody reads it.
-            self.loop.remove_reader(fd)
-            self._fds.discard(fd)
-        self._resolve()
-
-    def stop(self) -> None:
-        """Leave the loop."""
-
-        def leave() -> None:
-            for fd in self._fds:
-                self.loop.remove_reader(fd)
-            self._fds.clear()
-            self._resolve()
-
-        if self.loop.is_closed():
-            return
-        self.loop.call_soon_threadsafe(leave)

@@ -1,0 +1,37 @@
+"""A lock that its holder may keep while it waits for input, and that it gives up when somebody else asks."""
+
+from __future__ import annotations
+
+import threading
+
+
+class Turn:
+    """A receiver holds `lock` while it blocks in a socket: the quickest way to wait for a message.
+
+    Everybody else enters with `with turn:`, which raises `asked` until the lock is theirs. A receiver looks
+    at `asked` before it blocks, and blocks for short times only.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._guard = threading.Lock()
+        self._waiting = 0
+
+    @property
+    def asked(self) -> bool:
+        """Whether somebody else wants the lock."""
+        return self._waiting > 0
+
+    def __enter__(self) -> None:
+        if self.lock.acquire(blocking=False):
+            return
+        with self._guard:
+            self._waiting += 1
+        try:
+            self.lock.acquire()
+        finally:
+            with self._guard:
+                self._waiting -= 1
+
+    def __exit__(self, *_: object) -> None:
+        self.lock.release()
