@@ -70,6 +70,7 @@ class Codec:
             if field.name == "stamp_ns" and isinstance(field.type, str) and "int" in field.type:
                 self.stamp_of = attrgetter("stamp_ns")
         encoder, decoder = self._encoder, Decoder(self.schema, message_type)
+        self._decoder = decoder
         self._layout: Layout = encoder.layout
         self.encode: Callable[[Any, int], bytes | None] = self._encode
         """Message and limit to the body, or None if it would be larger than `limit` bytes.

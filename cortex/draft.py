@@ -113,7 +113,8 @@ class Drafter:
         """Write what is not yet in its place and return the size of the body; the views become read-only."""
         buffer, places = draft._Draft__buffer, draft._Draft__places
         views = draft._Draft__views
-        message: Any = new_message(self._cls, [self._value_of(draft, name) for name in self._names])
+        self._set_defaults(draft)
+        message: Any = new_message(self._cls, [getattr(draft, name) for name in self._names])
         try:
             parts, end = self._layout(message, places)
         except ENCODE_ERRORS as error:
@@ -148,17 +149,16 @@ class Drafter:
             values += (place.offset, len(place.shape) << 8 | DTYPES.index(place.dtype), *place.shape)
         return self._encoder.finish(values, tail), tail.end
 
-    def _value_of(self, draft: Draft, name: str) -> Any:
-        views, values = draft._Draft__views, draft._Draft__values
-        value = views.get(name, values[name])
-        if value is not _UNSET:
-            return value
-        field = self._defaults[name]
-        if field.default is not dataclasses.MISSING:
-            return field.default
-        if field.default_factory is not dataclasses.MISSING:
-            return field.default_factory()
-        raise ValueError(f"{self._schema.name}.{name} was not set and has no default")
+    def _set_defaults(self, draft: Draft) -> None:
+        for name, field in self._defaults.items():
+            if hasattr(draft, name):
+                continue
+            if field.default is not dataclasses.MISSING:
+                setattr(draft, name, field.default)
+            elif field.default_factory is not dataclasses.MISSING:
+                setattr(draft, name, field.default_factory())
+            else:
+                raise ValueError(f"{self._schema.name}.{name} was not set and has no default")
 
     def _unplaced(self, places: dict[str, _Place]) -> list[str]:
         fixed = {name for name, _, _ in self._fixed}

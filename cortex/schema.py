@@ -266,11 +266,10 @@ def describe(schema: Schema) -> str:
 
 def _describe_fields(schema: Schema, indent: str) -> Iterator[str]:
     names = max((len(field.name) for field in schema.fields), default=0)
-    kinds = max((len(_describe_type(field.type)) for field in schema.fields), default=0)
     for field in schema.fields:
         unit = f" [{field.unit}]" if field.unit else ""
         frame = f" in {field.frame}" if field.frame else ""
-        yield f"{indent}{field.name:<{names}}  {_describe_type(field.type):<{kinds}}{unit}{frame}".rstrip()
+        yield f"{indent}{field.name:<{names}}  {_describe_type(field.type)}{unit}{frame}"
         inner: FieldType = field.type
         while isinstance(inner, (OptionalType, ListType)):
             inner = inner.item

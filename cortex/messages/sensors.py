@@ -69,7 +69,7 @@ class CameraInfo:
     height: Annotated[UInt32, Unit("px")]
     """Height of the picture [px]."""
     matrix: Annotated[Array["float64", 3, 3], Unit("px")]
-    """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; pixel centres are at +0.5."""
+    """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [px], shape [3, 3]; pixel centres are at +0.5."""
     distortion_model: str
     """Name of the model, such as "plumb_bob"; empty for a pinhole."""
     distortion: Array["float64", "k"]

@@ -1,0 +1,513 @@
+"""Encoding and decoding against an independent reading of WIRE.md, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import sys
+import threading
+import tracemalloc
+import weakref
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import pytest
+import wire_oracle
+from hypothesis import given
+from random_schemas import any_message, flat_schemas, schemas, to_plain
+
+from cortex.codec import Codec, MalformedMessage, Plan, codec_of
+from cortex.message import Array, Float32, Int8, UInt16, UInt64, message
+from cortex.messages import Events, Image, Imu, MotorCommand
+from cortex.schema import schema_of
+
+
+class Mode(Enum):
+    OFF = 0
+    ON = 3
+
+
+@message
+class Point:
+    x: float
+    ok: bool = False
+
+
+@message
+class Everything:
+    stamp_ns: int
+    small: Int8
+    flag: bool
+    mode: Mode
+    text: str
+    data: bytes
+    fixed: Array["float32", 3]
+    large: Array["uint8", 40, 40]
+    a: Array["float32", "n"]
+    b: Array["float64", "n", 3]
+    open_: Array["any", "h", "w"]
+    point: Point
+    maybe: float | None
+    points: list[Point]
+    numbers: list[UInt16]
+    ragged: list[Array["float32", "k"]]
+
+
+def everything(**changes: Any) -> Everything:
+    made = Everything(
+        1,
+        -2,
+        True,
+        Mode.ON,
+        "hé",
+        b"ab",
+        np.arange(3, dtype=np.float32),
+        np.arange(1600, dtype=np.uint8).reshape(40, 40),
+        np.arange(5, dtype=np.float32),
+        np.zeros((5, 3)),
+        np.eye(3, dtype=np.complex128)[::2],
+        Point(1.5),
+        None,
+        [Point(1.0, True), Point(2.0)],
+        [1, 2, 3],
+        [np.zeros(2, np.float32), np.zeros(0, np.float32)],
+    )
+    return dataclasses.replace(made, **changes)
+
+
+def body_of(value: Any) -> bytes:
+    body = codec_of(type(value)).encode(value, 2**30)
+    assert body is not None
+    return body
+
+
+def check_against_oracle(value: Any) -> None:
+    codec = codec_of(type(value))
+    schema = json.loads(codec.schema.to_json())
+    plain = to_plain(codec.schema, value)
+    body = wire_oracle.encode(schema, plain)
+
+    assert codec.encode(value, len(body)) == body
+    assert codec.size(value) == len(body)
+    assert codec.prepare(value, len(body)) == body
+    assert codec.fixed_size in (None, len(body))
+    if body:
+        assert codec.encode(value, len(body) - 1) is None
+        assert isinstance(codec.prepare(value, len(body) - 1), Plan)
+    memory = np.full(len(body) + 8, 0xAA, np.uint8)
+    assert codec.encode_into(value, memory) == len(body)
+    assert memory.tobytes() == body + b"\xaa" * 8  # and not a byte beyond
+
+    assert wire_oracle.decode(schema, body) == plain
+    frame = b"header" + body + b"trailer"
+    read_only = np.frombuffer(frame, np.uint8)
+    for decoded in (
+        codec.decode(body),
+        codec.decode(frame, 6, len(body)),
+        codec.decode(read_only, 6, len(body)),
+        codec._decoder.decode(frame, 6, len(body)),
+    ):
+        assert type(decoded) is type(value)
+        assert to_plain(codec.schema, decoded) == plain
+
+
+@given(any_message())
+def test_bodies_are_those_of_the_oracle(value):
+    check_against_oracle(value)
+
+
+@given(any_message(flat_schemas))
+def test_bodies_of_flat_types_are_those_of_the_oracle(value):
+    check_against_oracle(value)
+
+
+def test_a_type_with_everything():
+    check_against_oracle(everything())
+
+
+@pytest.mark.parametrize("count", [0, 1, 10, 255, 256, 3000])
+def test_the_most_common_shape_of_message(count):
+    check_against_oracle(MotorCommand(5, np.arange(count, dtype=np.float64)))
+
+
+def test_a_codec_is_made_once():
+    assert codec_of(Point) is codec_of(Point)
+    with pytest.raises(TypeError, match="@cortex"):
+        codec_of(int)
+
+
+def test_stamp_of_finds_integer_stamps_only():
+    @message
+    class Floating:
+        stamp_ns: float
+
+    assert codec_of(Everything).stamp_of(everything()) == 1
+    assert codec_of(Floating).stamp_of is None
+    assert codec_of(Point).stamp_of is None
+
+
+WRONG = [
+    ("stamp_ns", 1.5, TypeError, "no number for int64"),
+    ("stamp_ns", 2**63, ValueError, "out of the range of int64"),
+    ("small", 128, ValueError, "out of the range of int8"),
+    ("flag", "yes", TypeError, "no bool"),
+    ("flag", np.zeros(2), TypeError, "no bool"),
+    ("mode", 3, TypeError, "allowed are Mode.OFF, Mode.ON"),
+    ("text", b"bytes", TypeError, "no str"),
+    ("text", "\ud800", ValueError, "UTF-8"),
+    ("data", "text", TypeError, "no bytes"),
+    ("data", bytearray(b"ab"), TypeError, "no bytes"),
+    ("fixed", np.zeros(4, np.float32), ValueError, r"shape \[4\], expected \[3\]"),
+    ("fixed", [1.0, 2.0, 3.0], TypeError, "expected an array, got list"),
+    ("large", np.zeros((40, 41), np.uint8), ValueError, r"expected \[40, 40\]"),
+    ("large", np.zeros((40, 40), np.int8), TypeError, "dtype int8, expected uint8"),
+    ("a", np.zeros(5), TypeError, r"dtype float64, expected float32.*astype"),
+    ("a", np.zeros(5, ">f4"), TypeError, "dtype >f4"),
+    ("a", np.zeros((5, 1), np.float32), ValueError, r"shape \[5, 1\], expected \[n\]"),
+    ("b", np.zeros((4, 3)), ValueError, "dimension n is 4, but 5 in an earlier field"),
+    ("b", np.zeros((5, 2)), ValueError, r"expected \[n, 3\]"),
+    ("open_", np.zeros((2, 2), "M8[s]"), TypeError, "dtype datetime64"),
+    ("open_", np.zeros((2, 2), object), TypeError, "dtype object"),
+    ("point", (1.0, True), TypeError, "got tuple, expected Point"),
+    ("point", Point("x"), TypeError, r"\.x: 'x' is no number"),
+    ("maybe", "x", TypeError, "no number for float64"),
+    ("points", Point(1.0), TypeError, "no list"),
+    ("points", [Point(1.0), 5], TypeError, r"\[1\]: got int"),
+    ("numbers", [1, -1], ValueError, r"\[1\]: -1 is out of the range of uint16"),
+    ("numbers", "12", TypeError, "no list"),
+    ("ragged", [np.zeros(2)], TypeError, r"\[0\]: dtype float64"),
+]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "kind", "text"), WRONG, ids=[f"{w[0]}-{w[3][:20]}" for w in WRONG]
+)
+def test_wrong_values_are_named(field, value, kind, text):
+    codec = codec_of(Everything)
+    wrong = everything(**{field: value})
+    for attempt in (
+        lambda: codec.encode(wrong, 2**20),
+        lambda: codec.size(wrong),
+        lambda: codec.encode_into(wrong, np.zeros(10000, np.uint8)),
+        lambda: codec.prepare(wrong, 0),
+    ):
+        with pytest.raises(kind, match=rf"Everything\.{field}.*{text}"):
+            attempt()
+
+
+@pytest.mark.parametrize("value", [1.5, "x", 2**64, -1, None])
+def test_wrong_values_are_named_on_the_short_cuts(value):
+    @message
+    class Numbers:
+        a: UInt64
+        b: Float32 = 0.0
+
+    @message
+    class Stamped:
+        a: UInt64
+        data: Array["uint8", "n"]
+
+    with pytest.raises((TypeError, ValueError), match=r"Numbers\.a"):
+        codec_of(Numbers).encode(Numbers(value), 100)
+    with pytest.raises((TypeError, ValueError), match=r"Stamped\.a"):
+        codec_of(Stamped).encode(Stamped(value, np.zeros(3, np.uint8)), 100)
+    with pytest.raises(ValueError, match=r"Numbers\.b.*range of float32"):
+        codec_of(Numbers).encode(Numbers(1, 1e300), 100)
+
+
+def test_a_message_of_another_type_is_refused():
+    @message(name="Point")
+    class Other:
+        x: float
+        ok: bool = False
+
+    for cls, value in ((Point, Other(1.0)), (Imu, Point(1.0)), (MotorCommand, Point(1.0))):
+        with pytest.raises(TypeError, match=f"got {type(value).__name__}, expected {cls.__name__}"):
+            codec_of(cls).encode(value, 1000)
+
+
+def test_arrays_of_any_memory_layout_are_accepted():
+    grid = np.arange(4096, dtype=np.float64).reshape(64, 64)
+    for array in (
+        grid[::2, 1:],
+        grid.T,
+        np.asfortranarray(grid),
+        grid[::-1],
+        np.broadcast_to(grid[0], (3, 64)),
+    ):
+        image = Image(0, array[:, :, None], "64FC1")
+        decoded = codec_of(Image).decode(body_of(image))
+        assert decoded == image
+        memory = np.zeros(2**16, np.uint8)
+        size = codec_of(Image).encode_into(image, memory)
+        assert memory[:size].tobytes() == body_of(image)
+    strided = MotorCommand(0, grid[0, ::2])
+    assert codec_of(MotorCommand).decode(body_of(strided)) == strided
+
+
+def test_encoding_takes_a_snapshot():
+    command = MotorCommand(0, np.ones(1000))
+    body = body_of(command)
+    command.speed[:] = 0.0
+    assert codec_of(MotorCommand).decode(body).speed.sum() == 1000.0
+
+
+def test_decoded_arrays_are_read_only_views():
+    value = everything()
+    body = body_of(value)
+    for decoded in (
+        codec_of(Everything).decode(body),
+        codec_of(Everything).decode(np.frombuffer(body, np.uint8)),
+    ):
+        for array in (decoded.fixed, decoded.large, decoded.a, decoded.open_, decoded.ragged[0]):
+            assert not array.flags.writeable
+            assert not array.flags.owndata
+            with pytest.raises(ValueError, match="read-only"):
+                array[...] = 0
+            with pytest.raises(ValueError, match="WRITEABLE"):
+                array.flags.writeable = True
+
+
+def test_views_keep_the_buffer_alive():
+    class Lease:
+        def __init__(self, data: bytes) -> None:
+            self.memory = np.frombuffer(data, np.uint8)
+            self.__array_interface__ = self.memory.__array_interface__
+
+    lease = Lease(body_of(MotorCommand(0, np.ones(1000))))
+    gone = weakref.ref(lease)
+    view = np.asarray(lease)
+    view.flags.writeable = False
+    decoded = codec_of(MotorCommand).decode(view, 0, len(view))
+    part = decoded.speed[10:20]
+    del lease, view, decoded
+    gc.collect()
+    assert gone() is not None
+    assert part.sum() == 10.0
+    del part
+    gc.collect()
+    assert gone() is None
+
+
+def test_encode_into_refuses_small_memory_and_touches_nothing():
+    memory = np.full(100, 7, np.uint8)
+    with pytest.raises(ValueError, match="does not fit into a buffer of 100"):
+        codec_of(Everything).encode_into(everything(), memory)
+    assert (memory == 7).all()
+
+
+def test_encode_into_takes_a_memoryview():
+    body = body_of(everything())
+    memory = bytearray(len(body))
+    assert codec_of(Everything).encode_into(everything(), memoryview(memory)) == len(body)
+    assert memory == body
+    large = bytearray(2**17)
+    command = MotorCommand(0, np.arange(10000.0))
+    size = codec_of(MotorCommand).encode_into(command, memoryview(large))
+    assert large[:size] == body_of(command)
+
+
+def test_bodies_beyond_4_gib_are_refused():
+    huge = np.broadcast_to(np.zeros(1), 2**29)  # 4 GiB that take up 8 bytes
+    for attempt in (codec_of(MotorCommand).size, lambda value: codec_of(MotorCommand).encode(value, 2**33)):
+        with pytest.raises(ValueError, match=r"shorter than 2\^32"):
+            attempt(MotorCommand(0, huge))
+
+
+@given(any_message(schemas.filter(lambda schema: codec_of_schema(schema).record_dtype is not None)))
+def test_records_are_the_decoded_fields(value):
+    codec = codec_of(type(value))
+    body = body_of(value)
+    assert codec.record_dtype.itemsize == codec.fixed_size == len(body)
+    if not body:
+        return
+    records = np.frombuffer(body * 3, codec.record_dtype)
+    assert records.shape == (3,)
+    for field in codec.schema.fields:
+        expected = getattr(value, field.name)
+        actual = records[1][field.name]
+        if expected is None or (actual.dtype.names and "present" in actual.dtype.names):
+            assert bool(actual["present"]) == (expected is not None)
+        elif isinstance(expected, Enum):
+            assert actual == expected.value
+        elif not actual.dtype.names:
+            np.testing.assert_array_equal(actual, expected)
+
+
+def codec_of_schema(schema: Any) -> Codec:
+    from cortex.schema import type_from_schema
+
+    return codec_of(type_from_schema(schema))
+
+
+def test_types_with_a_tail_have_no_record():
+    assert codec_of(Everything).record_dtype is None
+    assert codec_of(Everything).fixed_size is None
+    assert codec_of(Imu).record_dtype["specific_force"].shape == (3,)
+
+
+@pytest.mark.parametrize("extra", [-1, 1, 8])
+def test_bodies_of_fixed_size_have_that_size(extra):
+    body = body_of(Imu(0, np.zeros(3), np.zeros(3)))
+    with pytest.raises(MalformedMessage, match="allowed are 64 to 64"):
+        codec_of(Imu).decode(body[:extra] if extra < 0 else body + bytes(extra))
+
+
+def test_a_size_beyond_the_buffer_is_malformed():
+    for value in (everything(), Imu(0, np.zeros(3), np.zeros(3)), Point(1.0), MotorCommand(0, np.zeros(3))):
+        body = body_of(value)
+        for size in (len(body) + 1, 2**40, -1):
+            with pytest.raises(MalformedMessage):
+                codec_of(type(value)).decode(body, 0, size)
+
+
+def test_a_small_body_cannot_claim_much_memory():
+    """Lists of lists whose offsets all point to one place would unfold without the bound on claims."""
+
+    @message
+    class Bomb:
+        lists: list[list[list[bool]]]
+
+    count = 2000
+    place = (8).to_bytes(4, "little") + count.to_bytes(4, "little")
+    body = place + place * count  # each of 2000 lists has 2000 elements, which are the lists themselves
+    codec = codec_of(Bomb)
+    tracemalloc.start()
+    try:
+        with pytest.raises(MalformedMessage, match="claim more than the body"):
+            codec.decode(body)
+        assert tracemalloc.get_traced_memory()[1] < 4 * 2**20  # 2000^2 elements would take 32 MB and more
+    finally:
+        tracemalloc.stop()
+
+
+def test_threads_may_share_a_codec():
+    codec = codec_of(Everything)
+    values = [everything(stamp_ns=k, text="x" * k, a=np.full(5, k, np.float32)) for k in range(20)]
+    bodies = [body_of(value) for value in values]
+    failures: list[object] = []
+
+    def work() -> None:
+        for value, body in zip(values * 5, bodies * 5, strict=True):
+            if codec.encode(value, 2**20) != body or codec.decode(body) != value:
+                failures.append(value)
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(timeout=20.0)
+    finally:
+        sys.setswitchinterval(interval)
+    assert not failures
+    assert not any(thread.is_alive() for thread in threads)
+
+
+# Drafts
+
+
+def test_a_draft_gives_the_same_body():
+    codec = codec_of(Events)
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 640, (2, 500)).astype(np.uint16)
+    t, polarity = np.sort(rng.integers(0, 1000, 500)), rng.integers(0, 2, 500).astype(np.uint8)
+    memory = np.full(codec.draft_size({"n": 500}), 0xAA, np.uint8)
+    draft = codec.draft(memory, {"n": 500})
+    draft.x[:], draft.y[:], draft.t[:] = x, y, t
+    draft.polarity = polarity
+    draft.stamp_ns, draft.width, draft.height, draft.frame_id = 7, 640, 480, "camera"
+    size = codec.finish(draft)
+    decoded = codec.decode(memory[:size].tobytes())
+    assert decoded == Events(7, x, y, t, polarity, 640, 480, frame_id="camera")
+    assert draft.stamp_ns == 7
+    assert draft.sequence == 0
+    # What lies between the arrays is zero, not what the memory held before.
+    arrays = sum(array.nbytes for array in (x, y, t, polarity))
+    assert np.count_nonzero(memory[:size] == 0xAA) <= np.count_nonzero(x == 0xAA) + arrays // 100
+
+
+def test_a_draft_of_an_image_of_open_dtype():
+    codec = codec_of(Image)
+    dims, dtypes = {"height": 48, "width": 64, "channels": 3}, {"data": "uint8"}
+    memory = np.zeros(codec.draft_size(dims, dtypes), np.uint8)
+    draft = codec.draft(memory, dims, dtypes)
+    assert np.shares_memory(draft.data, memory)
+    draft.data[:] = 200
+    draft.stamp_ns, draft.encoding = 5, "rgb8"
+    size = codec.finish(draft)
+    assert codec.decode(memory[:size].tobytes()) == Image(5, np.full((48, 64, 3), 200, np.uint8), "rgb8")
+    assert not draft.data.flags.writeable
+
+
+def test_fixed_arrays_of_a_draft_are_in_place():
+    codec = codec_of(Everything)
+    memory = np.full(codec.draft_size({"n": 5}), 0xAA, np.uint8)
+    draft = codec.draft(memory, {"n": 5})
+    value = everything()
+    assert np.shares_memory(draft.large, memory)
+    for name in (field.name for field in codec.schema.fields):
+        setattr(draft, name, getattr(value, name))
+    size = codec.finish(draft)
+    assert codec.decode(memory[:size].tobytes()) == value
+
+
+def test_drafts_refuse_what_does_not_fit():
+    codec = codec_of(Events)
+    memory = np.zeros(codec.draft_size({"n": 3}), np.uint8)
+    with pytest.raises(ValueError, match="no dimension m, its arrays have"):
+        codec.draft_size({"m": 3})
+    with pytest.raises(ValueError, match="dimension n is -1"):
+        codec.draft_size({"n": -1})
+    with pytest.raises(ValueError, match="no array x of open dtype"):
+        codec.draft_size({"n": 1}, {"x": "uint8"})
+    with pytest.raises(ValueError, match="dtype object is none of"):
+        codec_of(Image).draft_size({}, {"data": "object"})
+    with pytest.raises(ValueError, match=r"draft of \d+ bytes, the buffer has"):
+        codec.draft(memory, {"n": 3000})
+    draft = codec.draft(memory, {"n": 3})
+    with pytest.raises(ValueError, match=r"stamp_ns was not set"):
+        codec.finish(draft)
+    with pytest.raises(AttributeError, match="field stamp_ns is not set yet"):
+        _ = draft.stamp_ns
+    with pytest.raises(AttributeError, match="field stamp is none of"):
+        draft.stamp = 5
+    with pytest.raises(ValueError, match=r"x: shape \[2\], expected \[3\]"):
+        draft.x = np.zeros(2, np.uint16)
+    with pytest.raises(TypeError, match="cast"):
+        draft.x = np.zeros(3)
+    draft.stamp_ns, draft.width, draft.height = 1, 2, "wide"
+    with pytest.raises(TypeError, match=r"Events\.height: 'wide' is no number"):
+        codec.finish(draft)
+    draft.height, draft.frame_id = 3, "f" * 5000
+    with pytest.raises(ValueError, match="bytes more than the 4096 in reserve"):
+        codec.finish(draft)
+    draft.frame_id = "f" * 4000
+    assert codec.decode(memory[: codec.finish(draft)].tobytes()).frame_id == "f" * 4000
+
+
+def test_arrays_of_unknown_size_go_into_the_reserve_of_a_draft():
+    codec = codec_of(Everything)
+    memory = np.zeros(codec.draft_size(), np.uint8)
+    draft = codec.draft(memory)
+    for field in dataclasses.fields(Everything):
+        setattr(draft, field.name, getattr(everything(), field.name))
+    assert codec.decode(memory[: codec.finish(draft)].tobytes()) == everything()
+    draft = codec.draft(memory, {"n": 5})
+    for field in dataclasses.fields(Everything):
+        setattr(draft, field.name, getattr(everything(), field.name))
+    assert codec.decode(memory[: codec.finish(draft)].tobytes()) == everything()
+
+
+def test_codecs_of_one_schema_read_each_other():
+    from cortex.schema import type_from_schema
+
+    twin = type_from_schema(schema_of(Everything))
+    body = body_of(everything())
+    copy = codec_of(twin).decode(body)
+    assert type(copy) is not Everything
+    assert codec_of(twin).encode(copy, 2**20) == body

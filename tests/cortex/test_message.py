@@ -1,0 +1,330 @@
+"""The decorator: what is a message, how it behaves as a Python object, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from dataclasses import KW_ONLY, field
+from enum import Enum, Flag, IntEnum
+from typing import Annotated, Any, ClassVar, Optional, Union
+
+import numpy as np
+import pytest
+from hypothesis import given
+from numpy.typing import NDArray
+from random_schemas import any_message
+
+from cortex.message import Array, Float32, Int16, UInt8, Unit, is_message, message
+from cortex.schema import ArrayType, EnumType, Field, ListType, OptionalType, SchemaError, schema_of
+
+
+class Mode(IntEnum):
+    OFF = 0
+    ON = 1
+
+
+@message
+class Point:
+    x: float
+    y: float = 0.0
+
+
+@message(name="test/Scan")
+class Scan:
+    stamp_ns: int
+    ranges: Annotated[Array["float32", "n"], Unit("m", frame="lidar")]
+    mode: Mode = Mode.OFF
+    at: Point = field(default_factory=lambda: Point(1.0))
+    tags: list[str] = field(default_factory=list)
+
+
+def scan(**changes: Any) -> Scan:
+    return dataclasses.replace(Scan(1, np.arange(4, dtype=np.float32), tags=["a"]), **changes)
+
+
+def test_schema_of_the_annotations():
+    @message
+    class All:
+        flag: bool
+        number: int
+        real: Float32
+        small: Int16
+        text: str
+        data: bytes
+        mode: Mode
+        fixed: Array["uint8", 2, 3]
+        by_type: Array[np.float64, "n"]
+        one: Array["float16"]
+        anything: Array["any", "h", "w"]
+        point: Point
+        maybe: Optional[Annotated[float, Unit("rad")]]  # noqa: UP045
+        also: UInt8 | None
+        united: Annotated[list[Point], Unit("m", "world")]
+        nested: list[list[int] | None]
+
+    modes = EnumType("Mode", (("OFF", 0), ("ON", 1)))
+    point = schema_of(Point)
+    assert schema_of(All).name == "All"
+    assert schema_of(All).fields == (
+        Field("flag", "bool"),
+        Field("number", "int64"),
+        Field("real", "float32"),
+        Field("small", "int16"),
+        Field("text", "str"),
+        Field("data", "bytes"),
+        Field("mode", modes),
+        Field("fixed", ArrayType("uint8", (2, 3))),
+        Field("by_type", ArrayType("float64", ("n",))),
+        Field("one", ArrayType("float16", ())),
+        Field("anything", ArrayType("any", ("h", "w"))),
+        Field("point", point),
+        Field("maybe", OptionalType("float64"), "rad"),
+        Field("also", OptionalType("uint8")),
+        Field("united", ListType(point), "m", "world"),
+        Field("nested", ListType(OptionalType(ListType("int64")))),
+    )
+
+
+def test_a_message_is_a_frozen_dataclass_with_slots():
+    value = scan()
+    assert [f.name for f in dataclasses.fields(Scan)] == ["stamp_ns", "ranges", "mode", "at", "tags"]
+    assert not hasattr(value, "__dict__")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        value.stamp_ns = 2  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        del value.stamp_ns
+    assert dataclasses.replace(value, stamp_ns=5).stamp_ns == 5
+    assert dataclasses.asdict(value)["at"] == {"x": 1.0, "y": 0.0}
+    assert value.at == Point(1.0)
+    assert is_message(value)
+    assert is_message(Scan)
+    assert not is_message(5)
+    assert not is_message(int)
+
+
+def test_messages_compare_by_value():
+    assert scan() == scan()
+    assert scan() != scan(stamp_ns=2)
+    assert scan() != scan(ranges=np.arange(5, dtype=np.float32))
+    assert scan() != scan(ranges=np.arange(4, dtype=np.float64))
+    assert scan() != scan(ranges=np.arange(1, 5, dtype=np.float32))
+    assert scan() != scan(ranges=[0.0, 1.0, 2.0, 3.0])
+    assert scan() != scan(at=Point(2.0))
+    assert scan() != scan(tags=["a", "b"])
+    assert scan() != (1, 2)
+    assert Point(0.0) != object()
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(scan())
+
+
+def test_lists_of_arrays_compare_by_value():
+    @message
+    class Ragged:
+        rows: list[Array["int64", "n"]]
+
+    assert Ragged([np.arange(2), np.arange(3)]) == Ragged([np.arange(2), np.arange(3)])
+    assert Ragged([np.arange(2)]) != Ragged([np.arange(3)])
+
+
+def test_repr_is_short():
+    assert repr(Point(1.0)) == "Point(x=1.0, y=0.0)"
+    assert "ranges=float32[4](0.0, 1.0, 2.0, 3.0)" in repr(scan())
+    assert "ranges=float32[1000]," in repr(scan(ranges=np.zeros(1000, np.float32)))
+    assert len(repr(scan(tags=["x" * 10000] * 100))) < 2000
+
+
+@given(any_message())
+def test_a_copy_is_equal_and_owns_its_arrays(value):
+    copied = value.copy() if "copy" not in value.__cortex_names__ else None
+    if copied is None:
+        return
+    assert type(copied) is type(value)
+    assert copied == value
+    for name in value.__cortex_names__:
+        if isinstance(getattr(value, name), np.ndarray):
+            assert getattr(copied, name).flags.owndata
+            assert getattr(copied, name).flags.writeable
+            assert not np.shares_memory(getattr(copied, name), getattr(value, name))
+
+
+def test_a_copy_is_deep():
+    value = scan(tags=["a"])
+    copied = value.copy()
+    copied.tags.append("b")
+    copied.ranges[:] = -1.0
+    assert value == scan()
+    assert copied.at is not value.at
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        copied.stamp_ns = 2
+
+
+def test_keyword_only_fields():
+    @message
+    class Keyed:
+        a: int
+        _: KW_ONLY
+        b: int
+        c: int = 3
+
+    assert Keyed(1, b=2) == Keyed(a=1, b=2, c=3)
+    assert [f.name for f in schema_of(Keyed).fields] == ["a", "b", "c"]
+    with pytest.raises(TypeError):
+        Keyed(1, 2)
+
+
+def test_inherited_fields_come_first():
+    @message
+    class Stamped:
+        stamp_ns: int
+
+    @message
+    class Reading(Stamped):
+        value: float
+
+    assert [f.name for f in schema_of(Reading).fields] == ["stamp_ns", "value"]
+    assert Reading(1, 2.0).copy() == Reading(1, 2.0)
+    assert Reading(1, 2.0) != Stamped(1)
+
+    class Plain(Stamped):  # not a message: it has no schema of its own
+        pass
+
+    assert not is_message(Plain)
+    with pytest.raises(TypeError, match="not a message type"):
+        schema_of(Plain)
+
+
+def test_methods_and_class_variables_are_no_fields():
+    @message
+    class Circle:
+        radius: float
+        sides: ClassVar[int] = 0
+
+        def __post_init__(self) -> None:
+            if self.radius < 0.0:
+                raise ValueError("radius")
+
+        @property
+        def area(self) -> float:
+            return 3.0 * self.radius**2
+
+        def __repr__(self) -> str:
+            return "circle"
+
+    assert [f.name for f in schema_of(Circle).fields] == ["radius"]
+    assert Circle(2.0).area == 12.0
+    assert repr(Circle(2.0)) == "circle"
+    with pytest.raises(ValueError, match="radius"):
+        Circle(-1.0)
+
+
+def test_the_fingerprint_does_not_depend_on_the_module():
+    def define(module: str) -> type:
+        class Twin:
+            __module__ = module
+            a: int
+
+        return message(Twin)
+
+    first, second = define("json"), define("math")
+    assert first is not second
+    assert first.__module__ != second.__module__
+    assert schema_of(first).fingerprint == schema_of(second).fingerprint == first.__cortex_fingerprint__
+
+
+class Colours(Enum):
+    RED = "red"
+
+
+class Bits(Flag):
+    A = 1
+
+
+BAD_HINTS = {
+    "complex": complex,
+    "dict": dict[str, int],
+    "tuple": tuple[int, int],
+    "set": set[int],
+    "any": Any,
+    "union": Union[int, str],  # noqa: UP007
+    "union of three": int | str | None,
+    "bare array": np.ndarray,
+    "ndarray": NDArray[np.float32],
+    "bare list": list,
+    "enum of text": Colours,
+    "flags": Bits,
+    "plain class": Exception,
+    "two units": Annotated[Annotated[float, Unit("m")], Unit("s")],
+    "two types": Annotated[Int16, UInt8.__metadata__[0]],
+    "optional of optional": typing.Optional[Annotated[typing.Optional[int], "hidden"]],  # noqa: UP045
+}
+
+
+@pytest.mark.parametrize("hint", BAD_HINTS.values(), ids=BAD_HINTS.keys())
+def test_annotations_that_have_no_place_in_a_message(hint):
+    namespace: dict[str, Any] = {"__annotations__": {"wrong": hint}}
+    with pytest.raises(SchemaError, match=r"Wrong\.wrong"):
+        message(type("Wrong", (), namespace))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        (("float33", "n"), "dtype"),
+        (("M8[s]", "n"), "dtype"),
+        ((">f4", "n"), "byte order"),
+        (("float32", "n m"), "dimension name"),
+        (("float32", "__n"), "dimension name"),
+        (("float32", 0), "dimension 0"),
+        (("float32", 2**32), "dimension"),
+        (("float32", 1.5), "dimension 1.5"),
+        (("float32", True), "dimension True"),
+        (("float32", *(["n"] * 33)), "33 dimensions"),
+    ],
+)
+def test_arrays_that_are_refused(parameters, text):
+    with pytest.raises(SchemaError, match=text):
+        Array[parameters]
+
+
+def test_annotations_that_cannot_be_resolved():
+    with pytest.raises(SchemaError, match=r"Lost: .*Nowhere.*defined before it"):
+
+        @message
+        class Lost:
+            a: Nowhere  # type: ignore[name-defined]
+
+    with pytest.raises(SchemaError, match=r"Tree: .*cannot contain itself"):
+
+        @message
+        class Tree:
+            children: list[Tree]
+
+
+def test_names_that_are_refused():
+    with pytest.raises(SchemaError, match=r"Wrong\.copy: .*method"):
+
+        @message
+        class Wrong:
+            copy: int
+
+    with pytest.raises(SchemaError, match="field name '__a'"):
+        message(type("Wrong", (), {"__annotations__": {"__a": int}}))
+    with pytest.raises(SchemaError, match="type name 'a b'"):
+        message(name="a b")(type("Wrong", (), {"__annotations__": {"a": int}}))
+    with pytest.raises(SchemaError, match="257 fields"):
+        message(type("Wrong", (), {"__annotations__": {f"a{k}": int for k in range(257)}}))
+
+
+def test_mutable_defaults_are_refused():
+    for default in (np.zeros(3), [], {}):
+        with pytest.raises((TypeError, ValueError), match="mutable default"):
+            message(type("Wrong", (), {"__annotations__": {"a": Array["float64", 3]}, "a": default}))
+
+
+def test_array_defaults_by_factory():
+    @message
+    class Zeroed:
+        a: Array["float64", 3] = field(default_factory=lambda: np.zeros(3))
+
+    assert Zeroed() == Zeroed()
+    assert Zeroed().a is not Zeroed().a

@@ -1,0 +1,379 @@
+"""Schemas: canonical text, fingerprint, limits, and classes made from them."""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import dataclasses
+import hashlib
+import itertools
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from random_schemas import schemas
+
+from cortex import schema as schema_module
+from cortex.codec import codec_of
+from cortex.message import Array, Unit, message
+from cortex.schema import (
+    DTYPE_NAMES,
+    SCALAR_SIZES,
+    ArrayType,
+    EnumType,
+    Field,
+    ListType,
+    OptionalType,
+    Schema,
+    SchemaError,
+    TypeMismatch,
+    describe,
+    schema_of,
+    type_from_schema,
+)
+
+
+@message(name="test/Scan")
+class Scan:
+    stamp_ns: int
+    ranges: Annotated[Array["float32", "n", 2], Unit("m", frame="Körper")]
+
+
+SCAN_TEXT = (
+    '{"name":"test/Scan","fields":[{"name":"stamp_ns","type":"int64","unit":"","frame":""},'
+    '{"name":"ranges","type":{"array":"float32","shape":["n",2]},"unit":"m","frame":"Körper"}]}'
+)
+
+
+def test_the_canonical_text():
+    assert schema_of(Scan).to_json() == SCAN_TEXT
+    assert Schema.from_json(SCAN_TEXT) == schema_of(Scan)
+
+
+def test_the_fingerprint_is_blake2b_of_the_text():
+    digest = hashlib.blake2b(SCAN_TEXT.encode("utf-8"), digest_size=8).digest()
+    assert schema_of(Scan).fingerprint == int.from_bytes(digest, "little")
+    # A value written down, so that a change of the format cannot go unseen.
+    assert schema_of(Scan).fingerprint == 0xA79F0BA004364C4
+
+
+@given(schemas)
+def test_text_and_back(schema):
+    text = schema.to_json()
+    assert Schema.from_json(text) == schema
+    assert json.dumps(json.loads(text), ensure_ascii=False, separators=(",", ":")) == text
+
+
+def field(kind: Any = "int64", name: str = "a", unit: str = "", frame: str = "") -> Field:
+    return Field(name, kind, unit, frame)
+
+
+def nested(depth: int) -> Any:
+    kind: Any = "int64"
+    for _ in range(depth):
+        kind = ListType(kind)
+    return kind
+
+
+BAD_TEXTS = {
+    "no JSON": "{",
+    "not an object": "[]",
+    "a number": "5",
+    "white space": SCAN_TEXT.replace(",", ", "),
+    "escaped": SCAN_TEXT.replace("ö", "\\u00f6"),
+    "order of keys": '{"fields":[],"name":"a"}',
+    "key missing": '{"name":"a"}',
+    "key too many": '{"name":"a","fields":[],"x":1}',
+    "key twice": '{"name":"a","name":"a","fields":[]}',
+    "unit missing": '{"name":"a","fields":[{"name":"a","type":"int8","frame":""}]}',
+    "unknown type": SCAN_TEXT.replace("int64", "int65"),
+    "unknown dtype": SCAN_TEXT.replace("float32", "float8"),
+    "dtype is a type": SCAN_TEXT.replace("float32", "str"),
+    "type is null": SCAN_TEXT.replace('"int64"', "null"),
+    "type is a list": SCAN_TEXT.replace('"int64"', "[1]"),
+    "type of unknown form": SCAN_TEXT.replace('"int64"', '{"map":"int64"}'),
+    "type of two forms": SCAN_TEXT.replace('"int64"', '{"list":"int64","optional":"int64"}'),
+    "name is a number": SCAN_TEXT.replace('"ranges"', "5"),
+    "name of a field": SCAN_TEXT.replace("ranges", "ran ges"),
+    "name with dunder": SCAN_TEXT.replace("ranges", "__class__"),
+    "name too long": SCAN_TEXT.replace("ranges", "r" * 65),
+    "no name": SCAN_TEXT.replace("ranges", ""),
+    "name twice": SCAN_TEXT.replace("ranges", "stamp_ns"),
+    "type name": SCAN_TEXT.replace("test/Scan", "test Scan"),
+    "type name too long": SCAN_TEXT.replace("test/Scan", "t" * 129),
+    "newline after a name": SCAN_TEXT.replace("ranges", "ranges\\n"),
+    "negative dimension": SCAN_TEXT.replace(",2]", ",-2]"),
+    "dimension zero": SCAN_TEXT.replace(",2]", ",0]"),
+    "dimension too large": SCAN_TEXT.replace(",2]", ",4294967296]"),
+    "dimension is a float": SCAN_TEXT.replace(",2]", ",2.0]"),
+    "dimension is a bool": SCAN_TEXT.replace(",2]", ",true]"),
+    "quote in a unit": SCAN_TEXT.replace('"m"', '"\\""'),
+    "control character in a unit": SCAN_TEXT.replace('"m"', '"\\u0001"'),
+    "unit too long": SCAN_TEXT.replace('"m"', f'"{"m" * 65}"'),
+    "unit is null": SCAN_TEXT.replace('"m"', "null"),
+    "half a surrogate pair": SCAN_TEXT.replace("ö", "\\ud800"),
+    "enum without values": SCAN_TEXT.replace('"int64"', '{"enum":"E","values":{}}'),
+    "enum value beyond 32 bits": SCAN_TEXT.replace('"int64"', '{"enum":"E","values":{"A":2147483648}}'),
+    "enum value is a bool": SCAN_TEXT.replace('"int64"', '{"enum":"E","values":{"A":true}}'),
+    "enum value name": SCAN_TEXT.replace('"int64"', '{"enum":"E","values":{"A B":1}}'),
+    "enum values are a list": SCAN_TEXT.replace('"int64"', '{"enum":"E","values":[1]}'),
+    "optional of optional": SCAN_TEXT.replace('"int64"', '{"optional":{"optional":"int64"}}'),
+    "empty message within": SCAN_TEXT.replace('"int64"', '{"message":{"name":"E","fields":[]}}'),
+    "list of empty messages": SCAN_TEXT.replace('"int64"', '{"list":{"message":{"name":"E","fields":[]}}}'),
+    "too deep": SCAN_TEXT.replace('"int64"', '{"list":' * 8 + '"int64"' + "}" * 8),
+    "far too deep": SCAN_TEXT.replace('"int64"', '{"list":' * 5000 + '"int64"' + "}" * 5000),
+    "deep JSON": "[" * 100_000,
+    "33 dimensions": SCAN_TEXT.replace('"n",2', ",".join(['"n"'] * 33)),
+    "too many fields": json.dumps(
+        {
+            "name": "a",
+            "fields": [{"name": f"a{k}", "type": "int8", "unit": "", "frame": ""} for k in range(257)],
+        },
+        separators=(",", ":"),
+    ),
+    "too long": SCAN_TEXT.replace("Körper", "k" * 2**20),
+    "huge number": SCAN_TEXT.replace(",2]", "," + "9" * 5000 + "]"),
+    "NaN": SCAN_TEXT.replace(",2]", ",NaN]"),
+}
+
+
+@pytest.mark.parametrize("text", BAD_TEXTS.values(), ids=BAD_TEXTS.keys())
+def test_texts_that_are_refused(text):
+    assert text != SCAN_TEXT
+    with pytest.raises(SchemaError):
+        Schema.from_json(text)
+
+
+@given(st.text() | st.binary().map(lambda data: data.decode("latin-1")))
+def test_any_text_is_a_schema_or_a_schema_error(text):
+    with pytest.raises(SchemaError):
+        Schema.from_json(text)
+
+
+@given(st.data())
+def test_damaged_texts_raise_nothing_else(data):
+    text = schema_of(Scan).to_json()
+    for _ in range(data.draw(st.integers(1, 3))):
+        start = data.draw(st.integers(0, len(text)))
+        end = data.draw(st.integers(start, min(len(text), start + 4)))
+        text = (
+            text[:start] + data.draw(st.sampled_from(["", "{", "}", '"', ",", "0", "null", "a"])) + text[end:]
+        )
+    with contextlib.suppress(SchemaError):
+        assert Schema.from_json(text).to_json() == text
+
+
+def test_limits_are_inclusive():
+    assert len(Schema("a", tuple(field(name=f"a{k}") for k in range(256))).fields) == 256
+    assert Schema("a", (field(nested(7)),))
+    with pytest.raises(SchemaError, match="9 levels deep, allowed are 8"):
+        Schema("a", (field(nested(8)),))
+    assert Schema("a" * 128, (field(name="b" * 64, unit="m" * 64),))
+    values = tuple((f"A{k}" + "x" * 50, k) for k in range(20000))
+    with pytest.raises(SchemaError, match="longer than 1048576 bytes"):
+        Schema("a", (field(EnumType("E", values)),))
+
+
+def test_a_fixed_part_beyond_4_gib_has_no_codec():
+    schema = Schema("a", (field(ArrayType("uint8", (2**31, 2))),))
+    with pytest.raises(SchemaError, match=r"shorter than 2\^32"):
+        codec_of(type_from_schema(schema))
+
+
+CHANGES = {
+    "name": lambda s: dataclasses.replace(s, name=s.name + "x"),
+    "order": lambda s: dataclasses.replace(s, fields=s.fields[::-1]),
+    "field left out": lambda s: dataclasses.replace(s, fields=s.fields[1:]),
+    "field added": lambda s: dataclasses.replace(s, fields=(*s.fields, field(name="added_last"))),
+    "field name": lambda s: with_first(s, name="renamed_1st"),
+    "unit": lambda s: with_first(s, unit=s.fields[0].unit[:60] + "x"),
+    "frame": lambda s: with_first(s, frame=s.fields[0].frame[:60] + "x"),
+    "optional": lambda s: with_first(s, type=ListType(s.fields[0].type)),
+}
+
+
+def with_first(schema: Schema, **changes: Any) -> Schema:
+    return dataclasses.replace(
+        schema, fields=(dataclasses.replace(schema.fields[0], **changes), *schema.fields[1:])
+    )
+
+
+@given(schemas.filter(lambda schema: len(schema.fields) > 1), st.sampled_from(sorted(CHANGES)))
+def test_every_change_of_structure_changes_the_fingerprint(schema, change):
+    try:
+        changed = CHANGES[change](schema)
+    except SchemaError:  # a list around a type that is as deep as can be
+        return
+    assert changed != schema
+    assert changed.fingerprint != schema.fingerprint
+
+
+def test_every_change_of_a_type_changes_the_fingerprint():
+    arrays = [
+        ArrayType(dtype, shape)
+        for dtype in (*DTYPE_NAMES, "any")
+        for shape in ((), ("n",), ("m",), (3,), (4,), ("n", 3), (3, "n"), ("n", "n"), ("n", "m"))
+    ]
+    enums = [
+        EnumType(name, values)
+        for name in ("E", "F")
+        for values in ((("A", 0),), (("A", 1),), (("B", 0),), (("A", 0), ("B", 1)), (("B", 1), ("A", 0)))
+    ]
+    plain: list[Any] = [*SCALAR_SIZES, "str", "bytes", *arrays, *enums]
+    kinds = [
+        *plain,
+        *(ListType(kind) for kind in plain),
+        *(OptionalType(kind) for kind in plain),
+        *(Schema("S", (field(kind),)) for kind in plain),
+    ]
+    prints = {Schema("a", (field(kind),)).fingerprint for kind in kinds}
+    assert len(prints) == len(kinds) > 500
+
+
+def test_no_collision_among_100_000_types():
+    """64 bits: the chance that two of 1e5 collide by accident is 3e-10."""
+    words = ["position", "velocity", "force", *"abcdefg"]
+    types = [*SCALAR_SIZES, "str", "bytes"]
+    units = ["", "m", "m/s", "rad"]
+    frames = ["", "world", "body"]
+    rows = itertools.product(words, types, units, frames, words, types[:9], ["", "s"])
+    template = (
+        '{"name":"t","fields":[{"name":"%s","type":"%s","unit":"%s","frame":"%s"},'
+        '{"name":"%s_","type":"%s","unit":"%s","frame":""}]}'
+    )
+    texts = [template % row for row in rows]
+    prints = {schema_module.fingerprint_of(text.encode()) for text in texts}
+    assert len(prints) == len(texts) == len(set(texts)) >= 100_000
+    for text in (texts[0], texts[len(texts) // 2], texts[-1]):  # the texts are what schemas are written as
+        assert Schema.from_json(text).fingerprint == schema_module.fingerprint_of(text.encode())
+
+
+def test_the_fingerprint_is_the_same_in_every_process():
+    program = "from cortex.messages import Events; print(Events.__cortex_fingerprint__)"
+    prints = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env={"PYTHONHASHSEED": seed, "PYTHONPATH": ":".join(sys.path)},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=30,
+        ).stdout
+        for seed in ("0", "1")
+    }
+    assert len(prints) == 1
+
+
+def test_description_shows_the_structure():
+    @message
+    class Inner:
+        x: Annotated[float, Unit("m")]
+
+    @message
+    class Outer:
+        stamp_ns: int
+        inner: list[Inner]
+        data: Annotated[Array["uint8", "n", 3], Unit(frame="world")]
+        maybe: str | None
+
+    assert describe(schema_of(Outer)).splitlines()[1:] == [
+        "  stamp_ns  int64",
+        "  inner     list of message Inner",
+        "    x  float64 [m]",
+        "  data      uint8[n, 3] in world",
+        "  maybe     optional str",
+    ]
+    error = TypeMismatch("/scan has two types", schema_of(Outer), schema_of(Inner))
+    assert error.expected is schema_of(Outer)
+    assert error.actual is schema_of(Inner)
+    for line in (
+        "/scan has two types",
+        "  inner     list of message Inner",
+        "actual: Inner (",
+        "  x  float64 [m]",
+    ):
+        assert line in str(error)
+    assert "expected: unknown" in str(TypeMismatch("x", None, None))
+
+
+# Classes
+
+
+def test_a_class_from_a_schema():
+    cls: Any = type_from_schema(schema_of(Scan))
+    assert cls is type_from_schema(Schema.from_json(SCAN_TEXT))
+    assert cls is not Scan
+    assert schema_of(cls) == schema_of(Scan)
+    value = cls(5, ranges=np.zeros((2, 2), np.float32))
+    assert value.stamp_ns == 5
+    assert repr(value).startswith("Scan(stamp_ns=5, ranges=float32[2, 2]")
+    assert value == value.copy()
+    assert [f.name for f in dataclasses.fields(cls)] == ["stamp_ns", "ranges"]
+    assert dataclasses.replace(value, stamp_ns=6).stamp_ns == 6
+    assert dataclasses.asdict(value)["stamp_ns"] == 5
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        value.stamp_ns = 6
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        del value.stamp_ns
+    for args, kwargs in (((1, 2, 3), {}), ((1,), {}), ((1, 2), {"stamp_ns": 1}), ((1, 2), {"other": 1})):
+        with pytest.raises(TypeError, match="Scan"):
+            cls(*args, **kwargs)
+
+
+@given(schemas)
+def test_a_class_from_any_schema(schema):
+    cls = type_from_schema(schema)
+    assert schema_of(cls) is schema or schema_of(cls) == schema
+    assert codec_of(cls).fingerprint == schema.fingerprint
+
+
+@pytest.mark.parametrize(
+    "name", ["class", "None", "import", "lambda", "self", "cls", "copy", "mro", "_", "_a"]
+)
+def test_field_names_that_mean_something_to_python(name):
+    cls: Any = type_from_schema(Schema("a", (field(name=name), field(name="other"))))
+    value = cls(1, 2)
+    assert getattr(value, name) == 1
+    body = codec_of(cls).encode(value, 100)
+    assert body is not None
+    assert getattr(codec_of(cls).decode(body), name) == 1
+
+
+def test_no_code_is_generated_from_a_schema(monkeypatch):
+    def refuse(*_: Any) -> None:
+        raise AssertionError("code was generated")
+
+    schema = Schema(
+        "only/Here", (field(name="import"), field(EnumType("E", (("A", 1),)), "e"), field("str", "s"))
+    )
+    monkeypatch.setattr(builtins, "exec", refuse)
+    monkeypatch.setattr(builtins, "eval", refuse)
+    cls: Any = type_from_schema(schema)
+    monkeypatch.undo()
+    assert cls(1, None, "x").s == "x"
+
+
+@pytest.mark.parametrize("name", ["mro", "_ignore_", "_E__x"])
+def test_enum_values_that_python_cannot_have(name):
+    with pytest.raises(SchemaError, match="cannot be an enum in Python"):
+        type_from_schema(Schema("a", (field(EnumType("E", (("A", 1), (name, 2)))),)))
+
+
+def test_the_cache_of_classes_is_bounded():
+    for k in range(600):
+        type_from_schema(Schema(f"bounded/T{k}", (field(),)))
+    assert len(schema_module._classes) <= 256
+
+
+def test_threads_get_one_class():
+    for k in range(20):
+        schema = Schema(f"threads/T{k}", (field(), field("str", "b")))
+        with ThreadPoolExecutor(4) as pool:
+            made = list(pool.map(type_from_schema, [schema] * 4))
+        assert len(set(made)) == 1

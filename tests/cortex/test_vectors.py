@@ -1,0 +1,89 @@
+"""The test vectors: up to date, right by an independent reading of WIRE.md, and passed by the codec."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import wire_oracle
+from random_schemas import to_plain
+
+from cortex.codec import MalformedMessage, codec_of
+from cortex.schema import Schema, fingerprint_of, type_from_schema
+from cortex.vectors import DIRECTORY, load_vectors, message_from_plain, message_to_plain
+from cortex.vectors.__main__ import files
+from cortex.vectors.catalogue import CATALOGUE
+
+VECTORS = load_vectors()
+CASES = [(name, case) for name, vector in VECTORS.items() for case in vector["cases"]]
+MALFORMED = [(name, case) for name, vector in VECTORS.items() for case in vector["malformed"]]
+
+
+def label(value: Any) -> str:
+    return value["name"] if isinstance(value, dict) else value
+
+
+def test_the_files_are_what_the_script_writes():
+    texts = files()
+    assert {path.name for path in DIRECTORY.glob("*.json")} == set(texts)
+    for name, text in texts.items():
+        written = (DIRECTORY / name).read_text(encoding="utf-8")
+        assert written == text, f"{name} is out of date: run python -m cortex.vectors"
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_schema_and_fingerprint(name):
+    vector = VECTORS[name]
+    schema = Schema.from_json(vector["schema"])
+    assert f"{schema.fingerprint:016x}" == vector["fingerprint"]
+    assert schema.fingerprint == CATALOGUE[name].type.__cortex_fingerprint__
+    assert codec_of(type_from_schema(schema)).fixed_size == vector["fixed_size"]
+
+
+@pytest.mark.parametrize(("name", "case"), CASES, ids=label)
+def test_bodies(name, case):
+    schema = Schema.from_json(VECTORS[name]["schema"])
+    codec = codec_of(type_from_schema(schema))
+    body = bytes.fromhex(case["body"])
+    value = message_from_plain(schema, case["value"])
+    assert codec.encode(value, len(body)) == body
+    assert message_to_plain(schema, codec.decode(body)) == case["value"]
+    assert codec_of(CATALOGUE[name].type).decode(body) == CATALOGUE[name].cases[case["name"]] or (
+        case["name"] == "nan"
+    )
+    # The same from WIRE.md, by other code.
+    assert wire_oracle.encode(json.loads(VECTORS[name]["schema"]), to_plain(schema, value)) == body
+
+
+@pytest.mark.parametrize(("name", "case"), MALFORMED, ids=label)
+def test_malformed_bodies(name, case):
+    schema = Schema.from_json(VECTORS[name]["schema"])
+    body = bytes.fromhex(case["body"])
+    assert all(body.hex() != good["body"] for good in VECTORS[name]["cases"])
+    with pytest.raises(MalformedMessage, match=schema.name):
+        codec_of(type_from_schema(schema)).decode(body)
+    with pytest.raises(wire_oracle.Bad):
+        wire_oracle.decode(json.loads(VECTORS[name]["schema"]), body)
+
+
+def test_there_are_vectors_for_everything():
+    text = "".join(vector["schema"] for vector in VECTORS.values())
+    for part in (
+        '"optional":',
+        '"list":',
+        '"enum":',
+        '"message":',
+        '"array":"any"',
+        '"str"',
+        '"bytes"',
+        '"bool"',
+    ):
+        assert part in text
+    assert len(VECTORS) >= 15
+    assert len(MALFORMED) >= 40
+    assert {"cortex/NodeRecord", "cortex/Events", "cortex/Image"} <= {
+        entry["name"] for entry in json.loads((DIRECTORY / "types.json").read_text(encoding="utf-8"))
+    }
+    for entry in json.loads((DIRECTORY / "types.json").read_text(encoding="utf-8")):
+        assert f"{fingerprint_of(entry['schema'].encode()):016x}" == entry["fingerprint"]
