@@ -6,6 +6,7 @@ wrong value, a malformed body) they leave to those, which also know what to say 
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from itertools import accumulate
 from operator import attrgetter
@@ -112,7 +113,26 @@ def _specials(schema: Schema, cls: type) -> tuple[list[tuple[int, int, Any]], in
     return result, name_count
 
 
-def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+def only_vector(schema: Schema, cls: type) -> tuple[np.dtype[Any], int] | None:
+    """Return dtype and descriptor code of the vector that ends a type of numbers otherwise; else None."""
+    if not is_flat(schema):
+        return None
+    specials, _ = _specials(schema, cls)
+    if len(specials) != 1 or specials[0][0] != len(schema.fields) - 1:
+        return None
+    _, handling, known = specials[0]
+    return (known.dtype, known.head) if _is_vector(handling, known) else None
+
+
+def block_struct(schema: Schema, cls: type) -> struct.Struct | None:
+    """Return the struct of the block of a type of numbers, or of numbers before one vector; else None."""
+    if not is_flat(schema) or (_specials(schema, cls)[0] and only_vector(schema, cls) is None):
+        return None
+    return writing_structs(schema, block_size(schema))[0][0]
+
+
+def getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """Return a function from a message to the tuple of its fields."""
     if len(names) > 1:
         return attrgetter(*names)
     get = attrgetter(names[0])
@@ -127,7 +147,7 @@ def make_layout(schema: Schema, cls: type) -> Layout:
     specials, name_count = _specials(schema, cls)
     block = block_size(schema)
     pack = writing_structs(schema, block)[0][0].pack
-    get_all = _getter([field.name for field in schema.fields])
+    get_all = getter([field.name for field in schema.fields])
 
     def layout(message: Any) -> tuple[list[Any], int]:
         if message.__class__ is not cls:
@@ -222,7 +242,7 @@ def make_encode(schema: Schema, cls: type, fallback: Encode) -> Encode | None:
 def _encode_numbers(schema: Schema, cls: type, fallback: Encode) -> Encode:
     block = block_size(schema)
     pack = writing_structs(schema, block)[0][0].pack
-    get_all = _getter([field.name for field in schema.fields])
+    get_all = getter([field.name for field in schema.fields])
 
     def encode_numbers(message: Any, limit: int) -> bytes | None:
         try:
@@ -238,7 +258,7 @@ def _encode_numbers(schema: Schema, cls: type, fallback: Encode) -> Encode:
 def _encode_vector(schema: Schema, cls: type, fallback: Encode, known: _Array) -> Encode:
     block = block_size(schema)
     pack = writing_structs(schema, block)[0][0].pack
-    get_all = _getter([field.name for field in schema.fields])
+    get_all = getter([field.name for field in schema.fields])
     dtype, head = known.dtype, known.head
     itemsize = np.dtype(dtype).itemsize
     large = -(-block // 64) * 64
@@ -268,7 +288,7 @@ def _encode_stamped(schema: Schema, cls: type, fallback: Encode, known: _Array) 
     # Most messages are a stamp and an array. Naming the stamp saves a fifth of the time.
     block = block_size(schema)
     pack = writing_structs(schema, block)[0][0].pack
-    get_all = _getter([field.name for field in schema.fields])
+    get_all = getter([field.name for field in schema.fields])
     dtype, head = known.dtype, known.head
     itemsize = np.dtype(dtype).itemsize
     large = -(-block // 64) * 64

@@ -17,8 +17,20 @@ from cortex.codec import Codec
 from cortex.context import Closed
 from cortex.large import LargeSender, Reader, Slot
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
+from cortex.packer import make_packer
 from cortex.stats import PublisherCounters
-from cortex.wire import BATCH, LARGE, MESSAGE, RECORD, REST, TAIL, AttachKey, message_head, prefix
+from cortex.wire import (
+    BATCH,
+    HEADER_SIZE,
+    LARGE,
+    MESSAGE,
+    RECORD,
+    REST,
+    TAIL,
+    AttachKey,
+    message_head,
+    prefix,
+)
 
 logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
@@ -68,6 +80,7 @@ class Publisher(Generic[T]):
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         self._batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
+        self._pack = make_packer(codec, self._head)
         self._plain = not latch and not coalesce
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
@@ -116,18 +129,19 @@ class Publisher(Generic[T]):
             if not self._readers and not self.latch:
                 self._sequence += 1
                 return True
+            if self._plain:
+                sequence = self._sequence
+                frame = self._pack(message, sequence, now_ns, self._inline_max)
+                if frame is not None:
+                    self._sequence = sequence + 1
+                    self._bytes += len(frame) - HEADER_SIZE
+                    for send in self._lossy_sends:
+                        send(frame, DONTWAIT)
+                    return self._send_strict_all(frame) if self._strict_outlets else True
             body = self._encode(message, self._inline_max)
             if body is not None:
                 stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-                if not self._plain:
-                    return self._publish_inline(body, stamp_ns, now_ns)
-                sequence, size = self._sequence, len(body)
-                self._sequence = sequence + 1
-                self._bytes += size
-                frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
-                for send in self._lossy_sends:
-                    send(frame, DONTWAIT)
-                return self._send_strict_all(frame) if self._strict_outlets else True
+                return self._publish_inline(body, stamp_ns, now_ns)
         size = self.codec.size(message)
         stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
         with self._large_lock:
