@@ -7,6 +7,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from cortex.bench.report import case_lines, header, summary_lines, threshold_lin
 _QUICK_SECONDS = 0.05
 _QUICK_REPEATS = 2
 _QUICK_COUNT = 5_000
+_REGISTRY_START_S = 10.0
 _REGISTRY_LINGER_S = 60.0
 """The registry ends itself so long after the last node, should this process be killed."""
 
@@ -70,12 +72,15 @@ def _run_all(cases: list[Case], settings: Settings) -> list[CaseResult]:
     print(
         f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved; median ± half of the range\n"
     )
-    results = []
-    for case in cases:
-        result = run_case(case, settings, progress=_progress)
+    results: list[CaseResult] = []
+    try:
+        for case in cases:
+            results.append(run_case(case, settings, progress=_progress))
+            _progress("")
+            print("\n".join(case_lines(results[-1])), end="\n\n", flush=True)
+    except KeyboardInterrupt:
         _progress("")
-        print("\n".join(case_lines(result)), end="\n\n", flush=True)
-        results.append(result)
+        print("interrupted; what was measured until then:", end="\n\n")
     for table in (threshold_lines(results), summary_lines(results)):
         if text := "\n".join(table):
             print(text, end="\n\n")
@@ -95,6 +100,7 @@ def _own_registry(folder: Path) -> Iterator[None]:
     with open(folder / "registry.log", "ab") as log:
         registry = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": path})
     try:
+        _await_socket(folder)
         yield
     finally:
         registry.terminate()
@@ -107,6 +113,17 @@ def _own_registry(folder: Path) -> Iterator[None]:
             del os.environ["CORTEX_RUNTIME_DIR"]
         else:
             os.environ["CORTEX_RUNTIME_DIR"] = saved
+
+
+def _await_socket(folder: Path) -> None:
+    """Wait until the registry answers: a node that finds none would start another, which we could not end."""
+    deadline = time.monotonic() + _REGISTRY_START_S
+    while not list((folder / "rt").glob("*/registry")):
+        if time.monotonic() > deadline:
+            raise RuntimeError(
+                f"no registry within {_REGISTRY_START_S} s: {(folder / 'registry.log').read_text()}"
+            )
+        time.sleep(0.005)
 
 
 def _progress(text: str) -> None:

@@ -22,6 +22,8 @@ from cortex.bench.transports import missing
 _SHM = Path("/dev/shm")
 _GRACE_S = 30.0
 _SLOWEST_HZ = 2_000.0
+_PARENT_MAX = 40
+"""Longest directory of temporary files [characters]: paths of sockets end at 107."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,5 +290,8 @@ def _sweep(left: set[Path]) -> None:
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
     """Make the run's directory, with a path short enough for the sockets in it, and remove it afterwards."""
-    with tempfile.TemporaryDirectory(prefix="cxb", dir="/tmp" if Path("/tmp").is_dir() else None) as folder:
+    parent = tempfile.gettempdir()
+    with tempfile.TemporaryDirectory(
+        prefix="cxb", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"
+    ) as folder:
         yield Path(folder)
