@@ -74,7 +74,6 @@ class Publisher(Generic[T]):
         self._skipped = 0
         stamped = codec.stamp_of is not None
         self._type = codec.type
-        self._encode = codec.encode
         self._stamp_of = codec.stamp_of
         self._fingerprint = codec.fingerprint
         self._inline_max = inline_max
@@ -138,23 +137,16 @@ class Publisher(Generic[T]):
                     for send in self._lossy_sends:
                         send(frame, DONTWAIT)
                     return self._send_strict_all(frame) if self._strict_outlets else True
-            body = self._encode(message, self._inline_max)
-            if body is not None:
-                stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-                return self._publish_inline(body, stamp_ns, now_ns)
-        size = self.codec.size(message)
-        stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
+            prepared = self.codec.prepare(message, self._inline_max)
+            stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
+            if isinstance(prepared, bytes):
+                return self._publish_inline(prepared, stamp_ns, now_ns)
         with self._large_lock:
-            slot = self._acquire_slot(size)
+            slot = self._acquire_slot(prepared.size)
             if slot is None:
                 return False
-            try:
-                self.codec.encode_into(message, slot.buffer)
-            except BaseException:
-                with self._lock:
-                    self._large.abandon(slot)
-                raise
-            return self._publish_slot(slot, size, stamp_ns)
+            prepared.write(slot.buffer)
+            return self._publish_slot(slot, prepared.size, stamp_ns)
 
     @contextmanager
     def loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Iterator[Any]:

@@ -18,6 +18,17 @@ class RawMessage(NamedTuple):
     stamp_ns: int = 0
 
 
+class RawPlan(NamedTuple):
+    """A large body, ready to be written."""
+
+    body: bytes | np.ndarray
+    size: int
+
+    def write(self, buffer: np.ndarray) -> None:
+        """Copy the body."""
+        np.copyto(buffer[: self.size], np.frombuffer(self.body, np.uint8))
+
+
 class RawCodec:
     """Stands for a type that is known by its schema only: bodies pass through as they are."""
 
@@ -31,21 +42,12 @@ class RawCodec:
         stamped = any(f.name == "stamp_ns" and str(f.type).startswith(("int", "uint")) for f in schema.fields)
         self.stamp_of = _stamp if stamped else None
 
-    def encode(self, message: RawMessage, limit: int) -> bytes | None:
-        """The body, unless it is larger than the limit."""
-        return bytes(message.body) if len(message.body) <= limit else None
-
-    def size(self, message: RawMessage) -> int:
-        """Bytes of the body."""
-        if len(message.body) > BODY_LIMIT:
-            raise ValueError(f"a body has at most {BODY_LIMIT} bytes, got {len(message.body)}")
-        return len(message.body)
-
-    def encode_into(self, message: RawMessage, buffer: Any) -> int:
-        """Copy the body."""
+    def prepare(self, message: RawMessage, limit: int) -> bytes | RawPlan:
+        """The body, or what writes it if it is larger than the limit."""
         size = len(message.body)
-        np.copyto(np.frombuffer(buffer, np.uint8)[:size], np.frombuffer(message.body, np.uint8))
-        return size
+        if size > BODY_LIMIT:
+            raise ValueError(f"a body has at most {BODY_LIMIT} bytes, got {size}")
+        return bytes(message.body) if size <= limit else RawPlan(message.body, size)
 
     def draft_size(
         self, dims: Mapping[str, int] | None = None, dtypes: Mapping[str, Any] | None = None
