@@ -148,6 +148,19 @@ def test_ring_between_threads(programs: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
+def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
+    """Under the thread sanitizer: shared publishers, leases that end elsewhere, nodes that end under their users."""
+    done = subprocess.run(
+        [programs / "node_test"],
+        capture_output=True,
+        text=True,
+        timeout=120.0,
+        check=False,
+        env={**os.environ, "TSAN_OPTIONS": f"suppressions={CPP}/tests/tsan.supp"},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
+
+
 def test_installed_package_has_all_headers(programs: Path) -> None:
     installed = {path.name for path in (programs / "installed/include/cortex").iterdir()}
     assert installed == {path.name for path in (CPP / "include/cortex").iterdir()}

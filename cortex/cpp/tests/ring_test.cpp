@@ -143,6 +143,29 @@ int main() {
     }
     expect(refused, "a slot or size beyond the ring");
   }
+  // A reader that leaves keeps what it looks at, though the publisher writes to its slot again.
+  const auto held = std::make_shared<cortex::RingView>(source, ring.place(), 6);
+  const int kept = ring.acquire();
+  std::memset(ring.buffer(kept).data(), 21, 4096);
+  ring.commit(kept, messages + 20, 4096, 1u << 6);
+  std::shared_ptr<const void> keeper;
+  const auto kept_body = held->take(static_cast<std::uint32_t>(kept), messages + 20, 4096, keeper);
+  held->close();
+  ring.free_column(6);
+  for (int written = 0; written < 8; ++written) {
+    const int again = ring.acquire();
+    if (again >= 0) std::memset(ring.buffer(again).data(), 99, 4096);
+    if (again >= 0) ring.commit(again, messages + 30, 4096, 0);
+  }
+  expect(ring.buffer(kept)[0] == 99 && kept_body[0] == 21 && kept_body[4095] == 21, "a private copy of a slot");
+  keeper.reset();
+  ring.pin(kept);
+  for (int tries = 0; tries < 9; ++tries) {
+    const int other = ring.acquire();
+    expect(other != kept, "a pinned slot is not written");
+    if (other >= 0) ring.commit(other, messages + 40, 1, 0);
+  }
+  ring.unpin(kept);
   ring.free_column(5);
   for (auto place : {ring.place(), ring.place(), ring.place()}) {
     static int kind = 0;

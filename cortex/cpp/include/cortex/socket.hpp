@@ -2,6 +2,7 @@
 // How ZeroMQ sockets are set up, and a way to wake a thread that sleeps in poll.
 #pragma once
 
+#include <algorithm>
 #include <cerrno>
 #include <cstdint>
 #include <functional>
@@ -31,11 +32,14 @@ inline bool is_tcp(const std::string& address) { return address.rfind("tcp://", 
 
 // A socket that never blocks its owner at close, and over tcp notices a peer that is gone. On ipc the kernel reports
 // a dead peer at once, and a stopped one may still hold leases of shared memory.
+//
+// Of a SUB socket only the receiving queue is short: its subscriptions go through the sending one, which drops what
+// exceeds it.
 inline zmq::socket_t make_socket(zmq::context_t& context, zmq::socket_type type, bool tcp, int high_water_mark,
                                  int linger_ms) {
   zmq::socket_t socket(context, type);
   socket.set(zmq::sockopt::linger, linger_ms);
-  socket.set(zmq::sockopt::sndhwm, high_water_mark);
+  socket.set(zmq::sockopt::sndhwm, std::max(high_water_mark, queue_max));
   socket.set(zmq::sockopt::rcvhwm, high_water_mark);
   socket.set(zmq::sockopt::reconnect_ivl, 20);
   socket.set(zmq::sockopt::reconnect_ivl_max, 500);

@@ -1,0 +1,147 @@
+// SPDX-License-Identifier: Apache-2.0
+// Nodes in one process, used by many threads at once, for the thread sanitizer (ZeroMQ itself is not judged: it is
+// built without). No registry: the nodes are static peers.
+#include <atomic>
+#include <chrono>
+#include <iostream>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include <cortex/node.hpp>
+
+#include "peer_messages.hpp"
+
+using namespace std::chrono_literals;
+
+namespace {
+
+std::atomic<int> failures{0};
+
+void expect(bool condition, const std::string& what) {
+  if (!condition && ++failures < 10) std::cerr << "failed: " << what << "\n";
+}
+
+Scan scan_of(std::int64_t number, std::uint32_t size) {
+  Scan scan;
+  scan.stamp_ns = number;
+  scan.ranges = cortex::Array<float>::zeros({size});
+  for (auto& range : scan.ranges.writable()) range = static_cast<float>(number);
+  return scan;
+}
+
+bool is_whole(const Scan& scan) {
+  for (const float range : scan.ranges) {
+    if (range != static_cast<float>(scan.stamp_ns)) return false;
+  }
+  return true;
+}
+
+cortex::Options alone(const std::vector<std::string>& peers = {}) {
+  cortex::Options options;
+  options.registry = "off";
+  options.peers = peers;
+  return options;
+}
+
+// Two threads publish on one publisher, three subscriptions read: none of a reliable one's messages is missing.
+void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic, std::uint32_t size, int count) {
+  auto publisher = talker.advertise<Scan>(topic);
+  auto every = hearer.subscribe<Scan>(topic, cortex::reliable(16, 20s));
+  auto newest = hearer.subscribe<Scan>(topic, cortex::latest());
+  expect(publisher.wait_for_subscribers(2, 10s), "two subscribers attach");
+  std::vector<std::thread> threads;
+  for (int writer = 0; writer < 2; ++writer) {
+    threads.emplace_back([&publisher, size, count, writer] {
+      for (int number = 0; number < count; ++number) {
+        expect(publisher.publish(scan_of(2 * number + writer, size)), "a reliable subscriber keeps up");
+      }
+    });
+  }
+  threads.emplace_back([&newest] {
+    std::vector<cortex::Received<Scan>> held;
+    while (auto scan = newest.receive(200ms)) {
+      expect(is_whole(**scan), "a whole scan of the newest");
+      held.push_back(std::move(*scan));
+      if (held.size() > 2) held.erase(held.begin());
+    }
+    newest.close();
+    for (const auto& scan : held) expect(is_whole(*scan), "a scan that outlives its subscription");
+  });
+  std::vector<int> seen(static_cast<std::size_t>(2 * count), 0);
+  for (int left = 2 * count; left > 0; --left) {
+    const auto scan = every.receive(20s);
+    expect(scan.has_value(), "every scan arrives");
+    if (!scan) break;
+    expect(is_whole(**scan), "a whole scan");
+    ++seen[static_cast<std::size_t>((*scan)->stamp_ns)];
+  }
+  for (const int times : seen) expect(times == 1, "each scan arrives once");
+  for (auto& thread : threads) thread.join();
+  expect(every.counters().lost == 0 && every.counters().rejected == 0, "nothing is lost");
+}
+
+// A node that ends under its users: receivers return, publishers throw, received messages stay.
+void end_early() {
+  auto talker = std::make_unique<cortex::Node>("talker", alone());
+  auto hearer = std::make_unique<cortex::Node>("hearer", alone({talker->control_address()}));
+  auto publisher = talker->advertise<Scan>("/end");
+  auto subscription = hearer->subscribe<Scan>("/end", cortex::reliable(4, 100ms));
+  expect(publisher.wait_for_subscribers(1, 10s), "the subscriber attaches");
+  expect(publisher.publish(scan_of(7, 50'000)), "a large scan is published");
+  auto kept = subscription.receive(10s);
+  expect(kept.has_value(), "it arrives");
+  std::thread waiting([&subscription] {
+    while (auto scan = subscription.receive(30s)) expect(is_whole(**scan), "a whole scan");
+  });
+  std::atomic<bool> told{false};
+  std::thread talking([&publisher, &told] {
+    try {
+      for (int number = 0;; ++number) publisher.publish(scan_of(number, 5000));
+    } catch (const std::logic_error&) {
+      told = true;
+    }
+  });
+  std::this_thread::sleep_for(50ms);
+  hearer.reset();
+  waiting.join();
+  talker.reset();
+  talking.join();
+  expect(told, "the publisher tells that its node has ended");
+  expect(kept && is_whole(**kept), "a message outlives both nodes");
+}
+
+}  // namespace
+
+int main() {
+  {
+    cortex::Node talker{"talker", alone()};
+    cortex::Node hearer{"hearer", alone({talker.control_address()})};
+    std::thread large([&] { share(talker, hearer, "/large", 8000, 150); });
+    share(talker, hearer, "/small", 10, 500);
+    large.join();
+    auto wrong = talker.advertise<Scan>("/wrong");
+    bool refused = false;
+    try {
+      auto loan = wrong.loan({{"n", 100'000}});
+      loan->ranges = cortex::Array<float>::zeros({200'000});
+      loan.publish();
+    } catch (const std::invalid_argument&) {
+      refused = true;
+    }
+    expect(refused, "a loan does not take what does not fit");
+    for (int round = 0; round < 100; ++round) wrong.loan({{"n", 100'000}});  // slots come back unpublished
+    for (const char* topic : {"", "scan", "/", "/a//b", "/a/", "/a b"}) {
+      refused = false;
+      try {
+        talker.advertise<Scan>(topic);
+      } catch (const std::invalid_argument&) {
+        refused = true;
+      }
+      expect(refused, std::string("the topic '") + topic + "' is refused");
+    }
+  }
+  end_early();
+  std::cout << failures << " failures\n";
+  return failures == 0 ? 0 : 1;
+}
