@@ -1,0 +1,36 @@
+"""What a recording is made of: the names that writer and reader share.
+
+A recording is an MCAP file. Each publisher of a topic has a channel of its own, so that its sequence numbers
+mean something: message encoding `cortex` (the body of WIRE.md, section 5), schema encoding `cortex-json` (the
+canonical schema of section 4), and as metadata the fingerprint, the publisher's number, its node's name and
+whether it latches. `log_time` is when a message was received and `publish_time` when it was published, both
+as CLOCK_REALTIME was when the recording began, advanced by CLOCK_MONOTONIC: somebody who sets the clock
+meanwhile does not tear the recording apart. `sequence` holds the low 32 bits of the publisher's. The metadata
+record `cortex.start` says where and when, `cortex.end` what was counted, as JSON for each topic.
+"""
+
+from __future__ import annotations
+
+PROFILE = "cortex"
+MESSAGE_ENCODING = "cortex"
+SCHEMA_ENCODING = "cortex-json"
+FORMAT_VERSION = "1"
+START, END = "cortex.start", "cortex.end"
+
+
+class LogError(ValueError):
+    """A file is no recording, or is damaged where it should not be."""
+
+
+def require_mcap() -> None:
+    """Refuse in words if the library is missing.
+
+    Raises:
+        ImportError: It is not installed.
+    """
+    try:
+        import mcap  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            "recordings need the library mcap, which is not installed: pip install 'neurosim[record]'"
+        ) from error

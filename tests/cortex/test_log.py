@@ -1,0 +1,564 @@
+"""Recordings: what goes in comes out, whatever happens to the recorder, the disk or the file."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from peer import Block as Large
+from peer import Number, OtherNumber, Scan, is_whole, make_block
+from processes import ROOT, SOON_S, wait_for
+
+from cortex import MalformedMessage, Node, TypeMismatch, keep_last, reliable
+from cortex.log import Log, LogError, Player, Recorder, open_log
+from cortex.log.recorder import CHUNK_BYTES
+from cortex.schema import Schema, schema_of
+
+MakeNode = Callable[..., Node]
+
+
+@pytest.fixture
+def node(make_node: MakeNode) -> Node:
+    """A node that knows only itself, so that no registry has to start."""
+    return make_node("alone", registry="off")
+
+
+def numbers(log: Log, **options: object) -> list[int]:
+    return [message.value for _, message, _ in log.messages(**options)]  # type: ignore[arg-type]
+
+
+def write_numbers(path: Path, values: range, *, gap_ns: int = 10_000_000, chunk_size: int = 1 << 20) -> None:
+    """A recording with one message every 10 ms, without waiting for it."""
+    from mcap.writer import CompressionType, Writer
+
+    from cortex.codec import codec_of
+
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_size, compression=CompressionType.NONE)
+        writer.start("cortex", "test")
+        schema = writer.register_schema("Number", "cortex-json", schema_of(Number).to_json().encode())
+        channel = writer.register_channel("/number", "cortex", schema, {"source": "a1", "node": "writer"})
+        for value in values:
+            body = codec_of(Number).encode(Number(-value, value), 1000)
+            assert body is not None
+            at_ns = 10**18 + value * gap_ns
+            writer.add_message(channel, at_ns, body, at_ns, value)
+        writer.finish()
+
+
+def test_what_is_recorded_can_be_read(node: Node, tmp_path: Path) -> None:
+    """Typed, generic and raw, small and large, with all that is known besides."""
+    path = tmp_path / "run.mcap"
+    number, block = node.publisher("/number", Number), node.publisher("/block", Large)
+    before_ns = time.time_ns()
+    with Recorder(node, path, ["/number", "/block"]) as recorder:
+        assert number.wait_for_subscribers()
+        assert block.wait_for_subscribers()
+        for i in range(100):
+            number.publish(Number(10**18 + i, i))
+        for i in range(5):
+            block.publish(make_block(i, 300_000))
+        wait_for(lambda: recorder.stats.written == 105)
+    after_ns = time.time_ns()
+    with open_log(path) as log:
+        assert log.cut == ""
+        assert [(t.topic, t.schema, t.message_count, t.nodes) for t in log.topics] == [
+            ("/block", schema_of(Large), 5, ("alone",)),
+            ("/number", schema_of(Number), 100, ("alone",)),
+        ]
+        assert log.start["node"] == "alone"
+        assert json.loads(log.end["/number"]) == {
+            "written": 100, "bytes": 1600, "lost": 0, "overtaken": 0, "rejected": 0,
+        }  # fmt: skip
+        typed = list(log.messages(types={"/number": Number}))
+        assert [message for _, message, _ in typed] == [Number(10**18 + i, i) for i in range(100)]
+        for i, (topic, _, info) in enumerate(typed):
+            assert (topic, info.topic, info.node) == ("/number", "/number", "alone")
+            assert (info.sequence, info.stamp_ns, info.size) == (i, 10**18 + i, 16)
+            assert info.source == number.source
+            assert before_ns - 10**6 <= info.publish_ns <= info.log_ns <= after_ns + 10**6
+        assert all(is_whole(message) for _, message, _ in log.messages(["/block"]))
+        assert [schema for _, _, schema in log.raw(["/block"])] == [schema_of(Large)] * 5
+        times = [info.log_ns for info, _, _ in log.raw()]
+        assert times == sorted(times)
+        assert (log.start_ns, log.end_ns) == (times[0], times[-1])
+
+
+def test_other_tools_can_read_the_file(node: Node, tmp_path: Path) -> None:
+    """The library's own reader, which checks all sums, sees the same messages."""
+    from mcap.reader import make_reader
+
+    path = tmp_path / "run.mcap"
+    publisher = node.publisher("/number", Number)
+    with Recorder(node, path) as recorder:
+        assert publisher.wait_for_subscribers()
+        for i in range(1000):
+            publisher.publish(Number(i, i))
+        wait_for(lambda: recorder.stats.written == 1000)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        seen = [(schema, channel, message) for schema, channel, message in reader.iter_messages()]
+    assert [message.sequence for _, _, message in seen] == list(range(1000))
+    schema, channel, _ = seen[0]
+    assert schema is not None
+    assert Schema.from_json(schema.data.decode()) == schema_of(Number)
+    assert (channel.message_encoding, schema.encoding) == ("cortex", "cortex-json")
+    assert channel.metadata["fingerprint"] == f"{schema_of(Number).fingerprint:016x}"
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_a_busy_topic_is_recorded_without_loss(node: Node, tmp_path: Path, compression: str) -> None:
+    """Under `reliable`, the default, the publisher is held up rather than a message lost."""
+    path = tmp_path / "run.mcap"
+    publisher, other = node.publisher("/number", Number), node.publisher("/scan", Scan)
+    with Recorder(node, path, compression=compression) as recorder:
+        assert publisher.wait_for_subscribers()
+        assert other.wait_for_subscribers()
+        for i in range(20_000):
+            publisher.publish(Number(i, i))
+            if i % 1000 == 0:
+                other.publish(Scan(i, np.zeros(50_000, np.float32)))
+        wait_for(lambda: recorder.stats.written == 20_020)
+        assert recorder.stats.lost == 0
+    with open_log(path) as log:
+        assert numbers(log, topics=["/number"]) == list(range(20_000))
+        assert [info.stamp_ns for info, _, _ in log.raw(["/scan"])] == list(range(0, 20_000, 1000))
+
+
+def test_all_topics_are_recorded_also_those_that_come_later(make_node: MakeNode, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    robot, logger = make_node("robot"), make_node("logger")
+    first = robot.publisher("/first", Number)
+    with Recorder(logger, path) as recorder:
+        assert first.wait_for_subscribers()
+        first.publish(Number(1, 1))
+        second = make_node("late").publisher("/second", Scan)
+        assert second.wait_for_subscribers()
+        second.publish(Scan(2, np.ones(3, np.float32)))
+        first.close()
+        again = robot.publisher("/first", Number)  # has another number, and counts from 0 again
+        assert again.wait_for_subscribers()
+        again.publish(Number(3, 3))
+        other = robot.publisher("/first", OtherNumber)
+        assert other.wait_for_subscribers()
+        other.publish(OtherNumber(4, 0.5))
+        wait_for(lambda: recorder.stats.written == 4)
+    with open_log(path) as log:
+        found = {
+            (t.topic, t.schema.name, t.schema.fingerprint): (t.message_count, t.nodes) for t in log.topics
+        }
+        assert found == {
+            ("/first", "Number", schema_of(Number).fingerprint): (2, ("robot",)),
+            ("/first", "Number", schema_of(OtherNumber).fingerprint): (1, ("robot",)),
+            ("/second", "Scan", schema_of(Scan).fingerprint): (1, ("late",)),
+        }
+        infos = [info for info, _, _ in log.raw(["/first"])]
+        assert [info.sequence for info in infos] == [0, 0, 0]
+        assert len({info.source for info in infos}) == 3
+        with pytest.raises(TypeMismatch, match="recorded with another type"):
+            list(log.messages(types={"/second": Number}))
+
+
+def test_files_are_not_overwritten_by_mistake(node: Node, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(FileExistsError):
+        Recorder(node, path)
+    assert path.read_bytes() == b"precious"
+    with Recorder(node, path, overwrite=True):
+        pass
+    with open_log(path) as log:
+        assert (log.message_count, log.topics, log.duration_s) == (0, (), 0.0)
+
+
+def test_wrong_arguments_are_refused(node: Node, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with pytest.raises(ValueError, match="compression must be one of none, lz4, zstd, got 'rar'"):
+        Recorder(node, path, compression="rar")
+    with pytest.raises(ValueError, match="got 'number'"):
+        Recorder(node, path, ["number"])
+    with pytest.raises(ValueError, match="None records all"):
+        Recorder(node, path, [])
+    with pytest.raises(FileNotFoundError):
+        Recorder(node, tmp_path / "nowhere" / "run.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_library_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    with pytest.raises(ImportError, match=r"pip install 'neurosim\[record\]'"):
+        open_log(tmp_path / "run.mcap")
+
+
+def test_a_node_that_closes_first_ends_the_recording_in_order(make_node: MakeNode, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    node = make_node("alone", registry="off")
+    publisher = node.publisher("/number", Number)
+    recorder = Recorder(node, path)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(Number(1, 1))
+    wait_for(lambda: recorder.stats.written)
+    node.close()
+    wait_for(lambda: not recorder.running)
+    assert recorder.close().written == 1
+    with open_log(path) as log:
+        assert log.cut == ""
+        assert numbers(log) == [1]
+
+
+def test_best_effort_counts_what_it_loses(node: Node, tmp_path: Path) -> None:
+    """Everything that was published is either in the file or counted."""
+    path = tmp_path / "run.mcap"
+    publisher = node.publisher("/number", Number)
+    with Recorder(node, path, ["/number"], policy=keep_last(4)) as recorder:
+        assert publisher.wait_for_subscribers()
+        for i in range(30_000):
+            publisher.publish(Number(i, i))
+        last = 29_999
+
+        def is_complete() -> bool:
+            stats = recorder.stats
+            return stats.written + stats.lost == last + 1
+
+        wait_for(is_complete)
+    with open_log(path) as log:
+        values = numbers(log)
+        assert values == sorted(set(values))
+        assert values[-1] == last
+        ended = json.loads(log.end["/number"])
+        assert ended["written"] == len(values)
+        assert ended["written"] + ended["lost"] + ended["overtaken"] == last + 1
+
+
+# Files that were cut off or damaged
+
+RECORD = """
+import sys, time, resource
+from cortex import Node, reliable
+from cortex.log import Recorder
+from peer import Number
+limit = int(sys.argv[2])
+if limit:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+with Node("child", registry="off") as node:
+    publisher = node.publisher("/number", Number)
+    recorder = Recorder(node, sys.argv[1])
+    publisher.wait_for_subscribers()
+    number = 0
+    while recorder.running:
+        publisher.publish(Number(time.monotonic_ns(), number))
+        number += 1
+        if number % 10 == 0:
+            print(number, flush=True)
+            time.sleep(1e-3)
+    try:
+        recorder.close()
+    except OSError as error:
+        print(recorder.stats.written, recorder.stats.unwritten, error.errno, error, flush=True)
+"""
+
+
+@pytest.fixture
+def recording_child(runtime: Path, tmp_path: Path) -> Iterator[Callable[[int], subprocess.Popen[str]]]:
+    children: list[subprocess.Popen[str]] = []
+
+    def start(limit: int) -> subprocess.Popen[str]:
+        path = os.pathsep.join((str(ROOT), str(ROOT / "tests" / "cortex")))
+        child = subprocess.Popen(
+            [sys.executable, "-c", RECORD, str(tmp_path / "run.mcap"), str(limit)],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+        children.append(child)
+        return child
+
+    yield start
+    for child in children:
+        child.kill()
+        child.wait(SOON_S)
+        assert child.stdout is not None
+        child.stdout.close()
+
+
+def test_a_killed_recorder_leaves_all_but_the_last_second(
+    recording_child: Callable[[int], subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    child = recording_child(0)
+    assert child.stdout is not None
+    child.stdout.readline()
+    began = path.stat().st_size
+    wait_for(lambda: path.stat().st_size > began)
+    flushed_s = time.monotonic()
+    wait_for(lambda: time.monotonic() - flushed_s > 0.4)  # the worst moment: just before the next flush
+    killed_ns = time.monotonic_ns()
+    child.send_signal(signal.SIGKILL)
+    child.wait(SOON_S)
+    assert path.stat().st_size < CHUNK_BYTES  # so it was time, not size, that brought it into the file
+    with open_log(path) as log:
+        assert log.cut.startswith("it was not closed")
+        assert log.end == {}
+        values = numbers(log)
+        assert values == list(range(len(values)))
+        assert log.message_count == len(values)
+        last_ns = max(message.stamp_ns for _, message, _ in log.messages())
+        assert killed_ns - last_ns < 1_000_000_000
+
+
+def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(
+    recording_child: Callable[[int], subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    """RLIMIT_FSIZE stands for the full disk: a write fails in the middle."""
+    path = tmp_path / "run.mcap"
+    child = recording_child(300_000)
+    output, _ = child.communicate(timeout=SOON_S)
+    assert child.returncode == 0
+    written, unwritten, errno, text = output.splitlines()[-1].split(maxsplit=3)
+    assert "File too large" in text
+    assert f"{unwritten} messages that had arrived are not in the file" in text
+    assert str(path) in text
+    assert int(errno) > 0
+    assert path.stat().st_size <= 300_000
+    with open_log(path) as log:
+        values = numbers(log)
+        assert log.cut == "it was not closed"  # nothing is torn
+        assert values == list(range(int(written)))
+        assert int(unwritten) > 0
+
+
+def test_a_write_that_fails_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel may take a part of a record before it says that the disk is full."""
+    from cortex.log.sink import Sink
+
+    path = tmp_path / "file"
+    sink = Sink(path)
+    sink.write(b"whole")
+    plain_write = os.write
+    taken = iter([3])
+
+    def write(descriptor: int, data: memoryview) -> int:
+        for count in taken:
+            return plain_write(descriptor, data[:count])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write)
+        with pytest.raises(OSError, match="No space"):
+            sink.write(b"torn in two")
+    assert path.read_bytes() == b"whole"
+    sink.write(b", and on")
+    sink.close()
+    assert path.read_bytes() == b"whole, and on"
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of ten messages in several chunks."""
+    path = tmp_path_factory.mktemp("log") / "sample.mcap"
+    write_numbers(path, range(10), chunk_size=200)
+    return path
+
+
+def test_a_file_can_be_cut_anywhere(sample: Path, tmp_path: Path) -> None:
+    """What is read is a beginning of what was written, and never shrinks when more of the file is there."""
+    path = tmp_path / "cut.mcap"
+    data = sample.read_bytes()
+    most = 0
+    for size in range(len(data)):
+        path.write_bytes(data[:size])
+        if size < 8:
+            with pytest.raises(LogError, match="not an MCAP file"):
+                open_log(path)
+            continue
+        with open_log(path) as log:
+            values = numbers(log)
+            assert values == list(range(len(values)))
+            assert len(values) == log.message_count >= most
+            assert log.cut
+            most = len(values)
+    assert most == 10
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=4),
+    cut=st.booleans(),
+)
+def test_a_damaged_file_is_refused_in_words(sample: Path, changes: list[tuple[int, int]], cut: bool) -> None:
+    """Whatever the bytes are: a `LogError` or messages, nothing else, and nothing that takes long."""
+    data = bytearray(sample.read_bytes())
+    if cut:
+        del data[len(data) * 2 // 3 :]
+    for position, value in changes:
+        data[position % len(data)] = value
+    path = sample.with_name("damaged.mcap")
+    path.write_bytes(data)
+    try:
+        with open_log(path) as log:
+            assert len(numbers(log)) <= 10
+    except (LogError, MalformedMessage):
+        pass
+
+
+def test_other_files_are_refused_and_other_encodings_passed_over(tmp_path: Path) -> None:
+    from mcap.writer import CompressionType, Writer
+
+    text = tmp_path / "text"
+    text.write_text("no recording at all")
+    with pytest.raises(LogError, match="not an MCAP file"):
+        open_log(text)
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.NONE)
+    writer.start()
+    writer.add_message(writer.register_channel("/ros", "cdr", 0), 5, b"abc", 5)
+    writer.finish()
+    foreign = tmp_path / "foreign.mcap"
+    foreign.write_bytes(stream.getvalue())
+    with open_log(foreign) as log:
+        assert (log.foreign, log.topics, list(log.raw())) == (("/ros",), (), [])
+
+
+def test_a_range_of_time_and_topics_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    write_numbers(path, range(100), chunk_size=500)
+    with open_log(path) as log:
+        assert log.duration_s == pytest.approx(0.99)
+        assert numbers(log, start_s=0.5) == list(range(50, 100))
+        assert numbers(log, end_s=0.5) == list(range(50))
+        assert numbers(log, start_s=0.2, end_s=0.25) == list(range(20, 25))
+        assert numbers(log, start_s=5.0) == []
+        with pytest.raises(ValueError, match="has no topic /nothing; it has /number"):
+            next(log.raw(["/nothing"]))
+
+
+# Playing
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Iterator[Log]:
+    """50 messages, one every 10 ms."""
+    path = tmp_path / "run.mcap"
+    write_numbers(path, range(50))
+    with open_log(path) as log:
+        yield log
+
+
+def test_playing_keeps_the_pace_without_drift(node: Node, recording: Log) -> None:
+    """Message k is published at k * 10 ms / rate, never earlier, and delays do not add up."""
+    subscriber = node.subscriber("/number", Number, policy=reliable(100))
+    with Player(node, recording) as player:
+        began_ns = time.monotonic_ns()
+        assert player.run(rate=2.0) == 50
+        late_ns = player.late_ns
+    first_ns = 0
+    for k in range(50):
+        message, info = subscriber.recv_with_info(SOON_S)
+        assert message == Number(-k, k)  # the stamp is the recorded one
+        first_ns = first_ns or info.publish_ns
+        assert info.publish_ns - began_ns >= k * 5_000_000
+        # Each message is due on its own; what the machine was late with is all that may be added.
+        assert info.publish_ns - first_ns <= k * 5_000_000 + late_ns + 5_000_000
+
+
+def test_a_reliable_subscriber_gets_all_at_full_speed(make_node: MakeNode, tmp_path: Path) -> None:
+    """The player waits until the subscriber, in another node, is connected, and then for its queue."""
+    path = tmp_path / "run.mcap"
+    write_numbers(path, range(20_000), gap_ns=1000)
+    received: list[int] = []
+    listener, player_node = make_node("listener"), make_node("player")
+    subscriber = listener.subscriber(
+        "/number", Number, lambda m: received.append(m.value), policy=reliable(32)
+    )
+    wait_for(lambda: any(t.topic == "/number" for t in player_node.topics()))
+    with open_log(path) as log, Player(player_node, log) as player:
+        assert player.run(rate=float("inf")) == 20_000
+        wait_for(lambda: len(received) == 20_000)
+    assert received == list(range(20_000))
+    assert subscriber.counters.lost == 0
+
+
+def test_a_part_is_played_under_another_name_again_and_again(node: Node, recording: Log) -> None:
+    subscriber = node.subscriber("/again", Number, policy=reliable(1000))
+    with Player(node, recording, remap={"/number": "/again"}) as player:
+        thread = threading.Thread(
+            target=lambda: player.run(rate=20.0, start_s=0.1, duration_s=0.05, loop=True), daemon=True
+        )
+        thread.start()
+        values = [subscriber.recv(SOON_S).value for _ in range(23)]
+        player.stop()
+        thread.join(SOON_S)
+        assert not thread.is_alive()
+    assert values == [10 + k % 5 for k in range(23)]
+
+
+def test_a_paused_player_waits_and_goes_on_where_it_was(node: Node, recording: Log) -> None:
+    subscriber = node.subscriber("/number", Number, policy=reliable(100))
+    with Player(node, recording) as player:
+        player.pause()
+        thread = threading.Thread(target=player.run, daemon=True)
+        thread.start()
+        with pytest.raises(TimeoutError):
+            subscriber.recv(0.3)
+        player.resume()
+        began_ns = time.monotonic_ns()
+        values = [subscriber.recv(SOON_S).value for _ in range(50)]
+        # The pause has shifted the rest: it is not caught up with by playing faster.
+        assert time.monotonic_ns() - began_ns >= 400_000_000
+        thread.join(SOON_S)
+    assert values == list(range(50))
+
+
+def test_what_was_latched_is_latched_again(node: Node, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    publisher = node.publisher("/map", Number, latch=True)
+    publisher.publish(Number(7, 7))
+    with Recorder(node, path) as recorder:
+        wait_for(lambda: recorder.stats.written == 1)
+    publisher.close()
+    with open_log(path) as log, Player(node, log) as player:
+        assert log.topics[0].latch
+        player.run()
+        assert node.subscriber("/map", Number).recv(SOON_S) == Number(7, 7)
+
+
+def test_playing_nothing_is_refused(node: Node, recording: Log) -> None:
+    with pytest.raises(ValueError, match="has no topic /other; it has /number"):
+        Player(node, recording, topics=["/other"])
+    with pytest.raises(ValueError, match="has no topic /other"):
+        Player(node, recording, remap={"/other": "/new"})
+    with pytest.raises(ValueError, match="got 'new'"):
+        Player(node, recording, remap={"/number": "new"})
+    with Player(node, recording) as player:
+        with pytest.raises(ValueError, match="no message from 7 s to the end"):
+            player.run(start_s=7.0, loop=True)
+        with pytest.raises(ValueError, match="rate must be > 0, got 0"):
+            player.run(rate=0.0)
+
+
+def test_descriptors_are_given_back(node: Node, tmp_path: Path) -> None:
+    """Recording and reading many times leaves no file open."""
+
+    def once(number: int) -> None:
+        path = tmp_path / f"{number}.mcap"
+        with Recorder(node, path, ["/number"]):
+            pass
+        open_log(path).close()
+
+    once(0)
+    before = len(os.listdir("/proc/self/fd"))
+    for number in range(1, 20):
+        once(number)
+    assert len(os.listdir("/proc/self/fd")) <= before + 2
