@@ -1,0 +1,7 @@
+"""`python -m cortex`."""
+
+import sys
+
+from cortex.cli import main
+
+sys.exit(main())

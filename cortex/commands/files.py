@@ -1,0 +1,150 @@
+"""`cortex record` and `cortex play`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from cortex.commands.session import UsageError, hint, open_node
+from cortex.commands.text import bytes_of, plain, seconds, table
+from cortex.log import Log, Player, Recorder, RecordStats, open_log
+from cortex.policy import keep_last
+
+_TICK_S = 0.1
+_REPORT_S = 1.0
+_NOTHING_S = 3.0
+
+
+def record(options: argparse.Namespace) -> int:
+    """`cortex record`; it ends with Ctrl-C, SIGTERM, or after `--duration`."""
+    if not options.all and not options.topic:
+        raise UsageError("say which topics to record, or --all")
+    if options.all and options.topic:
+        raise UsageError(f"--all records every topic: leave out {' '.join(options.topic)}")
+    if options.output.exists() and not options.force:
+        raise FileExistsError(f"{options.output} exists: choose another name, or --force to overwrite it")
+    stop = threading.Event()
+    with open_node(options) as node:
+        recorder = Recorder(
+            node,
+            options.output,
+            None if options.all else options.topic,
+            policy=keep_last(1024) if options.best_effort else None,
+            overwrite=options.force,
+            compression=options.compression,
+        )
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        hint(f"recording into {options.output}; Ctrl-C ends it")
+        _wait_for_end(recorder, stop, options.duration)
+        stats = recorder.close()
+    _report(options.output, stats)
+    return 0
+
+
+def _wait_for_end(recorder: Recorder, stop: threading.Event, duration_s: float | None) -> None:
+    began_s = report_s = time.monotonic()
+    warned = False
+    while recorder.running and not stop.wait(_TICK_S):
+        now_s = time.monotonic()
+        if duration_s is not None and now_s - began_s >= duration_s:
+            break
+        if now_s - report_s >= _REPORT_S:
+            report_s = now_s
+            stats = recorder.stats
+            if sys.stderr.isatty():
+                text = (
+                    f"{stats.duration_s:.0f} s  {bytes_of(stats.file_bytes)}  {len(stats.topics)} topics  "
+                    f"{stats.written:,} messages  {stats.lost:,} lost"
+                )
+                print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+            if not stats.written and not warned and now_s - began_s > _NOTHING_S:
+                warned = True
+                hint("nothing has come yet: `cortex topics` shows what is published")
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def _report(path: Path, stats: RecordStats) -> None:
+    rows = [
+        (topic, f"{s.written:,}", bytes_of(s.bytes), f"{s.lost:,}", f"{s.overtaken:,}", f"{s.rejected:,}")
+        for topic, s in stats.topics.items()
+    ]
+    if rows:
+        for line in table(("topic", "messages", "size", "lost", "overtaken", "rejected"), rows):
+            print(line)
+    print(f"{path}: {stats.written:,} messages in {stats.duration_s:.1f} s, {bytes_of(stats.file_bytes)}")
+
+
+def play(options: argparse.Namespace) -> int:
+    """`cortex play`."""
+    with open_log(options.file) as log:
+        if log.cut:
+            hint(f"{options.file}: {log.cut}; it is played up to there")
+        for topic in log.foreign:
+            hint(f"{plain(topic)} is passed over: its messages are not those of Cortex")
+        if options.info:
+            _describe(log)
+            return 0
+        remap = dict(_split(pair) for pair in options.remap)
+        with (
+            open_node(options) as node,
+            Player(node, log, topics=options.topic or None, remap=remap) as player,
+        ):
+            if options.paused:
+                player.pause()
+                threading.Thread(target=_toggle_on_enter, args=(player,), daemon=True).start()
+                hint("paused; Enter goes on and pauses again")
+            progress = threading.Thread(target=_show_progress, args=(player, log), daemon=True)
+            progress.start()
+            try:
+                count = player.run(
+                    rate=options.rate, start_s=options.start, duration_s=options.duration, loop=options.loop
+                )
+            finally:
+                player.stop()
+                progress.join(1.0)
+            hint(f"{count:,} messages played" + _lateness(player, options.rate))
+    return 0
+
+
+def _lateness(player: Player, rate: float) -> str:
+    return f"; the latest was {seconds(player.late_ns * 1e-9)} late" if rate != math.inf else ""
+
+
+def _describe(log: Log) -> None:
+    rows = [
+        (entry.topic, entry.schema.name, f"{entry.message_count:,}", plain(", ".join(entry.nodes)))
+        for entry in log.topics
+    ]
+    for line in table(("topic", "<type", "messages", "<from"), rows):
+        print(line)
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(log.start_ns * 1e-9))
+    print(f"{log.path}: {log.message_count:,} messages, {log.duration_s:.3f} s from {began} on")
+
+
+def _split(pair: str) -> tuple[str, str]:
+    old, separator, new = pair.partition(":=")
+    if not separator:
+        raise UsageError(f"--remap takes /old:=/new, got {pair!r}")
+    return old, new
+
+
+def _toggle_on_enter(player: Player) -> None:
+    for _ in sys.stdin:
+        (player.resume if player.paused else player.pause)()
+
+
+def _show_progress(player: Player, log: Log) -> None:
+    if not sys.stderr.isatty():
+        return
+    while not player.wait_stopped(_TICK_S):
+        state = "  paused" if player.paused else ""
+        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {player.published:,} messages{state}"
+        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+    print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,199 @@
+"""`cortex echo`, `hz`, `bw` and `delay`: what goes over a topic, and how regularly."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from cortex.codec import MalformedMessage, codec_of
+from cortex.commands.session import CommandError, Patience, hint, open_node
+from cortex.commands.text import bytes_of, message_lines, rate, seconds, to_plain
+from cortex.node import Node
+from cortex.policy import keep_last
+from cortex.schema import type_from_schema
+from cortex.subscriber import Info, Subscriber
+
+_WAIT_S = 0.1
+_PERIOD_NS = 1_000_000_000
+_HEAD_EVERY = 20
+_QUEUE = 4096
+_COLUMN = 11
+
+
+def echo(options: argparse.Namespace) -> int:
+    """`cortex echo`."""
+    arrays = "none" if options.no_arrays else "full" if options.full else "short"
+    with open_node(options) as node, _subscribe(node, options.topic, 64) as subscriber:
+        patience = Patience(node, options.topic)
+        shown = 0
+        try:
+            while options.count is None or shown < options.count:
+                try:
+                    info, body, schema = subscriber.recv_raw(_WAIT_S)
+                except TimeoutError:
+                    patience.check()
+                    continue
+                patience.heard()
+                try:
+                    message = codec_of(type_from_schema(schema)).decode(body)
+                except MalformedMessage as error:
+                    hint(f"{info.topic} #{info.sequence} cannot be read: {error}")
+                    continue
+                shown += 1
+                if options.json:
+                    _print_json(info, to_plain(schema, message, arrays=not options.no_arrays))
+                else:
+                    facts = f"#{info.sequence}  {bytes_of(info.size)}  {seconds(info.latency_ns * 1e-9)}"
+                    lines = [f"--- {info.topic}  {facts}", *message_lines(schema, message, arrays=arrays)]
+                    print("\n".join(lines), flush=True)
+        finally:
+            missed = subscriber.counters.overtaken + subscriber.counters.lost
+            if missed:
+                hint(f"{missed:,} further messages came faster than they could be shown")
+    return 0
+
+
+def _print_json(info: Info, message: dict[str, Any]) -> None:
+    facts = {
+        "topic": info.topic,
+        "source": f"{info.source:016x}",
+        "sequence": info.sequence,
+        "latency_ns": info.latency_ns,
+        "size": info.size,
+        "message": message,
+    }
+    print(json.dumps(facts, allow_nan=False), flush=True)
+
+
+def show_rate(options: argparse.Namespace) -> int:
+    """`cortex hz`: the time between messages as they were published, which our own delays do not change."""
+    last: dict[int, tuple[int, int]] = {}
+
+    def period(info: Info) -> float | None:
+        sequence, publish_ns = last.get(info.source, (-1, 0))
+        last[info.source] = info.sequence, info.publish_ns
+        return (info.publish_ns - publish_ns) * 1e-9 if info.sequence == sequence + 1 > 0 else None
+
+    return _watch(options, period, "period", seconds)
+
+
+def show_bandwidth(options: argparse.Namespace) -> int:
+    """`cortex bw`."""
+    return _watch(options, lambda info: float(info.size), "size", bytes_of)
+
+
+def show_delay(options: argparse.Namespace) -> int:
+    """`cortex delay`."""
+    if not options.stamp:
+        return _watch(options, lambda info: info.latency_ns * 1e-9, "delay", seconds)
+
+    def age(info: Info) -> float:
+        if info.stamp_ns is None:
+            raise CommandError(f"the messages of {info.topic} have no stamp_ns")
+        return (time.time_ns() - info.stamp_ns) * 1e-9
+
+    return _watch(options, age, "age", seconds)
+
+
+class _Second:
+    """What came within one second."""
+
+    def __init__(self) -> None:
+        self.began_ns = time.monotonic_ns()
+        self.values: list[float] = []
+        self.seen = 0
+        self.bytes = 0
+        self.missed = 0
+
+
+def _watch(
+    options: argparse.Namespace,
+    measure: Callable[[Info], float | None],
+    what: str,
+    show: Callable[[float], str],
+) -> int:
+    """Print a line of statistics each second, over the last `--window` seconds."""
+    with open_node(options) as node, _subscribe(node, options.topic, _QUEUE) as subscriber:
+        patience = Patience(node, options.topic)
+        window: deque[tuple[_Second, np.ndarray, float]] = deque(maxlen=max(1, round(options.window)))
+        printed = 0
+        for second in _by_second(subscriber, measure, patience):
+            if not second.seen and not window:
+                continue
+            elapsed_s = (time.monotonic_ns() - second.began_ns) * 1e-9
+            window.append((second, np.array(second.values), elapsed_s))
+            if printed % _HEAD_EVERY == 0:
+                print(_line("rate", "bandwidth", what, "std", "min", "p50", "p99", "max", "lost"))
+            print(_statistics(window, show), flush=True)
+            printed += 1
+            if options.count is not None and printed >= options.count:
+                break
+    return 0
+
+
+def _by_second(
+    subscriber: Subscriber[Any], measure: Callable[[Info], float | None], patience: Patience
+) -> Iterator[_Second]:
+    second = _Second()
+    before = 0
+    started = False
+    while True:
+        left_ns = second.began_ns + _PERIOD_NS - time.monotonic_ns()
+        if left_ns > 0:
+            try:
+                info, _, _ = subscriber.recv_raw(min(left_ns * 1e-9, _WAIT_S))
+            except TimeoutError:
+                patience.check()
+                continue
+            patience.heard()
+            value = measure(info)
+            if not started:  # the first message begins the first second, and counts for none
+                started, second = True, _Second()
+                continue
+            second.seen += 1
+            second.bytes += info.size
+            if value is not None:
+                second.values.append(value)
+            continue
+        missed = subscriber.counters.lost + subscriber.counters.overtaken
+        second.missed, before = missed - before, missed
+        yield second
+        second = _Second()
+
+
+def _statistics(window: deque[tuple[_Second, np.ndarray, float]], show: Callable[[float], str]) -> str:
+    values = np.concatenate([values for _, values, _ in window])
+    elapsed_s = sum(elapsed_s for _, _, elapsed_s in window)
+    seen = sum(second.seen for second, _, _ in window)
+    missed = sum(second.missed for second, _, _ in window)
+    # What we did not see was published, too; it is taken to be as large as the rest.
+    share = (seen + missed) / seen if seen else 0.0
+    sizes = sum(second.bytes for second, _, _ in window) * share
+    if not seen:
+        return f"no message for {elapsed_s:.0f} s"
+    if not values.size:
+        values = np.array([float("nan")])
+    low, middle, high, top = np.percentile(values, (0, 50, 99, 100))
+    return _line(
+        rate((seen + missed) / elapsed_s),
+        f"{bytes_of(sizes / elapsed_s)}/s",
+        *map(show, (float(values.mean()), float(values.std()), low, middle, high, top)),
+        f"{sum(second.missed for second, _, _ in window):,}",
+    )
+
+
+def _line(*cells: str) -> str:
+    return "".join(cell.rjust(_COLUMN) for cell in cells)
+
+
+def _subscribe(node: Node, topic: str, depth: int) -> Subscriber[Any]:
+    subscriber: Subscriber[Any] = node.subscriber(topic, None, policy=keep_last(depth))
+    sys.stdout.flush()
+    return subscriber
