@@ -22,6 +22,8 @@ from types import TracebackType
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1
+_ALARM_S = 5
+"""So long after its deadline a child ends itself, should nobody be left to kill it."""
 
 Report = dict[str, Any]
 
@@ -98,6 +100,7 @@ class Child:
         if self.pid == 0:
             os.close(to_child[1])
             os.close(from_child[0])
+            signal.alarm(int(deadline_s) + _ALARM_S)
             _run(role, Channel(to_child[0], from_child[1]), job, log, parent)
         os.close(to_child[0])
         os.close(from_child[1])
@@ -190,7 +193,7 @@ def _run(role: Callable[[Channel, Any], None], channel: Channel, job: Any, log: 
 
 
 def _die_with_parent(parent: int) -> None:
-    """Ask the kernel to kill this process when its parent ends (Linux; elsewhere the closed pipe ends it)."""
+    """Ask the kernel to kill this process when its parent ends (Linux; elsewhere its alarm ends it)."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
