@@ -149,7 +149,7 @@ def test_ring_between_threads(programs: Path) -> None:
 
 
 def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
-    """Under the thread sanitizer: shared publishers, leases that end elsewhere, nodes that end under their users."""
+    """Under the thread sanitizer: shared publishers, leases that end elsewhere, nodes that end early."""
     done = subprocess.run(
         [programs / "node_test"],
         capture_output=True,

@@ -323,11 +323,15 @@ class Node {
     for (const auto& endpoint : node.endpoints) {
       if (endpoint.transport == "ipc" && same_host) return &endpoint;
     }
+    bool keyed = false;
     for (const auto& endpoint : node.endpoints) {
-      if (endpoint.transport == "tcp" && endpoint.server_key.empty()) return &endpoint;
+      if (endpoint.transport != "tcp") continue;
+      if (endpoint.server_key.empty()) return &endpoint;
+      keyed = true;
     }
     complaints_->once("reach " + std::to_string(node.node),
-                      "node '" + node.name + "' offers no address that this client can use (it has no CURVE)");
+                      "node '" + node.name + "' cannot be reached: " +
+                          (keyed ? "it wants CURVE, which this client has not" : "it does not listen beyond its host"));
     return nullptr;
   }
 
