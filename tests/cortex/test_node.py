@@ -1,0 +1,429 @@
+"""Nodes: who sees whom, what they are asked, junk on their control sockets, forks, and closing in any order."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import zmq
+from peer import Number, OtherNumber, Scan, make
+from processes import ROOT, wait_for
+
+from cortex import latest, reliable
+from cortex.context import new_socket
+from cortex.host import runtime_dir
+from cortex.node import Node
+from cortex.publisher import Closed
+from cortex.records import StatsReply, StatsRequest
+from cortex.registry import control_types
+from cortex.schema import schema_of
+from cortex.wire import control_frame, pack_header, parse_control, unpack_header
+
+DOMAIN_FILES = {"registry", "registry.lock", "registry.log"}
+
+
+def run_script(code, *, timeout_s=30.0):
+    """Run a program of its own; its output."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-X", "faulthandler", "-c", code],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'cortex'}"},
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+    assert done.returncode == 0, f"ended with {done.returncode}: {done.stdout}{done.stderr}"
+    return done.stdout.split()
+
+
+# Seeing each other
+
+
+def test_a_name_is_needed(runtime):
+    for name in ("", "x" * 101):
+        with pytest.raises(ValueError, match="1 to 100 characters"):
+            Node(name)
+    assert not list(runtime.iterdir())
+
+
+def test_importing_the_package_and_its_parts_in_any_order(runtime):
+    """`from cortex import message` is the decorator, whatever was imported before."""
+    for first in ("cortex.host", "cortex.message", "cortex.node"):
+        code = f"import {first}\nfrom cortex import message, Node\nprint(callable(message), callable(Node))"
+        assert run_script(code) == ["True", "True"]
+
+
+def test_nodes_and_topics(make_node):
+    one, two = make_node("one"), make_node("two")
+    one.publisher("/scan", Scan)
+    one.publisher("/number", Number)
+    two.publisher("/scan", Scan)
+    two.publisher("/number", OtherNumber)
+    two.subscriber("/scan", None)
+    two.subscriber("/number", Number)
+    one.subscriber("/nobody", Scan)
+    for node in (one, two):
+        wait_for(lambda node=node: len(node.topics()) == 4)
+        wait_for(lambda node=node: node.topics()[-1].subscribers)
+        found = {(t.topic, t.fingerprint): t for t in node.topics()}
+        scan = found["/scan", schema_of(Scan).fingerprint]
+        assert sorted(scan.publishers) == ["one", "two"]
+        assert scan.subscribers == ("two",)
+        assert scan.schema == schema_of(Scan).to_json()
+        assert found["/number", schema_of(Number).fingerprint].subscribers == ("two",)
+        assert found["/number", schema_of(OtherNumber).fingerprint].publishers == ("two",)
+        assert found["/nobody", schema_of(Scan).fingerprint].publishers == ()
+        assert sorted(n.name for n in node.nodes()) == ["one", "two"]
+    two.close()
+    wait_for(lambda: [n.name for n in one.nodes()] == ["one"])
+    assert one.wait_for_registry(0.0)
+
+
+def test_domains_do_not_see_each_other(make_node):
+    publisher = make_node("one", domain=3).publisher("/numbers", Number)
+    subscriber = make_node("two", domain=4).subscriber("/numbers", Number)
+    assert not publisher.wait_for_subscribers(1, 0.5)
+    assert subscriber.publisher_count == 0
+
+
+def test_a_subscriber_that_is_there_first(make_node):
+    """In either order the two meet, within milliseconds."""
+    one, two = make_node("one"), make_node("two")
+    wait_for(lambda: len(one.nodes()) == 2 == len(two.nodes()))
+    for k, (first, second) in enumerate(itertools.product((one, two), repeat=2)):
+        subscriber = first.subscriber(f"/topic{k}", Number)
+        begin = time.monotonic()
+        publisher = second.publisher(f"/topic{k}", Number)
+        assert publisher.wait_for_subscribers()
+        assert time.monotonic() - begin < 2.0
+        publisher.publish(Number(0, k))
+        assert subscriber.recv(1.0).value == k
+
+
+# Counters of others
+
+
+def test_counters_of_this_and_other_nodes(make_node):
+    one, two = make_node("one"), make_node("two")
+    publisher = one.publisher("/numbers", Number)
+    subscriber = two.subscriber("/numbers", Number, policy=reliable())
+    assert publisher.wait_for_subscribers()
+    for value in range(10):
+        publisher.publish(Number(0, value))
+        subscriber.recv(1.0)
+    wait_for(lambda: len(two.nodes()) == 2)
+    for asked in (one, two):
+        sent = asked.ask_stats(one.id).publishers[0]
+        assert (sent.topic, sent.source, sent.subscribers) == ("/numbers", publisher.source, 1)
+        assert (sent.published, sent.timeouts, sent.skipped) == (10, 0, 0)
+        got = asked.ask_stats(two.id).subscribers[0]
+        assert (got.topic, got.policy) == ("/numbers", str(reliable()))
+        assert (got.received, got.lost, got.overtaken, got.rejected) == (10, 0, 0, 0)
+        assert got.latency_counts.sum() > 0
+    with pytest.raises(KeyError):
+        one.ask_stats(12345)
+
+
+def test_a_node_that_does_not_answer(make_node, start_child):
+    """A stopped process: an error in time."""
+    child = start_child("peer")
+    node_id = child.hear()["node"]
+    node = make_node()
+    wait_for(lambda: len(node.nodes()) == 2)
+    with child.stopped():
+        begin = time.monotonic()
+        with pytest.raises(TimeoutError, match=r"did not answer within 0\.2 s"):
+            node.ask_stats(node_id, timeout_s=0.2)
+        assert time.monotonic() - begin < 1.0
+    wait_for(lambda: node_id in {n.node for n in node.nodes()})
+    assert node.ask_stats(node_id, timeout_s=5.0).node == node_id
+
+
+# Junk
+
+
+def test_junk_on_the_control_socket(make_node, caplog):
+    """Rejected, counted, logged once; the node answers the next one."""
+    node = make_node(registry="off")
+    socket = new_socket(zmq.DEALER)
+    socket.linger = 0
+    good = control_frame(StatsRequest(0), 7)
+    request = bytearray(good)
+    request[3:4] = b"Q"
+    junk = [
+        [b""],
+        [b"junk"],
+        [b"x" * 200],
+        [good, b"more"],
+        [b"", good],
+        [good[:-1]],
+        [good + b"x"],
+        [pack_header(unpack_header(good)._replace(kind=b"M")) + good[64:]],
+        [pack_header(unpack_header(good)._replace(fingerprint=1)) + good[64:]],
+        [bytes(request[:-1])],
+    ]
+    try:
+        socket.connect(node.nodes()[0].endpoints[0].control)
+        for parts in junk:
+            socket.send_multipart(parts)
+        socket.send(control_frame(StatsRequest(0), 8))
+        assert socket.poll(5000)
+        reply, header = parse_control(socket.recv(), control_types(StatsReply))
+        assert header.sequence == 8
+        assert isinstance(reply, StatsReply)
+        assert reply.rejected == len(junk)
+        assert not socket.poll(20)
+    finally:
+        socket.close(0)
+    logged = [r for r in caplog.records if r.levelno >= logging.WARNING]
+    assert 1 <= len(logged) <= 3
+    assert "rejected a control frame" in " ".join(r.getMessage() for r in logged)
+
+
+# The end
+
+
+def test_closing_ends_everything(make_node):
+    node = make_node(registry="off")
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number)
+    client = node.client("/double", Number, Number)
+    node.close()
+    node.close()
+    for call in (
+        lambda: publisher.publish(Number(0, 0)),
+        lambda: subscriber.recv(0.0),
+        lambda: node.publisher("/numbers", Number),
+        lambda: node.subscriber("/numbers", Number),
+        lambda: node.raw_publisher("/numbers", schema_of(Number)),
+        lambda: node.service("/double", Number, Number, lambda request: request),
+        lambda: node.client("/double", Number, Number),
+    ):
+        with pytest.raises(Closed):
+            call()
+    with pytest.raises(ConnectionError):
+        client.call(Number(0, 0), timeout_s=0.05)
+    client.close()
+
+
+def test_closing_in_any_order(make_node):
+    """Publisher, subscriber and both nodes: all 24 orders, while messages flow."""
+    for order in itertools.permutations(range(4)):
+        one, two = make_node("one", registry="off"), make_node("two", registry="off")
+        publisher = one.publisher("/numbers", Number)
+        own = one.subscriber("/numbers", Number, lambda message: None)
+        subscriber = two.subscriber("/numbers", Number, lambda message: None)
+        assert publisher.wait_for_subscribers()
+        stop = threading.Event()
+
+        def publish(publisher=publisher, stop=stop):
+            with contextlib.suppress(Closed):
+                while not stop.is_set():
+                    publisher.publish(Number(0, 0))
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        things = [publisher, one, two, subscriber]
+        for index in order:
+            things[index].close()
+        own.close()
+        stop.set()
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+def test_closing_from_several_threads(make_node):
+    for _ in range(5):
+        node = make_node(registry="off")
+        publisher = node.publisher("/numbers", Number)
+        subscriber = node.subscriber("/numbers", Number, lambda message: None)
+        assert publisher.wait_for_subscribers()
+        closes = [node.close, publisher.close, subscriber.close] * 2
+        threads = [threading.Thread(target=close) for close in closes]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(10.0)
+            assert not thread.is_alive()
+
+
+def test_closing_is_quick(make_node):
+    """Also with a reliable subscriber that does not read."""
+    node, other = make_node("one"), make_node("two")
+    publisher = node.publisher("/scans", Scan)
+    subscriber = other.subscriber("/scans", Scan, policy=reliable(2, 0.01))
+    assert publisher.wait_for_subscribers()
+    for number in range(30):
+        publisher.publish(make(Scan, number, 100_000))
+    begin = time.monotonic()
+    node.close()
+    assert time.monotonic() - begin < 1.0
+    assert subscriber.recv(1.0).stamp_ns == 0
+    begin = time.monotonic()
+    other.close()
+    assert time.monotonic() - begin < 1.0
+
+
+def test_no_files_are_left(make_node):
+    node = make_node("one", listen="127.0.0.1")
+    names = set(os.listdir(runtime_dir(0)))
+    assert {name.partition(".")[2] for name in names - DOMAIN_FILES} == {"control", "lock", "lossy", "strict"}
+    assert all(os.stat(runtime_dir(0) / name).st_mode & 0o077 == 0 for name in names if name.endswith("lock"))
+    node.close()
+    wait_for(lambda: set(os.listdir(runtime_dir(0))) <= DOMAIN_FILES)
+
+
+def test_a_program_that_forgets_to_close(runtime):
+    """It ends, quickly, and leaves no files."""
+    code = """
+import time
+from cortex import Node
+from peer import Number, make, Scan
+node = Node("forgetful")
+publisher = node.publisher("/scans", Scan)
+subscriber = node.subscriber("/scans", Scan)
+callback = node.subscriber("/scans", Scan, lambda message: None)
+assert publisher.wait_for_subscribers(2)
+publisher.publish(make(Scan, 1, 200_000))
+kept = subscriber.recv(2.0)
+print(time.time())
+"""
+    (ended,) = run_script(code)
+    assert time.time() - float(ended) < 3.0
+    wait_for(lambda: set(os.listdir(runtime_dir(0))) <= DOMAIN_FILES)
+
+
+def test_a_program_that_raises_with_open_nodes(runtime):
+    code = """
+import sys
+from cortex import Node
+from peer import Number
+node = Node("failing")
+publisher = node.publisher("/numbers", Number)
+sys.exit(0) if publisher.publish(Number(0, 0)) else None
+"""
+    assert run_script(code) == []
+
+
+# Forks
+
+
+def test_a_fork_disturbs_neither_side(runtime):
+    """The parent's node goes on; the child ends as it likes, and may have a node of its own."""
+    code = """
+import os, sys, time
+from cortex import Node, reliable
+from peer import Number, Scan, make, number_of
+node = Node("parent")
+publisher = node.publisher("/scans", Scan)
+subscriber = node.subscriber("/scans", Scan, policy=reliable(8))
+assert publisher.wait_for_subscribers()
+publisher.publish(make(Scan, 1, 100_000))
+kept = subscriber.recv(2.0)
+pid = os.fork()
+if not pid:
+    assert kept.ranges[0] == 1.0
+    del kept
+    for call in (
+        lambda: publisher.publish(make(Scan, 2, 100)),
+        lambda: publisher.publish(make(Scan, 2, 100_000)),
+        lambda: subscriber.recv(0.0),
+        lambda: node.publisher("/more", Number),
+    ):
+        try:
+            call()
+        except RuntimeError:
+            continue
+        print("child", "used", "it")
+    node.close()
+    with Node("child") as own:
+        mine = own.publisher("/numbers", Number)
+        assert mine.wait_for_subscribers(1, 10.0)
+        mine.publish(Number(7, 7))
+        time.sleep(0.2)
+    sys.exit(0)
+numbers = node.subscriber("/numbers", Number)
+assert numbers.recv(10.0).value == 7
+assert os.waitpid(pid, 0)[1] == 0
+assert (kept.ranges == 1.0).all()
+for number in range(20):
+    assert publisher.publish(make(Scan, number, 100_000 if number % 2 else 10))
+    assert subscriber.recv(2.0).stamp_ns == number
+assert subscriber.counters.lost == 0
+node.close()
+print("parent", "lives")
+"""
+    assert run_script(code) == ["parent", "lives"]
+
+
+def test_a_fork_while_messages_flow(runtime):
+    """Locks that other threads hold at that moment do not stop the child from ending."""
+    code = """
+import os, sys, threading, time
+from cortex import Node
+from peer import Number
+node = Node("parent", registry="off")
+publisher = node.publisher("/numbers", Number)
+count = [0]
+node.subscriber("/numbers", Number, lambda message: count.__setitem__(0, count[0] + 1))
+assert publisher.wait_for_subscribers()
+stop = threading.Event()
+def publish():
+    while not stop.is_set():
+        publisher.publish(Number(0, 0))
+thread = threading.Thread(target=publish)
+thread.start()
+for _ in range(20):
+    pid = os.fork()
+    if not pid:
+        node.close()
+        sys.exit(0)
+    deadline = time.monotonic() + 10
+    while os.waitpid(pid, os.WNOHANG) == (0, 0):
+        assert time.monotonic() < deadline, "the child hangs"
+        time.sleep(0.005)
+before = count[0]
+deadline = time.monotonic() + 5
+while count[0] < before + 100:
+    assert time.monotonic() < deadline
+    time.sleep(0.01)
+stop.set()
+thread.join()
+node.close()
+print("done")
+"""
+    assert run_script(code, timeout_s=60.0) == ["done"]
+
+
+# The clock
+
+
+def test_a_jump_of_the_clock(make_node, monkeypatch):
+    """Somebody sets the clock by an hour: the stream goes on, latencies stay right, the others are told."""
+    one, two = make_node("one"), make_node("two")
+    publisher = one.publisher("/numbers", Number)
+    subscriber = two.subscriber("/numbers", Number, policy=latest())
+    assert publisher.wait_for_subscribers()
+    wait_for(lambda: len(two.nodes()) == 2)
+
+    def known():
+        return next(n for n in two.nodes() if n.node == one.id).clock_offset_ns
+
+    before_ns, real = known(), time.time_ns
+    for jump_ns in (3600 * 10**9, -3600 * 10**9):
+        monkeypatch.setattr(time, "time_ns", lambda jump_ns=jump_ns: real() + jump_ns)
+        wait_for(lambda jump_ns=jump_ns: abs(known() - before_ns - jump_ns) < 10**9)
+        for value in range(10):
+            publisher.publish(Number(0, value))
+            message, info = subscriber.recv_with_info(1.0)
+            assert message.value == value
+            assert 0 < info.latency_ns < 10**9
+    assert subscriber.counters.lost == 0
+    assert len(one.nodes()) == 2

@@ -1,0 +1,411 @@
+"""Publishing: order, snapshots, latching, coalescing, loans of small messages, threads, and the end."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+
+import numpy as np
+import pytest
+import zmq
+from peer import Number, Scan
+from processes import wait_for
+
+from cortex import keep_last, reliable
+from cortex.context import new_socket
+from cortex.publisher import Closed
+from cortex.wire import BATCH, HEADER_SIZE, MESSAGE
+
+LARGE = 100_000
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+def scan(number, size=3):
+    return Scan(number, np.full(size, number, np.float32))
+
+
+# What is refused
+
+
+def test_nobody_listens(node):
+    publisher = node.publisher("/numbers", Number)
+    assert all(publisher.publish(Number(0, value)) for value in range(10))
+    counters = publisher.counters
+    assert (counters.published, counters.timeouts, counters.skipped) == (10, 0, 0)
+    assert publisher.subscriber_count == 0
+    begin = time.monotonic()
+    assert not publisher.wait_for_subscribers(1, 0.05)
+    assert 0.05 <= time.monotonic() - begin < 1.0
+
+
+@pytest.mark.parametrize("listened", [False, True])
+def test_a_message_of_another_type_is_refused(node, listened):
+    publisher = node.publisher("/numbers", Number)
+    if listened:
+        node.subscriber("/numbers", Number)
+        assert publisher.wait_for_subscribers()
+    for wrong in (scan(1), None, {"stamp_ns": 1}, Number):
+        with pytest.raises(TypeError, match="/numbers carries Number, got"):
+            publisher.publish(wrong)
+
+
+def test_a_value_that_does_not_fit_takes_no_number(node):
+    """The subscriber sees no gap."""
+    publisher = node.publisher("/scans", Scan)
+    subscriber = node.subscriber("/scans", Scan)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(scan(0))
+    with pytest.raises((TypeError, ValueError), match="ranges"):
+        publisher.publish(Scan(1, np.zeros(3)))
+    with pytest.raises((TypeError, ValueError), match="ranges"):
+        publisher.publish(Scan(1, np.zeros(LARGE)))
+    with pytest.raises((TypeError, ValueError), match="stamp_ns"):
+        publisher.publish(Scan(2**63, np.zeros(LARGE, np.float32)))
+    publisher.publish(scan(2))
+    publisher.publish(scan(3, LARGE))
+    assert [subscriber.recv_with_info(1.0)[1].sequence for _ in range(3)] == [0, 1, 2]
+    assert subscriber.counters.lost == 0
+
+
+@pytest.mark.parametrize("topic", ["scan", "/", "/a//b", "/a b", "/ä", "", "/" + 200 * "x", 3])
+def test_a_topic_has_a_form(node, topic):
+    for make in (node.publisher, node.subscriber):
+        with pytest.raises(ValueError, match="a topic or service is named like"):
+            make(topic, Number)
+    assert node.topics() == []
+
+
+def test_a_type_must_be_a_message(node):
+    with pytest.raises(TypeError, match="int"):
+        node.publisher("/numbers", int)
+    with pytest.raises(TypeError, match="int"):
+        node.subscriber("/numbers", int)
+
+
+# Snapshots and order
+
+
+@pytest.mark.parametrize("size", [10, LARGE])
+def test_what_was_published_may_be_changed(node, size):
+    publisher = node.publisher("/scans", Scan)
+    subscriber = node.subscriber("/scans", Scan)
+    assert publisher.wait_for_subscribers()
+    ranges = np.ones(size, np.float32)
+    publisher.publish(Scan(1, ranges))
+    ranges[:] = 2.0
+    received = subscriber.recv(1.0).ranges
+    assert (received == 1.0).all()
+    assert not np.shares_memory(received, ranges)
+
+
+def test_arrays_that_are_not_contiguous(node):
+    publisher = node.publisher("/scans", Scan)
+    subscriber = node.subscriber("/scans", Scan)
+    assert publisher.wait_for_subscribers()
+    for size in (10, LARGE):
+        ranges = np.arange(2 * size, dtype=np.float32)[::-2]
+        publisher.publish(Scan(1, ranges))
+        np.testing.assert_array_equal(subscriber.recv(1.0).ranges, ranges)
+
+
+@pytest.mark.parametrize("coalesce", [False, True])
+def test_small_and_large_messages_keep_their_order(node, coalesce):
+    publisher = node.publisher("/scans", Scan, coalesce=coalesce)
+    subscriber = node.subscriber("/scans", Scan, policy=reliable(8, 10.0))
+    assert publisher.wait_for_subscribers()
+    sizes = [1, 1, 1, LARGE, 1, LARGE, LARGE, 1, 4096, 4097, 20_000, 1]
+    received = []
+
+    def take():
+        while len(received) < 240:
+            message, info = subscriber.recv_with_info(10.0)
+            assert (message.ranges == np.float32(message.stamp_ns)).all()
+            received.append((message.stamp_ns, info.sequence, len(message.ranges)))
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    for number, size in zip(range(240), itertools.cycle(sizes), strict=False):
+        assert publisher.publish(scan(number, size))
+    thread.join(20.0)
+    assert received == [(k, k, sizes[k % len(sizes)]) for k in range(240)]
+
+
+@pytest.mark.parametrize("coalesce", [False, True])
+def test_several_threads_publish(node, coalesce):
+    """Numbers are given in the order in which the messages go, whoever publishes; none is lost."""
+    publisher = node.publisher("/scans", Scan, coalesce=coalesce)
+    received = []
+    subscriber = node.subscriber(
+        "/scans", Scan, lambda m: received.append((m.stamp_ns, len(m.ranges))), policy=reliable(8, 20.0)
+    )
+    assert publisher.wait_for_subscribers()
+
+    def publish(thread):
+        for k in range(300):
+            assert publisher.publish(scan(1000 * thread + k, LARGE if k % 50 == 49 else 4))
+
+    threads = [threading.Thread(target=publish, args=(thread,)) for thread in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30.0)
+    wait_for(lambda: len(received) == 1200)
+    for thread in range(4):
+        assert [n % 1000 for n, _ in received if n // 1000 == thread] == list(range(300))
+    counters = subscriber.counters
+    assert (counters.received, counters.lost, counters.rejected) == (1200, 0, 0)
+    assert publisher.counters.published == 1200
+
+
+# Latching
+
+
+@pytest.mark.parametrize("size", [3, LARGE])
+@pytest.mark.parametrize("policy", [keep_last(4), reliable(4)], ids=str)
+def test_a_late_subscriber_gets_the_last_message(node, size, policy):
+    """Once; what follows comes as usual."""
+    publisher = node.publisher("/scans", Scan, latch=True)
+    for number in range(5):
+        publisher.publish(scan(number, size))
+    for late in range(3):
+        subscriber = node.subscriber("/scans", Scan, policy=policy)
+        message, info = subscriber.recv_with_info(5.0)
+        assert (message.stamp_ns, info.sequence) == (4 + late, 4 + late)
+        assert (message.ranges == 4.0 + late).all()
+        with pytest.raises(TimeoutError):
+            subscriber.recv(0.02)
+        publisher.publish(scan(5 + late, size))
+        assert subscriber.recv(2.0).stamp_ns == 5 + late
+        assert subscriber.counters.lost == 0
+        subscriber.close()
+
+
+def test_a_latch_that_was_filled_before_anybody_came_and_across_nodes(make_node):
+    publisher = make_node("early").publisher("/scans", Scan, latch=True)
+    publisher.publish(scan(1, LARGE))
+    subscriber = make_node("late").subscriber("/scans", Scan)
+    assert subscriber.recv(5.0).stamp_ns == 1
+
+
+def test_without_a_latch_a_late_subscriber_gets_nothing(node):
+    publisher = node.publisher("/scans", Scan)
+    publisher.publish(scan(1))
+    subscriber = node.subscriber("/scans", Scan)
+    assert publisher.wait_for_subscribers()
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.05)
+    empty = node.publisher("/empty", Scan, latch=True)
+    subscriber = node.subscriber("/empty", Scan)
+    assert empty.wait_for_subscribers()
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.05)
+
+
+def test_a_loan_is_latched_too(node):
+    publisher = node.publisher("/scans", Scan, latch=True)
+    for size in (3, LARGE):
+        with publisher.loan(n=size) as draft:
+            draft.stamp_ns = size
+            draft.ranges[:] = 7.0
+        subscriber = node.subscriber("/scans", Scan)
+        message = subscriber.recv(5.0)
+        assert message.stamp_ns == size
+        assert (message.ranges == 7.0).all()
+
+
+# Coalescing
+
+
+def listen(node):
+    """All frames of a node's lossy socket, as they are."""
+    endpoint = node.nodes()[0].endpoints[0]
+    socket = new_socket(zmq.SUB, high_water_mark=0)
+    for kind in (MESSAGE, BATCH):
+        socket.subscribe(b"CTX" + kind)
+    socket.connect(endpoint.lossy)
+    return socket
+
+
+def test_a_burst_travels_together(node):
+    """Far fewer frames than messages; every message comes, in order, with the time at which it was published."""
+    publisher = node.publisher("/numbers", Number, coalesce=True)
+    subscriber = node.subscriber("/numbers", Number, policy=keep_last(2000))
+    assert publisher.wait_for_subscribers()
+    socket = listen(node)
+    try:
+        wait_for(lambda: publisher.publish(Number(-1, -1)) and socket.poll(1))
+        while socket.poll(20):
+            socket.recv()
+        for value in range(1000):
+            publisher.publish(Number(value, value))
+        publisher.flush()
+        frames = []
+        while socket.poll(200):
+            frames.append(socket.recv())
+    finally:
+        socket.close(0)
+    messages = [subscriber.recv_with_info(1.0)]
+    while messages[-1][0].value < 999:
+        messages.append(subscriber.recv_with_info(1.0))
+    messages = [pair for pair in messages if pair[0].value >= 0]
+    assert [message.value for message, _ in messages] == list(range(1000))
+    times = [info.publish_ns for _, info in messages]
+    assert times == sorted(times)
+    assert len(set(times)) > 900
+    first = messages[0][1].sequence
+    assert [info.sequence for _, info in messages] == list(range(first, first + 1000))
+    assert len(frames) < 300
+    assert {frame[3:4] for frame in frames} <= {MESSAGE, BATCH}
+    assert max(map(len, frames)) > 10 * HEADER_SIZE
+
+
+def test_the_tail_of_a_burst_does_not_wait(node):
+    """It is sent when nothing more comes: within 0.15 ms, and a busy machine's scheduling."""
+    publisher = node.publisher("/numbers", Number, coalesce=True)
+    subscriber = node.subscriber("/numbers", Number, policy=keep_last(2000))
+    assert publisher.wait_for_subscribers()
+    delays_s = []
+    for burst in range(30):
+        for k in range(7):
+            publisher.publish(Number(burst, k))
+        begin = time.monotonic()
+        while subscriber.recv(2.0) != Number(burst, 6):
+            pass
+        delays_s.append(time.monotonic() - begin)
+    assert np.median(delays_s) < 2e-3
+    assert max(delays_s) < 0.5
+
+
+def test_a_lone_message_is_not_held_back(node):
+    """It goes as a plain message, at once."""
+    publisher = node.publisher("/numbers", Number, coalesce=True)
+    node.subscriber("/numbers", Number)
+    assert publisher.wait_for_subscribers()
+    socket = listen(node)
+    try:
+        for value in range(10):
+            wait_for(lambda value=value: publisher.publish(Number(0, value)) and socket.poll(5))
+            assert socket.recv()[3:4] == MESSAGE
+    finally:
+        socket.close(0)
+
+
+def test_closing_sends_what_is_held_back(make_node):
+    receiver = make_node("receiver")
+    subscriber = receiver.subscriber("/numbers", Number, policy=keep_last(100))
+    for close_node in (False, True):
+        node = make_node("sender")
+        publisher = node.publisher("/numbers", Number, coalesce=True)
+        assert publisher.wait_for_subscribers()
+        for value in range(50):
+            publisher.publish(Number(0, value))
+        (node if close_node else publisher).close()
+        assert [subscriber.recv(2.0).value for _ in range(50)] == list(range(50))
+
+
+# Coming and going
+
+
+def test_subscribers_are_counted(node):
+    publisher = node.publisher("/numbers", Number)
+    subscribers = [node.subscriber("/numbers", Number) for _ in range(3)]
+    assert publisher.wait_for_subscribers(3)
+    assert publisher.subscriber_count == 3
+    for left in (2, 1, 0):
+        subscribers.pop().close()
+        wait_for(lambda left=left: publisher.subscriber_count == left, 1.0)
+
+
+def test_attached_means_that_nothing_is_missed(node):
+    """From the moment that `wait_for_subscribers` returns, every message comes."""
+    for round_ in range(20):
+        publisher = node.publisher(f"/round{round_}", Number)
+        subscriber = node.subscriber(f"/round{round_}", Number)
+        assert publisher.wait_for_subscribers()
+        for value in range(3):
+            publisher.publish(Number(0, value))
+        assert [subscriber.recv(1.0).value for _ in range(3)] == [0, 1, 2]
+
+
+def test_counters(node):
+    publisher = node.publisher("/scans", Scan)
+    node.subscriber("/scans", Scan)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(scan(1, 10))
+    publisher.publish(scan(2, LARGE))
+    counters = publisher.counters
+    assert counters.published == 2
+    assert 4 * (10 + LARGE) <= counters.bytes < 4 * (10 + LARGE) + 300
+
+
+@pytest.mark.parametrize("options", [{}, {"latch": True}, {"coalesce": True}])
+def test_use_after_close(node, options):
+    publisher = node.publisher("/scans", Scan, **options)
+    subscriber = node.subscriber("/scans", Scan)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(scan(0))
+    publisher.close()
+    publisher.close()
+    for size in (1, LARGE):
+        with pytest.raises(Closed, match="the publisher of /scans is closed"):
+            publisher.publish(scan(1, size))
+        with pytest.raises(Closed, match="the publisher of /scans is closed"), publisher.loan(n=size):
+            pass
+    with pytest.raises(Closed):
+        publisher.wait_for_subscribers()
+    assert subscriber.recv(1.0).stamp_ns == 0
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.02)
+    assert publisher.counters.published == 1
+
+
+def test_closing_while_another_thread_is_held_up(node):
+    """It gets out at once, with `Closed`."""
+    publisher = node.publisher("/numbers", Number)
+    node.subscriber("/numbers", Number, policy=reliable(1, 30.0))
+    assert publisher.wait_for_subscribers()
+    ended = []
+
+    def publish():
+        try:
+            while True:
+                publisher.publish(Number(0, 0))
+        except Closed as error:
+            ended.append(str(error))
+
+    threads = [threading.Thread(target=publish) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    published = -1
+    while published != (published := publisher._sequence) or published < 100:
+        time.sleep(0.05)
+    begin = time.monotonic()
+    publisher.close()
+    for thread in threads:
+        thread.join(5.0)
+    assert ended == ["the publisher of /numbers is closed"] * 2
+    assert time.monotonic() - begin < 1.0
+
+
+def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(1, 30.0))
+    assert publisher.wait_for_subscribers()
+    done = threading.Event()
+
+    def publish():
+        for value in range(5000):
+            assert publisher.publish(Number(0, value))
+        done.set()
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    assert not done.wait(0.1)
+    subscriber.close()
+    assert done.wait(5.0)
+    thread.join()
