@@ -40,7 +40,7 @@ def new_socket(kind: int, *, tcp: bool = False, high_water_mark: int = 1000) -> 
     """
     socket = context().socket(kind)
     socket.linger = LINGER_MS
-    socket.set_hwm(high_water_mark)
+    socket.rcvhwm = high_water_mark  # that for sending, which also holds a SUB's subscriptions, stays 1000
     socket.setsockopt(zmq.RECONNECT_IVL, 20)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
     if tcp:

@@ -191,6 +191,11 @@ class FileLock:
                 self._descriptor = -1
 
     @classmethod
+    def no_fork(cls) -> threading.Lock:
+        """A lock that keeps other threads from `os.fork` while it is held."""
+        return cls._guard
+
+    @classmethod
     def _after_fork_in_child(cls) -> None:
         for lock in cls._held:
             os.close(lock._descriptor)

@@ -324,6 +324,11 @@ class LargeSender:
                 reader.outlet.send_anyway(frame)
         return ring
 
+    @property
+    def taken_in(self) -> bool:
+        """Whether all that was sent through slots has been given back; the caller holds the lock."""
+        return all(ring.idle for ring in self._rings)
+
     def close(self) -> None:
         """Let the rings go; readers keep what they have mapped. The caller holds the lock."""
         for ring in self._rings:

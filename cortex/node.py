@@ -30,7 +30,7 @@ from cortex.link import Link
 from cortex.outlet import Outlets
 from cortex.places import Places, clock_offset_ns, reach
 from cortex.policy import Policy, keep_last
-from cortex.publisher import INLINE_MAX, Publisher
+from cortex.publisher import INLINE_MAX, LINGER_S, Publisher
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import (
     NodeRecord,
@@ -113,7 +113,6 @@ class Node:
         self.id = secrets.randbits(64) or 1
         self._keys = keys
         self._pid = os.getpid()
-        self._host = host_id()
         self._lock = threading.RLock()
         self._outlets = Outlets()
         self._publishers: list[Publisher[Any]] = []
@@ -129,6 +128,7 @@ class Node:
         self.rejected = 0
         """Control frames that made no sense."""
         self._places = Places(self.domain, self.id, self._outlets, listen, keys=keys, insecure=insecure)
+        self._host = host_id()  # once the runtime directory exists: it counts
         try:
             self._directory = Directory(
                 context(),
@@ -323,8 +323,9 @@ class Node:
             self._closed = True
             publishers, subscribers = list(self._publishers), list(self._subscribers)
         self._flusher.close()
+        deadline_s = time.monotonic() + LINGER_S
         for publisher in publishers:
-            publisher.close()
+            publisher.close(max(0.0, deadline_s - time.monotonic()))
         for subscriber in subscribers:
             subscriber.close()
         self._callbacks.close()
@@ -332,6 +333,13 @@ class Node:
         if threading.current_thread() is not self._thread:
             self._thread.join(5.0)
         self._outlets.close()
+
+    def disown(self) -> None:
+        """Give up in a forked child: threads and sockets are the parent's."""
+        for publisher in self._publishers:
+            publisher.disown()
+        for subscriber in self._subscribers:
+            subscriber.disown()
 
     def __enter__(self) -> Node:
         return self
@@ -634,6 +642,7 @@ class Node:
         if header.kind == REQUEST:
             self._server.handle(frame, partial(self._reply, router, identity))
         elif header.kind == CONTROL and header.fingerprint == schema_of(StatsRequest).fingerprint:
+            parse_control(frame, control_types(StatsRequest))
             self._reply(router, identity, control_frame(self._stats(), header.sequence))
         else:
             answer = self._directory.answer(frame)
@@ -650,6 +659,14 @@ class Node:
             router, identity, frame = self._replies.popleft()
             with contextlib.suppress(zmq.Again, zmq.ZMQError):  # an asker that is gone gets nothing
                 router.send_multipart([identity, frame], zmq.DONTWAIT)
+
+
+def _after_fork_in_child() -> None:
+    for node in list(_nodes):
+        node.disown()
+
+
+os.register_at_fork(after_in_child=_after_fork_in_child)
 
 
 @atexit.register

@@ -41,6 +41,7 @@ INLINE_MAX = 16_384
 """Bodies up to this size travel in the frame; measured by `cortex bench threshold`."""
 REFRESH_NS = 1_000_000
 READERS_MAX = 1024
+LINGER_S = 0.5
 
 BURST_NS = 15_000
 """Two messages closer than this are a burst."""
@@ -427,15 +428,34 @@ class Publisher(Generic[T]):
             time.sleep(0.5e-3)
         return True
 
-    def close(self) -> None:
-        """Send what is held back, and leave the topic."""
+    def disown(self) -> None:
+        """Give up without touching the sockets, which belong to the process that this one was forked from."""
+        self._lock = threading.Lock()  # the old one may have been held at the fork
+        self._closed = True
+        self._refresh_ns = 0
+
+    def close(self, linger_s: float = LINGER_S) -> None:
+        """Send what is held back, and leave the topic.
+
+        Args:
+            linger_s: How long to wait for large messages that are on their way to be taken in [s].
+        """
         with self._lock:
             if self._closed:
                 return
-            if not self._outlets.closed:
-                self._flush()
             self._closed = True
             self._refresh_ns = 0  # so that `publish` looks
+            if not self._outlets.closed:
+                self._flush()
+        backoff = Backoff(linger_s)
+        while True:
+            with self._lock:
+                if not self._outlets.closed:
+                    self._outlets.refresh()
+                taken_in = self._outlets.closed or self._large.taken_in
+            if taken_in or not backoff.wait():
+                break
+        with self._lock:
             self._readers.clear()
             self._route()
             self._large.close()

@@ -389,7 +389,8 @@ def _spawn(command: list[str], descriptor: int, log: Path) -> None:
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
     environment["OPENBLAS_NUM_THREADS"] = "1"  # numpy would start threads that a registry has no use for
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-    with open(os.open(log, flags, 0o600), "ab") as output:
+    # `Popen` waits until nobody else has the end of a pipe; a process forked meanwhile would keep it.
+    with FileLock.no_fork(), open(os.open(log, flags, 0o600), "ab") as output:
         if output.tell() > _LOG_BYTES_MAX:
             output.truncate(0)
         detacher = subprocess.Popen(

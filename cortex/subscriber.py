@@ -546,7 +546,7 @@ class Subscriber(Generic[T]):
     @property
     def must_read(self) -> bool:
         """Whether the last look left something in a socket, which its descriptor may not show."""
-        return not self._exhausted and not self.policy.reliable
+        return not self._exhausted and (not self.policy.reliable or len(self._queue) < self.policy.depth)
 
     def fds(self) -> list[int]:
         """File descriptors that become readable when a message may have come."""
@@ -598,6 +598,7 @@ class Subscriber(Generic[T]):
                 return
             link.whole_batches = self._whole_batches
             self._links.append(link)
+            self._exhausted = False  # a descriptor shows nothing until its socket was found empty once
             self._links_changed()
 
     def sources(self) -> set[int]:
@@ -641,6 +642,12 @@ class Subscriber(Generic[T]):
                 self._links.remove(link)
                 del self._leaving[link]
                 self._links_changed()
+
+    def disown(self) -> None:
+        """Give up without touching the sockets, which belong to the process that this one was forked from."""
+        self._turn = Turn()  # the old one may have been held at the fork
+        self._lock = self._turn.lock
+        self._closed = True
 
     def close(self) -> None:
         """Stop receiving. Messages that the user still holds stay valid."""
