@@ -40,7 +40,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run_module("cortex.bench.command", arguments[1:])
     if arguments[:1] == ["discovery"]:
         return _run_module("cortex.discovery", arguments[1:])
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    if not arguments:
+        parser.print_help(sys.stderr)
+        return 2
+    options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format=f"cortex {options.command}: %(message)s")
     signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _terminate)

@@ -57,6 +57,7 @@ def look_around(options: argparse.Namespace) -> Node | None:
     Raises:
         CommandError: A registry or peer does not answer.
     """
+    read_keys(options.keys)  # wrong ones are worth an error even if nobody is there
     if _registry(options) == "auto" and not _is_registry_there(options.domain):
         # Opening a node would start a registry, only to hear from it that there is nobody.
         say_empty(options)

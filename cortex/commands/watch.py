@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections import deque
@@ -24,7 +25,7 @@ _WAIT_S = 0.1
 _PERIOD_NS = 1_000_000_000
 _HEAD_EVERY = 20
 _QUEUE = 4096
-_COLUMN = 11
+_COLUMN = 12
 
 
 def echo(options: argparse.Namespace) -> int:
@@ -105,8 +106,12 @@ def show_delay(options: argparse.Namespace) -> int:
 class _Second:
     """What came within one second."""
 
-    def __init__(self) -> None:
+    def __init__(self, since_ns: int) -> None:
         self.began_ns = time.monotonic_ns()
+        self.since_ns = since_ns
+        """When the last message before was published."""
+        self.last_ns = since_ns
+        """When the last message was published."""
         self.values: list[float] = []
         self.seen = 0
         self.bytes = 0
@@ -122,18 +127,13 @@ def _watch(
     """Print a line of statistics each second, over the last `--window` seconds."""
     with open_node(options) as node, _subscribe(node, options.topic, _QUEUE) as subscriber:
         patience = Patience(node, options.topic)
-        window: deque[tuple[_Second, np.ndarray, float]] = deque(maxlen=max(1, round(options.window)))
-        printed = 0
-        for second in _by_second(subscriber, measure, patience):
-            if not second.seen and not window:
-                continue
-            elapsed_s = (time.monotonic_ns() - second.began_ns) * 1e-9
-            window.append((second, np.array(second.values), elapsed_s))
+        window: deque[_Second] = deque(maxlen=max(1, round(options.window)))
+        for printed, second in enumerate(_by_second(subscriber, measure, patience)):
+            window.append(second)
             if printed % _HEAD_EVERY == 0:
                 print(_line("rate", "bandwidth", what, "std", "min", "p50", "p99", "max", "lost"))
             print(_statistics(window, show), flush=True)
-            printed += 1
-            if options.count is not None and printed >= options.count:
+            if printed + 1 == options.count:
                 break
     return 0
 
@@ -141,51 +141,53 @@ def _watch(
 def _by_second(
     subscriber: Subscriber[Any], measure: Callable[[Info], float | None], patience: Patience
 ) -> Iterator[_Second]:
-    second = _Second()
+    second: _Second | None = None
     before = 0
-    started = False
     while True:
-        left_ns = second.began_ns + _PERIOD_NS - time.monotonic_ns()
-        if left_ns > 0:
-            try:
-                info, _, _ = subscriber.recv_raw(min(left_ns * 1e-9, _WAIT_S))
-            except TimeoutError:
-                patience.check()
-                continue
-            patience.heard()
-            value = measure(info)
-            if not started:  # the first message begins the first second, and counts for none
-                started, second = True, _Second()
-                continue
-            second.seen += 1
-            second.bytes += info.size
-            if value is not None:
-                second.values.append(value)
+        left_ns = 1 if second is None else second.began_ns + _PERIOD_NS - time.monotonic_ns()
+        if second is not None and left_ns <= 0:
+            missed = subscriber.counters.lost + subscriber.counters.overtaken
+            second.missed, before = missed - before, missed
+            yield second
+            second = _Second(second.last_ns)
             continue
-        missed = subscriber.counters.lost + subscriber.counters.overtaken
-        second.missed, before = missed - before, missed
-        yield second
-        second = _Second()
+        try:
+            info, _, _ = subscriber.recv_raw(_WAIT_S if second is None else min(left_ns * 1e-9, _WAIT_S))
+        except TimeoutError:
+            patience.check()
+            continue
+        patience.heard()
+        value = measure(info)
+        if second is None:  # the first message begins the first second, and counts for none
+            second = _Second(info.publish_ns)
+            continue
+        second.seen += 1
+        second.bytes += info.size
+        second.last_ns = max(second.last_ns, info.publish_ns)
+        if value is not None:
+            second.values.append(value)
 
 
-def _statistics(window: deque[tuple[_Second, np.ndarray, float]], show: Callable[[float], str]) -> str:
-    values = np.concatenate([values for _, values, _ in window])
-    elapsed_s = sum(elapsed_s for _, _, elapsed_s in window)
-    seen = sum(second.seen for second, _, _ in window)
-    missed = sum(second.missed for second, _, _ in window)
-    # What we did not see was published, too; it is taken to be as large as the rest.
-    share = (seen + missed) / seen if seen else 0.0
-    sizes = sum(second.bytes for second, _, _ in window) * share
+def _statistics(window: deque[_Second], show: Callable[[float], str]) -> str:
+    seen = sum(second.seen for second in window)
+    missed = sum(second.missed for second in window)
+    silence_s = (time.monotonic_ns() - window[-1].last_ns) * 1e-9
     if not seen:
-        return f"no message for {elapsed_s:.0f} s"
-    if not values.size:
-        values = np.array([float("nan")])
+        return f"no message for {silence_s:.0f} s"
+    # From message to message: the edges of the window would make the rate of a slow topic jump.
+    elapsed_s = (window[-1].last_ns - window[0].since_ns) * 1e-9
+    if silence_s > 1.0 and silence_s > 3.0 * elapsed_s / seen:
+        elapsed_s += silence_s
+    # What we did not see was published, too; it is taken to be as large as the rest.
+    published_hz = (seen + missed) / elapsed_s if elapsed_s > 0.0 else math.nan
+    mean_bytes = sum(second.bytes for second in window) / seen
+    values = np.array([value for second in window for value in second.values] or [math.nan])
     low, middle, high, top = np.percentile(values, (0, 50, 99, 100))
     return _line(
-        rate((seen + missed) / elapsed_s),
-        f"{bytes_of(sizes / elapsed_s)}/s",
+        rate(published_hz),
+        f"{bytes_of(mean_bytes * published_hz)}/s",
         *map(show, (float(values.mean()), float(values.std()), low, middle, high, top)),
-        f"{sum(second.missed for second, _, _ in window):,}",
+        f"{missed:,}",
     )
 
 

@@ -1,0 +1,600 @@
+"""The command `cortex`, run as people run it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from peer import Number, Scan
+from processes import ROOT, SOON_S, wait_for
+
+from cortex import Array, Node, Publisher, Unit, keep_last, reliable
+from cortex.cli import main
+from cortex.commands import session
+from cortex.commands.text import bytes_of, message_lines, rate, seconds, table, to_plain
+from cortex.log import open_log
+from cortex.message import message
+from cortex.schema import schema_of
+
+MakeNode = Callable[..., Node]
+PROMPTLY_S = 3.0
+"""How soon a command must end after Ctrl-C, on a machine that does a lot besides."""
+
+
+class Mode(Enum):
+    SLOW = 0
+    FAST = 1
+
+
+# Outside of a class, where nobody takes the names of dtypes and dimensions for those of types.
+Position = Annotated[Array[np.float64, 3], Unit("m", frame="world")]
+Ranges = Annotated[Array["float32", "n"], Unit("m")]  # noqa: F821
+Field = Array["complex64", "k"]
+
+
+@message
+class Pose:
+    position: Position
+
+
+@message
+class Everything:
+    stamp_ns: int
+    speed: Annotated[float, Unit("m/s")]
+    mode: Mode
+    label: str
+    blob: bytes
+    ok: bool
+    pose: Pose
+    last: Pose | None
+    track: list[Pose]
+    ids: list[int]
+    ranges: Ranges
+    field: Field
+
+
+def everything(size: int = 1000, label: str = "a\x1b[31mb") -> Everything:
+    ranges = np.linspace(0.0, 1.0, size, dtype=np.float32)
+    pose = Pose(np.array([1.0, 2.5, -3.0]))
+    field = np.array([1 + 2j], np.complex64)
+    return Everything(
+        7, 1.5, Mode.FAST, label, b"\0\1", True, pose, None, [pose, pose], [1, 2], ranges, field
+    )
+
+
+def start(*arguments: object, columns: int = 120, **options: object) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": str(columns)}
+    command = [sys.executable, "-m", "cortex", *map(str, arguments)]
+    child: subprocess.Popen[str] = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **options
+    )  # type: ignore[call-overload]
+    _children.append(child)
+    return child
+
+
+_children: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def no_child_left() -> Iterator[None]:
+    """End what a test that failed has left running."""
+    yield
+    while _children:
+        child = _children.pop()
+        child.kill()
+        child.wait(SOON_S)
+        for stream in (child.stdout, child.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def finish(child: subprocess.Popen[str], timeout_s: float = SOON_S) -> tuple[int, str, str]:
+    """Wait for a command: status, output, complaints."""
+    try:
+        output, errors = child.communicate(timeout=timeout_s)
+    finally:
+        child.kill()
+        child.wait(SOON_S)
+    return child.returncode, output, errors
+
+
+def cortex(*arguments: object, **options: object) -> tuple[int, str, str]:
+    return finish(start(*arguments, **options))  # type: ignore[arg-type]
+
+
+def interrupt(child: subprocess.Popen[str], number: int = signal.SIGINT) -> tuple[int, str, str]:
+    child.send_signal(number)
+    return finish(child, PROMPTLY_S)
+
+
+@contextmanager
+def publishing(publisher: Publisher[Number], period_s: float) -> Iterator[None]:
+    """Publish numbers regularly, from a thread."""
+    done = threading.Event()
+
+    def run() -> None:
+        began_s = time.monotonic()
+        for number in range(10**9):
+            publisher.publish(Number(time.time_ns(), number))
+            if done.wait(max(0.0, began_s + (number + 1) * period_s - time.monotonic())):
+                return
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join(SOON_S)
+
+
+def column(output: str, name: str, line: int = -1) -> str:
+    """What stands under a title, the columns being separated by two blanks or more."""
+    import re
+
+    lines = output.splitlines()
+    titles, cells = (re.split(r" {2,}", text.strip()) for text in (lines[0], lines[line]))
+    return cells[titles.index(name)]
+
+
+# Looking
+
+
+def test_where_nothing_runs_it_says_what_to_do(runtime: Path) -> None:
+    for command in ("topics", "nodes"):
+        status, output, errors = cortex(command)
+        assert (status, output) == (0, "")
+        assert "no node is running in domain 0" in errors
+        assert "--registry" in errors
+    assert not list(runtime.glob("*/registry*"))  # looking has started nothing
+
+
+def test_topics_and_nodes_are_listed(make_node: MakeNode) -> None:
+    robot, viewer = make_node("robot"), make_node("viewer")
+    robot.publisher("/number", Number)
+    robot.publisher("/scan", Scan)
+    viewer.subscriber("/scan", Scan)
+    viewer.subscriber("/scan", None)
+    viewer.subscriber("/command", Number)
+    wait_for(lambda: len(viewer.topics()) == len(robot.topics()) == 3)
+    wait_for(lambda: cortex("topics")[1].count("/") == 3)  # the registry has heard of all, too
+    status, output, errors = cortex("topics")
+    assert [line.split() for line in output.splitlines()] == [
+        ["topic", "type", "publishers", "subscribers"],
+        ["/command", "Number", "viewer"],
+        ["/number", "Number", "robot"],
+        ["/scan", "Scan", "robot", "viewer", "(2)"],
+    ]
+    assert (status, errors) == (0, "")
+    status, output, _ = cortex("nodes")
+    assert status == 0
+    assert [line.split() for line in output.splitlines()[1:]] == [
+        ["robot", f"{robot.id:016x}", str(os.getpid()), "2", "0", "0", "this", "host", "ipc"],
+        ["viewer", f"{viewer.id:016x}", str(os.getpid()), "0", "3", "0", "this", "host", "ipc"],
+    ]
+
+
+def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
+    robot, viewer = make_node("robot"), make_node("viewer")
+    publisher = robot.publisher("/scan", Scan, latch=True)
+    received: list[Scan] = []
+    viewer.subscriber("/scan", Scan, received.append, policy=reliable(8))
+    viewer.subscriber("/scan", Scan, policy=keep_last(2))
+    assert publisher.wait_for_subscribers(2)
+    for i in range(1234):
+        publisher.publish(Scan(i, np.ones(3, np.float32)))
+    wait_for(lambda: len(received) == 1234)
+    wait_for(lambda: cortex("topics")[1].count("viewer (2)"))
+    status, output, errors = cortex("info", "/scan", "--once")
+    assert (status, errors) == (0, "")
+    lines = output.splitlines()
+    assert lines[0] == "/scan"
+    assert lines[3].split() == ["robot", "1,234", "-", "-", "2", "0", "0", "yes"]
+    assert lines[6].split()[:8] == [
+        "viewer",
+        "reliable(depth=8,",
+        "timeout_s=1)",
+        "1,234",
+        "-",
+        "0",
+        "0",
+        "0",
+    ]
+    assert lines[6].split()[-1] in ("us", "ms")  # a latency
+    assert "keep_last(2)" in lines[7]
+    assert "  ranges    float32[n]" in lines
+    status, output, errors = cortex("info", "/nothing", "--once")
+    assert (status, output) == (1, "")
+    assert errors == "cortex info: there is no topic /nothing; there are /scan\n"
+
+
+def test_info_goes_on_until_interrupted_and_shows_rates(make_node: MakeNode) -> None:
+    publisher = make_node("robot").publisher("/number", Number)
+    with publishing(publisher, 0.01):
+        wait_for(lambda: "/number" in cortex("topics")[1])
+        child = start("info", "/number")
+        assert child.stdout is not None
+        rates = []
+        while len(rates) < 2:
+            line = child.stdout.readline()
+            assert line
+            if line.startswith("robot"):
+                rates.append(line.split()[2])
+        assert rates[0] == "-"
+        assert float(rates[1]) == pytest.approx(100.0, rel=0.3)  # Hz; the machine may be busy
+        status, _, errors = interrupt(child)
+    assert (status, errors) == (0, "")
+
+
+# Watching
+
+
+def test_echo_fits_the_terminal(make_node: MakeNode) -> None:
+    publisher = make_node("robot").publisher("/all", Everything, latch=True)
+    publisher.publish(everything())
+    status, output, errors = cortex("echo", "/all", "-n", 1, columns=72)
+    assert (status, errors) == (0, "")
+    lines = output.splitlines()
+    assert lines[0].startswith("--- /all  #0  4.")
+    assert max(map(len, lines)) <= 72
+    shown = "\n".join(lines[1:])
+    assert "speed: 1.5  m/s" in shown
+    assert "mode: FAST" in shown
+    assert "label: 'a\\x1b[31mb'" in shown  # a terminal obeys nothing that came over the network
+    assert "last: none" in shown
+    assert "  - 1:\n    position: float64[3]  1 2.5 -3  m" in shown
+    assert "ids: [1, 2]" in shown
+    (ranges,) = [line for line in lines if line.startswith("ranges")]
+    assert ranges.startswith("ranges: float32[1000]  0 0.001001 ")
+    assert ranges.endswith(" … 1  m")
+    status, output, _ = cortex("echo", "/all", "-n", 1, "--no-arrays")
+    assert "ranges: float32[1000]  m" in output.splitlines()
+    status, output, _ = cortex("echo", "/all", "-n", 1, "--full")
+    assert len(output) > 8000
+    assert "…" not in output
+
+
+def test_echo_as_json_holds_everything(make_node: MakeNode) -> None:
+    publisher = make_node("robot").publisher("/all", Everything, latch=True)
+    publisher.publish(everything(3))
+    status, output, _ = cortex("echo", "/all", "-n", 1, "--json")
+    assert status == 0
+    facts = json.loads(output)
+    assert (facts["topic"], facts["sequence"], facts["source"]) == ("/all", 0, f"{publisher.source:016x}")
+    assert facts["message"] == {
+        "stamp_ns": 7, "speed": 1.5, "mode": "FAST", "label": "a\x1b[31mb", "blob": "AAE=", "ok": True,
+        "pose": {"position": [1.0, 2.5, -3.0]}, "last": None, "track": [{"position": [1.0, 2.5, -3.0]}] * 2,
+        "ids": [1, 2], "ranges": [0.0, 0.5, 1.0], "field": [[1.0, 2.0]],
+    }  # fmt: skip
+
+
+def test_echo_says_that_it_waits_and_ends_at_once(make_node: MakeNode) -> None:
+    make_node("robot").publisher("/other", Number)
+    child = start("echo", "/number")
+    assert child.stderr is not None
+    assert child.stderr.readline() == "waiting for a publisher of /number; published are: /other\n"
+    began_s = time.monotonic()
+    status, output, errors = interrupt(child)
+    assert (status, output, errors) == (0, "", "")
+    assert time.monotonic() - began_s < PROMPTLY_S
+
+
+def test_echo_into_head_is_quiet(make_node: MakeNode) -> None:
+    publisher = make_node("robot").publisher("/number", Number)
+    with publishing(publisher, 0.001):
+        child = start("echo", "/number")
+        assert child.stdout is not None
+        assert child.stdout.readline().startswith("--- /number")
+        child.stdout.close()  # what `head` does when it has seen enough
+        assert child.wait(SOON_S) == 141
+        assert child.stderr is not None
+        assert [line for line in child.stderr.read().splitlines() if "further messages" not in line] == []
+        child.stderr.close()
+
+
+def test_rate_bandwidth_and_delay_are_measured(make_node: MakeNode) -> None:
+    """100 messages of 16 bytes each second."""
+    publisher = make_node("robot").publisher("/number", Number)
+    with publishing(publisher, 0.01):
+        children = [start(command, "/number", "-n", 1) for command in ("hz", "bw", "delay")]
+        stamped = start("delay", "/number", "--stamp", "-n", 1)
+        (_, hz, hz_errors), (_, bw, _), (_, delay, _), (_, age, _) = map(finish, (*children, stamped))
+    assert hz_errors == ""
+    assert len(hz.splitlines()) == 2
+    assert float(column(hz, "rate").split()[0]) == pytest.approx(100.0, rel=0.3)  # the machine may be busy
+    assert column(hz, "period").endswith(" ms")
+    assert float(column(hz, "p50").split()[0]) == pytest.approx(10.0, rel=0.2)
+    assert column(hz, "lost") == "0"
+    assert column(bw, "size") == column(bw, "max") == "16 B"
+    assert float(column(bw, "bandwidth").removesuffix(" kB/s")) == pytest.approx(1.6, rel=0.3)
+    for output, name in ((delay, "delay"), (age, "age")):
+        value, unit = column(output, name).split()
+        assert 0.0 < float(value) * {"us": 1e-6, "ms": 1e-3}[unit] < 0.5
+
+
+def test_silence_is_told(make_node: MakeNode) -> None:
+    publisher = make_node("robot").publisher("/number", Number)
+    child = start("hz", "/number", "--window", 1)
+    assert publisher.wait_for_subscribers()
+    for i in range(2):
+        publisher.publish(Number(i, i))
+    assert child.stdout is not None
+    lines = [child.stdout.readline() for _ in range(3)]
+    assert lines[0].split()[0] == "rate"
+    assert lines[2].startswith("no message for ")
+    assert interrupt(child)[0] == 0
+
+
+# Files
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_record_until_told_to_stop_then_play(make_node: MakeNode, tmp_path: Path, number: int) -> None:
+    path = tmp_path / "run.mcap"
+    robot = make_node("robot")
+    publisher = robot.publisher("/number", Number)
+    child = start("record", "-o", path, "--all")
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    for i in range(50):
+        publisher.publish(Number(i, i))
+    wait_for(lambda: path.stat().st_size > 2500)
+    status, output, errors = interrupt(child, number)
+    assert status == 0
+    assert errors == f"recording into {path}; Ctrl-C ends it\n"
+    assert output.splitlines()[1].split()[:3] == ["/number", "50", "800"]
+    with open_log(path) as log:
+        assert (log.cut, log.message_count) == ("", 50)
+    publisher.close()
+    subscriber = robot.subscriber("/again", Number, policy=reliable(100))
+    status, output, errors = cortex("play", path, "--remap", "/number:=/again", "--rate", "max")
+    assert (status, output, errors) == (0, "", "50 messages played\n")
+    assert [subscriber.recv(SOON_S) for _ in range(50)] == [Number(i, i) for i in range(50)]
+    status, output, _ = cortex("play", path, "--info")
+    assert status == 0
+    assert output.splitlines()[1].split() == ["/number", "Number", "50", "robot"]
+
+
+def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_text("precious")
+    status, output, errors = cortex("record", "-o", path, "/number")
+    assert (status, output) == (1, "")
+    assert errors == f"cortex record: {path} exists: choose another name, or --force to overwrite it\n"
+    assert path.read_text() == "precious"
+    assert cortex("record", "-o", path, "/number", "--force", "--duration", 0.1, "--registry", "off")[0] == 0
+    with open_log(path) as log:
+        assert log.message_count == 0
+
+
+def test_playing_can_be_interrupted(make_node: MakeNode, tmp_path: Path) -> None:
+    from test_log import write_numbers
+
+    path = tmp_path / "run.mcap"
+    write_numbers(path, range(100))
+    subscriber = make_node("listener").subscriber("/number", Number, policy=reliable(100))
+    child = start("play", path, "--loop", "--start", 0.5, "--duration", 0.1)
+    values = [subscriber.recv(SOON_S).value for _ in range(15)]
+    assert values == [50 + k % 10 for k in range(15)]
+    status, output, errors = interrupt(child)
+    assert (status, output, errors) == (130, "", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ("play {}/missing", "cortex play: {}/missing: No such file or directory"),
+        ("play {}/text", "cortex play: {}/text: not an MCAP file"),
+        ("play {}/run.mcap /b --registry off", "cortex play: {}/run.mcap has no topic /b; it has /number"),
+        ("play {}/run.mcap --start 9 --registry off", "cortex play: no message from 9 s to the end; {}/run"),
+        ("topics --keys {}/none", "cortex topics: {}/none/key.secret does not exist: make keys with "),
+        ("topics --domain 233", "cortex topics: domain must be an integer from 0 to 232, got 233"),
+        ("cpp peer:Missing", "cortex cpp: peer has no message type Missing; it has "),
+        ("cpp no_such_module:Scan", "cortex cpp: there is no module no_such_module here or on the "),
+    ],
+)
+def test_errors_are_one_line(
+    runtime: Path,
+    tmp_path: Path,
+    arguments: str,
+    complaint: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from test_log import write_numbers
+
+    write_numbers(tmp_path / "run.mcap", range(5))
+    (tmp_path / "text").write_text("no recording")
+    with signals_kept():
+        assert main(arguments.format(tmp_path).split()) == 1
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert errors.startswith(complaint.format(tmp_path))
+    assert errors.count("\n") == 1
+
+
+@contextmanager
+def signals_kept() -> Iterator[None]:
+    """`main` takes the signals over, which pytest wants back."""
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    path = list(sys.path)
+    try:
+        yield
+    finally:
+        sys.path[:] = path
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["fly"], "invalid choice: 'fly'"),
+        (["echo", "scan"], "got 'scan'"),
+        (["hz", "/scan", "--window", "0"], "must be a number > 0, got '0'"),
+        (["echo", "/scan", "-n", "-3"], "must be an integer > 0, got '-3'"),
+        (["play", "x.mcap", "--rate", "fast"], "must be a number > 0, or \"max\", got 'fast'"),
+        (["record", "/scan"], "-o"),
+        (["record", "-o", "x.mcap"], "say which topics to record, or --all"),
+        (["record", "-o", "x.mcap", "--all", "/scan"], "leave out /scan"),
+        (["cpp", "Scan"], "a type is named like robot.messages:Scan, got 'Scan'"),
+        (["keys", "old"], "invalid choice: 'old'"),
+    ],
+)
+def test_wrong_use_is_told_from_failure(
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with signals_kept():
+        try:
+            status = main(arguments)
+        except SystemExit as exit_of_the_parser:
+            status = exit_of_the_parser.code  # type: ignore[assignment]
+    assert status == 2
+    assert complaint in capsys.readouterr().err
+
+
+# Tools
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "",
+        "topics",
+        "nodes",
+        "info",
+        "echo",
+        "hz",
+        "bw",
+        "delay",
+        "record",
+        "play",
+        "keys",
+        "cpp",
+        "bench",
+        "discovery",
+    ],
+)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end, signals_kept():
+        main([*command.split(), "--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: cortex {command}".rstrip())
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_help_loads_no_sockets() -> None:
+    code = "import sys, cortex.cli; assert 'zmq' not in sys.modules; assert 'cortex.node' not in sys.modules"
+    subprocess.run(
+        [sys.executable, "-c", code], check=True, timeout=SOON_S, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+
+
+def test_keys_are_made_once(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    status, output, errors = cortex("keys", "new", "--dir", folder)
+    assert status == 0
+    assert output.strip() == (folder / "key.public").read_text().strip()
+    assert stat.S_IMODE((folder / "key.secret").stat().st_mode) == 0o600
+    assert "authorized_keys" in errors
+    secret = (folder / "key.secret").read_text()
+    assert secret.strip() not in output + errors
+    status, output, errors = cortex("keys", "new", "--dir", folder)
+    assert (status, output) == (1, "")
+    assert "exists" in errors
+    assert (folder / "key.secret").read_text() == secret
+
+
+def test_cpp_finds_modules_of_this_directory(tmp_path: Path) -> None:
+    (tmp_path / "robot.py").write_text(
+        "from cortex import Array, message\n\n\n@message\nclass Lidar:\n    ranges: Array['float32', 'n']\n"
+    )
+    status, output, errors = cortex("cpp", "robot:Lidar", "--namespace", "mine", cwd=tmp_path)
+    assert (status, errors) == (0, "")
+    assert "struct Lidar" in output
+    assert "namespace mine" in output
+
+
+def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) -> None:
+    child = start("discovery")
+    wait_for(lambda: (runtime / "0" / "registry").exists())
+    make_node("robot").publisher("/number", Number)
+    wait_for(lambda: "/number" in cortex("topics")[1])
+    status, output, errors = cortex("discovery")
+    assert (status, output) == (1, "")
+    assert "serves domain 0" in errors
+    assert interrupt(child)[0] == 0
+
+
+def test_a_registry_that_does_not_answer_is_an_error(
+    runtime: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(session, "_ANSWER_S", 0.2)
+    with signals_kept():
+        assert main(["topics", "--registry", "tcp://127.0.0.1:1"]) == 1
+    output, errors = capsys.readouterr()
+    assert (output, errors) == ("", "cortex topics: no answer from tcp://127.0.0.1:1\n")
+
+
+# Text
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (seconds(0.0), "0 ns"),
+        (seconds(123e-9), "123.0 ns"),
+        (seconds(9.99996e-3), "10.00 ms"),
+        (seconds(0.999999), "1.000 s"),
+        (seconds(12345.0), "12,345 s"),
+        (seconds(math.nan), "-"),
+        (bytes_of(16), "16 B"),
+        (bytes_of(999.99), "1.000 kB"),
+        (bytes_of(23.7e6), "23.70 MB"),
+        (rate(99.98), "99.98 Hz"),
+        (rate(123456.0), "123.5 kHz"),
+    ],
+)
+def test_numbers_have_units(shown: str, expected: str) -> None:
+    assert shown == expected
+
+
+def test_tables_are_aligned() -> None:
+    lines = list(table(("name", "count", "<what"), [("a", "1", "x"), ("long", "1,000", "")]))
+    assert lines == ["name  count  what", "a         1  x", "long  1,000"]
+
+
+@given(
+    columns=st.integers(20, 200),
+    size=st.integers(0, 300),
+    label=st.text(max_size=300),
+    arrays=st.sampled_from(["none", "short"]),
+)
+def test_no_line_is_longer_than_the_terminal(columns: int, size: int, label: str, arrays: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", str(columns))
+        shown = everything(size, label.encode(errors="ignore").decode())
+        lines = list(message_lines(schema_of(Everything), shown, arrays=arrays))
+    assert all(len(line) <= columns and line.isprintable() for line in lines)
+
+
+def test_json_has_no_numbers_that_json_does_not_know() -> None:
+    shown = everything()
+    odd = Scan(1, np.array([math.nan, math.inf, 1.0], np.float32))
+    assert to_plain(schema_of(Scan), odd) == {"stamp_ns": 1, "ranges": ["nan", "inf", 1.0]}
+    json.dumps(to_plain(schema_of(Everything), shown), allow_nan=False)
