@@ -98,16 +98,17 @@ def check(target: Target, body: bytes, *, with_oracle: bool) -> bool:
     codec = target.codec
     first = outcome(codec.decode, body)
     framed = b"\xff" * 64 + body + b"\xff" * 64
+    within = outcome(codec.decode, framed, 64, len(body))
     general = outcome(codec._decoder.decode, np.frombuffer(framed, np.uint8), 64, len(body))
     accepted = first is not None
-    assert accepted == (general is not None), (target.name, body.hex())
+    assert accepted == (within is not None) == (general is not None), (target.name, body.hex())
     if accepted:
         # Items never share bytes, and a list element takes a byte at least.
         assert touch(first) <= 2 * len(body), (target.name, body.hex())
         # Through the bytes, which are equal for nan as well.
         again = codec.encode(first, 2**32)
         assert again is not None
-        assert again == codec.encode(general, 2**32), (target.name, body.hex())
+        assert again == codec.encode(general, 2**32) == codec.encode(within, 2**32), (target.name, body.hex())
         assert codec.encode(codec.decode(again), 2**32) == again
     if with_oracle:
         try:

@@ -20,12 +20,16 @@ from random_schemas import any_message, flat_schemas, schemas, to_plain
 
 from cortex.codec import Codec, MalformedMessage, Plan, codec_of
 from cortex.message import Array, Float32, Int8, UInt16, UInt64, message
-from cortex.messages import Events, Image, Imu, MotorCommand
+from cortex.messages import Clock, Events, Image, Imu, MotorCommand
 from cortex.schema import schema_of
 
 
 class Mode(Enum):
     OFF = 0
+    ON = 3
+
+
+class OtherMode(Enum):
     ON = 3
 
 
@@ -155,6 +159,7 @@ WRONG = [
     ("flag", "yes", TypeError, "no bool"),
     ("flag", np.zeros(2), TypeError, "no bool"),
     ("mode", 3, TypeError, "allowed are Mode.OFF, Mode.ON"),
+    ("mode", OtherMode.ON, TypeError, "is no Mode"),
     ("text", b"bytes", TypeError, "no str"),
     ("text", "\ud800", ValueError, "UTF-8"),
     ("data", "text", TypeError, "no bytes"),
@@ -349,10 +354,13 @@ def test_types_with_a_tail_have_no_record():
 
 
 @pytest.mark.parametrize("extra", [-1, 1, 8])
-def test_bodies_of_fixed_size_have_that_size(extra):
-    body = body_of(Imu(0, np.zeros(3), np.zeros(3)))
-    with pytest.raises(MalformedMessage, match="allowed are 64 to 64"):
-        codec_of(Imu).decode(body[:extra] if extra < 0 else body + bytes(extra))
+@pytest.mark.parametrize("value", [Imu(0, np.zeros(3), np.zeros(3)), Clock(1, 2)], ids=["arrays", "numbers"])
+def test_bodies_of_fixed_size_have_that_size(value, extra):
+    codec, body = codec_of(type(value)), body_of(value)
+    wrong = body[:extra] if extra < 0 else body + bytes(extra)
+    for arguments in ((wrong,), (wrong, 0, len(wrong)), (wrong + bytes(64), 0, len(wrong))):
+        with pytest.raises(MalformedMessage, match=f"allowed are {len(body)} to {len(body)}"):
+            codec.decode(*arguments)
 
 
 def test_a_size_beyond_the_buffer_is_malformed():
@@ -424,6 +432,7 @@ def test_a_draft_gives_the_same_body():
     size = codec.finish(draft)
     decoded = codec.decode(memory[:size].tobytes())
     assert decoded == Events(7, x, y, t, polarity, 640, 480, frame_id="camera")
+    assert memory[:size].tobytes() == body_of(decoded)
     assert draft.stamp_ns == 7
     assert draft.sequence == 0
     # What lies between the arrays is zero, not what the memory held before.

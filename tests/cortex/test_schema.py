@@ -359,7 +359,7 @@ def test_no_code_is_generated_from_a_schema(monkeypatch):
     assert cls(1, None, "x").s == "x"
 
 
-@pytest.mark.parametrize("name", ["mro", "_ignore_", "_E__x"])
+@pytest.mark.parametrize("name", ["mro", "_ignore_"])
 def test_enum_values_that_python_cannot_have(name):
     with pytest.raises(SchemaError, match="cannot be an enum in Python"):
         type_from_schema(Schema("a", (field(EnumType("E", (("A", 1), (name, 2)))),)))
