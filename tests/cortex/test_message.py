@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import typing
 from dataclasses import KW_ONLY, field
 from enum import Enum, Flag, IntEnum
@@ -158,6 +159,7 @@ def test_a_copy_is_deep():
         copied.stamp_ns = 2
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="typing resolves KW_ONLY in text from 3.11 on")
 def test_keyword_only_fields():
     @message
     class Keyed:
