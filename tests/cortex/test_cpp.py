@@ -396,6 +396,29 @@ def test_killed_cpp_reader_frees_its_slots(
     assert time.monotonic() - began_s < 5.0  # its patience of 10 s is not used up
 
 
+def test_cpp_publisher_takes_slots_of_the_dead_back(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """A reader that is killed with all slots of its share leaves them to the next one with its column."""
+    node = make_node()
+    start("publish", "/scan", -1, 20_000)
+    slow = start("count", "/scan", "reliable", 20_000, 3)
+
+    def published() -> int:
+        replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
+        return max((publisher.published for reply in replies for publisher in reply.publishers), default=0)
+
+    wait_for(lambda: published() > 45)  # more than the ring has slots: the reader has as many as it may
+    slow.process.kill()
+    scans = node.subscriber("/scan", Scan, policy=reliable(8))
+    first = scans.recv(10.0).stamp_ns
+    began_s = time.monotonic()
+    for number in range(first + 1, first + 200):
+        assert scans.recv(10.0).stamp_ns == number
+    assert time.monotonic() - began_s < 5.0
+    assert scans.counters.lost == 0
+
+
 def test_killed_cpp_publisher_leaves_no_trace(
     start: Callable[..., Peer], make_node: Callable[..., Node]
 ) -> None:

@@ -68,6 +68,17 @@ void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic,
     newest.close();
     for (const auto& scan : held) expect(is_whole(*scan), "a scan that outlives its subscription");
   });
+  std::atomic<bool> done{false};
+  std::thread watcher([&publisher, &every, &done] {
+    std::uint64_t published = 0;
+    while (!done) {
+      const std::uint64_t now = publisher.counters().published;
+      expect(now >= published && every.counters().lost == 0, "counters grow");
+      expect(publisher.subscriber_count() <= 2 && every.publisher_count() == 1, "who is attached");
+      published = now;
+      std::this_thread::sleep_for(1ms);
+    }
+  });
   std::vector<int> seen(static_cast<std::size_t>(2 * count), 0);
   for (int left = 2 * count; left > 0; --left) {
     const auto scan = every.receive(20s);
@@ -77,6 +88,8 @@ void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic,
     ++seen[static_cast<std::size_t>((*scan)->stamp_ns)];
   }
   for (const int times : seen) expect(times == 1, "each scan arrives once");
+  done = true;
+  watcher.join();
   for (auto& thread : threads) thread.join();
   expect(every.counters().lost == 0 && every.counters().rejected == 0, "nothing is lost");
 }

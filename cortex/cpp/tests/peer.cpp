@@ -59,7 +59,7 @@ void publish(cortex::Node& node, const std::string& topic, int count, std::uint3
   auto scans = node.advertise<Scan>(topic, options);
   std::cout << "ready" << std::endl;
   if (!latch && !scans.wait_for_subscribers(1, 10s)) std::exit(2);
-  for (int number = 0; number < count; ++number) {
+  for (int number = 0; number != count && !ended; ++number) {  // a negative count never ends
     Scan scan;
     scan.stamp_ns = number;
     scan.ranges = cortex::Array<float>::zeros({size});
