@@ -27,7 +27,8 @@ from cortex.vectors.catalogue import CATALOGUE
 
 INTERESTING = [bytes([n]) for n in (0, 1, 2, 127, 128, 255)]
 INTERESTING += [
-    n.to_bytes(4, "little") for n in (0, 1, 7, 8, 24, 255, 1024, 2**16, 2**30, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)
+    n.to_bytes(4, "little")
+    for n in (0, 1, 7, 8, 24, 255, 1024, 2**16, 2**30, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)
 ]
 INTERESTING += [n.to_bytes(8, "little") for n in (2**32, 2**63 - 1, 2**64 - 1)]
 
@@ -150,7 +151,9 @@ def run_atheris(count: int, seed: int) -> None:
 
 def main() -> int:
     """Run the fuzzer from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--atheris", action="store_true")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import contextlib
+import copy
 import dataclasses
 import hashlib
 import itertools
@@ -313,7 +314,7 @@ def test_a_class_from_a_schema():
     value = cls(5, ranges=np.zeros((2, 2), np.float32))
     assert value.stamp_ns == 5
     assert repr(value).startswith("Scan(stamp_ns=5, ranges=float32[2, 2]")
-    assert value == value.copy()
+    assert value == value.copy() == copy.copy(value) == copy.deepcopy(value)
     assert [f.name for f in dataclasses.fields(cls)] == ["stamp_ns", "ranges"]
     assert dataclasses.replace(value, stamp_ns=6).stamp_ns == 6
     assert dataclasses.asdict(value)["stamp_ns"] == 5
