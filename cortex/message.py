@@ -112,8 +112,8 @@ def message(cls: Any = None, /, *, name: str | None = None) -> Any:
     """Make a class a message type: a frozen dataclass with slots, a schema and a fingerprint.
 
     Messages compare by value, arrays included, and so are not hashable. `copy()` returns a deep copy with
-    writable arrays (`copy.deepcopy` does the same, and type checkers know it). Decoding does not run `__init__`
-    or `__post_init__`.
+    writable arrays (`copy.deepcopy` does the same, and type checkers know it). Decoding does not run
+    `__init__` or `__post_init__`.
 
     Args:
         cls: Class with annotated fields.
