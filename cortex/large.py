@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import mmap
+import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import zmq
@@ -14,14 +16,16 @@ import zmq
 from cortex.outlet import DONTWAIT, SNDMORE, Backoff, Outlet, Outlets
 from cortex.shm import Ring, ShmUnavailable
 from cortex.wire import (
+    HEADER_SIZE,
     LARGE,
-    MASK,
+    MESSAGE,
+    REST,
     SLOT,
     AttachAnswer,
     AttachKey,
     RingPlace,
     answer_frame,
-    prefix,
+    message_head,
 )
 
 logger = logging.getLogger(__name__)
@@ -33,6 +37,8 @@ RING_BYTES_MAX = 2 << 30
 PRIVATE_BYTES = 64 << 20
 """Most memory outside rings that waits to be sent."""
 RINGS_ALIVE = 4
+_SLOT_REST = struct.Struct(REST.format + "Q")
+"""The rest of a descriptor's header, and the mask."""
 
 
 @dataclass(eq=False)
@@ -50,13 +56,20 @@ class Reader:
         return self.request.timeout_ms / 1000.0 if self.request.strict else 0.0
 
 
-@dataclass(eq=False)
-class Slot:
+class Slot(NamedTuple):
     """Where a large message is written: a slot of a ring, or private memory where there is no ring."""
 
     buffer: np.ndarray
     ring: Ring | None
-    index: int
+    number: int
+
+
+class Stamps(NamedTuple):
+    """What the header of a message says besides its place."""
+
+    sequence: int
+    stamp_ns: int
+    publish_ns: int
 
 
 @dataclass(eq=False)
@@ -75,12 +88,13 @@ class LargeSender:
     Everything that touches readers or sockets runs under the outlets' lock.
     """
 
-    def __init__(self, source: int, *, stamped: bool, topic: str, outlets: Outlets) -> None:
+    def __init__(self, source: int, fingerprint: int, *, stamped: bool, topic: str, outlets: Outlets) -> None:
         self._source = source
         self._topic = topic
         self._outlets = outlets
-        self._slot_head = prefix(SLOT, source, stamped=stamped)
-        self._large_head = prefix(LARGE, source, stamped=stamped)
+        self._slot_head = message_head(SLOT, source, fingerprint, stamped=stamped)
+        self._message_head = message_head(MESSAGE, source, fingerprint, stamped=stamped)
+        self._large_head = message_head(LARGE, source, fingerprint, stamped=stamped)
         self._rings: list[Ring] = []
         self._ring_count = 0
         self._columns: dict[int, Reader] = {}
@@ -92,8 +106,10 @@ class LargeSender:
         self._shares = 1
         self._ring: Ring | None = None
         self._pin_quota = 0
-        self._grants: list[tuple[int, int, int]] = []
-        self._strict: list[tuple[Reader, int]] = []
+        self._slots_wanted = 4
+        self._grants: list[tuple[int, int, int, bool]] = []
+        self._inline_strict = False
+        self._timeout_s = 0.0
         self._slot_outlets: list[Outlet] = []
         self._inline_outlets: list[Outlet] = []
 
@@ -101,14 +117,18 @@ class LargeSender:
         """Work out what every message needs, when readers or the ring have changed."""
         self._shares = max(1, len(self._columns) + bool(self._inline))
         ring = self._ring = self._rings[-1] if self._rings else None
+        self._slots_wanted = 2 * self._shares + 2
         self._pin_quota = 0 if ring is None else max(1, (ring.slots - 1) // self._shares)
 
         def quota(reader: Reader) -> int:
             return min(self._pin_quota, reader.request.quota or self._pin_quota)
 
-        self._grants = [(column, 1 << column, quota(reader)) for column, reader in self._columns.items()]
-        readers = [*self._columns.values(), *self._inline]
-        self._strict = [(reader, quota(reader)) for reader in readers if reader.request.strict]
+        self._grants = [
+            (column, 1 << column, quota(reader), reader.request.strict)
+            for column, reader in self._columns.items()
+        ]
+        self._inline_strict = any(reader.request.strict for reader in self._inline)
+        self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
         self._slot_outlets = list({reader.outlet for reader in self._columns.values()})
         self._inline_outlets = list({reader.outlet for reader in self._inline})
 
@@ -155,17 +175,53 @@ class LargeSender:
         Returns:
             None if every slot is taken (by loans that were not published).
         """
-        self._prune()
-        ring = self._ring_for(size, sequence, exact=exact)
-        if ring is None:
-            return Slot(np.empty(size, np.uint8), None, 0)
+        if self._pins:
+            self._prune()
+        ring = self._ring
+        if ring is None or ring.slot_bytes < size or ring.slots < self._slots_wanted:
+            ring = self._ring_for(size, sequence, exact=exact)
+            if ring is None:
+                return Slot(np.empty(HEADER_SIZE + size, np.uint8)[HEADER_SIZE:], None, 0)
         index = ring.acquire()
         return None if index < 0 else Slot(ring.buffer(index), ring, index)
+
+    def renew(self, slot: Slot, size: int, sequence: int) -> Slot | None:
+        """Move a message out of a ring that readers were told to forget; the caller holds the lock.
+
+        Returns:
+            The slot itself if its ring is in use, another one with the same bytes, or None if there is no slot.
+        """
+        if slot.ring is None or slot.ring in self._rings[-RINGS_ALIVE:]:
+            return slot
+        other = self.acquire(size, sequence, exact=False)
+        if other is not None:
+            other.buffer[:size] = slot.buffer[:size]
+        slot.ring.abandon(slot.number)
+        return other
 
     def abandon(self, slot: Slot) -> None:
         """Give a slot back unpublished; the caller holds the lock."""
         if slot.ring is not None:
-            slot.ring.abandon(slot.index)
+            slot.ring.abandon(slot.number)
+
+    def grant(self, ring: Ring | None) -> tuple[int, bool, bool]:
+        """Decide who gets the next message; the caller holds the lock.
+
+        Returns:
+            The mask of columns that get a lease, whether a reliable reader has no room, whether some reader
+            with shared memory is passed over.
+        """
+        full = bool(self._inline_strict) and self._inline_full(ring)
+        if ring is None:
+            return 0, full, False
+        mask, passed_over = 0, False
+        for column, bit, quota, strict in self._grants:
+            if ring.has_room(column, quota):
+                mask |= bit
+            else:
+                passed_over = True
+                full |= strict
+        return mask, full, passed_over
 
     def await_strict(self, ring: Ring | None) -> bool:
         """Wait until every reliable reader can take one more; the lock is held, and let go while sleeping.
@@ -173,11 +229,8 @@ class LargeSender:
         Returns:
             False if one could not within its time: it loses the message.
         """
-        full = [reader for reader, quota in self._strict if self._is_full(reader, quota, ring)]
-        if not full:
-            return True
-        backoff = Backoff(max(reader.timeout_s for reader in full))
-        while any(self._is_full(reader, quota, ring) for reader, quota in self._strict):
+        backoff = Backoff(self._timeout_s)
+        while self.grant(ring)[1]:
             self._outlets.lock.release()
             try:
                 more = backoff.wait()
@@ -193,8 +246,8 @@ class LargeSender:
         self,
         slot: Slot,
         size: int,
-        tail: Callable[[int], bytes],
-        sequence: int,
+        mask: int,
+        stamps: Stamps,
         send_strict: Callable[[Outlet, bytes, int], bool],
     ) -> tuple[bool, bool]:
         """Hand a written slot to all readers; the caller holds the lock.
@@ -202,43 +255,67 @@ class LargeSender:
         Args:
             slot: Where the body is.
             size: Its bytes.
-            tail: Makes the header's last 48 bytes, given `aux`.
-            sequence: The message's number.
+            mask: The columns that get a lease, from `grant`.
+            stamps: Number and times of the message.
             send_strict: Sends one frame over a strict outlet with these flags, waiting for room.
 
         Returns:
-            Whether every reliable reader was served in time, and whether some reader was passed over.
+            Whether every reliable reader was served in time, and whether some inline one was passed over.
         """
         on_time, passed_over = True, False
         ring = slot.ring
-        if ring is not None:
-            mask = 0
-            for column, bit, quota in self._grants:
-                if ring.has_room(column, quota):
-                    mask |= bit
-                else:
-                    passed_over = True
-            ring.commit(slot.index, sequence, size, mask)
-            if self._grants:
-                frame = self._slot_head + tail(ring.ring_id << 32 | slot.index) + MASK.pack(mask)
-                for outlet in self._slot_outlets:
-                    if not outlet.strict:
-                        outlet.send(frame, DONTWAIT)
-                    elif not send_strict(outlet, frame, 0):
-                        on_time = False
-            outlets = self._inline_outlets
-        else:
-            outlets = list({*self._inline_outlets, *self._slot_outlets})
-        for outlet in outlets:
-            passed_over |= not self._send_large(outlet, slot, size, tail(0), send_strict)
+        if ring is None:
+            for outlet in {*self._slot_outlets, *self._inline_outlets}:
+                passed_over |= not self._send_joined(outlet, slot, size, stamps, send_strict)
+            return on_time, passed_over
+        ring.commit(slot.number, stamps.sequence, size, mask)
+        if self._slot_outlets:
+            place = ring.ring_id << 32 | slot.number
+            frame = self._slot_head + _SLOT_REST.pack(*stamps, size, place, mask)
+            for outlet in self._slot_outlets:
+                if not outlet.strict:
+                    outlet.send(frame, DONTWAIT)
+                elif not outlet.try_send(frame) and not send_strict(outlet, frame, 0):
+                    on_time = False
+        for outlet in self._inline_outlets:
+            passed_over |= not self._send_large(outlet, slot, size, REST.pack(*stamps, size, 0), send_strict)
         return on_time, passed_over
+
+    def _send_joined(
+        self,
+        outlet: Outlet,
+        slot: Slot,
+        size: int,
+        stamps: Stamps,
+        send_strict: Callable[[Outlet, bytes, int], bool],
+    ) -> bool:
+        """Without a ring, send header and body as a plain message: every reader takes those.
+
+        Returns:
+            False if too much waits to be sent already, or a reliable reader has no room.
+        """
+        if self._private_bytes + size > max(PRIVATE_BYTES, 4 * size):
+            return False
+        whole = slot.buffer.base
+        assert whole is not None
+        header = self._message_head + REST.pack(*stamps, size, 0)
+        whole[:HEADER_SIZE] = np.frombuffer(header, np.uint8)
+        frame = whole[: HEADER_SIZE + size]
+        try:
+            tracker = outlet.send(frame.data, DONTWAIT, False, True)
+        except zmq.Again:
+            return send_strict(outlet, frame.tobytes(), 0)
+        assert tracker is not None
+        self._private_bytes += size
+        self._pins.append(_Pin(tracker, None, 0, size))
+        return True
 
     def _send_large(
         self,
         outlet: Outlet,
         slot: Slot,
         size: int,
-        tail: bytes,
+        rest: bytes,
         send_strict: Callable[[Outlet, bytes, int], bool],
     ) -> bool:
         """Send header and body without a copy; False if too much waits to be sent already."""
@@ -249,7 +326,7 @@ class LargeSender:
             if self._private_bytes + size > max(PRIVATE_BYTES, 4 * size):
                 return False
             self._private_bytes += size
-        head = self._large_head + tail
+        head = self._large_head + rest
         on_time = True
         if outlet.strict:
             on_time = send_strict(outlet, head, SNDMORE)
@@ -258,8 +335,8 @@ class LargeSender:
         tracker = outlet.send(body.data, DONTWAIT, False, True)
         assert tracker is not None
         if ring is not None:
-            ring.pin(slot.index)
-        self._pins.append(_Pin(tracker, ring, slot.index, size))
+            ring.pin(slot.number)
+        self._pins.append(_Pin(tracker, ring, slot.number, size))
         return on_time
 
     def prune(self) -> None:
@@ -278,11 +355,9 @@ class LargeSender:
             else:
                 self._private_bytes -= pin.size
 
-    def _is_full(self, reader: Reader, quota: int, ring: Ring | None) -> bool:
+    def _inline_full(self, ring: Ring | None) -> bool:
         if ring is None:
             return self._private_bytes > PRIVATE_BYTES // 2
-        if reader.column is not None:
-            return not ring.has_room(reader.column, quota)
         return self._pinned(ring) >= self._pin_quota
 
     def _pinned(self, ring: Ring) -> int:
@@ -291,10 +366,7 @@ class LargeSender:
     def _ring_for(self, size: int, sequence: int, *, exact: bool) -> Ring | None:
         if self._unavailable:
             return None
-        current, wanted = self._ring, 2 * self._shares + 2
-        if current is not None and current.slot_bytes >= size and current.slots >= wanted:
-            return current
-        page = mmap.PAGESIZE
+        current, wanted, page = self._ring, self._slots_wanted, mmap.PAGESIZE
         slot_bytes = size if exact else size + size // 4
         if current is not None:
             slot_bytes = max(slot_bytes, current.slot_bytes)
@@ -313,8 +385,10 @@ class LargeSender:
             return None
         self._ring_count += 1
         self._rings.append(ring)
-        while len(self._rings) > RINGS_ALIVE:
-            self._rings.pop(0).close()
+        for old in self._rings[:-RINGS_ALIVE]:
+            if not old.in_writing:  # not while a loan lies there
+                self._rings.remove(old)
+                old.close()
         self._plan()
         for reader in self._columns.values():
             frame = self.answer(reader, sequence, b"")

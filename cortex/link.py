@@ -47,6 +47,8 @@ JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
 WHOLE_BATCH = -1
+make = tuple.__new__
+"""Makes a named tuple in half of the time that its own constructor takes."""
 
 
 class Item(NamedTuple):
@@ -162,9 +164,8 @@ class Link:
             return handler(frame)
         except MalformedMessage as error:
             self.reject(str(error))
-            return []
-        finally:
             self._drop_parts()
+            return []
 
     def _drop_parts(self) -> None:
         while self.socket.get(zmq.RCVMORE):
@@ -200,6 +201,7 @@ class Link:
         if len(frame) != HEADER_SIZE or not self.socket.get(zmq.RCVMORE):
             raise MalformedMessage("a large message without its body")
         body = self.socket.recv(zmq.DONTWAIT, copy=False)
+        self._drop_parts()
         self._check(fingerprint, size)
         if len(body) != size:
             raise MalformedMessage(f"a large message of {len(body)} bytes that says it has {size}")
@@ -213,7 +215,8 @@ class Link:
         fingerprint, sequence, stamp_ns, publish_ns, size, aux = TAIL.unpack_from(frame, 16)
         if len(frame) != HEADER_SIZE + MASK.size:
             raise MalformedMessage(f"a descriptor of {len(frame)} bytes")
-        self._check(fingerprint, size)
+        if fingerprint != self.codec.fingerprint:
+            self._check(fingerprint, size)
         (mask,) = MASK.unpack_from(frame, HEADER_SIZE)
         view, slot = self._rings.get(aux >> 32), aux & 0xFFFFFFFF
         leased = self._column is not None and bool(mask >> self._column & 1)
@@ -221,7 +224,8 @@ class Link:
             if self._large_subscribed or sequence < self.expected:
                 return []  # it comes, or came, as a large message
             if view is None or self._policy.reliable:
-                # Left out on purpose: the publisher held us to our share. The next one shows the gap.
+                if self.advance(sequence):  # left out on purpose: the publisher held us to our share
+                    self.counters.lost += 1
                 return []
             self.advance(sequence)
             return [Item(self, None, 0, size, sequence, stamp_ns, publish_ns, (view, slot))]
@@ -229,9 +233,11 @@ class Link:
             data = view.lease(slot, sequence, size)
         except ValueError as error:
             raise MalformedMessage(str(error)) from None
-        if not self.advance(sequence):
+        if sequence == self.expected:
+            self.expected = sequence + 1
+        elif not self.advance(sequence):
             return []  # `data` gives the slot back
-        return [Item(self, data, 0, size, sequence, stamp_ns, publish_ns, None)]
+        return [make(Item, (self, data, 0, size, sequence, stamp_ns, publish_ns, None))]
 
     def _on_batch(self, frame: bytes) -> list[Item]:
         fingerprint, first, _, publish_ns, size, count = TAIL.unpack_from(frame, 16)
@@ -298,7 +304,7 @@ class Link:
             except ShmUnavailable as error:
                 self._do_without_shared_memory(error)
                 return []
-            for number in sorted(self._rings)[:-2]:
+            for number in self._rings.keys() - {place.ring for place in answer.rings}:
                 self._rings.pop(number).close()
             if self._large_subscribed:
                 self.socket.unsubscribe(self._large_head)

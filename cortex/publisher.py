@@ -15,7 +15,7 @@ import zmq
 
 from cortex.codec import Codec
 from cortex.context import Closed
-from cortex.large import LargeSender, Reader, Slot
+from cortex.large import LargeSender, Reader, Slot, Stamps
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
 from cortex.packer import make_packer
 from cortex.stats import PublisherCounters
@@ -86,13 +86,16 @@ class Publisher(Generic[T]):
         self._outlets = outlets
         self._lock = outlets.lock
         self._large_lock = threading.Lock()
-        self._large = LargeSender(self.source, stamped=stamped, topic=topic, outlets=outlets)
+        self._large = LargeSender(
+            self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
+        )
         self._readers: dict[bytes, Reader] = {}
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_outlets: tuple[Outlet, ...] = ()
         self._sequence = 0
         self._latched = b""
         self._refresh_ns = 0
+        self._was_large = False
         self._late: set[Outlet] = set()
         """Strict outlets on which a reader was too late: libzmq sends it nothing until it has caught up."""
         self._blocked = False
@@ -129,7 +132,7 @@ class Publisher(Generic[T]):
             if not self._readers and not self.latch:
                 self._sequence += 1
                 return True
-            if self._plain:
+            if self._plain and not self._was_large:
                 sequence = self._sequence
                 frame = self._pack(message, sequence, now_ns, self._inline_max)
                 if frame is not None:
@@ -138,16 +141,30 @@ class Publisher(Generic[T]):
                     for send in self._lossy_sends:
                         send(frame, DONTWAIT)
                     return self._send_strict_all(frame) if self._strict_outlets else True
-            prepared = self.codec.prepare(message, self._inline_max)
+            if self._was_large:  # the next is most likely large, too
+                prepared: Any = self.codec.plan(message)
+                if prepared.size <= self._inline_max:
+                    prepared = self.codec.prepare(message, self._inline_max)
+            else:
+                prepared = self.codec.prepare(message, self._inline_max)
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-            if isinstance(prepared, bytes):
+            self._was_large = not isinstance(prepared, bytes)
+            if not self._was_large:
                 return self._publish_inline(prepared, stamp_ns, now_ns)
-        with self._large_lock:
-            slot = self._acquire_slot(prepared.size)
+            ours = self._large_lock.acquire(blocking=False)
+            slot = self._acquire_slot(prepared.size) if ours else None
+        if not ours:
+            self._large_lock.acquire()
+            with self._lock:
+                slot = self._acquire_slot(prepared.size)
+        try:
             if slot is None:
                 return False
             prepared.write(slot.buffer)
-            return self._publish_slot(slot, prepared.size, stamp_ns)
+            with self._lock:
+                return self._publish_slot(slot, prepared.size, stamp_ns, now_ns)
+        finally:
+            self._large_lock.release()
 
     @contextmanager
     def loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Iterator[Any]:
@@ -171,7 +188,8 @@ class Publisher(Generic[T]):
             self._check_open()
             slot = Slot(np.empty(size, np.uint8), None, 0)
         else:
-            with self._large_lock:
+            with self._large_lock, self._lock:
+                self._prepare(monotonic_ns())
                 slot = self._acquire_slot(size)
             if slot is None:
                 raise RuntimeError(f"{self.topic}: every slot is out on loan; publish or drop one first")
@@ -190,8 +208,13 @@ class Publisher(Generic[T]):
                 self._prepare(now_ns)
                 self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
         else:
-            with self._large_lock:
-                self._publish_slot(slot, size, stamp_ns)
+            with self._large_lock, self._lock:
+                now_ns = monotonic_ns()
+                self._prepare(now_ns)
+                slot = self._large.renew(slot, size, self._sequence)
+                if slot is None:
+                    raise RuntimeError(f"{self.topic}: every slot is out on loan; the message is lost")
+                self._publish_slot(slot, size, stamp_ns, now_ns)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send or collect a small message; the lock is held."""
@@ -303,44 +326,41 @@ class Publisher(Generic[T]):
             return self._flush()
 
     def _acquire_slot(self, size: int) -> Slot | None:
-        with self._lock:
-            now_ns = monotonic_ns()
-            if now_ns >= self._refresh_ns or self._blocked:
-                self._prepare(now_ns)
-            slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
-            if slot is None:
-                self._sequence += 1
-                self._skipped += 1
-            return slot
+        """Find memory for a large message; both locks are held."""
+        slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
+        if slot is None:
+            self._sequence += 1
+            self._skipped += 1
+        return slot
 
-    def _publish_slot(self, slot: Slot, size: int, stamp_ns: int) -> bool:
-        """Send what was written into a slot; the large lock is held."""
-        with self._lock:
-            now_ns = monotonic_ns()
-            if now_ns >= self._refresh_ns or self._blocked:
-                self._prepare(now_ns)
-            if self._batch:
-                self._flush()
+    def _publish_slot(self, slot: Slot, size: int, stamp_ns: int, now_ns: int) -> bool:
+        """Send what was written into a slot; both locks are held."""
+        if self._blocked:
+            self._prepare(now_ns)
+        if self._batch:
+            self._flush()
+        on_time = not self._late
+        mask, full, passed_over = self._large.grant(slot.ring)
+        if full:
             self._blocked = True
             try:
-                on_time = self._large.await_strict(slot.ring)
-                self._check_open()
+                on_time &= self._large.await_strict(slot.ring)
             finally:
                 self._blocked = False
-            sequence = self._sequence
-            self._sequence = sequence + 1
-            self._bytes += size
-
-            def tail(aux: int) -> bytes:
-                return TAIL.pack(self._fingerprint, sequence, stamp_ns, now_ns, size, aux)
-
-            if self.latch:
-                self._latched = self._large_kind + tail(0) + slot.buffer[:size].tobytes()
-            sent, passed_over = self._large.send(slot, size, tail, sequence, self._send_strict)
-            self._skipped += passed_over
-            on_time = on_time and sent and not self._late
-            self._timeouts += not on_time
-            return on_time
+            mask, _, passed_over = self._large.grant(slot.ring)
+        if self._closed:
+            self._check_open()
+        stamps = Stamps(self._sequence, stamp_ns, now_ns)
+        self._sequence += 1
+        self._bytes += size
+        if self.latch:
+            head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
+            self._latched = head + slot.buffer[:size].tobytes()
+        sent, inline_passed_over = self._large.send(slot, size, mask, stamps, self._send_strict)
+        self._skipped += passed_over or inline_passed_over
+        on_time &= sent and not self._late
+        self._timeouts += not on_time
+        return on_time
 
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""

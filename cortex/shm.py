@@ -223,6 +223,12 @@ class Ring:
             self._held[column].clear()
 
     @property
+    def in_writing(self) -> bool:
+        """Whether a slot is being written, or read by a socket."""
+        with self._lock:
+            return any(self._busy)
+
+    @property
     def idle(self) -> bool:
         """Whether no reader, socket or writer uses any slot, so that the ring can be closed unnoticed."""
         with self._lock:
