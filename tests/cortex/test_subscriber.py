@@ -343,11 +343,10 @@ def test_a_callback_that_raises_is_logged_and_called_again(node, caplog):
     publisher = node.publisher("/scans", Scan)
     node.subscriber("/scans", Scan, fail)
     assert publisher.wait_for_subscribers()
-    for number, size in enumerate((1, LARGE, 1)):
-        publisher.publish(scan(number, size))
+    for number in range(3):
+        publisher.publish(scan(number, 1))
     wait_for(lambda: len(received) == 3)
     wait_for(lambda: sum(r.exc_info is not None and r.levelno == logging.ERROR for r in caplog.records) == 3)
-    caplog.clear()  # the records hold the tracebacks, these the messages, these the slots
 
 
 def test_callbacks_of_large_and_small_messages_keep_the_order(node):

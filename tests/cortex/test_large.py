@@ -1,0 +1,440 @@
+"""Large messages: leases, quotas, growing rings, loans, and what happens without shared memory."""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from peer import Block, Number, Scan, is_whole, make_block
+from processes import shared_mappings, wait_for
+
+import cortex.large
+import cortex.link
+from cortex import keep_last, latest, reliable
+from cortex.shm import ShmUnavailable
+
+LARGE = 100_000
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+def scan(number, size=LARGE):
+    return Scan(number, np.full(size, number, np.float32))
+
+
+def connected(node, kind, policy, **options):
+    publisher = node.publisher("/large", kind, **options)
+    subscriber = node.subscriber("/large", kind, policy=policy)
+    assert publisher.wait_for_subscribers()
+    return publisher, subscriber
+
+
+def slots_held(publisher):
+    """Slots of all rings that any reader holds."""
+    with publisher._outlets.lock:
+        return sum(ring.outstanding(column) for ring in publisher._large._rings for column in range(64))
+
+
+def is_shared(message):
+    """Whether a received array lies in a ring, not in memory of its own."""
+    address = message.ranges.__array_interface__["data"][0]
+    for line in Path("/proc/self/maps").read_text(encoding="ascii").splitlines():
+        low, high = (int(part, 16) for part in line.split()[0].split("-"))
+        if low <= address < high:
+            return "memfd:cortex-" in line
+    return False
+
+
+# Leases
+
+
+def test_a_large_message_is_a_view(node):
+    publisher, subscriber = connected(node, Scan, keep_last())
+    publisher.publish(scan(1))
+    message = subscriber.recv(1.0)
+    assert is_shared(message)
+    assert slots_held(publisher) == 1
+    publisher.publish(scan(2, 10))
+    assert not is_shared(subscriber.recv(1.0))
+    del message
+    assert slots_held(publisher) == 0
+
+
+def test_a_slice_keeps_the_lease(node):
+    """The slot is not written again until the last array that looks at it is gone."""
+    publisher, subscriber = connected(node, Scan, latest())
+    publisher.publish(scan(1))
+    part = subscriber.recv(1.0).ranges[10:20][::2]
+    for number in range(2, 100):
+        publisher.publish(scan(number))
+        subscriber.recv(1.0)
+    assert part.tolist() == [1.0] * 5
+    assert slots_held(publisher) == 1
+    del part
+    assert slots_held(publisher) == 0
+
+
+def test_messages_that_wait_and_are_overtaken_give_their_slots_back(node):
+    publisher, subscriber = connected(node, Scan, latest())
+    for number in range(50):
+        publisher.publish(scan(number))
+    assert subscriber.recv(1.0).stamp_ns == 49
+    wait_for(lambda: slots_held(publisher) == 0)
+    counters = subscriber.counters
+    assert counters.received + counters.overtaken + counters.lost == 50
+
+
+def test_views_outlive_everything(make_node):
+    """The subscriber, its node and the publisher are closed; what was received stays as it was."""
+    kept = []
+    one, two = make_node("one"), make_node("two")
+    publisher = one.publisher("/large", Block)
+    for end in ("subscriber", "publisher", "node of the reader", "node of the writer"):
+        if end == "node of the writer":
+            two = make_node("two again")
+        subscriber = two.subscriber("/large", Block, policy=reliable(4))
+        assert publisher.wait_for_subscribers()
+        for number in range(2):
+            publisher.publish(make_block(number, 300_000))
+            kept.append(subscriber.recv(1.0))
+        if end == "subscriber":
+            subscriber.close()
+        elif end == "publisher":
+            publisher.close()
+            publisher = one.publisher("/large", Block)
+        elif end == "node of the reader":
+            two.close()
+        else:
+            one.close()
+        gc.collect()
+        if end == "subscriber":  # its slots are written again
+            other = two.subscriber("/large", Block, policy=latest())
+            assert publisher.wait_for_subscribers()
+            for number in range(10, 30):
+                publisher.publish(make_block(number, 300_000))
+                other.recv(1.0)
+            other.close()
+        assert all(is_whole(block) for block in kept)
+    two.close()
+    assert [block.number for block in kept] == [0, 1] * 4
+    assert all(is_whole(block) for block in kept)
+    kept.clear()
+    gc.collect()
+    wait_for(lambda: not shared_mappings())
+
+
+# Quotas
+
+
+def test_a_reader_that_hoards_hurts_only_itself(node):
+    """It loses messages and knows it; the other gets all, and the publisher waits for neither."""
+    publisher, hoarder = connected(node, Scan, keep_last(64))
+    other = node.subscriber("/large", Scan, policy=keep_last(64))
+    assert publisher.wait_for_subscribers(2)
+    kept = []
+    slowest_s = 0.0
+    for number in range(100):
+        begin = time.monotonic()
+        assert publisher.publish(scan(number))
+        slowest_s = max(slowest_s, time.monotonic() - begin)
+        assert other.recv(1.0).stamp_ns == number
+        if (message := _try(hoarder)) is not None:
+            kept.append(message)
+    assert slowest_s < 0.5
+    assert [message.stamp_ns for message in kept] == sorted({message.stamp_ns for message in kept})
+    assert all((message.ranges == message.stamp_ns).all() for message in kept)
+    counters = hoarder.counters
+    assert counters.received + counters.lost + counters.overtaken == 100
+    assert (other.counters.received, other.counters.lost) == (100, 0)
+    leased = [message for message in kept if is_shared(message)]
+    assert 1 <= len(leased) <= 32
+    assert publisher.counters.skipped > 0
+    kept.clear()
+    del leased, message
+    publisher.publish(scan(100))
+    message = hoarder.recv(1.0)
+    assert is_shared(message)
+
+
+def test_a_reader_that_was_passed_over_knows_at_once(node):
+    """It need not wait for a next message that may never come."""
+    publisher, subscriber = connected(node, Scan, reliable(2, 0.01))
+    delivered = [publisher.publish(scan(number)) for number in range(20)]
+    count = delivered.count(True)
+    assert 2 <= count < 20
+    assert [subscriber.recv(1.0).stamp_ns for _ in range(count)] == list(range(count))
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.1)
+    assert subscriber.counters.lost == 20 - count
+
+
+@pytest.mark.parametrize("count", [3, 70])
+def test_many_readers(node, count):
+    """More than there are columns: the others get the same bytes through the socket."""
+    publisher = node.publisher("/large", Scan)
+    subscribers = [node.subscriber("/large", Scan, policy=keep_last(8)) for _ in range(count)]
+    assert publisher.wait_for_subscribers(count)
+    for number in range(5):
+        assert publisher.publish(scan(number, 30_000))
+        messages = [subscriber.recv(5.0) for subscriber in subscribers]
+        assert all(message == scan(number, 30_000) for message in messages)
+        with publisher._outlets.lock:
+            assert len(publisher._large._columns) == min(count, 64)
+        del messages
+    assert sum(subscriber.counters.lost for subscriber in subscribers) == 0
+    wait_for(lambda: slots_held(publisher) == 0)
+
+
+# Rings
+
+
+@pytest.mark.parametrize("policy", [reliable(4, 5.0), keep_last(4)], ids=str)
+def test_messages_that_grow_and_shrink(node, policy):
+    publisher, subscriber = connected(node, Scan, policy)
+    sizes = [5_000, 10, 20_000, 80_000, 320_000, 1_280_000, 5_000, 2_000_000, 10, 4_200, 2_000_001]
+    kept = []
+    for number, size in enumerate(sizes * 2):
+        assert publisher.publish(scan(number, size))
+        message = subscriber.recv(2.0)
+        assert len(message.ranges) == size
+        assert (message.ranges == number).all()
+        kept.append(message)
+        del kept[:-2]
+    assert subscriber.counters.lost == 0
+    del kept, message
+    wait_for(lambda: len(publisher._large._rings) == 1)  # the small rings are given up
+    assert len(shared_mappings()) < 12
+
+
+def test_growing_while_messages_wait(node):
+    """What lies in an older ring is still delivered."""
+    publisher, subscriber = connected(node, Scan, keep_last(64))
+    sizes = [5_000, 50_000, 500_000]
+    for number, size in enumerate(sizes):
+        assert publisher.publish(scan(number, size))
+    for number, size in enumerate(sizes):
+        message = subscriber.recv(1.0)
+        assert (message.stamp_ns, len(message.ranges)) == (number, size)
+    assert subscriber.counters.lost == 0
+
+
+def test_memory_stays_flat(node):
+    """Thousands of messages, large ones among them, on both sides of one process."""
+
+    def resident():
+        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * mmap.PAGESIZE
+
+    publisher, subscriber = connected(node, Scan, reliable(8, 5.0))
+    small, large = scan(1, 10), scan(2, 50_000)
+
+    def run(count):
+        for number in range(count):
+            assert publisher.publish(large if number % 8 == 0 else small)
+            subscriber.recv(1.0)
+        gc.collect()
+
+    run(3000)
+    before = resident()
+    run(12_000)
+    assert resident() - before < 8 << 20  # 1 kB each would be 12 MB; one large one leaked in eight, 300 MB
+
+
+# Without shared memory
+
+
+def test_a_reader_without_shared_memory(node, monkeypatch):
+    """It gets the same bytes; one that can share goes on sharing."""
+    publisher, sharing = connected(node, Scan, reliable(8, 5.0))
+    publisher.publish(scan(0))
+    assert is_shared(sharing.recv(1.0))
+
+    def refuse(*args):
+        raise ShmUnavailable("not for you")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cortex.link, "RingView", refuse)
+        plain = node.subscriber("/large", Scan, policy=reliable(8, 5.0))
+        assert publisher.wait_for_subscribers(2)
+        assert plain.wait_for_publisher()
+        wait_for(lambda: publisher.publish(scan(1)) and _try(plain))
+    while _try(sharing) or _try(plain):
+        pass
+    for number, size in enumerate((10, LARGE, 5_000, 10, 300_000)):
+        publisher.publish(scan(number, size))
+        first, second = sharing.recv(1.0), plain.recv(1.0)
+        assert first == second == scan(number, size)
+        assert is_shared(first) == (size > 4096)
+        assert not second.ranges.flags.writeable
+    assert plain.counters.rejected == 0
+
+
+def _try(subscriber):
+    try:
+        return subscriber.recv(0.005)
+    except TimeoutError:
+        return None
+
+
+@pytest.mark.parametrize("policy", [reliable(8, 5.0), keep_last(8)], ids=str)
+def test_a_publisher_without_shared_memory(node, monkeypatch, policy, caplog):
+    def refuse(*args, **options):
+        raise ShmUnavailable(28, "no memory")
+
+    monkeypatch.setattr(cortex.large, "Ring", refuse)
+    publisher, subscriber = connected(node, Scan, policy)
+    for number in range(20):
+        assert publisher.publish(scan(number))
+        message = subscriber.recv(1.0)
+        assert message == scan(number)
+        assert not is_shared(message)
+    with publisher.loan(n=LARGE) as draft:
+        draft.stamp_ns = 77
+        draft.ranges[:] = 1.0
+    assert subscriber.recv(1.0).stamp_ns == 77
+    assert subscriber.counters.lost == 0
+    assert [record.levelname for record in caplog.records if "shared memory" in record.getMessage()] == [
+        "WARNING"
+    ]
+
+
+@pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
+def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
+    """A reader that reads nothing, large messages, no shared memory: memory does not grow for ever."""
+
+    def refuse(*args, **options):
+        raise ShmUnavailable(28, "no memory")
+
+    monkeypatch.setattr(cortex.large, "Ring", refuse)
+    publisher, subscriber = connected(node, Scan, policy)
+    message = scan(0, 1_000_000)
+    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
+    for _ in range(60):
+        publisher.publish(message)
+    assert publisher._large._private_bytes <= 80 << 20
+    counters, last = subscriber.counters, 0
+    while _try(subscriber):
+        last += 1
+    publisher.publish(message)
+    wait_for(lambda: publisher.publish(scan(1, 10)) and _try(subscriber))
+    assert last >= 1
+    assert counters.lost > 0
+
+
+# Loans
+
+
+@pytest.mark.parametrize("size", [3, LARGE])
+def test_a_loan_is_published_when_it_ends(node, size):
+    publisher, subscriber = connected(node, Scan, keep_last())
+    with publisher.loan(n=size) as draft:
+        draft.stamp_ns = 5
+        draft.ranges[:] = np.arange(size)
+        with pytest.raises(TimeoutError):
+            subscriber.recv(0.02)
+    message, info = subscriber.recv_with_info(1.0)
+    assert (message.stamp_ns, info.stamp_ns, info.sequence) == (5, 5, 0)
+    np.testing.assert_array_equal(message.ranges, np.arange(size, dtype=np.float32))
+    assert publisher.counters.published == 1
+
+
+@pytest.mark.parametrize("size", [3, LARGE])
+def test_a_loan_that_raises_is_dropped(node, size):
+    """It takes no number and no slot."""
+    publisher, subscriber = connected(node, Scan, keep_last())
+    for _ in range(100):
+        with pytest.raises(KeyError, match="changed my mind"), publisher.loan(n=size) as draft:
+            draft.ranges[:] = 1.0
+            raise KeyError("changed my mind")
+    with pytest.raises((TypeError, ValueError), match="stamp_ns"), publisher.loan(n=size) as draft:
+        draft.ranges[:] = 1.0  # and no stamp
+    with publisher.loan(n=size) as draft:
+        draft.stamp_ns = 1
+        draft.ranges[:] = 2.0
+    message, info = subscriber.recv_with_info(1.0)
+    assert (message.stamp_ns, info.sequence) == (1, 0)
+    assert subscriber.counters.lost == 0
+
+
+def test_several_loans_at_once(node):
+    """Numbers are given when they are published; another message may go in between."""
+    publisher, subscriber = connected(node, Scan, keep_last())
+    with publisher.loan(n=LARGE) as first:
+        first.stamp_ns = 1
+        first.ranges[:] = 1.0
+        with publisher.loan(n=LARGE) as second:
+            second.stamp_ns = 2
+            second.ranges[:] = 2.0
+            publisher.publish(scan(3))
+            publisher.publish(scan(4, 10))
+    received = [subscriber.recv_with_info(1.0) for _ in range(4)]
+    assert [message.stamp_ns for message, _ in received] == [3, 4, 2, 1]
+    assert [info.sequence for _, info in received] == [0, 1, 2, 3]
+    assert all((message.ranges == message.stamp_ns).all() for message, _ in received)
+
+
+def test_too_many_loans(node):
+    publisher, subscriber = connected(node, Scan, keep_last(64))
+    loans = []
+    with pytest.raises(RuntimeError, match="every slot is out on loan"):
+        for _ in range(200):
+            loan = publisher.loan(n=1_000_000)
+            loan.__enter__()
+            loans.append(loan)
+    assert len(loans) >= 3
+    for loan in loans:
+        assert not loan.__exit__(KeyError, KeyError("no"), None)
+    with publisher.loan(n=1_000_000) as draft:
+        draft.stamp_ns = 9
+        draft.ranges[:] = 9.0
+    message, info = subscriber.recv_with_info(1.0)
+    assert message.stamp_ns == 9
+    assert info.sequence == subscriber.counters.lost  # a loan that was refused may count as skipped
+
+
+def test_a_loan_while_the_rings_grow(node):
+    """Its ring may be given up meanwhile: the message is published all the same."""
+    publisher, subscriber = connected(node, Scan, keep_last(64))
+    with publisher.loan(n=5_000) as draft:
+        draft.stamp_ns = 100
+        draft.ranges[:] = 100.0
+        for number in range(7):
+            publisher.publish(scan(number, 5_000 * 2 ** (number + 1)))
+            assert subscriber.recv(1.0).stamp_ns == number
+    message = subscriber.recv(1.0)
+    assert message.stamp_ns == 100
+    assert (message.ranges == 100.0).all()
+    assert subscriber.counters.lost == 0
+
+
+def test_a_loan_of_a_closed_publisher(node):
+    """Closing while the block runs: an error, not a message from the grave."""
+    from cortex.publisher import Closed
+
+    publisher, subscriber = connected(node, Scan, keep_last())
+    for size in (3, LARGE):
+        other = node.publisher("/large", Scan)
+        with pytest.raises(Closed), other.loan(n=size) as draft:
+            draft.stamp_ns = 1
+            draft.ranges[:] = 1.0
+            other.close()
+    assert publisher.publish(scan(2))
+    assert subscriber.recv(1.0).stamp_ns == 2
+
+
+def test_a_fixed_type_has_nothing_to_declare(node):
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number)
+    assert publisher.wait_for_subscribers()
+    with publisher.loan() as draft:
+        draft.stamp_ns = 1
+        draft.value = 2
+    assert subscriber.recv(1.0) == Number(1, 2)
+    with pytest.raises((TypeError, ValueError), match="n"), publisher.loan(n=3):
+        pass

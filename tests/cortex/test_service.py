@@ -1,0 +1,367 @@
+"""Services: replies, failures, deadlines, and servers that stop or die during a call."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+from peer import Number, OtherNumber, Scan
+from processes import wait_for
+
+from cortex import ServiceFailed, ServiceTimeout, ServiceUnavailable
+from cortex.message import message
+from cortex.schema import TypeMismatch
+from cortex.service import PENDING_MAX
+from cortex.wire import CONTROL_LIMIT
+
+
+@message
+class Bulk:
+    data: bytes
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+def double(request):
+    return Number(request.stamp_ns, 2 * request.value)
+
+
+def served(child, name="/double"):
+    """A child that offers a service; its hello."""
+    hello = child.hear()
+    child.ask(do="serve", name=name)
+    return hello
+
+
+# Replies
+
+
+def test_a_call_is_answered(node):
+    node.service("/double", Number, Number, double)
+    with node.client("/double", Number, Number) as client:
+        assert client.available()
+        for value in range(50):
+            assert client.call(Number(value, value)) == Number(value, 2 * value)
+
+
+def test_a_call_between_processes(make_node, start_child):
+    """Found through discovery; the deadline covers finding it."""
+    child = start_child("peer")
+    served(child)
+    client = make_node().client("/double", Number, Number)
+    assert client.call(Number(0, 21), timeout_s=10.0) == Number(child.pid, 42)
+    assert child.ask(do="serve", name="/other") == {}
+    client.close()
+
+
+def test_request_and_reply_of_different_types(node):
+    node.service("/bulk", Number, Bulk, lambda request: Bulk(bytes(request.value)))
+    with node.client("/bulk", Number, Bulk) as client:
+        for size in (0, 1, 1000, 10_000_000):
+            assert client.call(Number(0, size), timeout_s=10.0).data == bytes(size)
+
+
+# Failures
+
+
+def test_a_handler_that_raises(node, caplog):
+    """The text comes back; the next call works; a failure is in the server's log."""
+
+    def fail(request):
+        raise KeyError(f"no {request.value}")
+
+    node.service("/fail", Number, Number, fail)
+    with node.client("/fail", Number, Number) as client:
+        for value in range(3):
+            with pytest.raises(ServiceFailed, match=f"/fail: KeyError: 'no {value}'"):
+                client.call(Number(0, value))
+    assert sum(record.exc_info is not None for record in caplog.records) == 3
+
+
+def test_a_handler_that_returns_something_else(node, caplog):
+    node.service("/wrong", Number, Number, lambda request: None)
+    node.service("/value", Number, Number, lambda request: Number("x", 1))
+    with node.client("/wrong", Number, Number) as client, pytest.raises(ServiceFailed, match="must return Number"):
+        client.call(Number(0, 0))
+    with node.client("/value", Number, Number) as client, pytest.raises(ServiceFailed, match="stamp_ns"):
+        client.call(Number(0, 0))
+
+
+def test_nobody_offers_it(node):
+    with node.client("/nobody", Number, Number) as client:
+        assert not client.available()
+        begin = time.monotonic()
+        with pytest.raises(ServiceUnavailable, match=r"nobody offers /nobody \(waited 0\.1 s\)"):
+            client.call(Number(0, 0), timeout_s=0.1)
+        assert 0.1 <= time.monotonic() - begin < 1.0
+
+
+def test_it_comes_in_time(node):
+    with node.client("/late", Number, Number) as client:
+        timer = threading.Timer(0.1, node.service, ("/late", Number, Number, double))
+        timer.start()
+        assert client.call(Number(0, 4), timeout_s=5.0).value == 8
+        timer.join()
+
+
+def test_it_is_withdrawn(node):
+    withdraw = node.service("/double", Number, Number, double)
+    with node.client("/double", Number, Number) as client:
+        assert client.call(Number(0, 4)).value == 8
+        withdraw()
+        withdraw()
+        with pytest.raises(ServiceUnavailable):
+            client.call(Number(0, 4), timeout_s=0.05)
+        node.service("/double", Number, Number, lambda request: Number(0, 3 * request.value))
+        assert client.call(Number(0, 4)).value == 12
+
+
+def test_other_types(node):
+    node.service("/double", Number, Number, double)
+    with node.client("/double", OtherNumber, Number) as client, pytest.raises(TypeMismatch) as caught:
+        client.call(OtherNumber(0, 1.0))
+    text = str(caught.value)
+    assert "/double" in text
+    assert text.index("float64") < text.index("int64", text.index("actual"))
+    with node.client("/double", Number, Scan) as client, pytest.raises(TypeMismatch):
+        client.call(Number(0, 1))
+
+
+def test_wrong_use(node):
+    node.service("/double", Number, Number, double)
+    with pytest.raises(ValueError, match="offers /double already"):
+        node.service("/double", OtherNumber, Number, double)
+    with pytest.raises(ValueError, match="is named like"):
+        node.service("double", Number, Number, double)
+    with node.client("/double", Number, Number) as client, pytest.raises(TypeError, match="takes Number, got Scan"):
+        client.call(Scan(0, None))
+
+
+@pytest.mark.parametrize("excess", [-64, 0, 1, 1000])
+def test_a_request_has_a_limit(node, excess):
+    """At the limit it arrives; above it is refused at once, not lost."""
+    node.service("/bulk", Bulk, Number, lambda request: Number(0, len(request.data)))
+    size = CONTROL_LIMIT - 8 + excess  # the block of the body
+    with node.client("/bulk", Bulk, Number) as client:
+        if excess > 0:
+            with pytest.raises(ValueError, match="over the limit"):
+                client.call(Bulk(bytes(size)), timeout_s=5.0)
+        else:
+            assert client.call(Bulk(bytes(size)), timeout_s=10.0).value == size
+        assert client.call(Bulk(b"123")).value == 3
+
+
+def test_a_reply_has_a_limit(node, caplog):
+    node.service("/bulk", Number, Bulk, lambda request: Bulk(bytes(request.value)))
+    with node.client("/bulk", Number, Bulk) as client:
+        with pytest.raises(ServiceFailed, match="over the limit"):
+            client.call(Number(0, CONTROL_LIMIT + 1), timeout_s=10.0)
+        assert client.call(Number(0, 3)).data == bytes(3)
+
+
+# Deadlines
+
+
+def test_a_handler_that_takes_too_long(node):
+    """An error in time; the reply that comes later is not taken for that of the next call."""
+    node.service("/slow", Number, Number, lambda request: (time.sleep(request.stamp_ns * 1e-3), double(request))[1])
+    with node.client("/slow", Number, Number) as client:
+        begin = time.monotonic()
+        with pytest.raises(ServiceTimeout, match=r"/slow: no reply within 0\.05 s"):
+            client.call(Number(200, 1), timeout_s=0.05)
+        assert time.monotonic() - begin < 0.19
+        assert client.call(Number(0, 5), timeout_s=5.0).value == 10
+
+
+def test_a_request_whose_time_is_over_is_not_acted_upon(node):
+    """It waited behind another one until its caller had given up."""
+    seen = []
+
+    def handle(request):
+        seen.append(request.value)
+        time.sleep(request.stamp_ns * 1e-3)
+        return request
+
+    node.service("/slow", Number, Number, handle)
+    clients = [node.client("/slow", Number, Number) for _ in range(2)]
+    first = threading.Thread(target=lambda: clients[0].call(Number(300, 1), timeout_s=5.0))
+    first.start()
+    wait_for(lambda: seen)
+    with pytest.raises(ServiceTimeout):
+        clients[1].call(Number(0, 2), timeout_s=0.05)
+    first.join()
+    assert clients[1].call(Number(0, 3), timeout_s=5.0).value == 3
+    assert seen == [1, 3]
+    for client in clients:
+        client.close()
+
+
+def test_calls_of_several_threads_share_their_time(node):
+    """One client: the calls follow one another; who waits too long gets an error."""
+    node.service("/slow", Number, Number, lambda request: (time.sleep(0.1), request)[1])
+    with node.client("/slow", Number, Number) as client:
+        outcomes = []
+
+        def call(value):
+            try:
+                outcomes.append(client.call(Number(0, value), timeout_s=0.25).value == value)
+            except ServiceTimeout:
+                outcomes.append(None)
+
+        threads = [threading.Thread(target=call, args=(value,)) for value in range(5)]
+        begin = time.monotonic()
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert time.monotonic() - begin < 1.0
+        assert set(outcomes) == {True, None}
+        assert outcomes.count(True) in (1, 2, 3)
+
+
+def test_several_clients(node):
+    node.service("/double", Number, Number, double)
+    wrong = []
+
+    def run(number):
+        with node.client("/double", Number, Number) as client:
+            for k in range(50):
+                if client.call(Number(number, k), timeout_s=10.0) != Number(number, 2 * k):
+                    wrong.append((number, k))
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20.0)
+    assert not wrong
+
+
+def test_too_many_requests(node):
+    """Those over the number that may wait are refused at once, the others are served."""
+    release, entered = threading.Event(), threading.Event()
+
+    def handle(request):
+        entered.set()
+        release.wait(10.0)
+        return request
+
+    node.service("/busy", Number, Number, handle)
+    outcomes = []
+
+    def call(number):
+        with node.client("/busy", Number, Number) as client:
+            try:
+                outcomes.append(client.call(Number(0, number), timeout_s=20.0).value)
+            except ServiceUnavailable as error:
+                outcomes.append(str(error))
+
+    first = threading.Thread(target=call, args=(0,))
+    first.start()
+    assert entered.wait(5.0)
+    count = PENDING_MAX + 5
+    threads = [threading.Thread(target=call, args=(number,)) for number in range(1, count + 1)]
+    for thread in threads:
+        thread.start()
+    wait_for(lambda: len(outcomes) >= 5)
+    assert outcomes == [f"/busy: {PENDING_MAX} requests wait already"] * 5
+    release.set()
+    for thread in (first, *threads):
+        thread.join(20.0)
+    assert sum(isinstance(outcome, int) for outcome in outcomes) == PENDING_MAX + 1
+
+
+# Servers in other processes
+
+
+def test_a_handler_that_calls_back(make_node):
+    """A server asks its caller something before it answers: both threads are free for it."""
+    one, two = make_node("one"), make_node("two")
+    one.service("/base", Number, Number, lambda request: Number(0, 100))
+    back = two.client("/base", Number, Number)
+    two.service(
+        "/add", Number, Number, lambda request: Number(0, request.value + back.call(request, timeout_s=5.0).value)
+    )
+    with one.client("/add", Number, Number) as client:
+        assert client.call(Number(0, 7), timeout_s=10.0).value == 107
+    back.close()
+
+
+def test_a_handler_that_calls_its_own_node(node, caplog):
+    """The one thread for handlers is taken by itself: an error in time, and the node lives."""
+    node.service("/inner", Number, Number, double)
+    inner = node.client("/inner", Number, Number)
+    node.service("/outer", Number, Number, lambda request: inner.call(request, timeout_s=0.1))
+    with node.client("/outer", Number, Number) as client:
+        with pytest.raises(ServiceFailed, match="ServiceTimeout"):
+            client.call(Number(0, 1), timeout_s=5.0)
+    assert inner.call(Number(0, 1), timeout_s=5.0).value == 2
+    inner.close()
+
+
+def test_a_server_that_is_stopped(make_node, start_child):
+    """SIGSTOP: an error when the time is over, not before and not much later; then it goes on."""
+    child = start_child("peer")
+    served(child)
+    with make_node().client("/double", Number, Number) as client:
+        assert client.call(Number(0, 1), timeout_s=10.0).value == 2
+        with child.stopped():
+            begin = time.monotonic()
+            with pytest.raises(ServiceTimeout):
+                client.call(Number(0, 1), timeout_s=0.3)
+            assert 0.3 <= time.monotonic() - begin < 1.0
+        assert client.call(Number(0, 2), timeout_s=10.0).value == 4
+
+
+def test_a_server_that_is_killed_during_a_call(make_node, start_child):
+    """The caller hears of it when the server's lease is over, long before its own deadline."""
+    child = start_child("peer")
+    served(child)
+    with make_node().client("/double", Number, Number) as client:
+        assert client.call(Number(0, 1), timeout_s=10.0).value == 2
+        killer = threading.Timer(0.1, child.process.kill)
+        killer.start()
+        begin = time.monotonic()
+        with pytest.raises(ServiceUnavailable, match="the server of /double has gone"):
+            client.call(Number(10_000, 1), timeout_s=15.0)
+        assert time.monotonic() - begin < 5.0
+        killer.join()
+        other = start_child("peer")
+        served(other)
+        assert client.call(Number(0, 3), timeout_s=10.0) == Number(other.pid, 6)
+
+
+def test_a_server_that_closes_during_a_call(make_node):
+    server, caller = make_node("server"), make_node("caller")
+    entered, release = threading.Event(), threading.Event()
+
+    def handle(request):
+        entered.set()
+        release.wait(10.0)
+        return request
+
+    server.service("/hold", Number, Number, handle)
+    ended = []
+
+    def call():
+        with caller.client("/hold", Number, Number) as client:
+            begin = time.monotonic()
+            try:
+                client.call(Number(0, 0), timeout_s=20.0)
+            except ServiceUnavailable:
+                ended.append(time.monotonic() - begin)
+
+    thread = threading.Thread(target=call)
+    thread.start()
+    assert entered.wait(10.0)
+    closing = threading.Thread(target=server.close)
+    closing.start()
+    thread.join(10.0)
+    release.set()
+    closing.join(10.0)
+    assert len(ended) == 1
+    assert ended[0] < 8.0
