@@ -64,21 +64,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _call(options: argparse.Namespace) -> int:
-    from cortex.commands.session import UsageError
-    from cortex.context import Closed
-    from cortex.schema import TypeMismatch
-
     module, name = options.run
     try:
         return int(getattr(importlib.import_module(f"cortex.commands.{module}"), name)(options))
     except BrokenPipeError:
         raise
-    except (ValueError, OSError, ImportError, TypeMismatch, Closed) as error:
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
         text = " ".join(str(error).split())
         if isinstance(error, OSError) and error.strerror and error.filename:
             text = f"{error.filename}: {error.strerror}"
         print(f"cortex {options.command}: {text}", file=sys.stderr)
-        return 2 if isinstance(error, UsageError) else 1
+        return int(getattr(error, "status", 1))
 
 
 def _run_module(name: str, arguments: Sequence[str]) -> int:

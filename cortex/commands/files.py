@@ -85,7 +85,7 @@ def play(options: argparse.Namespace) -> int:
     """`cortex play`."""
     with open_log(options.file) as log:
         if log.cut:
-            hint(f"{options.file}: {log.cut}; it is played up to there")
+            hint(f"{options.file}: {log.cut}; what is before can be read")
         for topic in log.foreign:
             hint(f"{plain(topic)} is passed over: its messages are not those of Cortex")
         if options.info:

@@ -194,7 +194,6 @@ def _subscriber_table(counts: _Counts, before: _Counts | None) -> Iterator[str]:
         rows.append(
             (
                 plain(name),
-                plain(stats.policy),
                 f"{stats.received:,}",
                 rate((stats.received - earlier.received) / elapsed_s if earlier else math.nan),
                 f"{stats.lost:,}",
@@ -202,19 +201,10 @@ def _subscriber_table(counts: _Counts, before: _Counts | None) -> Iterator[str]:
                 f"{stats.rejected:,}",
                 seconds(quantile_ns(latency, 0.5) * 1e-9),
                 seconds(quantile_ns(latency, 0.99) * 1e-9),
+                plain(stats.policy),
             )
         )
-    head = (
-        "subscriber",
-        "<policy",
-        "received",
-        "rate",
-        "lost",
-        "overtaken",
-        "rejected",
-        "latency p50",
-        "p99",
-    )
+    head = ("subscriber", "received", "rate", "lost", "overtaken", "rejected", "delay p50", "p99", "<policy")
     yield from table(head, rows) if rows else ("no subscriber",)
 
 

@@ -19,9 +19,13 @@ _ANSWER_S = 3.0
 class CommandError(ValueError):
     """Why a command failed, in one line for people."""
 
+    status = 1
+
 
 class UsageError(CommandError):
     """It was used in a wrong way, which its parser alone cannot see."""
+
+    status = 2
 
 
 def open_node(options: argparse.Namespace) -> Node:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89MCAP0\r\n"
 _FRAME = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _INDEX_HEAD = struct.Struct("<HI")
@@ -255,18 +257,37 @@ def _read_contents(file: BinaryIO, size: int) -> _Contents:
     if file.read(len(MAGIC)) != MAGIC:
         raise LogError("not an MCAP file")
     file.seek(max(len(MAGIC), size - len(MAGIC)))
-    if file.read() == MAGIC:
+    if file.read() == MAGIC and _is_summary_whole(file, size):
         contents = _from_summary(file)
         if contents is not None:
             return contents
     return _scan(file, size)
 
 
+def _is_summary_whole(file: BinaryIO, size: int) -> bool:
+    """Whether the check sum of summary and footer is right; the library does not look at it."""
+    footer_at = size - len(MAGIC) - _FOOTER.size
+    if footer_at < len(MAGIC):
+        return False
+    file.seek(footer_at)
+    code, length, summary_at, _, expected = _FOOTER.unpack(file.read(_FOOTER.size))
+    if code != _opcodes().FOOTER or length != _FOOTER.size - _FRAME.size:
+        return False
+    if not len(MAGIC) <= summary_at <= footer_at:
+        return False  # 0: there is none
+    file.seek(summary_at)
+    checksum, left = 0, footer_at + _FOOTER.size - 4 - summary_at
+    while left > 0 and (block := file.read(min(left, 1 << 20))):  # a wrong number may claim the whole file
+        checksum = zlib.crc32(block, checksum)
+        left -= len(block)
+    return expected in (0, checksum)
+
+
 def _from_summary(file: BinaryIO) -> _Contents | None:
     from mcap.reader import SeekingReader
 
     file.seek(0)
-    reader = SeekingReader(file)
+    reader = SeekingReader(file, validate_crcs=True)
     with _Damage("its summary cannot be read"):
         summary: Summary | None = reader.get_summary()
         if summary is None or summary.statistics is None:
@@ -300,7 +321,10 @@ def _scan(file: BinaryIO, size: int) -> _Contents:
             break
         code, length = _FRAME.unpack(frame)
         end = position + _FRAME.size + length
-        if end > size or code == opcode.DATA_END:
+        if code == opcode.DATA_END:
+            contents.cut = "its summary is missing or damaged"
+            break
+        if end > size:
             break
         with _Damage(f"the record at byte {position} is damaged"):
             if code == opcode.CHUNK:
@@ -314,7 +338,8 @@ def _scan(file: BinaryIO, size: int) -> _Contents:
                 contents.metadata[record.name] = record.metadata
         position = end
     missing = size - position
-    contents.cut = "it was not closed" + (f", its last {missing} bytes are incomplete" if missing else "")
+    if not contents.cut:
+        contents.cut = "it was not closed" + (f", its last {missing} bytes are incomplete" if missing else "")
     _learn_channels(file, size, contents)
     return contents
 
@@ -354,6 +379,9 @@ def _known_channels(contents: _Contents) -> tuple[dict[int, _Channel], set[str]]
         try:
             schema = Schema.from_json(schema_record.data.decode())
             source = int(record.metadata.get("source", "0"), 16)
+            fingerprint = record.metadata.get("fingerprint", f"{schema.fingerprint:016x}")
+            if fingerprint != f"{schema.fingerprint:016x}":
+                raise SchemaError(f"its schema has not the fingerprint {fingerprint!r:.40}")
         except (SchemaError, ValueError) as error:
             raise LogError(f"channel {record.topic}: {error}") from error
         node, latch = record.metadata.get("node", ""), record.metadata.get("latch") == "1"
@@ -458,7 +486,8 @@ class _Damage:
         from mcap.exceptions import McapError
 
         # ValueError is a wrong check sum or text, RuntimeError comes from lz4, the others from wrong numbers.
-        kinds = (McapError, ValueError, RuntimeError, struct.error, OverflowError, EOFError, MemoryError)
+        wrong_numbers = (struct.error, OverflowError, EOFError, MemoryError, OSError)
+        kinds = (McapError, ValueError, RuntimeError, *wrong_numbers)
         is_zstd = kind is not None and kind.__name__ == "ZstdError"
         if isinstance(error, kinds) or is_zstd:
             raise LogError(f"{self._what}: {error}") from error
