@@ -399,6 +399,17 @@ def test_a_file_can_be_cut_anywhere(sample: Path, tmp_path: Path) -> None:
     assert most == 10
 
 
+def test_a_damaged_summary_is_passed_over(sample: Path, tmp_path: Path) -> None:
+    """The messages are still whole; the file is walked through to find them."""
+    data = bytearray(sample.read_bytes())
+    data[-100] ^= 1
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data)
+    with open_log(path) as log:
+        assert log.cut == "its summary is missing or damaged"
+        assert numbers(log) == list(range(10))
+
+
 @settings(max_examples=300, deadline=None)
 @given(
     changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=4),
