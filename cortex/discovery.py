@@ -191,7 +191,7 @@ class Directory:
     @property
     def connected(self) -> bool:
         """Whether the registry and all static peers have answered and not fallen silent."""
-        return all(link.welcomed for link in self._links)
+        return all(link.welcomed and not link.missing for link in self._links)
 
     def announce(self) -> None:
         """Say that this node's record has changed; the next `tick` sends it. Any thread may call this."""

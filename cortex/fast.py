@@ -124,10 +124,18 @@ def only_vector(schema: Schema, cls: type) -> tuple[np.dtype[Any], int] | None:
     return (known.dtype, known.head) if _is_vector(handling, known) else None
 
 
-def block_struct(schema: Schema, cls: type) -> struct.Struct | None:
-    """Return the struct of the block of a type of numbers, or of numbers before one vector; else None."""
-    if not is_flat(schema) or (_specials(schema, cls)[0] and only_vector(schema, cls) is None):
+def fixed_arrays(schema: Schema, cls: type) -> list[tuple[int, np.dtype[Any], tuple[int, ...]]] | None:
+    """Return index, dtype and shape of the fixed arrays of a type which is otherwise numbers; else None."""
+    if not is_flat(schema):
         return None
+    specials, _ = _specials(schema, cls)
+    if any(handling is not _FIXED for _, handling, _ in specials):
+        return None
+    return [(index, known[0], known[1]) for index, _, known in specials]
+
+
+def block_struct(schema: Schema) -> struct.Struct:
+    """Return the struct of the block of a flat type."""
     return writing_structs(schema, block_size(schema))[0][0]
 
 

@@ -189,7 +189,7 @@ class LargeSender:
         """Move a message out of a ring that readers were told to forget; the caller holds the lock.
 
         Returns:
-            The slot itself if its ring is in use, another one with the same bytes, or None if there is no slot.
+            The slot itself if its ring is in use, another with the same bytes, or None if there is none.
         """
         if slot.ring is None or slot.ring in self._rings[-RINGS_ALIVE:]:
             return slot

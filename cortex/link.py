@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import re
 import secrets
+from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
@@ -30,6 +31,7 @@ from cortex.wire import (
     SLOT,
     TAIL,
     AttachKey,
+    RingPlace,
     attach_key,
     batch_records,
     message_head,
@@ -107,8 +109,9 @@ class Link:
             prefix(BATCH, self.source, stamped=stamped): self._on_batch,
             prefix(ATTACH, self.source, stamped=stamped): self._on_answer,
         }
-        self._large_head, self._slot_head = list(self._handlers)[:2]
+        self._large_head, self._slot_head, self.batch_head = list(self._handlers)[:3]
         self._rings: dict[int, RingView] = {}
+        self._places: dict[int, RingPlace] = {}
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
@@ -218,7 +221,10 @@ class Link:
         if fingerprint != self.codec.fingerprint:
             self._check(fingerprint, size)
         (mask,) = MASK.unpack_from(frame, HEADER_SIZE)
-        view, slot = self._rings.get(aux >> 32), aux & 0xFFFFFFFF
+        ring, slot = aux >> 32, aux & 0xFFFFFFFF
+        view = self._rings.get(ring) or self._open_ring(ring)
+        if len(self._rings) > 1:
+            self._forget_rings(ring)
         leased = self._column is not None and bool(mask >> self._column & 1)
         if view is None or not leased:
             if self._large_subscribed or sequence < self.expected:
@@ -255,6 +261,31 @@ class Link:
         records = self._records(frame, first, count)
         return records if self.advance(first, count) else []
 
+    def read_batch(self, frame: bytes, messages: deque[Any]) -> None:
+        """Decode the messages of a batch; a frame that is not whole is rejected as a whole."""
+        try:
+            fingerprint, first, _, _, size, count = TAIL.unpack_from(frame, 16)
+            self._check(fingerprint, size)
+            end, offset = len(frame), HEADER_SIZE
+            if size != end - HEADER_SIZE or not 0 < count <= size // RECORD.size:
+                raise MalformedMessage(f"a batch of {end} bytes that says {count} records of {size}")
+            decode, unpack = self.codec.decode, RECORD.unpack_from
+            decoded: list[Any] = []
+            while offset + RECORD.size <= end and len(decoded) < count:
+                _, _, length, reserved = unpack(frame, offset)
+                offset += RECORD.size
+                if reserved:
+                    raise MalformedMessage("a record with reserved bits")
+                decoded.append(decode(frame, offset, length))
+                offset += (length + 7) & -8
+            if offset != end or len(decoded) != count:
+                raise MalformedMessage(f"a batch of {end} bytes whose {count} records do not fill it")
+        except MalformedMessage as error:
+            self.reject(str(error))
+            return
+        if self.advance(first, count):
+            messages.extend(decoded)
+
     def _records(self, frame: bytes, first: int, count: int) -> list[Item]:
         return [
             Item(self, frame, record.offset, record.size, first + k, record.stamp_ns, record.publish_ns, None)
@@ -289,22 +320,10 @@ class Link:
         self.attached = True
         self._column = answer.column
         if answer.column is not None:
-            try:
-                for place in answer.rings:
-                    if place.ring not in self._rings:
-                        self._rings[place.ring] = RingView(
-                            self.source,
-                            place.ring,
-                            place.slots,
-                            place.slot_bytes,
-                            place.pid,
-                            place.fd,
-                            answer.column,
-                        )
-            except ShmUnavailable as error:
-                self._do_without_shared_memory(error)
+            self._places = {place.ring: place for place in answer.rings}
+            if self._places and self._open_ring(max(self._places)) is None:
                 return []
-            for number in self._rings.keys() - {place.ring for place in answer.rings}:
+            for number in self._rings.keys() - self._places.keys():
                 self._rings.pop(number).close()
             if self._large_subscribed:
                 self.socket.unsubscribe(self._large_head)
@@ -314,6 +333,26 @@ class Link:
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
         return items
+
+    def _open_ring(self, number: int) -> RingView | None:
+        """Map a ring that the publisher has told us of; without it, go on without shared memory."""
+        place = self._places.get(number)
+        if place is None or self._column is None or number in self._rings:
+            return self._rings.get(number)
+        try:
+            view = RingView(self.source, *place, self._column)
+        except ShmUnavailable as error:
+            self._do_without_shared_memory(error)
+            return None
+        self._rings[number] = view
+        return view
+
+    def _forget_rings(self, newest: int) -> None:
+        """Unmap older rings that nobody looks at; one that is needed after all is mapped again."""
+        for number, view in list(self._rings.items()):
+            if number < newest and view.idle:
+                del self._rings[number]
+                view.close()
 
     def _latched(self, frame: bytes) -> list[Item]:
         if len(frame) < HEADER_SIZE or frame[:16] not in (self._message_prefix, self._large_head):
@@ -332,6 +371,7 @@ class Link:
         self.socket.unsubscribe(self._slot_head)
         self.socket.unsubscribe(self._key)
         self._column = None
+        self._places.clear()
         self._ask(shared_memory=False)
 
     def close(self) -> None:

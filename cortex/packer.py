@@ -1,79 +1,119 @@
-"""Header and body of a small message packed in one go, for the types that are sent most."""
+"""Header and body of a small message packed in one go, for the types that are sent most.
+
+They are types of numbers and arrays of fixed shape, and a stamp with one vector. Of every other type, and of
+every value that is not as it should be, the packers return None: the codec does it, and says what is wrong.
+"""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cortex.codec import Codec
 from cortex.encoder import ENCODE_ERRORS, PADS
-from cortex.fast import block_struct, getter, only_vector
+from cortex.fast import block_struct, fixed_arrays, getter, only_vector
 from cortex.layout import LARGE_ARRAY_BYTES
 from cortex.raw import RawMessage
-from cortex.wire import REST
+from cortex.wire import RECORD, REST
 
 Pack = Callable[[Any, int, int, int], "bytes | None"]
-"""Message, sequence, publish_ns and the limit of the body's size to a frame; None: do it the long way."""
+"""Message, sequence, publish_ns and the limit of the body's size to bytes; None: do it the long way."""
 
 
-def make_packer(codec: Codec, head: bytes) -> Pack:
-    """Build the packer of one publisher.
+class Packers(NamedTuple):
+    """How a publisher packs its messages."""
+
+    frame: Pack
+    """A whole frame."""
+    record: Pack
+    """A record of a batch; the sequence is not used."""
+
+
+def make_packers(codec: Codec, head: bytes) -> Packers:
+    """Build the packers of one publisher.
 
     Args:
         codec: Of its type.
         head: What all frames begin with: the first 24 bytes of the header.
     """
     if codec.type is RawMessage:
-        return _never
+        return Packers(_never, _never)
     names = [field.name for field in codec.schema.fields]
-    body = block_struct(codec.schema, codec.type)
-    if body is None:
-        return _never
-    # Both are little-endian and without implicit padding, so one follows the other as it stands.
-    pack = struct.Struct(REST.format + body.format.removeprefix("<")).pack
     stamp = names.index("stamp_ns") if codec.stamp_of is not None else None
-    if codec.fixed_size is not None:
-        return _numbers(codec, head, pack, stamp)
+    arrays = fixed_arrays(codec.schema, codec.type)
+    if arrays is not None:
+        return _pack_numbers(codec, head, stamp, arrays)
     vector = only_vector(codec.schema, codec.type)
-    if vector is None or names[:-1] != ["stamp_ns"] or stamp is None:
-        return _never
-    return _stamped_vector(codec, head, pack, body.size, *vector)
+    if vector is not None and stamp == 0 and len(names) == 2:
+        return _pack_vector(codec, head, *vector)
+    return Packers(_never, _never)
 
 
 def _never(message: Any, sequence: int, publish_ns: int, limit: int) -> None:
     return None
 
 
-def _numbers(codec: Codec, head: bytes, pack: Callable[..., bytes], stamp: int | None) -> Pack:
-    get = getter([field.name for field in codec.schema.fields])
-    cls, size = codec.type, codec.fixed_size
-    assert size is not None
+def _joined(front: struct.Struct, body: struct.Struct) -> Callable[..., bytes]:
+    # Both are little-endian and without implicit padding, so one follows the other as it stands.
+    return struct.Struct(front.format + body.format.removeprefix("<")).pack
 
-    def pack_numbers(message: Any, sequence: int, publish_ns: int, limit: int) -> bytes | None:
+
+def _pack_numbers(
+    codec: Codec, head: bytes, stamp: int | None, arrays: list[tuple[int, np.dtype[Any], tuple[int, ...]]]
+) -> Packers:
+    body = block_struct(codec.schema)
+    pack_frame, pack_record = _joined(REST, body), _joined(RECORD, body)
+    get = getter([field.name for field in codec.schema.fields])
+    cls, size = codec.type, body.size
+
+    def values_of(message: Any) -> Any:
+        if message.__class__ is not cls:
+            raise TypeError
+        if not arrays:
+            return get(message)
+        values = list(get(message))
+        for index, dtype, shape in arrays:
+            array = values[index]
+            if array.dtype is not dtype or array.shape != shape:
+                raise TypeError
+            values[index] = array.tobytes()
+        return values
+
+    def frame(message: Any, sequence: int, publish_ns: int, limit: int) -> bytes | None:
+        if size > limit:
+            return None
         try:
-            if message.__class__ is cls and size <= limit:
-                values = get(message)
-                stamp_ns = 0 if stamp is None else values[stamp]
-                return head + pack(sequence, stamp_ns, publish_ns, size, 0, *values)
+            values = values_of(message)
+            stamp_ns = 0 if stamp is None else values[stamp]
+            return head + pack_frame(sequence, stamp_ns, publish_ns, size, 0, *values)
         except ENCODE_ERRORS:
-            pass
-        return None
+            return None
 
-    return pack_numbers
+    def record(message: Any, sequence: int, publish_ns: int, limit: int) -> bytes | None:
+        if size > limit:
+            return None
+        try:
+            values = values_of(message)
+            stamp_ns = 0 if stamp is None else values[stamp]
+            return pack_record(stamp_ns, publish_ns, size, 0, *values)  # the block's size is a multiple of 8
+        except ENCODE_ERRORS:
+            return None
+
+    return Packers(frame, record)
 
 
-def _stamped_vector(
-    codec: Codec, head: bytes, pack: Callable[..., bytes], block: int, dtype: np.dtype[Any], code: int
-) -> Pack:
+def _pack_vector(codec: Codec, head: bytes, dtype: np.dtype[Any], code: int) -> Packers:
+    body = block_struct(codec.schema)
+    pack_frame, pack_record = _joined(REST, body), _joined(RECORD, body)
     get = getter([field.name for field in codec.schema.fields])
-    cls, itemsize = codec.type, dtype.itemsize
+    cls, block, itemsize = codec.type, body.size, dtype.itemsize
     large = -(-block // 64) * 64  # where a vector of 1024 bytes or more begins
     pad = PADS[large - block]
 
-    def pack_stamped_vector(message: Any, sequence: int, publish_ns: int, limit: int) -> bytes | None:
+    def frame(message: Any, sequence: int, publish_ns: int, limit: int) -> bytes | None:
         try:
             stamp_ns, array = get(message)
             (count,) = array.shape
@@ -82,17 +122,32 @@ def _stamped_vector(
                 if size >= LARGE_ARRAY_BYTES:
                     size += large
                     if size <= limit:
-                        front = pack(sequence, stamp_ns, publish_ns, size, 0, stamp_ns, large, code, count)
+                        front = pack_frame(
+                            sequence, stamp_ns, publish_ns, size, 0, stamp_ns, large, code, count
+                        )
                         return b"".join((head, front, pad, array))
                 elif 0 < size <= limit - block:
+                    size += block
+                    front = pack_frame(sequence, stamp_ns, publish_ns, size, 0, stamp_ns, block, code, count)
                     data: bytes = array.tobytes()
-                    return (
-                        head
-                        + pack(sequence, stamp_ns, publish_ns, block + size, 0, stamp_ns, block, code, count)
-                        + data
-                    )
+                    return head + front + data
         except ENCODE_ERRORS:
             pass
         return None
 
-    return pack_stamped_vector
+    def record(message: Any, sequence: int, publish_ns: int, limit: int) -> bytes | None:
+        try:
+            stamp_ns, array = get(message)
+            (count,) = array.shape
+            size = count * itemsize
+            if array.dtype is dtype and message.__class__ is cls and size:
+                start, gap = (large, pad) if size >= LARGE_ARRAY_BYTES else (block, b"")
+                size += start
+                if size <= limit:
+                    front = pack_record(stamp_ns, publish_ns, size, 0, stamp_ns, start, code, count)
+                    return b"".join((front, gap, array, PADS[-size % 8]))
+        except ENCODE_ERRORS:
+            pass
+        return None
+
+    return Packers(frame, record)

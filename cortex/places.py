@@ -16,6 +16,7 @@ from cortex.host import NodeFiles
 from cortex.outlet import Outlet, Outlets, open_outlet
 from cortex.records import Endpoint, NodeRecord
 from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address
+from cortex.wire import CONTROL_LIMIT, HEADER_SIZE
 
 Secure = Callable[[zmq.Socket[bytes]], None]
 
@@ -104,7 +105,7 @@ class Places:
     def _router(self, *, tcp: bool) -> zmq.Socket[bytes]:
         router = new_socket(zmq.ROUTER, tcp=tcp)
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        router.setsockopt(zmq.MAXMSGSIZE, 16 << 20)
+        router.setsockopt(zmq.MAXMSGSIZE, CONTROL_LIMIT + HEADER_SIZE)
         self.routers.append(router)
         return router
 

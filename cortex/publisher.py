@@ -17,7 +17,7 @@ from cortex.codec import Codec
 from cortex.context import Closed
 from cortex.large import LargeSender, Reader, Slot, Stamps
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
-from cortex.packer import make_packer
+from cortex.packer import make_packers
 from cortex.stats import PublisherCounters
 from cortex.wire import (
     BATCH,
@@ -80,8 +80,9 @@ class Publisher(Generic[T]):
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         self._batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
-        self._pack = make_packer(codec, self._head)
+        self._pack, self._pack_record = make_packers(codec, self._head)
         self._plain = not latch and not coalesce
+        self._gathers = coalesce and not latch
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
@@ -99,7 +100,6 @@ class Publisher(Generic[T]):
         self._late: set[Outlet] = set()
         """Strict outlets on which a reader was too late: libzmq sends it nothing until it has caught up."""
         self._blocked = False
-        self._coalesce = coalesce
         self._batch: list[bytes] = []
         self._batch_sequence = 0
         self._batch_bytes = 0
@@ -141,6 +141,10 @@ class Publisher(Generic[T]):
                     for send in self._lossy_sends:
                         send(frame, DONTWAIT)
                     return self._send_strict_all(frame) if self._strict_outlets else True
+            elif self._gathers and (self._batch or now_ns - self._last_ns < BURST_NS):
+                record = self._pack_record(message, 0, now_ns, self._inline_max)
+                if record is not None:
+                    return self._collect(record, now_ns)
             if self._was_large:  # the next is most likely large, too
                 prepared: Any = self.codec.plan(message)
                 if prepared.size <= self._inline_max:
@@ -219,12 +223,11 @@ class Publisher(Generic[T]):
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send or collect a small message; the lock is held."""
         size = len(body)
-        self._bytes += size
-        if self._coalesce and not self.latch:
-            burst = now_ns - self._last_ns < BURST_NS
+        if self._gathers:
+            if self._batch or now_ns - self._last_ns < BURST_NS:
+                return self._collect(RECORD.pack(stamp_ns, now_ns, size, 0) + body + bytes(-size % 8), now_ns)
             self._last_ns = now_ns
-            if burst or self._batch:
-                return self._collect(body, size, stamp_ns, now_ns)
+        self._bytes += size
         sequence = self._sequence
         self._sequence = sequence + 1
         frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
@@ -273,22 +276,20 @@ class Publisher(Generic[T]):
             self._blocked = False
         return True
 
-    def _collect(self, body: bytes, size: int, stamp_ns: int, now_ns: int) -> bool:
+    def _collect(self, record: bytes, now_ns: int) -> bool:
         """Add a message of a burst to the batch, and send that when it is full or old; the lock is held."""
-        if not self._batch:
+        batch = self._batch
+        if not batch:
             self._batch_sequence = self._sequence
             self._batch_start_ns = now_ns
             if self._on_batch is not None:
                 self._on_batch()
+        self._last_ns = now_ns
         self._sequence += 1
-        self._batch.append(RECORD.pack(stamp_ns, now_ns, size, 0))
-        self._batch.append(body)
-        padding = -size % 8
-        if padding:
-            self._batch.append(bytes(padding))
-        self._batch_bytes += RECORD.size + size + padding
+        batch.append(record)
+        self._batch_bytes += len(record)
         if (
-            self._sequence - self._batch_sequence >= BATCH_COUNT
+            len(batch) >= BATCH_COUNT
             or self._batch_bytes >= BATCH_BYTES
             or now_ns - self._batch_start_ns >= BATCH_NS
         ):
@@ -300,6 +301,7 @@ class Publisher(Generic[T]):
         if not self._batch:
             return True
         records = b"".join(self._batch)
+        self._bytes += len(records) - RECORD.size * len(self._batch)
         first = self._batch_sequence
         rest = REST.pack(first, 0, self._batch_start_ns, len(records), self._sequence - first)
         self._batch.clear()

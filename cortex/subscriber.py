@@ -27,7 +27,7 @@ from cortex.schema import Schema, TypeMismatch
 from cortex.stats import BUCKETS, SubscriberCounters
 from cortex.turn import Turn
 from cortex.wakeup import Wakeup
-from cortex.wire import HEAD_SIZE, HEADER_SIZE, RECORD, REST
+from cortex.wire import HEAD_SIZE, HEADER_SIZE, PREFIX_SIZE, RECORD, REST
 
 logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
@@ -411,6 +411,12 @@ class Subscriber(Generic[T]):
                 except zmq.Again:
                     break
                 if frame[:HEAD_SIZE] != head or len(frame) < HEADER_SIZE:
+                    if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
+                        link.read_batch(frame, messages)
+                        if len(messages) >= DRAIN_MAX:
+                            exhausted = False
+                            break
+                        continue
                     for item in link.handle(frame):
                         if item.buffer is None or self._queue:
                             self._enqueue(item)
