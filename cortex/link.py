@@ -248,8 +248,11 @@ class Link:
     def _on_batch(self, frame: bytes) -> list[Item]:
         fingerprint, first, _, publish_ns, size, count = TAIL.unpack_from(frame, 16)
         self._check(fingerprint, size)
-        if size != len(frame) - HEADER_SIZE or count == 0:
+        if size != len(frame) - HEADER_SIZE or (count == 0) != (size == 0):
             raise MalformedMessage(f"a batch of {len(frame)} bytes that says its records have {size}")
+        if not count:
+            self.advance(first, 0)
+            return []
         fixed = self.codec.fixed_size
         if self.whole_batches and fixed is not None:
             stride = RECORD.size + fixed + (-fixed % 8)
@@ -267,7 +270,7 @@ class Link:
             fingerprint, first, _, _, size, count = TAIL.unpack_from(frame, 16)
             self._check(fingerprint, size)
             end, offset = len(frame), HEADER_SIZE
-            if size != end - HEADER_SIZE or not 0 < count <= size // RECORD.size:
+            if size != end - HEADER_SIZE or (count == 0) != (size == 0) or count > size // RECORD.size:
                 raise MalformedMessage(f"a batch of {end} bytes that says {count} records of {size}")
             decode, unpack = self.codec.decode, RECORD.unpack_from
             decoded: list[Any] = []

@@ -607,7 +607,7 @@ class Node:
         with self._lock:
             publishers, subscribers = list(self._publishers), list(self._subscribers)
         for publisher in publishers:
-            publisher.tick()
+            publisher.tick(now_ns)
         self._top_up(subscribers, now_ns)
 
     def _top_up(self, subscribers: list[Subscriber[Any]], now_ns: int) -> None:

@@ -41,6 +41,8 @@ INLINE_MAX = 16_384
 """Bodies up to this size travel in the frame; measured by `cortex bench threshold`."""
 REFRESH_NS = 1_000_000
 READERS_MAX = 1024
+SILENCE_NS = 100_000_000
+"""After so long without a message readers are told how many there have been."""
 LINGER_S = 0.5
 
 BURST_NS = 15_000
@@ -97,6 +99,7 @@ class Publisher(Generic[T]):
         self._latched = b""
         self._refresh_ns = 0
         self._was_large = False
+        self._told = 0
         self._late: set[Outlet] = set()
         """Strict outlets on which a reader was too late: libzmq sends it nothing until it has caught up."""
         self._blocked = False
@@ -417,14 +420,27 @@ class Publisher(Generic[T]):
         self._lossy_sends = tuple(outlet.send for outlet in outlets if not outlet.strict)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
 
-    def tick(self) -> None:
-        """Free what the sockets have sent; called by the node now and then."""
+    def tick(self, now_ns: int) -> None:
+        """Free what the sockets have sent, end a burst; called by the node now and then."""
         if self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
                     self._large.prune()
+                    if self._told != self._sequence and now_ns - self._refresh_ns > SILENCE_NS:
+                        self._tell_sequence(now_ns)
             finally:
                 self._lock.release()
+
+    def _tell_sequence(self, now_ns: int) -> None:
+        """Send a batch of nothing, so that readers learn of a loss at the end of a burst; lock held."""
+        if self._batch or self._blocked:
+            return
+        frame = self._batch_head + REST.pack(self._sequence, 0, now_ns, 0, 0)
+        for send in self._lossy_sends:
+            send(frame, DONTWAIT)
+        sent = [outlet.try_send(frame) for outlet in self._strict_outlets]
+        if all(sent) and not self._late:
+            self._told = self._sequence
 
     @property
     def counters(self) -> PublisherCounters:
