@@ -1,4 +1,4 @@
-"""Fixtures for tests with nodes: a runtime directory of their own, and the check that nothing is left of them."""
+"""Fixtures for tests with nodes: a runtime directory of their own, and a check that nothing is left of it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         wait_for(lambda: not shared_mappings(), 5.0)
         assert not _shared_files() - files
         for domain in base.iterdir():
-            sweep(domain)  # of nodes that were killed; what is left then belongs to a node that was not closed
+            sweep(
+                domain
+            )  # of nodes that were killed; what is left then belongs to a node that was not closed
             left = {path.name for path in domain.iterdir()}
             assert left <= {REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET}
     finally:

@@ -120,7 +120,9 @@ class Peer:
     def await_publisher(self, topic: str) -> dict[str, Any]:
         return {"ok": self.subscribers[topic].wait_for_publisher(10.0)}
 
-    def publish(self, topic: str, count: int, start: int = 0, size: int = 0, rate_hz: float = 0.0) -> dict[str, Any]:
+    def publish(
+        self, topic: str, count: int, start: int = 0, size: int = 0, rate_hz: float = 0.0
+    ) -> dict[str, Any]:
         """Publish numbered messages; says how many were delivered, and the longest time that one took."""
         publisher = self.publishers[topic]
         delivered, longest_s, begin_s = 0, 0.0, time.monotonic()
@@ -242,7 +244,13 @@ def as_endless_subscriber(topic: str, policy: list[Any], keep: int = 0) -> None:
                     return
                 torn += sum(not is_whole(block) for block in kept)
                 found = sub.counters
-                say(count=count, torn=torn, lost=found.lost, overtaken=found.overtaken, rejected=found.rejected)
+                say(
+                    count=count,
+                    torn=torn,
+                    lost=found.lost,
+                    overtaken=found.overtaken,
+                    rejected=found.rejected,
+                )
             try:
                 block = sub.recv(0.02)
             except TimeoutError:

@@ -35,7 +35,9 @@ def wait_for(condition: Callable[[], object], timeout_s: float = SOON_S, *, ever
 class Child:
     """A process of `peer.py`."""
 
-    def __init__(self, role: str, *, prefix: Sequence[str] = (), env: dict[str, str] | None = None, **arguments: Any):
+    def __init__(
+        self, role: str, *, prefix: Sequence[str] = (), env: dict[str, str] | None = None, **arguments: Any
+    ):
         self._started = time.monotonic()
         self.role = role
         self.process = subprocess.Popen(
@@ -57,10 +59,10 @@ class Child:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(words).encode() + b"\n")
 
-    def hear(self, timeout_s: float = SOON_S) -> dict[str, Any]:
+    def hear(self, within_s: float = SOON_S) -> dict[str, Any]:
         """The next line that it prints."""
         assert self.process.stdout is not None
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + within_s
         while b"\n" not in self._rest:
             left_s = max(deadline - time.monotonic(), 0.0)
             if not select.select([self.process.stdout], [], [], left_s)[0]:
@@ -73,10 +75,10 @@ class Child:
         heard: dict[str, Any] = json.loads(line)
         return heard
 
-    def ask(self, timeout_s: float = SOON_S, **words: Any) -> dict[str, Any]:
+    def ask(self, within_s: float = SOON_S, **words: Any) -> dict[str, Any]:
         """Send it a line and wait for its answer."""
         self.say(**words)
-        return self.hear(timeout_s)
+        return self.hear(within_s)
 
     def errors(self) -> str:
         """What it has written to its standard error so far; all of it once it has ended."""

@@ -15,6 +15,7 @@ from processes import shared_mappings, wait_for
 import cortex.large
 import cortex.link
 from cortex import keep_last, latest, reliable
+from cortex.publisher import Closed
 from cortex.shm import ShmUnavailable
 
 LARGE = 100_000
@@ -348,10 +349,15 @@ def test_a_loan_is_published_when_it_ends(node, size):
 def test_a_loan_that_raises_is_dropped(node, size):
     """It takes no number and no slot."""
     publisher, subscriber = connected(node, Scan, keep_last())
-    for _ in range(100):
-        with pytest.raises(KeyError, match="changed my mind"), publisher.loan(n=size) as draft:
+
+    def change_ones_mind():
+        with publisher.loan(n=size) as draft:
             draft.ranges[:] = 1.0
             raise KeyError("changed my mind")
+
+    for _ in range(100):
+        with pytest.raises(KeyError, match="changed my mind"):
+            change_ones_mind()
     with pytest.raises((TypeError, ValueError), match="stamp_ns"), publisher.loan(n=size) as draft:
         draft.ranges[:] = 1.0  # and no stamp
     with publisher.loan(n=size) as draft:
@@ -382,11 +388,15 @@ def test_several_loans_at_once(node):
 def test_too_many_loans(node):
     publisher, subscriber = connected(node, Scan, keep_last(64))
     loans = []
-    with pytest.raises(RuntimeError, match="every slot is out on loan"):
-        for _ in range(200):
+
+    def hoard():
+        while len(loans) < 200:
             loan = publisher.loan(n=1_000_000)
             loan.__enter__()
             loans.append(loan)
+
+    with pytest.raises(RuntimeError, match="every slot is out on loan"):
+        hoard()
     assert len(loans) >= 3
     for loan in loans:
         assert not loan.__exit__(KeyError, KeyError("no"), None)
@@ -415,15 +425,18 @@ def test_a_loan_while_the_rings_grow(node):
 
 def test_a_loan_of_a_closed_publisher(node):
     """Closing while the block runs: an error, not a message from the grave."""
-    from cortex.publisher import Closed
-
     publisher, subscriber = connected(node, Scan, keep_last())
-    for size in (3, LARGE):
+
+    def lend_and_close(size):
         other = node.publisher("/large", Scan)
-        with pytest.raises(Closed), other.loan(n=size) as draft:
+        with other.loan(n=size) as draft:
             draft.stamp_ns = 1
             draft.ranges[:] = 1.0
             other.close()
+
+    for size in (3, LARGE):
+        with pytest.raises(Closed):
+            lend_and_close(size)
     assert publisher.publish(scan(2))
     assert subscriber.recv(1.0).stamp_ns == 2
 

@@ -1,4 +1,4 @@
-"""Nodes: who sees whom, what they are asked, junk on their control sockets, forks, and closing in any order."""
+"""Nodes: who sees whom, what they are asked, junk on their control sockets, forks, closing in any order."""
 
 from __future__ import annotations
 

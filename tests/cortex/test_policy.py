@@ -144,11 +144,16 @@ def test_every_message_of_a_reliable_stream_comes_in_order(make_node, start_chil
     """Received + lost == sent, and lost 0, whatever the pace of the two."""
     child = start_child("peer")
     child.hear()
-    child.ask(do="subscriber", topic="/numbers", type="Number", policy=["reliable", {"depth": 16, "timeout_s": 20.0}])
+    child.ask(
+        do="subscriber",
+        topic="/numbers",
+        type="Number",
+        policy=["reliable", {"depth": 16, "timeout_s": 20.0}],
+    )
     publisher = make_node().publisher("/numbers", Number)
     assert publisher.wait_for_subscribers(1, 10.0)
     child.say(do="receive", topic="/numbers", until=MANY - 1, timeout_s=120.0)
-    assert all([publisher.publish(Number(value, value)) for value in range(MANY)])
+    assert all(publisher.publish(Number(value, value)) for value in range(MANY))
     received = child.hear(120.0)
     assert received == {"count": MANY, "first": 0, "last": MANY - 1, "ordered": True, "whole": True}
     counters = child.ask(do="counters", topic="/numbers")
@@ -218,7 +223,7 @@ def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
     other = node.subscriber("/numbers", Number, take, policy=reliable(depth=2, timeout_s=10.0))
     assert publisher.wait_for_subscribers(2)
     subscriber.close()
-    assert all([publisher.publish(Number(0, value)) for value in range(5000)])
+    assert all(publisher.publish(Number(0, value)) for value in range(5000))
     wait_for(lambda: len(received) == 5000)
     assert received == list(range(5000))
     assert other.counters.lost == 0
@@ -227,7 +232,10 @@ def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
 def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_child):
     """On one topic: the first is stopped, the second gets everything, the publisher waits for neither."""
     stopped, steady = start_child("peer", name="stopped"), start_child("peer", name="steady")
-    for child, policy in ((stopped, ["keep_last", {"depth": 10}]), (steady, ["reliable", {"timeout_s": 20.0}])):
+    for child, policy in (
+        (stopped, ["keep_last", {"depth": 10}]),
+        (steady, ["reliable", {"timeout_s": 20.0}]),
+    ):
         child.hear()
         child.ask(do="subscriber", topic="/numbers", type="Number", policy=policy)
     publisher = make_node().publisher("/numbers", Number)
@@ -236,12 +244,14 @@ def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_c
     with stopped.stopped():
         steady.say(do="receive", topic="/numbers", until=count - 1, timeout_s=30.0)
         begin = time.monotonic()
-        assert all([publisher.publish(Number(value, value)) for value in range(count)])
+        assert all(publisher.publish(Number(value, value)) for value in range(count))
         assert time.monotonic() - begin < 10.0
         assert steady.hear(30.0)["count"] == count
     stopped.say(do="receive", topic="/numbers", until=count)
     sent = count
-    while not select.select([stopped.process.stdout], [], [], 1e-3)[0]:  # it hears of new ones when it has read old ones
+    while not select.select([stopped.process.stdout], [], [], 1e-3)[
+        0
+    ]:  # it hears of new ones when it has read old ones
         assert publisher.publish(Number(sent, sent))
         sent += 1
         assert sent < count + 10_000

@@ -232,7 +232,7 @@ def listen(node):
 
 
 def test_a_burst_travels_together(node):
-    """Far fewer frames than messages; every message comes, in order, with the time at which it was published."""
+    """Far fewer frames than messages; every message comes, in order, with its own time of publishing."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
     subscriber = node.subscriber("/numbers", Number, policy=keep_last(2000))
     assert publisher.wait_for_subscribers()

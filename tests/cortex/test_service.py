@@ -85,7 +85,10 @@ def test_a_handler_that_raises(node, caplog):
 def test_a_handler_that_returns_something_else(node, caplog):
     node.service("/wrong", Number, Number, lambda request: None)
     node.service("/value", Number, Number, lambda request: Number("x", 1))
-    with node.client("/wrong", Number, Number) as client, pytest.raises(ServiceFailed, match="must return Number"):
+    with (
+        node.client("/wrong", Number, Number) as client,
+        pytest.raises(ServiceFailed, match="must return Number"),
+    ):
         client.call(Number(0, 0))
     with node.client("/value", Number, Number) as client, pytest.raises(ServiceFailed, match="stamp_ns"):
         client.call(Number(0, 0))
@@ -137,7 +140,10 @@ def test_wrong_use(node):
         node.service("/double", OtherNumber, Number, double)
     with pytest.raises(ValueError, match="is named like"):
         node.service("double", Number, Number, double)
-    with node.client("/double", Number, Number) as client, pytest.raises(TypeError, match="takes Number, got Scan"):
+    with (
+        node.client("/double", Number, Number) as client,
+        pytest.raises(TypeError, match="takes Number, got Scan"),
+    ):
         client.call(Scan(0, None))
 
 
@@ -168,7 +174,9 @@ def test_a_reply_has_a_limit(node, caplog):
 
 def test_a_handler_that_takes_too_long(node):
     """An error in time; the reply that comes later is not taken for that of the next call."""
-    node.service("/slow", Number, Number, lambda request: (time.sleep(request.stamp_ns * 1e-3), double(request))[1])
+    node.service(
+        "/slow", Number, Number, lambda request: (time.sleep(request.stamp_ns * 1e-3), double(request))[1]
+    )
     with node.client("/slow", Number, Number) as client:
         begin = time.monotonic()
         with pytest.raises(ServiceTimeout, match=r"/slow: no reply within 0\.05 s"):
@@ -284,7 +292,10 @@ def test_a_handler_that_calls_back(make_node):
     one.service("/base", Number, Number, lambda request: Number(0, 100))
     back = two.client("/base", Number, Number)
     two.service(
-        "/add", Number, Number, lambda request: Number(0, request.value + back.call(request, timeout_s=5.0).value)
+        "/add",
+        Number,
+        Number,
+        lambda request: Number(0, request.value + back.call(request, timeout_s=5.0).value),
     )
     with one.client("/add", Number, Number) as client:
         assert client.call(Number(0, 7), timeout_s=10.0).value == 107
@@ -296,9 +307,11 @@ def test_a_handler_that_calls_its_own_node(node, caplog):
     node.service("/inner", Number, Number, double)
     inner = node.client("/inner", Number, Number)
     node.service("/outer", Number, Number, lambda request: inner.call(request, timeout_s=0.1))
-    with node.client("/outer", Number, Number) as client:
-        with pytest.raises(ServiceFailed, match="ServiceTimeout"):
-            client.call(Number(0, 1), timeout_s=5.0)
+    with (
+        node.client("/outer", Number, Number) as client,
+        pytest.raises(ServiceFailed, match="ServiceTimeout"),
+    ):
+        client.call(Number(0, 1), timeout_s=5.0)
     assert inner.call(Number(0, 1), timeout_s=5.0).value == 2
     inner.close()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import itertools
 import logging
 import threading
 import time
@@ -144,7 +145,7 @@ def test_several_threads_share_a_stream(numbers):
     for thread in threads:
         thread.join(5.0)
         assert not thread.is_alive()
-    assert sorted(sum(taken, [])) == list(range(2000))
+    assert sorted(itertools.chain.from_iterable(taken)) == list(range(2000))
     assert all(values == sorted(values) for values in taken)
     assert subscriber.counters.received == 2000
 

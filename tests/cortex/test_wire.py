@@ -131,7 +131,9 @@ def test_other_subscriptions_are_no_attach_keys(data):
     assert parse_attach_key(prefix(MESSAGE, 1, stamped=False) + bytes(16)) is None
 
 
-places = st.builds(RingPlace, ring=u32, slots=u32, slot_bytes=u64, pid=u32, fd=st.integers(-(2**31), 2**31 - 1))
+places = st.builds(
+    RingPlace, ring=u32, slots=u32, slot_bytes=u64, pid=u32, fd=st.integers(-(2**31), 2**31 - 1)
+)
 answers = st.builds(
     AttachAnswer,
     sequence=u64,
@@ -206,7 +208,9 @@ def batch(bodies, *, source=1, fingerprint=2, sequence=0, padding=b"\0"):
     records = b"".join(
         RECORD.pack(k, k, len(body), 0) + body + padding * (-len(body) % 8) for k, body in enumerate(bodies)
     )
-    return pack_header(Header(BATCH, source, fingerprint, sequence, 0, 0, len(records), len(bodies))) + records
+    return (
+        pack_header(Header(BATCH, source, fingerprint, sequence, 0, 0, len(records), len(bodies))) + records
+    )
 
 
 @given(st.lists(st.binary(max_size=40), max_size=10))
@@ -335,7 +339,9 @@ class Feed:
         return pack_header(Header(kind, self.SOURCE, self.codec.fingerprint, self.sequence, 0, 0, size, aux))
 
     def body(self, value):
-        made = Number(value, value) if self.codec.type is Number else Scan(value, np.full(9, value, np.float32))
+        made = (
+            Number(value, value) if self.codec.type is Number else Scan(value, np.full(9, value, np.float32))
+        )
         body = self.codec.encode(made, 1 << 20)
         assert body is not None
         return body
@@ -355,7 +361,9 @@ class Feed:
             self.ring.commit(slot, self.sequence, len(body), 1 << self.column)
             return [self.header(kind, len(body), slot) + struct.pack("<Q", 1 << self.column)]
         if kind == BATCH:
-            return [batch([body], source=self.SOURCE, fingerprint=self.codec.fingerprint, sequence=self.sequence)]
+            return [
+                batch([body], source=self.SOURCE, fingerprint=self.codec.fingerprint, sequence=self.sequence)
+            ]
         return [self.answer]
 
     def drain(self):
@@ -423,7 +431,9 @@ BAD = {
     "batch of a great many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2**63)],
     "batch that ends early": lambda f: [f.frames(BATCH, 1)[0][:-8]],
     "batch with a reserved number": lambda f: [_with(f.frames(BATCH, 1)[0], HEADER_SIZE + 20, "<I", 1)],
-    "batch with a record too long": lambda f: [_with(f.frames(BATCH, 1)[0], HEADER_SIZE + 16, "<I", 2**32 - 1)],
+    "batch with a record too long": lambda f: [
+        _with(f.frames(BATCH, 1)[0], HEADER_SIZE + 16, "<I", 2**32 - 1)
+    ],
     "answer with too many rings": lambda f: [_with(f.answer, 44, "<I", 5)],
     "answer with rings that are not there": lambda f: [_with(f.answer, 44, "<I", 2)],
     "answer with a column too high": lambda f: [_with(f.answer, 40, "<I", 64)],

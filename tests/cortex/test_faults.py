@@ -1,0 +1,363 @@
+"""Processes that are killed, stopped or restarted at any moment: nothing hangs, leaks or is torn.
+
+`CORTEX_KILLS=200 CORTEX_STOP_S=5` runs the long version.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import threading
+import time
+
+import pytest
+from peer import Block, Number, OtherNumber, is_whole, make_block
+from processes import SOON_S, processes_with, wait_for
+
+from cortex import keep_last, latest, reliable
+from cortex.host import REGISTRY_LOCK, runtime_dir
+from cortex.schema import TypeMismatch
+
+KILLS = int(os.environ.get("CORTEX_KILLS", "15"))
+STOP_S = float(os.environ.get("CORTEX_STOP_S", "2"))
+SIZES = [100, 200_000, 5_000, 60_000, 100]
+POLICIES = [["keep_last", {"depth": 8}], ["latest"], ["reliable", {"depth": 4, "timeout_s": 5.0}]]
+
+
+class Stream:
+    """A thread that publishes blocks until it is stopped."""
+
+    def __init__(self, publisher, rate_hz=1000.0, sizes=SIZES):
+        self.publisher = publisher
+        self.longest_s = 0.0
+        self.refused = 0
+        self._blocks = [make_block(0, size) for size in sizes]
+        self._pause_s = 1.0 / rate_hz
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    @property
+    def published(self):
+        return self.publisher.counters.published
+
+    def _run(self):
+        number = 0
+        while not self._stopping.wait(self._pause_s):
+            block = self._blocks[number % len(self._blocks)]
+            begin = time.monotonic()
+            self.refused += not self.publisher.publish(Block(number, block.check, block.data))
+            self.longest_s = max(self.longest_s, time.monotonic() - begin)
+            number += 1
+
+    def stop(self):
+        self._stopping.set()
+        self._thread.join(SOON_S)
+        assert not self._thread.is_alive()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stop()
+
+
+def slots_held(publisher):
+    with publisher._outlets.lock:
+        return sum(ring.outstanding(column) for ring in publisher._large._rings for column in range(64))
+
+
+def goes_on(stream, count=20):
+    """The stream publishes more within a second."""
+    before = stream.published
+    wait_for(lambda: stream.published >= before + count, 5.0)
+
+
+def registry_pid(base):
+    """The registry's process."""
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        pid = int((runtime_dir(0) / REGISTRY_LOCK).read_text())
+        return pid if pid in processes_with(str(base)) else None
+
+
+# SIGKILL
+
+
+@pytest.mark.parametrize("policy", [keep_last(8), reliable(4, 5.0)], ids=str)
+def test_publishers_are_killed(make_node, start_child, runtime, policy):
+    """Whatever it was doing: what has arrived is whole, and stays so; the next publisher is heard."""
+    generator = random.Random(str(policy))
+    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
+    kept, sources = [], set()
+    for _ in range(max(KILLS // 6, 1)):
+        child = start_child("endless_publisher", topic="/blocks", sizes=SIZES, rate_hz=2000.0)
+        child.hear()
+        known, came, last = len(sources), 0, -1
+        end = None
+        while end is None or time.monotonic() < end:
+            block, info = subscriber.recv_with_info(SOON_S)
+            assert is_whole(block)
+            sources.add(info.source)
+            if len(sources) > known:
+                assert block.number > last
+                last, came = block.number, came + 1
+                if came == 3:  # now it runs: any moment within the next cycles is as good as another
+                    end = time.monotonic() + generator.uniform(0.0, 0.05)
+            if len(block.data) > 100_000:
+                kept = [*kept[-1:], block]
+        child.kill()
+        while True:
+            try:
+                assert is_whole(subscriber.recv(0.05))
+            except TimeoutError:
+                break
+        assert all(is_whole(block) for block in kept)
+    assert len(sources) == max(KILLS // 6, 1)
+    assert subscriber.counters.rejected == 0
+    assert all(is_whole(block) for block in kept)
+
+
+@pytest.mark.parametrize("policy", POLICIES, ids=lambda policy: policy[0])
+def test_subscribers_are_killed(make_node, start_child, runtime, policy):
+    """While they hold messages and wait for more: the leases are back in 100 ms, the publisher goes on."""
+    generator = random.Random(policy[0])
+    publisher = make_node().publisher("/blocks", Block)
+    slow_ms = []
+    with Stream(publisher) as stream:
+        for _ in range(max(KILLS // 9, 1)):
+            child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=2)
+            child.hear()
+            wait_for(lambda child=child: child.ask()["count"] > 20)
+            assert child.ask()["torn"] == 0
+            assert publisher.subscriber_count == 1
+            pause_until = time.monotonic() + generator.uniform(0.0, 0.05)
+            while time.monotonic() < pause_until:
+                time.sleep(1e-3)
+            stream.longest_s = 0.0
+            begin = time.monotonic()
+            child.kill()
+            wait_for(lambda: slots_held(publisher) == 0, every_s=5e-4)
+            slow_ms.append(1e3 * (time.monotonic() - begin))
+            goes_on(stream)
+            wait_for(lambda: publisher.subscriber_count == 0)
+            assert stream.longest_s < 1.0
+    assert sorted(slow_ms)[len(slow_ms) // 2] < 100.0
+    assert max(slow_ms) < 1000.0  # this machine may be busy
+
+
+def test_the_other_subscriber_notices_nothing(make_node, start_child, runtime):
+    """One of two is killed again and again; the reliable one beside it gets every message."""
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    numbers = []
+
+    def take(block):
+        assert is_whole(block)
+        numbers.append(block.number)
+
+    other = node.subscriber("/blocks", Block, take, policy=reliable(64, 10.0))
+    assert publisher.wait_for_subscribers()
+    with Stream(publisher) as stream:
+        for round_ in range(max(KILLS // 7, 1)):
+            policy = POLICIES[round_ % len(POLICIES)]
+            child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=3)
+            child.hear()
+            wait_for(lambda child=child: child.ask()["count"] > 10)
+            child.kill()
+            goes_on(stream)
+    wait_for(lambda: len(numbers) == stream.published)
+    assert numbers == list(range(len(numbers)))
+    assert (other.counters.lost, other.counters.rejected) == (0, 0)
+    assert stream.refused == 0
+
+
+def test_registries_are_killed(make_node, start_child, runtime):
+    """Streams between those who know each other lose nothing; newcomers are found soon after."""
+    generator = random.Random(3)
+    child = start_child("endless_publisher", topic="/blocks", sizes=SIZES, rate_hz=500.0)
+    child.hear()
+    numbers = []
+
+    def take(block):
+        assert is_whole(block)
+        numbers.append(block.number)
+
+    subscriber = make_node().subscriber("/blocks", Block, take, policy=reliable(64, 10.0))
+    wait_for(lambda: len(numbers) > 10)
+    for round_ in range(max(KILLS // 5, 1)):
+        pid = wait_for(lambda: registry_pid(runtime))
+        time.sleep(generator.uniform(0.0, 0.3))  # any moment is as good as another
+        os.kill(pid, signal.SIGKILL)
+        begin = time.monotonic()
+        newcomer = make_node(f"newcomer {round_}")
+        late = newcomer.subscriber("/blocks", Block, policy=latest())
+        assert is_whole(late.recv(SOON_S))
+        assert time.monotonic() - begin < 4.0
+        newcomer.close()
+    published = child.ask()["published"]
+    wait_for(lambda: numbers[-1] >= published - 1)
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert (subscriber.counters.lost, subscriber.counters.rejected) == (0, 0)
+    child.finish()
+
+
+def test_files_of_the_dead_are_removed(make_node, start_child, runtime):
+    """The registry sweeps what a killed node has left."""
+    node = make_node()
+    child = start_child("peer", listen="127.0.0.1")
+    stem = f"{child.hear()['node']:016x}"
+    wait_for(lambda: len(node.nodes()) == 2)  # what dies before anybody knew it is swept by the next node
+    assert len(list(runtime.glob(f"*/{stem}.*"))) == 4
+    child.kill()
+    wait_for(lambda: not list(runtime.glob(f"*/{stem}.*")))
+    wait_for(lambda: [record.name for record in node.nodes()] == ["node"])
+
+
+# SIGSTOP
+
+
+@pytest.mark.parametrize("sizes", [[100], [150_000]], ids=["small", "large"])
+@pytest.mark.parametrize(
+    "policy", [*POLICIES[:2], ["reliable", {"depth": 4, "timeout_s": 0.3}]], ids=lambda p: p[0]
+)
+def test_a_subscriber_is_stopped(make_node, start_child, runtime, policy, sizes):
+    """The publisher waits no longer than the policy says, and the subscriber learns what it has missed."""
+    publisher = make_node().publisher("/blocks", Block)
+    child = start_child("endless_subscriber", topic="/blocks", policy=policy, keep=1)
+    child.hear()
+    assert publisher.wait_for_subscribers(1, SOON_S)
+
+    def accounted(found):
+        assert found["torn"] == found["rejected"] == 0
+        total = found["count"] + found["lost"] + found["overtaken"]
+        assert total <= publisher.counters.published
+        return total == publisher.counters.published
+
+    with Stream(publisher, rate_hz=2000.0, sizes=sizes) as stream:
+        wait_for(lambda: child.ask()["count"] > 20)
+        stream.longest_s = 0.0
+        begin = stream.published
+        with child.stopped():
+            time.sleep(STOP_S)
+        missed = stream.published - begin
+        before = child.ask(within_s=30.0)["count"]
+        wait_for(lambda: child.ask()["count"] > before + 20)
+        assert stream.longest_s < (0.3 if policy[0] == "reliable" else 0.0) + 0.7
+        if policy[0] != "reliable":
+            assert missed > 100 * STOP_S
+
+    def complete():
+        """After one more message, every earlier one was received, overtaken or lost."""
+        publisher.publish(make_block(0, sizes[0]))
+        return any(accounted(child.ask()) for _ in range(20))
+
+    wait_for(complete)
+    if policy[0] == "reliable":
+        assert child.ask()["lost"] <= stream.refused
+    child.finish()
+
+
+def test_a_publisher_is_stopped(make_node, start_child, runtime):
+    """It is not taken for dead, what it had sent is kept, and it goes on."""
+    child = start_child("endless_publisher", topic="/blocks", sizes=SIZES, rate_hz=500.0)
+    child.hear()
+    node = make_node()
+    subscriber = node.subscriber("/blocks", Block, policy=reliable(64, 10.0))
+    last = subscriber.recv(SOON_S).number
+    with child.stopped():
+        end = time.monotonic() + STOP_S
+        while time.monotonic() < end:
+            with contextlib.suppress(TimeoutError):
+                block = subscriber.recv(0.1)
+                assert block.number == last + 1
+                last += 1
+    for _ in range(100):
+        block = subscriber.recv(SOON_S)
+        assert (block.number, is_whole(block)) == (last + 1, True)
+        last += 1
+    assert subscriber.counters.lost == 0
+    child.finish()
+
+
+# Other faults
+
+
+def test_a_publisher_is_restarted(make_node, start_child, runtime):
+    """Under the same topic: the subscriber hears the new one, and counts no loss between two publishers."""
+    subscriber = make_node().subscriber("/numbers", Number, policy=reliable(64, 5.0))
+    sources = set()
+    for round_ in range(3):
+        child = start_child("peer", name=f"round {round_}")
+        child.hear()
+        child.ask(do="publisher", topic="/numbers", type="Number")
+        child.ask(do="await_subscribers", topic="/numbers")
+        child.say(do="publish", topic="/numbers", count=200, start=1000 * round_)
+        for value in range(200):
+            message, info = subscriber.recv_with_info(SOON_S)
+            assert (message.value, info.sequence) == (1000 * round_ + value, value)
+            sources.add(info.source)
+        child.hear()
+        if round_ == 1:
+            child.kill()
+        else:
+            child.finish()
+    assert len(sources) == 3
+    assert (subscriber.counters.received, subscriber.counters.lost) == (600, 0)
+
+
+def test_a_subscriber_of_another_version(make_node, start_child, runtime):
+    """It is told, the others are not disturbed, and no frame reaches it."""
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/numbers", type="Number")
+    node = make_node()
+    other = node.subscriber("/numbers", OtherNumber)
+    right = node.subscriber("/numbers", Number)
+    assert right.wait_for_publisher(SOON_S)
+    with pytest.raises(TypeMismatch, match="float64"):
+        other.recv(SOON_S)
+    child.ask(do="publish", topic="/numbers", count=10)
+    assert [right.recv(5.0).value for _ in range(10)] == list(range(10))
+    with pytest.raises(TimeoutError):
+        other.recv(0.0)
+    assert (other.counters.received, other.counters.rejected) == (0, 1)
+
+
+def test_two_hundred_topics(make_node, start_child, runtime):
+    """Between two processes: all meet within seconds, and each carries its own messages."""
+    child = start_child("peer")
+    child.hear()
+    node = make_node()
+    topics = [f"/topic{number}" for number in range(200)]
+    begin = time.monotonic()
+    for topic in topics:
+        child.ask(do="publisher", topic=topic, type="Number")
+    subscribers = [node.subscriber(topic, Number, policy=reliable(8, 5.0)) for topic in topics]
+    assert all(subscriber.wait_for_publisher(SOON_S) for subscriber in subscribers)
+    assert time.monotonic() - begin < 10.0
+    for number, topic in enumerate(topics):
+        child.ask(do="publish", topic=topic, count=3, start=10 * number)
+    for number, subscriber in enumerate(subscribers):
+        assert [subscriber.recv(5.0).value for _ in range(3)] == [10 * number + k for k in range(3)]
+    assert len(node.topics()) == 200
+    child.kill()
+    wait_for(lambda: not any(info.publishers for info in node.topics()))
+
+
+@pytest.mark.parametrize("policy", [keep_last(8), reliable(8, 5.0)], ids=str)
+def test_no_memory_for_a_ring(make_node, start_child, runtime, policy):
+    """A limit on the size of files stands for a full memory: the messages go through the socket."""
+    child = start_child("peer", limit_file_bytes=100_000)
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block")
+    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
+    assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
+    for number, size in enumerate((100, 300_000, 20_000, 100, 1_000_000, 300_000)):
+        assert child.ask(do="publish", topic="/blocks", count=1, start=number, size=size)["delivered"] == 1
+        block = subscriber.recv(5.0)
+        assert (block.number, len(block.data), is_whole(block)) == (number, size, True)
+    assert subscriber.counters.lost == 0
+    child.finish()
+    assert "no shared memory" in child.errors()

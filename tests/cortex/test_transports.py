@@ -1,0 +1,295 @@
+"""The same messages over inproc, ipc and tcp, plain and encrypted, with a registry and without."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+
+import pytest
+from peer import Block, Number, Scan, is_whole, make, make_block
+from processes import SOON_S, wait_for
+
+import cortex.node
+from cortex import keep_last, reliable
+from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
+
+SIZES = [0, 10, 4000, 16_384, 16_500, 100_000, 1_000_000, 30]
+"""Bytes of content, on both sides of what goes inline."""
+
+
+def addresses(subscriber):
+    return [link.address.partition("://")[0] for link in subscriber._links]
+
+
+def exchange(publisher, subscriber, count=3):
+    """Every size arrives as it was sent, in order."""
+    number = 0
+    for _ in range(count):
+        for size in SIZES:
+            assert publisher.publish(make_block(number, size))
+            block, info = subscriber.recv_with_info(SOON_S)
+            assert (block.number, len(block.data)) == (number, size)
+            assert is_whole(block)
+            assert -1e9 < info.latency_ns < SOON_S * 1e9
+            number += 1
+    assert subscriber.counters.lost == 0
+    assert subscriber.counters.rejected == 0
+
+
+def keys_of(base, names):
+    """Directories of keys that trust each other."""
+    made = {name: new_keys(base / name) for name in names}
+    for name in names:
+        lines = "".join(f"{made[other].public}\n" for other in names)
+        (base / name / AUTHORIZED_FILE).write_text(lines)
+        (base / name / AUTHORIZED_FILE).chmod(0o644)
+    return {name: base / name for name in names}
+
+
+@pytest.mark.parametrize("policy", [keep_last(64), reliable(8, 5.0)], ids=str)
+def test_inproc(make_node, policy):
+    publisher = make_node("one").publisher("/blocks", Block)
+    subscriber = make_node("two").subscriber("/blocks", Block, policy=policy)
+    assert publisher.wait_for_subscribers()
+    exchange(publisher, subscriber)
+    assert addresses(subscriber) == ["inproc"]
+
+
+TRANSPORTS = {
+    "ipc": ({}, {}),
+    "tcp": ({"listen": "127.0.0.1"}, {"listen": "127.0.0.1", "host": "elsewhere"}),
+    "tcp6": ({"listen": "::1"}, {"listen": "::1", "host": "elsewhere"}),
+    "curve": ({"listen": "127.0.0.1"}, {"listen": "127.0.0.1", "host": "elsewhere"}),
+}
+
+
+@pytest.fixture
+def pair(make_node, start_child, runtime, tmp_path):
+    """Makes a node and a child that talk over a transport."""
+
+    def make_pair(transport):
+        ours, theirs = ({**options} for options in TRANSPORTS[transport])
+        if transport == "curve":
+            directories = keys_of(tmp_path, ("ours", "theirs"))
+            ours["keys"] = load_keys(directories["ours"])
+            theirs["keys"] = str(directories["theirs"])
+        child = start_child("peer", **theirs)
+        child.hear()
+        return make_node("ours", **ours), child
+
+    return make_pair
+
+
+@pytest.mark.parametrize("policy", [["keep_last"], ["reliable", {"depth": 8, "timeout_s": 5.0}]], ids=str)
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_between_processes(pair, transport, policy):
+    """Both ways: we publish and they check, then they publish and we check."""
+    node, child = pair(transport)
+    child.ask(do="subscriber", topic="/ours", type="Block", policy=policy)
+    child.ask(do="publisher", topic="/theirs", type="Block")
+    publisher = node.publisher("/ours", Block)
+    subscriber = node.subscriber("/theirs", Block, policy=reliable(8, 5.0))
+    assert publisher.wait_for_subscribers(1, SOON_S)
+    assert child.ask(do="await_subscribers", topic="/theirs")["ok"]
+    number = 0
+    for _ in range(2):
+        for size in SIZES:
+            child.say(do="receive", topic="/ours", until=number)
+            assert publisher.publish(make_block(number, size))
+            got = child.hear()
+            assert (got["count"], got["last"], got["whole"]) == (1, number, True)
+            child.ask(do="publish", topic="/theirs", count=1, start=number, size=size)
+            block = subscriber.recv(SOON_S)
+            assert (block.number, len(block.data), is_whole(block)) == (number, size, True)
+            number += 1
+    counters = child.ask(do="counters", topic="/ours")
+    assert (counters["received"], counters["lost"], counters["rejected"]) == (number, 0, 0)
+    assert subscriber.counters.lost == 0
+    assert addresses(subscriber) == ["tcp" if transport != "ipc" else "ipc"]
+    child.finish()
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_a_stream_is_complete(pair, transport):
+    """Ten thousand messages as fast as they go, with back-pressure: each comes once, in order."""
+    node, child = pair(transport)
+    child.ask(do="publisher", topic="/numbers", type="Number", coalesce=True)
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(64, 20.0))
+    assert subscriber.wait_for_publisher(SOON_S)
+    child.say(do="publish", topic="/numbers", count=10_000)
+    values = [subscriber.recv(SOON_S).value for _ in range(10_000)]
+    assert values == list(range(10_000))
+    assert child.hear()["delivered"] == 10_000
+    assert subscriber.counters.lost == 0
+
+
+def test_near_and_far_subscribers_of_one_topic(make_node, start_child):
+    """One in this process, one on this host, one over tcp: all get the same bytes."""
+    near, far = (
+        start_child("peer", name="near"),
+        start_child("peer", name="far", listen="127.0.0.1", host="elsewhere"),
+    )
+    node = make_node(listen="127.0.0.1")
+    for child in (near, far):
+        child.hear()
+        child.ask(do="subscriber", topic="/blocks", type="Block", policy=["reliable", {"timeout_s": 10.0}])
+    own = node.subscriber("/blocks", Block, policy=reliable(8, 10.0))
+    publisher = node.publisher("/blocks", Block)
+    assert publisher.wait_for_subscribers(3, SOON_S)
+    for child in (near, far):
+        child.say(do="receive", topic="/blocks", until=39)
+    for number in range(40):
+        assert publisher.publish(make_block(number, SIZES[number % len(SIZES)]))
+        assert is_whole(own.recv(5.0))
+    for child in (near, far):
+        assert child.hear() == {"count": 40, "first": 0, "last": 39, "ordered": True, "whole": True}
+    with publisher.loan(n=200_000) as draft:
+        made = make_block(40, 200_000)
+        draft.number, draft.check = 40, made.check
+        draft.data[:] = made.data
+    for child in (near, far):
+        assert child.ask(do="receive", topic="/blocks", until=40)["whole"]
+
+
+def test_a_latch_over_tcp(pair):
+    node, child = pair("tcp")
+    publisher = node.publisher("/blocks", Block, latch=True)
+    for size in (10, 1_000_000):
+        publisher.publish(make_block(size, size))
+        child.ask(do="subscriber", topic="/blocks", type="Block", policy=["keep_last"])
+        got = child.ask(do="receive", topic="/blocks", until=size)
+        assert (got["count"], got["whole"]) == (1, True)
+        child.ask(do="close", topic="/blocks")
+
+
+# Security
+
+
+def test_plain_tcp_stays_on_this_host(runtime):
+    """Nothing else is opened before that is known."""
+    for address in ("0.0.0.0", "192.168.1.5", "::"):
+        with pytest.raises(ValueError, match="insecure"):
+            cortex.node.Node("open", listen=address)
+    assert not list(runtime.iterdir())
+
+
+@pytest.mark.parametrize("who", ["stranger", "without keys"])
+def test_who_is_not_let_in(make_node, start_child, tmp_path, who, runtime):
+    """A node without our trust, or without keys, gets nothing; one with it does."""
+    directories = keys_of(tmp_path, ("ours", "friend"))
+    stranger = new_keys(tmp_path / "stranger")
+    known = "".join(f"{load_keys(path).public}\n" for path in directories.values())
+    (tmp_path / "stranger" / AUTHORIZED_FILE).write_text(known)  # it trusts us, we do not trust it
+    node = make_node("ours", listen="127.0.0.1", keys=load_keys(directories["ours"]))
+    options = {} if who == "without keys" else {"keys": str(tmp_path / "stranger")}
+    refused = start_child("peer", name="refused", host="elsewhere", **options)
+    friend = start_child("peer", name="friend", host="elsewhere", keys=str(directories["friend"]))
+    for child in (refused, friend):
+        child.hear()
+        child.ask(do="subscriber", topic="/numbers", type="Number", policy=["keep_last"])
+    publisher = node.publisher("/numbers", Number, latch=True)
+    publisher.publish(Number(1, 1))
+    assert friend.ask(do="receive", topic="/numbers", until=1)["count"] == 1
+    assert publisher.subscriber_count == 1
+    assert refused.ask(do="receive", topic="/numbers", until=1, timeout_s=0.5)["count"] == 0
+    assert stranger.public not in known
+
+
+# Without a registry
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+def test_static_peers(make_node, start_child, transport, runtime):
+    """No registry is started; each names the other, or one of them does."""
+    options = {} if transport == "ipc" else {"listen": "127.0.0.1", "host": "elsewhere"}
+    child = start_child("peer", registry="off", **options)
+    control = child.hear()["control"]
+    assert control.startswith(transport)
+    node = make_node(registry="off", peers=[control], listen=None if transport == "ipc" else "127.0.0.1")
+    child.ask(do="subscriber", topic="/ours", type="Scan", policy=["reliable"])
+    child.ask(do="publisher", topic="/theirs", type="Scan")
+    publisher, subscriber = node.publisher("/ours", Scan), node.subscriber("/theirs", Scan)
+    assert publisher.wait_for_subscribers(1, SOON_S)
+    assert subscriber.wait_for_publisher(SOON_S)
+    for number, size in enumerate((12, 400_000)):
+        assert publisher.publish(make(Scan, number, size))
+        assert child.ask(do="receive", topic="/ours", until=number)["count"] == 1
+        child.ask(do="publish", topic="/theirs", count=1, start=number, size=size)
+        assert subscriber.recv(5.0) == make(Scan, number, size)
+    assert node.wait_for_registry(5.0)
+    assert not (runtime / "0" / "registry").exists()
+    child.finish()
+    wait_for(lambda: len(node.nodes()) == 1)
+
+
+# Two hosts
+
+
+@pytest.fixture
+def hosts(runtime):
+    """Two network namespaces with a cable between them; each has a runtime directory of its own."""
+    if os.getuid() != 0 or shutil.which("ip") is None:
+        pytest.skip("network namespaces need root and the command ip")
+    names = [f"ctx{side}{os.getpid()}" for side in "xy"]
+
+    def ip(*words):
+        subprocess.run(["ip", *words], check=True, capture_output=True, timeout=10.0)
+
+    with contextlib.ExitStack() as stack:
+        try:
+            for name in names:
+                ip("netns", "add", name)
+                stack.callback(ip, "netns", "del", name)
+            ip("link", "add", "cable", "netns", names[0], "type", "veth", "peer", "cable", "netns", names[1])
+            for number, name in enumerate(names, 1):
+                ip("-n", name, "address", "add", f"10.213.8.{number}/24", "dev", "cable")
+                ip("-n", name, "link", "set", "cable", "up")
+                ip("-n", name, "link", "set", "lo", "up")
+        except (OSError, subprocess.SubprocessError) as error:
+            pytest.skip(f"cannot make network namespaces: {error}")
+        yield [
+            (
+                {"prefix": ["ip", "netns", "exec", name], "env": {"CORTEX_RUNTIME_DIR": str(runtime / side)}},
+                address,
+            )
+            for name, side, address in zip(names, "xy", ("10.213.8.1", "10.213.8.2"), strict=True)
+        ]
+
+
+def test_two_hosts(hosts, start_child, tmp_path):
+    """Two kernels' worth of separation: static peers over a cable, encrypted, both ways, large and small."""
+    directories = keys_of(tmp_path, ("one", "two"))
+    (place, address), (other_place, other_address) = hosts
+    one = start_child(
+        "peer", name="one", listen=address, registry="off", keys=str(directories["one"]), **place
+    )
+    control = one.hear()["control"]
+    assert control.startswith(f"tcp://{address}:")
+    server = load_keys(directories["one"]).public
+    (directories["two"] / AUTHORIZED_FILE).write_text(f"{server} {address}\n")
+    two = start_child(
+        "peer",
+        name="two",
+        listen=other_address,
+        registry="off",
+        peers=[control],
+        keys=str(directories["two"]),
+        **other_place,
+    )
+    two.hear()
+    for sender, receiver, topic in ((one, two, "/a"), (two, one, "/b")):
+        sender.ask(do="publisher", topic=topic, type="Block")
+        receiver.ask(do="subscriber", topic=topic, type="Block", policy=["reliable", {"timeout_s": 10.0}])
+        assert sender.ask(do="await_subscribers", topic=topic)["ok"]
+        for start, size in ((0, 100), (50, 300_000)):
+            receiver.say(do="receive", topic=topic, until=start + 49)
+            sent = sender.ask(do="publish", topic=topic, count=50, start=start, size=size)
+            assert sent["delivered"] == 50
+            expected = {"count": 50, "first": start, "last": start + 49, "ordered": True, "whole": True}
+            assert receiver.hear() == expected
+    one.finish()
+    two.finish()
+    shutil.rmtree(place["env"]["CORTEX_RUNTIME_DIR"])
+    shutil.rmtree(other_place["env"]["CORTEX_RUNTIME_DIR"])
