@@ -6,6 +6,7 @@ import contextlib
 import importlib.util
 import json
 import os
+import select
 import shutil
 import subprocess
 import sys
@@ -37,6 +38,7 @@ from cortex.vectors import load_vectors
 
 CPP = Path(__file__).parents[2] / "cortex" / "cpp"
 MUTATIONS = 3000
+CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
 
 
 def _missing() -> str:
@@ -89,14 +91,28 @@ class Peer:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
         )
+        self._rest = b""
         assert self.line() == "ready"
 
-    def line(self) -> str:
-        """The next line that it prints; empty if it ends."""
+    def has_line(self, timeout_s: float = 0.0) -> bool:
+        """Whether it has printed a line that was not taken yet."""
         assert self.process.stdout is not None
-        return self.process.stdout.readline().rstrip("\n")
+        deadline_s = time.monotonic() + timeout_s
+        while b"\n" not in self._rest:
+            left_s = max(0.0, deadline_s - time.monotonic())
+            if not select.select([self.process.stdout], [], [], left_s)[0]:
+                return False
+            chunk = os.read(self.process.stdout.fileno(), 65536)
+            assert chunk, "the C++ program has ended"
+            self._rest += chunk
+        return True
+
+    def line(self) -> str:
+        """The next line that it prints."""
+        assert self.has_line(20.0), "the C++ program is silent"
+        line, self._rest = self._rest.split(b"\n", 1)
+        return line.decode()
 
     def end(self) -> str:
         """Close its input, wait, and return what it wrote to standard error."""
@@ -106,7 +122,7 @@ class Peer:
             self.process.kill()
             self.process.wait()
         assert self.process.returncode in (0, -9), (self.process.returncode, errors)
-        return errors
+        return errors.decode()
 
 
 @pytest.fixture
@@ -274,7 +290,7 @@ def test_reliable_flood_arrives_whole(
         assert scans.publish(Scan(number, np.full(size, number, np.float32)))
     assert scans.publish(Scan(-1, np.zeros(0, np.float32)))
     scans.flush()
-    assert json.loads(peer.line()) == {"received": 3000, "wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
+    assert json.loads(peer.line()) == {**CLEAN, "received": 3000, "sequence": 3000}
 
 
 @pytest.mark.parametrize(("policy", "size"), [("4", 10), ("4", 20_000), ("latest", 10), ("latest", 20_000)])
@@ -306,6 +322,43 @@ def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Cal
         assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
         peer.end()
         scans.close()
+
+
+def test_late_reliable_reader_of_python_is_told(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """A reader in C++ that holds up Python for too long loses messages, knows how many, and is taken back."""
+    scans = make_node().publisher("/scan", Scan)
+    peer = start("count", "/scan", "brief", 1000, 0)
+    assert scans.wait_for_subscribers(1, 10.0)
+    refused = 0
+    for number in range(1500):
+        refused += not scans.publish(Scan(number, np.full(3000, number, np.float32)))
+    while not peer.has_line():  # it may lose some of these, too
+        scans.publish(Scan(-1, np.zeros(0, np.float32)))
+        time.sleep(0.01)
+    result = json.loads(peer.line())
+    assert (result["wrong"], result["rejected"]) == (0, 0)
+    assert result["received"] + result["lost"] == result["sequence"]
+    assert result["lost"] > 0
+    assert refused > 0
+
+
+def test_late_reliable_reader_of_cpp_is_told(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """A reader in Python that holds up C++ for too long loses messages, knows how many, and is taken back."""
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(4, 0.001))
+    peer = start("publish", "/scan", 1500, 3000)
+    while True:
+        scan, info = scans.recv_with_info(10.0)
+        if scan.stamp_ns >= 1500:
+            break
+        time.sleep(0.001)  # work
+    result = json.loads(peer.line())
+    assert scans.counters.received + scans.counters.lost == info.sequence + 1
+    assert scans.counters.lost > 0
+    assert result["refused"] == result["timeouts"] > 0
 
 
 def test_slow_python_reader_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
@@ -342,7 +395,7 @@ def test_latched_message_to_cpp(start: Callable[..., Peer], make_node: Callable[
     peer = start("count", "/scan", "4", 0, 0)
     assert scans.wait_for_subscribers(1, 10.0)
     scans.publish(Scan(-1, np.zeros(0, np.float32)))
-    assert json.loads(peer.line()) == {"received": 1, "wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
+    assert json.loads(peer.line()) == {**CLEAN, "received": 1, "sequence": 1}
 
 
 def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:

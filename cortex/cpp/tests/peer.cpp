@@ -20,6 +20,7 @@ std::atomic<bool> ended{false};
 
 cortex::Policy policy_of(const std::string& text) {
   if (text == "reliable") return cortex::reliable(64, 10s);
+  if (text == "brief") return cortex::reliable(4, 1ms);
   if (text == "latest") return cortex::latest();
   return cortex::keep_last(static_cast<std::size_t>(std::stoi(text)));
 }
@@ -59,14 +60,20 @@ void publish(cortex::Node& node, const std::string& topic, int count, std::uint3
   auto scans = node.advertise<Scan>(topic, options);
   std::cout << "ready" << std::endl;
   if (!latch && !scans.wait_for_subscribers(1, 10s)) std::exit(2);
-  for (int number = 0; number != count && !ended; ++number) {  // a negative count never ends
+  const auto send = [&](int number) {
     Scan scan;
     scan.stamp_ns = number;
     scan.ranges = cortex::Array<float>::zeros({size});
     for (auto& range : scan.ranges.writable()) range = static_cast<float>(number);
-    scans.publish(scan);
+    return scans.publish(scan);
+  };
+  int refused = 0;
+  for (int number = 0; number != count && !ended; ++number) refused += send(number) ? 0 : 1;  // -1 never ends
+  std::cout << "{\"refused\": " << refused << ", \"timeouts\": " << scans.counters().timeouts << "}" << std::endl;
+  while (!ended) {
+    std::this_thread::sleep_for(5ms);
+    if (refused > 0) send(count);  // a subscriber that lost the last ones learns of it by the next
   }
-  while (!ended) std::this_thread::sleep_for(5ms);
 }
 
 // Receives until a scan with stamp -1, holding the last `hold` messages, and says what came.
@@ -75,6 +82,7 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
   std::cout << "ready" << std::endl;
   std::deque<cortex::Received<Scan>> held;
   std::int64_t last = -1;
+  std::uint64_t sequence = 0;
   int received = 0;
   int wrong = 0;
   while (!ended) {
@@ -86,6 +94,7 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
       continue;
     }
     if (!scan) continue;
+    sequence = scan->info().sequence;
     if ((*scan)->stamp_ns == -1) break;
     ++received;
     if ((*scan)->stamp_ns <= last) ++wrong;
@@ -104,7 +113,8 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
   }
   const auto counters = scans.counters();
   std::cout << "{\"received\": " << received << ", \"wrong\": " << wrong << ", \"lost\": " << counters.lost
-            << ", \"rejected\": " << counters.rejected << ", \"overtaken\": " << counters.overtaken << "}" << std::endl;
+            << ", \"rejected\": " << counters.rejected << ", \"overtaken\": " << counters.overtaken
+            << ", \"sequence\": " << sequence << "}" << std::endl;
   scans.close();
   for (const auto& old : held) {  // still there, though the publisher may write to the slots again
     if (!old->ranges.empty() && old->ranges[0] != static_cast<float>(old->stamp_ns)) std::exit(4);

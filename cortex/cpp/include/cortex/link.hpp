@@ -110,7 +110,7 @@ class Link {
   void attach(bool shared_memory) {
     wire::AttachKey key;
     key.source = source_;
-    key.reader = random_number();
+    key.reader = reader_ = random_number();
     key.shared_memory = shared_memory;
     key.strict = policy_.is_reliable;
     key.quota = static_cast<std::uint8_t>(std::min<std::size_t>(policy_.depth + 2, 255));
@@ -150,8 +150,14 @@ class Link {
   bool advance(std::uint64_t sequence, std::uint64_t count) {
     if (known_ && sequence < expected_) return false;
     if (known_ && sequence > expected_) {
+      if (sequence - expected_ > wire::jump_max) throw MalformedMessage("a sequence number from nowhere");
       counters_->lost += sequence - expected_;
       for (auto& ring : rings_) ring.second->heal(sequence);
+      if (policy_.is_reliable) {  // the publisher may have given us up
+        const std::string key = wire::pack_resume(source_, reader_, flags());
+        socket_.set(zmq::sockopt::subscribe, key);
+        socket_.set(zmq::sockopt::unsubscribe, key);
+      }
     }
     known_ = true;
     expected_ = sequence + count;
@@ -303,6 +309,7 @@ class Link {
   zmq::socket_t socket_;  // closes after `~Link` has given the leases back
   int fd_ = -1;
   std::string key_;
+  std::uint64_t reader_ = 0;
   bool attached_ = false;
   bool large_subscribed_ = true;
   bool known_ = false;  // whether `expected_` is

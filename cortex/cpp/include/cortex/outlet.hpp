@@ -157,7 +157,11 @@ class PublisherCore {
     counters_.bytes += size;
     if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
     if (lossy_readers_ > 0) outlets_->lossy.try_send(strict_readers_ > 0 ? share(frame) : std::move(frame));
-    return strict_readers_ == 0 || send_strict(lock, frame, zmq::send_flags::none);
+    if (strict_readers_ == 0) return true;
+    const bool late = is_late_;
+    const bool on_time = send_strict(lock, frame, zmq::send_flags::none) && !late;
+    if (!on_time) ++counters_.timeouts;
+    return on_time;
   }
 
   // Memory for a message; without a buffer if every slot is out on loan.
@@ -204,6 +208,7 @@ class PublisherCore {
       latched_ = head;
       latched_.append(reinterpret_cast<const char*>(slot.buffer.data()), size);
     }
+    on_time = on_time && !is_late_;
     bool passed_over = false;
     if (slot.ring != nullptr) {
       std::uint64_t mask = 0;
@@ -257,9 +262,13 @@ class PublisherCore {
     if (found->column != wire::no_column) {
       for (const auto& ring : rings_) ring->free_column(found->column);
     }
+    if (found->outlet->strict) is_late_ = false;
     --(found->outlet->strict ? strict_readers_ : lossy_readers_);
     readers_.erase(found);
   }
+
+  // A reliable reader that was too late has seen what it lost, and reads again; called under the lock.
+  void resume() noexcept { is_late_ = false; }
 
   std::size_t reader_count() {
     const Lock lock(outlets_->mutex);
@@ -349,7 +358,7 @@ class PublisherCore {
     if (closed_ || outlets_->closed) return false;
     if (!sent) {
       complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
-      if (flags == zmq::send_flags::none && frame.size() != wire::header_size) ++counters_.timeouts;
+      is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
       outlet.send_anyway(share(frame), flags);
     }
     return sent;
@@ -370,11 +379,7 @@ class PublisherCore {
       if (reader.column != wire::no_column) (reader.outlet->strict ? strict : lossy) = true;
     }
     if (lossy) outlets_->lossy.try_send(share(frame));
-    if (strict) {
-      const std::uint64_t before = counters_.timeouts;
-      on_time = send_strict(lock, frame, zmq::send_flags::none);
-      counters_.timeouts = before;  // the message is counted once, by the caller
-    }
+    if (strict) on_time = send_strict(lock, frame, zmq::send_flags::none);
     return on_time;
   }
 
@@ -546,6 +551,7 @@ class PublisherCore {
   PublisherCounters counters_;
   std::int64_t refresh_at_ns_ = 0;
   bool blocked_ = false;
+  bool is_late_ = false;
   bool closed_ = false;
 };
 
@@ -555,7 +561,13 @@ inline void Outlets::refresh() {
     while (outlet->socket.recv(event, zmq::recv_flags::dontwait)) {
       const auto bytes = net::bytes(event);
       wire::AttachKey request;
-      if (bytes.empty() || !wire::read_key({bytes.data() + 1, bytes.size() - 1}, request)) continue;
+      if (bytes.empty()) continue;
+      const Span<const std::uint8_t> subscription(bytes.data() + 1, bytes.size() - 1);
+      if (!wire::read_key(subscription, request)) {
+        const auto resumed = publishers.find(wire::read_resume(subscription));
+        if (resumed != publishers.end() && outlet->strict && bytes[0] == 1) resumed->second->resume();
+        continue;
+      }
       const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);
       const auto publisher = publishers.find(request.source);
       if (publisher == publishers.end()) {
