@@ -43,9 +43,12 @@ class Flusher:
         while not self._closed:
             self._pending.wait()
             self._pending.clear()  # before looking: a batch that begins now sets it again
-            waiting = True
+            waiting, pause_s = True, BATCH_NS * 1e-9
             while waiting and not self._closed:
-                time.sleep(BATCH_NS * 1e-9)
+                time.sleep(pause_s)
+                # While a stream lasts its publisher sends the batches itself. This thread takes the
+                # interpreter away from it each time: it then looks less often.
+                pause_s = min(2.0 * pause_s, 1e-3)
                 waiting = False
                 for publisher in self._publishers:
                     try:

@@ -14,6 +14,7 @@ import zmq
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import new_socket
+from cortex.packer import make_reader
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
@@ -102,6 +103,7 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
+        self.read = make_reader(codec)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,

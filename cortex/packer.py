@@ -1,4 +1,4 @@
-"""Header and body of a small message packed in one go, for the types that are sent most.
+"""Header and body of a small message packed and read in one go, for the types that are sent most.
 
 They are types of numbers and arrays of fixed shape, and a stamp with one vector. Of every other type, and of
 every value that is not as it should be, the packers return None: the codec does it, and says what is wrong.
@@ -15,9 +15,9 @@ import numpy as np
 from cortex.codec import Codec
 from cortex.encoder import ENCODE_ERRORS, PADS
 from cortex.fast import block_struct, fixed_arrays, getter, only_vector
-from cortex.layout import LARGE_ARRAY_BYTES
+from cortex.layout import LARGE_ARRAY_BYTES, reading_struct
 from cortex.raw import RawMessage
-from cortex.wire import RECORD, REST
+from cortex.wire import HEAD_SIZE, HEADER_SIZE, RECORD, REST
 
 Pack = Callable[[Any, int, int, int], "bytes | None"]
 """Message, sequence, publish_ns and the limit of the body's size to bytes; None: do it the long way."""
@@ -151,3 +151,72 @@ def _pack_vector(codec: Codec, head: bytes, dtype: np.dtype[Any], code: int) -> 
         return None
 
     return Packers(frame, record)
+
+
+Read = Callable[[bytes], "tuple[int, int, Any] | None"]
+"""A frame to its sequence, publish_ns and message; None: do it the long way."""
+
+
+def make_reader(codec: Codec) -> Read | None:
+    """Build what reads header and body of a plain message at once, for the types that `make_packers` serves.
+
+    The caller has compared the first 24 bytes. Returns None for other types.
+    """
+    if codec.type is RawMessage:
+        return None
+    if fixed_arrays(codec.schema, codec.type) == []:
+        return _read_numbers(codec)
+    vector = only_vector(codec.schema, codec.type)
+    if vector is not None and codec.stamp_of is not None and len(codec.schema.fields) == 2:
+        return _read_vector(codec, *vector)
+    return None
+
+
+def _unpacker(codec: Codec) -> Callable[[bytes, int], tuple[Any, ...]]:
+    body = reading_struct(codec.schema, block_struct(codec.schema).size)
+    return struct.Struct(REST.format + body.format.removeprefix("<")).unpack_from
+
+
+def _read_numbers(codec: Codec) -> Read | None:
+    if any(field.type == "bool" or not isinstance(field.type, str) for field in codec.schema.fields):
+        return None
+    unpack, cls = _unpacker(codec), codec.type
+    shell = cls.__cortex_shell__  # type: ignore[attr-defined]
+    size = block_struct(codec.schema).size
+
+    def read(frame: bytes) -> tuple[int, int, Any] | None:
+        try:
+            sequence, _, publish_ns, said, _, *values = unpack(frame, HEAD_SIZE)
+        except struct.error:
+            return None
+        if said != size or len(frame) != HEADER_SIZE + size:
+            return None
+        message = shell(*values)
+        message.__class__ = cls
+        return sequence, publish_ns, message
+
+    return read
+
+
+def _read_vector(codec: Codec, dtype: np.dtype[Any], code: int) -> Read:
+    unpack, cls, itemsize = _unpacker(codec), codec.type, dtype.itemsize
+    shell = cls.__cortex_shell__  # type: ignore[attr-defined]
+    block, ndarray = block_struct(codec.schema).size, np.ndarray
+
+    def read(frame: bytes) -> tuple[int, int, Any] | None:
+        try:
+            sequence, _, publish_ns, size, _, stamp, start, head, count = unpack(frame, HEAD_SIZE)
+        except struct.error:
+            return None
+        if (
+            head != code
+            or size != len(frame) - HEADER_SIZE
+            or start < block
+            or start + count * itemsize > size
+        ):
+            return None
+        message = shell(stamp, ndarray(count, dtype, frame, HEADER_SIZE + start))
+        message.__class__ = cls
+        return sequence, publish_ns, message
+
+    return read

@@ -88,11 +88,14 @@ class Publisher(Generic[T]):
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
+        self._acquire, self._release = outlets.lock.acquire, outlets.lock.release
         self._large_lock = threading.Lock()
         self._large = LargeSender(
             self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
         )
         self._readers: dict[bytes, Reader] = {}
+        self._only_send: Callable[..., Any] | None = None
+        """Where small messages go if that is one outlet and nothing special is to be done."""
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_outlets: tuple[Outlet, ...] = ()
         self._sequence = 0
@@ -126,28 +129,32 @@ class Publisher(Generic[T]):
             ValueError: A field's value does not fit its type.
             Closed: The publisher was closed.
         """
-        if type(message) is not self._type:
-            raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
-        with self._lock:
+        self._acquire()
+        try:
             now_ns = monotonic_ns()
-            if now_ns >= self._refresh_ns or self._blocked:
+            if now_ns >= self._refresh_ns:
                 self._prepare(now_ns)
-            if not self._readers and not self.latch:
-                self._sequence += 1
-                return True
-            if self._plain and not self._was_large:
+            send = self._only_send
+            if send is not None:
                 sequence = self._sequence
                 frame = self._pack(message, sequence, now_ns, self._inline_max)
                 if frame is not None:
                     self._sequence = sequence + 1
                     self._bytes += len(frame) - HEADER_SIZE
-                    for send in self._lossy_sends:
+                    try:
                         send(frame, DONTWAIT)
-                    return self._send_strict_all(frame) if self._strict_outlets else True
+                    except zmq.Again:
+                        return self._send_strict_all(frame)
+                    return True
             elif self._gathers and (self._batch or now_ns - self._last_ns < BURST_NS):
                 record = self._pack_record(message, 0, now_ns, self._inline_max)
                 if record is not None:
                     return self._collect(record, now_ns)
+            if type(message) is not self._type:
+                raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
+            if not self._readers and not self.latch:
+                self._sequence += 1
+                return True
             if self._was_large:  # the next is most likely large, too
                 prepared: Any = self.codec.plan(message)
                 if prepared.size <= self._inline_max:
@@ -155,11 +162,15 @@ class Publisher(Generic[T]):
             else:
                 prepared = self.codec.prepare(message, self._inline_max)
             stamp_ns = 0 if self._stamp_of is None else self._stamp_of(message)
-            self._was_large = not isinstance(prepared, bytes)
+            if self._was_large == isinstance(prepared, bytes):
+                self._was_large = not self._was_large
+                self._route()
             if not self._was_large:
                 return self._publish_inline(prepared, stamp_ns, now_ns)
             ours = self._large_lock.acquire(blocking=False)
             slot = self._acquire_slot(prepared.size) if ours else None
+        finally:
+            self._release()
         if not ours:
             self._large_lock.acquire()
             with self._lock:
@@ -257,7 +268,7 @@ class Publisher(Generic[T]):
             return True
         strict = [r.timeout_s for r in self._readers.values() if r.outlet is outlet]
         backoff = Backoff(max(strict, default=0.0))
-        self._blocked = True
+        self._block()
         try:
             while not outlet.try_send(frame, flags):
                 self._lock.release()
@@ -273,6 +284,7 @@ class Publisher(Generic[T]):
                             "%s: a reliable subscriber did not keep up and lost a message", self.topic
                         )
                     self._late.add(outlet)
+                    self._route()
                     outlet.send_anyway(frame, flags)
                     return False
         finally:
@@ -347,7 +359,7 @@ class Publisher(Generic[T]):
         on_time = not self._late
         mask, full, passed_over = self._large.grant(slot.ring)
         if full:
-            self._blocked = True
+            self._block()
             try:
                 on_time &= self._large.await_strict(slot.ring)
             finally:
@@ -366,6 +378,11 @@ class Publisher(Generic[T]):
         on_time &= sent and not self._late
         self._timeouts += not on_time
         return on_time
+
+    def _block(self) -> None:
+        """Make other threads wait until this message is sent; the lock is held."""
+        self._blocked = True
+        self._refresh_ns = 0  # they look at this
 
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
@@ -414,11 +431,15 @@ class Publisher(Generic[T]):
     def resume(self, outlet: Outlet) -> None:
         """A reader that was too late has caught up; called under the outlets' lock."""
         self._late.discard(outlet)
+        self._route()
 
     def _route(self) -> None:
+        """Work out where messages go, when readers or what is sent have changed."""
         outlets = {reader.outlet for reader in self._readers.values()}
         self._lossy_sends = tuple(outlet.send for outlet in outlets if not outlet.strict)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
+        usual = self._plain and not self._was_large and not self._late and len(outlets) == 1
+        self._only_send = next(iter(outlets)).send if usual else None
 
     def tick(self, now_ns: int) -> None:
         """Free what the sockets have sent, end a burst; called by the node now and then."""
@@ -469,6 +490,7 @@ class Publisher(Generic[T]):
     def disown(self) -> None:
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old one may have been held at the fork
+        self._acquire, self._release = self._lock.acquire, self._lock.release
         self._closed = True
         self._refresh_ns = 0
 

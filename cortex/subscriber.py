@@ -404,13 +404,24 @@ class Subscriber(Generic[T]):
         exhausted = True
         self._drained_ns = monotonic_ns()
         for link in self._rotated():
-            receive, head, decode = link.receive, link.message_head, link.codec.decode
+            receive, head, decode, read = link.receive, link.message_head, link.codec.decode, link.read
             for count in range(min(self.policy.depth, DRAIN_MAX)):
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
                     break
-                if frame[:HEAD_SIZE] != head or len(frame) < HEADER_SIZE:
+                is_plain = frame[:HEAD_SIZE] == head
+                if is_plain and read is not None and (found := read(frame)) is not None:
+                    sequence, publish_ns, message = found
+                    if sequence == link.expected:
+                        link.expected = sequence + 1
+                    elif not link.advance(sequence):
+                        continue
+                    if not count & 7:
+                        self._time(publish_ns, link)
+                    take(message)
+                    continue
+                if not is_plain or len(frame) < HEADER_SIZE:
                     if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
                         link.read_batch(frame, messages)
                         if len(messages) >= DRAIN_MAX:
