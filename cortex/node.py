@@ -117,6 +117,7 @@ class Node:
         self._outlets = Outlets()
         self._publishers: list[Publisher[Any]] = []
         self._subscribers: list[Subscriber[Any]] = []
+        self._clients: weakref.WeakSet[Client[Any, Any]] = weakref.WeakSet()
         self._callbacks = CallbackThread(name)
         self._flusher = Flusher(name)
         self._server = Server(self._callbacks.submit)
@@ -259,7 +260,9 @@ class Node:
         self._check_open()
         number = service_number(check_topic(name), request_type, reply_type)
         expected = schema_of(request_type)
-        return Client(name, request_type, reply_type, partial(self._find_service, name, number, expected))
+        client = Client(name, request_type, reply_type, partial(self._find_service, name, number, expected))
+        self._clients.add(client)
+        return client
 
     def nodes(self) -> list[NodeRecord]:
         """All nodes that are known now, this one included."""
@@ -328,6 +331,8 @@ class Node:
             publisher.close(max(0.0, deadline_s - time.monotonic()))
         for subscriber in subscribers:
             subscriber.close()
+        for client in list(self._clients):
+            client.close()
         self._callbacks.close()
         self._wakeup.set()
         if threading.current_thread() is not self._thread:

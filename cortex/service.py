@@ -303,6 +303,10 @@ class Client(Generic[Request, Reply]):
             self._socket.close(0)
             self._socket = None
 
+    def __del__(self) -> None:
+        if hasattr(self, "_socket"):
+            self._disconnect()
+
     def close(self) -> None:
         """Disconnect."""
         with self._lock:
