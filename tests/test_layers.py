@@ -18,7 +18,7 @@ FORBIDDEN = {
     "cortex_ros2_bridge": {"neurosim_core", "warp", "zmq"},
 }
 LAZY = {"torch", "rerun", "h5py", "matplotlib", "pyrender", "OpenGL", "gymnasium"}
-LAZY |= {"cyclonedds", "rclpy"}
+LAZY |= {"cyclonedds", "rclpy", "mcap", "zenoh", "iceoryx2", "lcm"}
 """Heavy or optional: imported where they are used, never when a module is imported."""
 
 
