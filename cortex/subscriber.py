@@ -115,7 +115,14 @@ class Subscriber(Generic[T]):
             TypeMismatch: A publisher of this topic sends another type; raised once for each.
             Closed: The subscriber was closed.
         """
-        message: T = self._receive(timeout_s, self._decode)
+        message: T
+        if self.policy.reliable and (timeout_s is None or timeout_s >= BLOCK_S):
+            with self._lock:
+                message = self._receive_decoded() if not self._queue else _LOST
+                if message is not _LOST:
+                    self.counters.received += 1
+                    return message
+        message = self._receive(timeout_s, self._decode)
         return message
 
     def recv_with_info(self, timeout_s: float | None = None) -> tuple[T, Info]:
@@ -354,6 +361,34 @@ class Subscriber(Generic[T]):
             return links[self._first :] + links[: self._first]
         return links
 
+    def _receive_decoded(self) -> Any:
+        """Wait for one message in the only socket, and decode it; the lock is held, and the queue is empty.
+
+        Returns:
+            The message, or `_LOST` if none came, or if it went to the queue because it needs more care.
+        """
+        links = self._links
+        if len(links) != 1 or self._turn.asked or self._closed or self._problems:
+            return _LOST
+        link = links[0]
+        read = link.read
+        self._exhausted = True
+        try:
+            frame = link.receive(0)
+        except zmq.Again:
+            return _LOST
+        self._exhausted = False
+        if read is not None and frame[:HEAD_SIZE] == link.message_head and (found := read(frame)) is not None:
+            sequence, publish_ns, message = found
+            if sequence == link.expected:
+                link.expected = sequence + 1
+            elif not link.advance(sequence):
+                return _LOST
+            self._time(publish_ns, link)
+            return message
+        self._accept(link, frame, timed=True)
+        return _LOST
+
     def _drain(self) -> None:
         """Read what has arrived into the queue; the lock is held."""
         exhausted = True
@@ -531,9 +566,12 @@ class Subscriber(Generic[T]):
                     self._hot = not self._exhausted
                 elif not self._queue:
                     asked_ns = monotonic_ns()
-                    self._receive_one(block=block)
+                    if block and (message := self._receive_decoded()) is not _LOST:
+                        messages.append(message)
+                    elif not block:
+                        self._receive_one()
                     # A message that waited for us is rarely the last: the next are read together.
-                    self._hot = bool(self._queue) and monotonic_ns() - asked_ns < BACKLOG_NS
+                    self._hot = bool(messages or self._queue) and monotonic_ns() - asked_ns < BACKLOG_NS
             else:
                 if block and not self._queue:
                     self._receive_one(block=True)
