@@ -6,14 +6,17 @@ import threading
 import time
 
 import pytest
+import zmq
 from peer import Number, OtherNumber, Scan
 from processes import wait_for
 
 from cortex import ServiceFailed, ServiceTimeout, ServiceUnavailable
+from cortex.codec import codec_of
+from cortex.context import new_socket
 from cortex.message import message
 from cortex.schema import TypeMismatch
-from cortex.service import PENDING_MAX
-from cortex.wire import CONTROL_LIMIT
+from cortex.service import PENDING_MAX, Client, Place
+from cortex.wire import CONTROL_LIMIT, REPLY, pack_header, unpack_header
 
 
 @message
@@ -206,6 +209,34 @@ def test_a_request_whose_time_is_over_is_not_acted_upon(node):
     assert seen == [1, 3]
     for client in clients:
         client.close()
+
+
+def test_an_answer_to_another_call_is_not_taken(runtime):
+    """Replies with another number or for another caller are passed over."""
+    socket = new_socket(zmq.ROUTER)
+    address = f"ipc://{runtime}/server"
+    socket.bind(address)
+    client = Client("/double", Number, Number, lambda: Place(1, address, True, None))
+
+    def answer():
+        assert socket.poll(5000)
+        identity, frame = socket.recv_multipart()
+        header = unpack_header(frame)._replace(kind=REPLY)
+        others = ({"sequence": header.sequence - 1}, {"source": header.source ^ 1}, {"sequence": 2**40})
+        for number, change in enumerate((*others, {})):
+            body = codec_of(Number).encode(Number(0, number), 1000)
+            reply = header._replace(body_size=len(body), **change)
+            socket.send_multipart([identity, pack_header(reply) + body])
+
+    try:
+        for _ in range(2):
+            thread = threading.Thread(target=answer)
+            thread.start()
+            assert client.call(Number(0, 0), timeout_s=5.0).value == 3
+            thread.join()
+    finally:
+        client.close()
+        socket.close(0)
 
 
 def test_calls_of_several_threads_share_their_time(node):

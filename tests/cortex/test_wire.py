@@ -425,6 +425,8 @@ BAD = {
     "slot far outside": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 0xFFFFFFFF)],
     "slot of another size": lambda f: [_with(f.frames(SLOT, 1)[0], 48, "<Q", 17)],
     "slot larger than it is": lambda f: [_with(f.frames(SLOT, 1)[0], 48, "<Q", 1 << 20)],
+    "copy of a slot that does not exist": lambda f: [_not_granted(f.frames(SLOT, 1)[0], 56, "<Q", 4)],
+    "copy of more than a slot holds": lambda f: [_not_granted(f.frames(SLOT, 1)[0], 48, "<Q", 4097)],
     "batch of records that are not there": lambda f: [f.header(BATCH, 0, 2)],
     "batch of records not counted": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 0)],
     "batch of too many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2)],
@@ -435,6 +437,7 @@ BAD = {
         _with(f.frames(BATCH, 1)[0], HEADER_SIZE + 16, "<I", 2**32 - 1)
     ],
     "answer with too many rings": lambda f: [_with(f.answer, 44, "<I", 5)],
+    "answer with five rings": lambda f: [_with(f.answer, 44, "<I", 5) + 4 * f.answer[-32:]],
     "answer with rings that are not there": lambda f: [_with(f.answer, 44, "<I", 2)],
     "answer with a column too high": lambda f: [_with(f.answer, 40, "<I", 64)],
     "answer cut short": lambda f: [f.answer[:50]],
@@ -445,6 +448,11 @@ def _with(frame, offset, form, value):
     data = bytearray(frame)
     struct.pack_into(form, data, offset, value)
     return bytes(data)
+
+
+def _not_granted(frame, offset, form, value):
+    """A descriptor without the reader's bit: it may try to copy the slot."""
+    return _with(_with(frame, offset, form, value), HEADER_SIZE, "<Q", 0)
 
 
 @pytest.mark.parametrize("name", BAD)
