@@ -1,4 +1,3 @@
-# ruff: noqa: F821, UP037 - names of dtypes and dimensions are text
 """The messages that the tests of the C++ client send to and fro."""
 
 from __future__ import annotations

@@ -6,29 +6,25 @@ import contextlib
 import importlib.util
 import json
 import os
-import select
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cpp_messages
 import numpy as np
 import pytest
-import zmq
-from cpp_messages import Mode, OtherScan, Picture, Point, Rich, Scan
+from cpp_client import Impostor, Peer, bad_frames, make_frame, make_rich
+from cpp_messages import OtherScan, Picture, Rich, Scan
 from processes import shared_mappings, wait_for
 
 import cortex.messages
 from cortex import records, wire
 from cortex.codec import codec_of
 from cortex.cppgen import generate
-from cortex.host import host_id
 from cortex.message import is_message
 from cortex.node import Node
 from cortex.policy import keep_last, reliable
@@ -80,49 +76,6 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         done = subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=False)
         assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     return build
-
-
-class Peer:
-    """A running `peer` program."""
-
-    def __init__(self, command: Sequence[object]) -> None:
-        self.process = subprocess.Popen(
-            [str(part) for part in command],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        self._rest = b""
-        assert self.line() == "ready"
-
-    def has_line(self, timeout_s: float = 0.0) -> bool:
-        """Whether it has printed a line that was not taken yet."""
-        assert self.process.stdout is not None
-        deadline_s = time.monotonic() + timeout_s
-        while b"\n" not in self._rest:
-            left_s = max(0.0, deadline_s - time.monotonic())
-            if not select.select([self.process.stdout], [], [], left_s)[0]:
-                return False
-            chunk = os.read(self.process.stdout.fileno(), 65536)
-            assert chunk, "the C++ program has ended"
-            self._rest += chunk
-        return True
-
-    def line(self) -> str:
-        """The next line that it prints."""
-        assert self.has_line(20.0), "the C++ program is silent"
-        line, self._rest = self._rest.split(b"\n", 1)
-        return line.decode()
-
-    def end(self) -> str:
-        """Close its input, wait, and return what it wrote to standard error."""
-        try:
-            _, errors = self.process.communicate(timeout=20.0)
-        finally:
-            self.process.kill()
-            self.process.wait()
-        assert self.process.returncode in (0, -9), (self.process.returncode, errors)
-        return errors.decode()
 
 
 @pytest.fixture
@@ -201,45 +154,6 @@ def test_shipped_headers_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None
     assert (CPP / "examples/scan.hpp").read_text() == generate([module.Scan, module.Cmd])
 
 
-def _point(number: int) -> Point:
-    return Point(number / 4, f"point {number} " + "ü" * number, np.arange(number, dtype=np.float64))
-
-
-def _rich(number: int, height: int, width: int) -> Rich:
-    rng = np.random.default_rng(number)
-    return Rich(
-        stamp_ns=number,
-        truth=number % 2 == 1,
-        tiny=-128,
-        small=65535,
-        middle=-(2**31),
-        large=2**64 - 1,
-        real=-0.1,
-        text="grüß 🚀" * number,
-        data=bytes(range(256)) * (number % 3),
-        mode=Mode.ACTIVE,
-        class_=-(2**63),
-        default=255,
-        point=_point(3),
-        maybe=None if number % 2 else 1e300,
-        maybe_point=_point(number) if number % 2 else None,
-        maybe_mode=Mode.NULL if number % 2 else None,
-        numbers=list(range(-number, number)),
-        truths=[True, False] * number,
-        words=["", "a", "long enough to leave the object of std::string"] * number,
-        points=[_point(k) for k in range(number)],
-        modes=[Mode.IDLE, Mode.ACTIVE] * number,
-        ragged=[np.arange(k, dtype=np.uint32) for k in range(number)],
-        pose=rng.standard_normal((3, 4)),
-        flags=np.array([True, False, True, True, False]),
-        plane=rng.standard_normal((16, 32)).astype(np.float32),
-        image=rng.integers(0, 255, (height, width, 3), np.uint8),
-        depth=rng.standard_normal((height, width)).astype(np.float16),
-        waves=rng.standard_normal(number) + 1j,
-        anything=rng.integers(-9, 9, (number, 2)).astype((np.int16, np.float64, np.complex64)[number % 3]),
-    )
-
-
 def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
     """Python -> C++ -> Python, small in frames and large in slots of shared memory, both ways."""
     start("echo")
@@ -249,7 +163,7 @@ def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callab
     assert out.wait_for_subscribers(1, 10.0)
     assert back.wait_for_publisher(10.0)
     for number, (height, width) in enumerate([(0, 5), (2, 3), (4, 4), (120, 160), (7, 1), (480, 640)]):
-        message = _rich(number, height, width)
+        message = make_rich(number, height, width)
         assert out.publish(message)
         assert back.recv(10.0) == message
     assert (back.counters.lost, back.counters.rejected) == (0, 0)
@@ -297,18 +211,20 @@ def test_reliable_flood_arrives_whole(
 def test_slow_reader_knows_what_it_missed(
     start: Callable[..., Peer], make_node: Callable[..., Node], policy: str, size: int
 ) -> None:
-    """Received, overtaken and lost messages add up to those that were sent; the last one arrives."""
+    """Received, overtaken and lost messages add up to those that were sent."""
     node = make_node()
     scans = node.publisher("/scan", Scan)
     peer = start("count", "/scan", policy, 500, 0)
     assert scans.wait_for_subscribers(1, 10.0)
     for number in range(2000):
         assert scans.publish(Scan(number, np.full(size, number, np.float32)))
-    scans.publish(Scan(-1, np.zeros(0, np.float32)))
+    while not peer.has_line():  # on a busy machine the end is lost as well as any other message
+        scans.publish(Scan(-1, np.zeros(0, np.float32)))
+        time.sleep(0.01)
     result = json.loads(peer.line())
     assert (result["wrong"], result["rejected"]) == (0, 0)
     assert 0 < result["received"] < 2000
-    assert result["received"] + result["lost"] + result["overtaken"] == 2000
+    assert result["received"] + result["lost"] + result["overtaken"] == result["sequence"]
 
 
 def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
@@ -350,13 +266,16 @@ def test_late_reliable_reader_of_cpp_is_told(
     """A reader in Python that holds up C++ for too long loses messages, knows how many, and is taken back."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(4, 0.001))
     peer = start("publish", "/scan", 1500, 3000)
-    while True:
-        scan, info = scans.recv_with_info(10.0)
-        if scan.stamp_ns >= 1500:
-            break
+    result: dict[str, int] = {}
+    while not result or scans.counters.received + scans.counters.lost < result["published"]:
+        with contextlib.suppress(TimeoutError):
+            scans.recv(0.05)
         time.sleep(0.001)  # work
-    result = json.loads(peer.line())
-    assert scans.counters.received + scans.counters.lost == info.sequence + 1
+        if not result and peer.has_line():
+            result = json.loads(peer.line())
+            deadline_s = time.monotonic() + 20.0
+        assert not result or time.monotonic() < deadline_s
+    assert scans.counters.received + scans.counters.lost == result["published"]
     assert scans.counters.lost > 0
     assert result["refused"] == result["timeouts"] > 0
 
@@ -421,7 +340,7 @@ def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[.
     node = make_node()
     scans = node.subscriber("/scan", Scan, policy=reliable(64))
     start("publish", "/scan", 10, 10)
-    start("count", "/scan", "reliable", 0, 0)
+    start("count", "/other", "reliable", 0, 0)
     for _ in range(10):
         scans.recv(10.0)
     replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
@@ -429,7 +348,7 @@ def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[.
     (subscribed,) = [subscriber for reply in replies for subscriber in reply.subscribers]
     assert (published.topic, published.published, published.timeouts) == ("/scan", 10, 0)
     assert published.bytes == 10 * (24 + 40)  # the fixed block and ten floats
-    assert (subscribed.topic, subscribed.policy) == ("/scan", "reliable(depth=64, timeout_s=10)")
+    assert (subscribed.topic, subscribed.policy) == ("/other", "reliable(depth=64, timeout_s=10)")
 
 
 def test_killed_cpp_reader_frees_its_slots(
@@ -507,96 +426,6 @@ def test_static_peer_without_registry(
     peer.end()
 
 
-class Impostor:
-    """A node that speaks through raw sockets, so that it can say anything."""
-
-    SOURCE = 77
-
-    def __init__(self, directory: Path) -> None:
-        self.context = zmq.Context()
-        self.router = self.context.socket(zmq.ROUTER)
-        self.xpub = self.context.socket(zmq.XPUB)
-        self.control = f"ipc://{directory}/control"
-        data = f"ipc://{directory}/data"
-        self.router.bind(self.control)
-        self.xpub.bind(data)
-        endpoint = records.Endpoint("ipc", data, data, self.control, "")
-        schema = schema_of(Scan)
-        publisher = records.PublisherRecord(
-            "/scan", self.SOURCE, schema.name, schema.fingerprint, schema.to_json(), False
-        )
-        record = records.NodeRecord(5, "impostor", host_id(), 1, 1, 0, [endpoint], [publisher], [], [])
-        self.record = wire.control_frame(records.Changed(0, record))
-        self.stopping = False
-        self.thread = threading.Thread(target=self._answer)
-        self.thread.start()
-
-    def _answer(self) -> None:
-        """Say who we are, between frames of nonsense, to whoever asks."""
-        while not self.stopping:
-            if not self.router.poll(20):
-                continue
-            identity, *_ = self.router.recv_multipart()
-            for frame in (b"", b"CTX", self.record[:-3], self.record, b"\xff" * 200):
-                self.router.send_multipart([identity, frame])
-
-    def await_key(self) -> bytes:
-        """The attach key of the subscriber."""
-        while True:
-            assert self.xpub.poll(10_000)
-            event = self.xpub.recv()
-            if event[:5] == b"\x01CTXA":
-                return bytes(event[1:])
-
-    def close(self) -> None:
-        self.stopping = True
-        self.thread.join()
-        self.context.destroy(linger=0)
-
-
-def _frame(
-    kind: bytes, sequence: int, body: bytes, *, size: int | None = None, aux: int = 0, **change: Any
-) -> bytes:
-    header = wire.Header(
-        kind,
-        Impostor.SOURCE,
-        schema_of(Scan).fingerprint,
-        sequence,
-        0,
-        0,
-        len(body) if size is None else size,
-        aux,
-    )
-    return wire.pack_header(header._replace(**change)) + body
-
-
-def _bad_frames(good: bytes, key: bytes) -> Iterator[list[bytes]]:
-    """Frames of every kind that a subscriber must reject; all of them match its subscriptions."""
-    head = good[:16]
-    yield [head]
-    yield [good[:63]]
-    yield [good[:-1]]
-    yield [good + b"x"]
-    yield [_frame(b"M", 9, good[64:], fingerprint=1)]
-    yield [_frame(b"M", 9, good[64:], size=2**63)]
-    yield [_frame(b"L", 9, b"", size=40)]
-    yield [_frame(b"L", 9, b"", size=41), good[64:]]
-    yield [_frame(b"L", 9, b"", size=2**40), good[64:]]
-    record = wire.RECORD.pack(0, 0, len(good) - 64, 0) + good[64:]
-    record += bytes(-len(record) % 8)
-    yield [_frame(b"B", 9, record, aux=0)]
-    yield [_frame(b"B", 9, record, aux=2)]
-    yield [_frame(b"B", 9, record, aux=2**64 - 1)]
-    yield [_frame(b"B", 2**64 - 1, record, aux=1)]
-    yield [_frame(b"B", 9, record[:-8], aux=1)]
-    yield [_frame(b"B", 9, wire.RECORD.pack(0, 0, 2**32 - 1, 0), aux=1)]
-    yield [_frame(b"S", 9, bytes(7), size=40)]
-    yield [key + bytes(31)]
-    yield [key + wire._ANSWER.pack(0, 64, 0, 0, 0)]
-    yield [key + wire._ANSWER.pack(0, 0, 2**32 - 1, 0, 0)]
-    yield [key + wire._ANSWER.pack(0, 0, 0, 2**64 - 1, 0)]
-
-
 def test_lies_are_rejected(
     programs: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -608,13 +437,13 @@ def test_lies_are_rejected(
         key = impostor.await_key()
         body = codec_of(Scan).encode(Scan(0, np.zeros(4, np.float32)), 1000)
         assert body is not None
-        good = _frame(b"M", 0, body)
-        bad = list(_bad_frames(good, key))
+        good = make_frame(b"M", 0, body)
+        bad = list(bad_frames(good, key))
         for frames in bad:
             impostor.xpub.send_multipart(frames)
-        malformed = _frame(b"M", 0, body[:8] + b"\xff" * 8 + body[16:])
+        malformed = make_frame(b"M", 0, body[:8] + b"\xff" * 8 + body[16:])
         impostor.xpub.send(malformed)
-        impostor.xpub.send(_frame(b"M", 1, body))
+        impostor.xpub.send(make_frame(b"M", 1, body))
         # A ring that is another process's standard input makes it ask again, without shared memory.
         place = wire.RingPlace(1, 4, 4096, os.getpid(), 0)
         impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(2, 3, (place,), b"")))
@@ -622,10 +451,10 @@ def test_lies_are_rejected(
         assert second[16:24] != key[16:24]
         assert not second[24] & 1
         impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(2, None, (), b"")))
-        impostor.xpub.send_multipart([_frame(b"L", 2, b"", size=len(body)), body])
+        impostor.xpub.send_multipart([make_frame(b"L", 2, b"", size=len(body)), body])
         end = codec_of(Scan).encode(Scan(-1, np.zeros(0, np.float32)), 1000)
         assert end is not None
-        impostor.xpub.send(_frame(b"M", 5, end))
+        impostor.xpub.send(make_frame(b"M", 5, end))
         result = json.loads(peer.line())
         assert result["received"] + result["wrong"] >= 1
         assert result["rejected"] == len(bad) + 1
@@ -653,7 +482,7 @@ def test_example_reads_the_other(programs: Path, runtime: Path) -> None:
 
 def test_generated_values_are_replaced_whole() -> None:
     """A rich message differs where one field differs: what the echo test compares is not vacuous."""
-    message = _rich(3, 2, 2)
-    assert message == _rich(3, 2, 2)
+    message = make_rich(3, 2, 2)
+    assert message == make_rich(3, 2, 2)
     assert message != replace(message, words=["other"])
     assert cpp_messages.Rich is Rich

@@ -1,4 +1,3 @@
-# ruff: noqa: F821, UP037 - names of dtypes and dimensions are text
 """The generator of C++ structs: names, guards, text; what its code does is tested in test_cpp.py."""
 
 from __future__ import annotations

@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "cortex/array.hpp"
+#include "cortex/placer.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex {
@@ -374,83 +375,6 @@ class Writer {
   std::uint8_t* out_;
   std::size_t capacity_;
   std::size_t cursor_;
-};
-
-using Dimensions = std::vector<std::pair<std::string, std::uint32_t>>;  // by the name of the dimension
-using Dtypes = std::vector<std::pair<std::string, Dtype>>;              // by the name of the field
-
-// Gives a loan's arrays their place in the slot: those whose dimensions are all known.
-class Placer {
- public:
-  struct Extent {
-    const char* name;  // null: the type says the size
-    std::uint32_t size;
-  };
-
-  // Without memory (data null) it only counts.
-  Placer(Span<std::uint8_t> body, std::size_t block, const Dimensions& dimensions, const Dtypes& dtypes)
-      : body_(body), cursor_(block), dimensions_(dimensions), dtypes_(dtypes) {}
-  std::size_t size() const noexcept { return cursor_; }
-
-  template <class T, std::size_t Rank>
-  void array(Array<T, Rank>& out, const std::array<Extent, Rank>& extents) {
-    std::array<std::uint32_t, Rank> shape{};
-    std::size_t bytes = sizeof(T);
-    if (!known(extents, shape, bytes)) return;
-    std::uint8_t* at = take(bytes);
-    if (at != nullptr) out = Array<T, Rank>::lent(reinterpret_cast<T*>(at), shape);
-  }
-  template <std::size_t Rank>
-  void any(const char* name, AnyArray<Rank>& out, const std::array<Extent, Rank>& extents) {
-    for (const auto& [field, dtype] : dtypes_) {
-      std::array<std::uint32_t, Rank> shape{};
-      std::size_t bytes = item_size(dtype);
-      if (field != name || !known(extents, shape, bytes)) continue;
-      std::uint8_t* at = take(bytes);
-      if (at != nullptr) {
-        out = AnyArray<Rank>(dtype, shape, Array<std::uint8_t>::lent(at, {static_cast<std::uint32_t>(bytes)}));
-      }
-      return;
-    }
-  }
-  template <class T, std::size_t Rank>
-  void fixed(std::size_t at, Array<T, Rank>& out, const std::array<std::uint32_t, Rank>& shape) {
-    if (body_.data() != nullptr) out = Array<T, Rank>::lent(reinterpret_cast<T*>(body_.data() + at), shape);
-  }
-
- private:
-  // Whether all dimensions are given: then the shape, and `bytes` times its items.
-  template <std::size_t Rank>
-  bool known(const std::array<Extent, Rank>& extents, std::array<std::uint32_t, Rank>& shape, std::size_t& bytes) const {
-    for (std::size_t index = 0; index < Rank; ++index) {
-      shape[index] = extents[index].size;
-      if (extents[index].name != nullptr) {
-        const auto found = std::find_if(dimensions_.begin(), dimensions_.end(),
-                                        [&](const auto& dimension) { return dimension.first == extents[index].name; });
-        if (found == dimensions_.end()) return false;
-        shape[index] = found->second;
-      }
-      if (shape[index] != 0 && bytes > wire::body_limit / shape[index]) too_large();
-      bytes *= shape[index];
-    }
-    return true;
-  }
-
-  // The next place for so many bytes, null while only counting.
-  std::uint8_t* take(std::size_t bytes) {
-    const auto start = static_cast<std::size_t>(wire::round_up(cursor_, bytes >= 1024 ? 64 : 8));
-    if (start + bytes > wire::body_limit) too_large();
-    if (body_.data() != nullptr && start > cursor_) std::memset(body_.data() + cursor_, 0, start - cursor_);
-    cursor_ = start + bytes;
-    return body_.data() == nullptr ? nullptr : body_.data() + start;
-  }
-
-  [[noreturn]] static void too_large() { throw std::invalid_argument("a loan is larger than 1 GiB"); }
-
-  Span<std::uint8_t> body_;
-  std::size_t cursor_;
-  const Dimensions& dimensions_;
-  const Dtypes& dtypes_;
 };
 
 template <class T>

@@ -203,7 +203,11 @@ class Link {
 
   void on_batch(const wire::Header& header, zmq::message_t& frame, std::deque<Item>& queue) {
     wire::body_of(header, net::bytes(frame), wire::body_limit);
-    if (header.aux == 0) throw MalformedMessage("a batch of nothing");
+    if (header.aux == 0) {  // tells which number comes next, so that a loss at the end of a burst is known
+      if (header.body_size != 0) throw MalformedMessage("a batch of bytes without records");
+      advance(header.sequence, 0);
+      return;
+    }
     const auto shared = std::make_shared<zmq::message_t>(std::move(frame));
     const auto records = wire::batch_records(header, net::bytes(*shared));
     if (!advance(header.sequence, header.aux)) return;

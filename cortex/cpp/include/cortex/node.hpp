@@ -22,6 +22,7 @@
 #include "cortex/outlet.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/publisher.hpp"
+#include "cortex/publisher_core.hpp"
 #include "cortex/records.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/subscriber.hpp"
@@ -210,6 +211,15 @@ class Node {
     return result;
   }
 
+  std::vector<std::shared_ptr<detail::PublisherCore>> publishers() {
+    std::vector<std::shared_ptr<detail::PublisherCore>> result;
+    const std::lock_guard<std::mutex> lock(mutex_);
+    for (const auto& published : publishers_) {
+      if (auto core = published.core.lock()) result.push_back(std::move(core));
+    }
+    return result;
+  }
+
   // Forgets those that have ended; true if there were any.
   bool prune() {
     const std::lock_guard<std::mutex> lock(mutex_);
@@ -294,6 +304,7 @@ class Node {
     if (changed) match(subscriptions);
     const std::int64_t now_ns = monotonic_ns();
     for (const auto& subscription : subscriptions) subscription->tend(now_ns);
+    for (const auto& publisher : publishers()) publisher->tend(now_ns);
     return changed;
   }
 
@@ -364,14 +375,7 @@ class Node {
     records::StatsReply reply;
     reply.node = id_;
     reply.rejected = rejected_ + directory_->rejected();
-    std::vector<std::shared_ptr<detail::PublisherCore>> publishers;
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      for (const auto& published : publishers_) {
-        if (auto core = published.core.lock()) publishers.push_back(std::move(core));
-      }
-    }
-    for (const auto& core : publishers) {
+    for (const auto& core : publishers()) {
       const auto counters = core->counters();
       reply.publishers.push_back({core->topic(), core->source, static_cast<std::uint32_t>(core->reader_count()),
                                   counters.published, counters.bytes, counters.timeouts, counters.skipped});

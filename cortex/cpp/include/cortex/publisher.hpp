@@ -13,7 +13,7 @@
 #include <utility>
 
 #include "cortex/codec.hpp"
-#include "cortex/outlet.hpp"
+#include "cortex/publisher_core.hpp"
 
 namespace cortex {
 
@@ -66,7 +66,7 @@ class Loan {
     Codec<T>::draft(measure, message_);
     tail_ = measure.size();
     const std::size_t size = tail_ + reserve;
-    slot_ = size <= core_->inline_max() ? core_->private_slot(size) : core_->acquire(size);
+    slot_ = size <= core_->inline_max() ? detail::private_slot(size) : core_->acquire(size);
     if (slot_.buffer.data() == nullptr) {
       core_.reset();
       throw std::runtime_error("every slot is out on loan; publish or drop one first");

@@ -1,0 +1,500 @@
+// SPDX-License-Identifier: Apache-2.0
+// What one publisher does with its node's sockets: readers, inline frames, slots of shared memory.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#include "cortex/outlet.hpp"
+#include "cortex/policy.hpp"
+#include "cortex/ring.hpp"
+#include "cortex/runtime.hpp"
+#include "cortex/slot.hpp"
+#include "cortex/socket.hpp"
+#include "cortex/wire.hpp"
+
+namespace cortex::detail {
+
+// One subscriber's link to this publisher.
+struct Reader {
+  std::string key;
+  wire::AttachKey request;
+  Outlet* outlet = nullptr;
+  std::uint32_t column = wire::no_column;
+};
+
+// What does not depend on the type of the messages. Bodies are written without the lock, by one thread at a time.
+class PublisherCore {
+ public:
+  PublisherCore(std::shared_ptr<Outlets> outlets, std::string topic, std::uint64_t fingerprint, bool stamped,
+                bool latch, std::size_t inline_max, bool exact, std::shared_ptr<net::Complaints> complaints)
+      : source(random_number()),
+        outlets_(std::move(outlets)),
+        topic_(std::move(topic)),
+        fingerprint_(fingerprint),
+        flags_(stamped ? wire::flag_stamp : 0),
+        latch_(latch),
+        exact_(exact),
+        inline_max_(inline_max),
+        complaints_(std::move(complaints)) {
+    const Lock lock(outlets_->mutex);
+    outlets_->publishers[source] = this;
+  }
+
+  ~PublisherCore() { close(); }
+  PublisherCore(const PublisherCore&) = delete;
+  PublisherCore& operator=(const PublisherCore&) = delete;
+
+  const std::uint64_t source;
+
+  const std::string& topic() const noexcept { return topic_; }
+  std::uint64_t fingerprint() const noexcept { return fingerprint_; }
+  bool latch() const noexcept { return latch_; }
+  std::size_t inline_max() const noexcept { return inline_max_; }
+
+  // One thread at a time encodes large messages: order, and one slot in hand, not many.
+  std::mutex large_mutex;
+
+  // Whether a message would reach anybody; otherwise it is counted as published and need not be encoded.
+  bool wanted() {
+    Lock lock(outlets_->mutex);
+    prepare(lock, false);
+    if (!readers_.empty() || latch_) return true;
+    ++sequence_;
+    ++counters_.published;
+    return false;
+  }
+
+  // Sends a frame whose body is in place after room for the header; false if a reliable subscriber lost it.
+  bool publish_inline(zmq::message_t frame, std::int64_t stamp_ns) {
+    Lock lock(outlets_->mutex);
+    prepare(lock, false);
+    const std::size_t size = frame.size() - wire::header_size;
+    write_header(static_cast<std::uint8_t*>(frame.data()), 'M', sequence_++, stamp_ns, size, 0);
+    ++counters_.published;
+    counters_.bytes += size;
+    if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
+    if (lossy_readers_ > 0) outlets_->lossy.try_send(strict_readers_ > 0 ? share(frame) : std::move(frame));
+    if (strict_readers_ == 0) return true;
+    const bool late = is_late_;
+    const bool on_time = send_strict(lock, frame, zmq::send_flags::none) && !late;
+    if (!on_time) ++counters_.timeouts;
+    return on_time;
+  }
+
+  // Memory for a message; without a buffer if every slot is out on loan.
+  Slot acquire(std::size_t size) {
+    Lock lock(outlets_->mutex);
+    prepare(lock, true);
+    const std::shared_ptr<Ring> ring = ring_for(size);
+    if (ring == nullptr) return private_slot(size);
+    const int index = ring->acquire();
+    if (index >= 0) return {ring->buffer(index), ring, index, nullptr};
+    ++sequence_;
+    ++counters_.published;
+    ++counters_.skipped;
+    return {};
+  }
+
+  void abandon(const Slot& slot) noexcept {
+    if (slot.ring == nullptr) return;
+    const Lock lock(outlets_->mutex);
+    slot.ring->abandon(slot.index);
+  }
+
+  // Sends what was written into a slot; false if a reliable subscriber lost it.
+  bool publish_slot(const Slot& slot, std::size_t size, std::int64_t stamp_ns) {
+    Lock lock(outlets_->mutex);
+    prepare(lock, true);
+    bool on_time = await_strict(lock, slot);
+    if (closed_) {
+      if (slot.ring != nullptr) slot.ring->abandon(slot.index);
+      return false;
+    }
+    const std::uint64_t sequence = sequence_++;
+    ++counters_.published;
+    counters_.bytes += size;
+    std::string head(wire::header_size, '\0');
+    auto* header = reinterpret_cast<std::uint8_t*>(head.data());
+    write_header(header, 'L', sequence, stamp_ns, size, 0);
+    if (latch_) {
+      latched_ = head;
+      latched_.append(reinterpret_cast<const char*>(slot.buffer.data()), size);
+    }
+    on_time = on_time && !is_late_;
+    bool passed_over = false;
+    if (slot.ring != nullptr) {
+      std::uint64_t mask = 0;
+      bool columns = false;
+      for (const auto& reader : readers_) {
+        if (reader.column == wire::no_column) continue;
+        columns = true;
+        if (has_room(reader, *slot.ring)) {
+          mask |= std::uint64_t{1} << reader.column;
+        } else {
+          passed_over = true;
+        }
+      }
+      slot.ring->pin(slot.index);  // until it has been handed to ZeroMQ below
+      slot.ring->commit(slot.index, sequence, size, mask);
+      if (columns) on_time &= send_descriptor(lock, slot, sequence, stamp_ns, size, mask);
+    }
+    for (Outlet* outlet : {&outlets_->lossy, &outlets_->strict}) {
+      const bool inline_readers = std::any_of(readers_.begin(), readers_.end(), [&](const Reader& reader) {
+        return reader.outlet == outlet && (slot.ring == nullptr || reader.column == wire::no_column);
+      });
+      if (inline_readers) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
+    }
+    if (slot.ring != nullptr) slot.ring->unpin(slot.index);
+    if (passed_over) ++counters_.skipped;
+    if (!on_time) ++counters_.timeouts;
+    return on_time;
+  }
+
+  // After a burst: tells readers which number comes next, so that they know of a loss at its end.
+  void tend(std::int64_t now_ns) {
+    const Lock lock(outlets_->mutex, std::try_to_lock);
+    if (!lock.owns_lock() || closed_ || outlets_->closed || blocked_ || told_ == sequence_ ||
+        now_ns - refresh_at_ns_ < silence_ns) {
+      return;
+    }
+    zmq::message_t frame(wire::header_size);
+    write_header(static_cast<std::uint8_t*>(frame.data()), 'B', sequence_, 0, 0, 0);
+    if (lossy_readers_ > 0) outlets_->lossy.try_send(share(frame));
+    const bool sent = strict_readers_ == 0 || outlets_->strict.try_send(std::move(frame));
+    if (sent && !is_late_) told_ = sequence_;
+  }
+
+  // A reader has come; called under the lock.
+  void attach(Outlet& outlet, const std::string& key, const wire::AttachKey& request) {
+    if (closed_ || readers_.size() >= 1024) return;
+    Reader reader{key, request, &outlet, wire::no_column};
+    if (request.shared_memory && !unavailable_) {
+      for (std::uint32_t column = 0; column < wire::column_count && reader.column == wire::no_column; ++column) {
+        const bool taken = std::any_of(readers_.begin(), readers_.end(),
+                                       [&](const Reader& other) { return other.column == column; });
+        if (!taken) reader.column = column;
+      }
+    }
+    readers_.push_back(reader);
+    ++(outlet.strict ? strict_readers_ : lossy_readers_);
+    answer(reader, latched_);
+  }
+
+  // A reader has left or died; called under the lock.
+  void detach(const std::string& key) {
+    const auto found =
+        std::find_if(readers_.begin(), readers_.end(), [&](const Reader& reader) { return reader.key == key; });
+    if (found == readers_.end()) return;
+    if (found->column != wire::no_column) {
+      for (const auto& ring : rings_) ring->free_column(found->column);
+    }
+    if (found->outlet->strict) is_late_ = false;
+    --(found->outlet->strict ? strict_readers_ : lossy_readers_);
+    readers_.erase(found);
+  }
+
+  // A reliable reader that was too late has seen what it lost, and reads again; called under the lock.
+  void resume() noexcept { is_late_ = false; }
+
+  std::size_t reader_count() {
+    const Lock lock(outlets_->mutex);
+    if (!outlets_->closed) outlets_->refresh();
+    return readers_.size();
+  }
+
+  PublisherCounters counters() const {
+    const Lock lock(outlets_->mutex);
+    return counters_;
+  }
+
+  bool closed() const {
+    const Lock lock(outlets_->mutex);
+    return closed_ || outlets_->closed;
+  }
+
+  void close() noexcept {
+    const Lock lock(outlets_->mutex);
+    if (closed_) return;
+    closed_ = true;
+    outlets_->publishers.erase(source);
+    readers_.clear();
+    lossy_readers_ = strict_readers_ = 0;
+    rings_.clear();
+  }
+
+ private:
+  static constexpr std::int64_t refresh_ns = 1'000'000;
+  static constexpr std::int64_t silence_ns = 100'000'000;
+  static constexpr std::uint64_t ring_bytes = 4u << 20;  // rings of small slots stay in cache
+  static constexpr std::uint64_t ring_bytes_max = std::uint64_t{2} << 30;
+  static constexpr std::size_t private_bytes_max = 64u << 20;  // outside of rings, waiting to be sent
+
+  void write_header(std::uint8_t* out, char kind, std::uint64_t sequence, std::int64_t stamp_ns, std::uint64_t size,
+                    std::uint64_t aux) const noexcept {
+    wire::write_header(out, {kind, flags_, source, fingerprint_, sequence, stamp_ns, monotonic_ns(), size, aux});
+  }
+
+  // Waits for our turn if another thread is held up by a reader, and sees who has come and gone.
+  void prepare(Lock& lock, bool now) {
+    while (blocked_) {
+      lock.unlock();
+      std::this_thread::sleep_for(std::chrono::microseconds(100));
+      lock.lock();
+    }
+    if (closed_ || outlets_->closed) throw std::logic_error("the publisher of " + topic_ + " is closed");
+    const std::int64_t time_ns = monotonic_ns();
+    if (!now && time_ns < refresh_at_ns_) return;
+    refresh_at_ns_ = time_ns + refresh_ns;
+    outlets_->refresh();
+    while (rings_.size() > 1 && rings_.front()->idle()) rings_.erase(rings_.begin());
+  }
+
+  void answer(const Reader& reader, const std::string& latched) {
+    wire::AttachAnswer answer;
+    answer.sequence = sequence_;
+    answer.column = reader.column;
+    answer.latched = {reinterpret_cast<const std::uint8_t*>(latched.data()), latched.size()};
+    if (reader.column != wire::no_column) {
+      for (const auto& ring : rings_) answer.rings.push_back(ring->place());
+    }
+    zmq::message_t frame = message_of(wire::pack_answer(reader.key, answer));
+    if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
+  }
+
+  // Sends over the strict outlet, waiting for the slowest reader; the lock is let go while sleeping.
+  bool send_strict(Lock& lock, zmq::message_t& frame, zmq::send_flags flags) {
+    Outlet& outlet = outlets_->strict;
+    if (outlet.try_send(share(frame), flags)) return true;
+    std::uint32_t timeout_ms = 0;
+    for (const auto& reader : readers_) {
+      if (reader.outlet == &outlet) timeout_ms = std::max(timeout_ms, reader.request.timeout_ms);
+    }
+    Backoff backoff(std::int64_t{timeout_ms} * 1'000'000);
+    bool sent = false;
+    bool in_time = true;
+    blocked_ = true;
+    while (!sent && in_time) {
+      lock.unlock();
+      in_time = backoff.wait();
+      lock.lock();
+      if (closed_ || outlets_->closed) break;
+      outlets_->refresh();
+      sent = outlet.try_send(share(frame), flags);
+    }
+    blocked_ = false;
+    if (closed_ || outlets_->closed) return false;
+    if (!sent) {
+      complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
+      is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
+      outlet.send_anyway(share(frame), flags);
+    }
+    return sent;
+  }
+
+  bool send_descriptor(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size,
+                       std::uint64_t mask) {
+    zmq::message_t frame(wire::header_size + 8);
+    auto* out = static_cast<std::uint8_t*>(frame.data());
+    const std::uint64_t aux =
+        static_cast<std::uint64_t>(slot.ring->number()) << 32 | static_cast<std::uint32_t>(slot.index);
+    write_header(out, 'S', sequence, stamp_ns, size, aux);
+    wire::store(out + wire::header_size, mask);
+    bool on_time = true;
+    bool lossy = false;
+    bool strict = false;
+    for (const auto& reader : readers_) {
+      if (reader.column != wire::no_column) (reader.outlet->strict ? strict : lossy) = true;
+    }
+    if (lossy) outlets_->lossy.try_send(share(frame));
+    if (strict) on_time = send_strict(lock, frame, zmq::send_flags::none);
+    return on_time;
+  }
+
+  // Header and body, the body from where it lies.
+  bool send_large(Lock& lock, Outlet& outlet, const Slot& slot, const std::string& head, std::size_t size,
+                  bool& passed_over) {
+    if (slot.ring == nullptr || slot.ring->pinned() > pin_quota(*slot.ring)) {
+      if (*private_bytes_ + size > std::max<std::size_t>(private_bytes_max, 4 * size)) {
+        passed_over = true;
+        return !outlet.strict;
+      }
+    }
+    zmq::message_t header = message_of(head);
+    bool on_time = true;
+    if (outlet.strict) {
+      on_time = send_strict(lock, header, zmq::send_flags::sndmore);
+    } else {
+      outlet.try_send(std::move(header), zmq::send_flags::sndmore);
+    }
+    // The second part goes where the first went: it must not be refused.
+    outlet.send_anyway(body_message(slot, size));
+    return on_time;
+  }
+
+  zmq::message_t body_message(const Slot& slot, std::size_t size) {
+    if (slot.ring != nullptr && slot.ring->pinned() <= pin_quota(*slot.ring)) return pinned_message(slot, size);
+    return private_message(slot, size, private_bytes_);
+  }
+
+  // Waits until every reliable reader can take one more; false if one could not in its time.
+  bool await_strict(Lock& lock, const Slot& slot) {
+    const auto timeout_ms = [&] {
+      std::int64_t longest = -1;
+      for (const auto& reader : readers_) {
+        if (reader.request.strict && is_full(reader, slot)) {
+          longest = std::max<std::int64_t>(longest, reader.request.timeout_ms);
+        }
+      }
+      return longest;
+    };
+    const std::int64_t first_ms = timeout_ms();
+    if (first_ms < 0) return true;
+    Backoff backoff(first_ms * 1'000'000);
+    bool in_time = true;
+    blocked_ = true;
+    while (in_time && !closed_ && !outlets_->closed && timeout_ms() >= 0) {
+      lock.unlock();
+      in_time = backoff.wait();
+      lock.lock();
+      if (!outlets_->closed) outlets_->refresh();
+    }
+    blocked_ = false;
+    if (outlets_->closed) closed_ = true;
+    if (!in_time) {
+      complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
+    }
+    return in_time;
+  }
+
+  bool is_full(const Reader& reader, const Slot& slot) {
+    if (slot.ring == nullptr) return *private_bytes_ > private_bytes_max / 2;
+    if (reader.column != wire::no_column) return !has_room(reader, *slot.ring);
+    return slot.ring->pinned() >= pin_quota(*slot.ring);
+  }
+
+  bool has_room(const Reader& reader, Ring& ring) {
+    std::uint32_t quota = pin_quota(ring);
+    if (reader.request.quota != 0) quota = std::min<std::uint32_t>(quota, reader.request.quota);
+    return ring.outstanding(reader.column, quota) < quota;
+  }
+
+  // Readers share the slots, so that one slow reader cannot take the ring from the others.
+  std::uint32_t shares() const {
+    std::uint32_t columns = 0;
+    bool inline_readers = false;
+    for (const auto& reader : readers_) {
+      if (reader.column == wire::no_column) {
+        inline_readers = true;
+      } else {
+        ++columns;
+      }
+    }
+    return std::max<std::uint32_t>(1, columns + (inline_readers ? 1 : 0));
+  }
+  std::uint32_t pin_quota(const Ring& ring) const { return std::max<std::uint32_t>(1, (ring.slots() - 1) / shares()); }
+
+  // The newest ring, made anew for larger messages or more readers; null where there is no shared memory.
+  std::shared_ptr<Ring> ring_for(std::size_t size) {
+    if (unavailable_) return nullptr;
+    const std::shared_ptr<Ring> current = rings_.empty() ? nullptr : rings_.back();
+    const std::uint64_t wanted = 2 * std::uint64_t{shares()} + 2;
+    const bool fits = current != nullptr && current->slot_bytes() >= size;
+    if (fits && current->slots() >= wanted) return current;
+    std::uint64_t slot_bytes = exact_ ? size : size + size / 4;
+    if (current != nullptr) slot_bytes = std::max(slot_bytes, current->slot_bytes());
+    slot_bytes = wire::round_up(slot_bytes, ring::page);
+    std::uint64_t slots = std::max(std::clamp<std::uint64_t>(ring_bytes / slot_bytes, 4, 64), wanted);
+    slots = std::max<std::uint64_t>(4, std::min(slots, ring_bytes_max / slot_bytes));
+    if (fits && current->slots() >= slots) return current;
+    try {
+      rings_.push_back(
+          std::make_shared<Ring>(source, ++ring_count_, static_cast<std::uint32_t>(slots), slot_bytes));
+    } catch (const ShmUnavailable& error) {
+      if (fits) return current;
+      complaints_->once("memory " + topic_, topic_ + ": no shared memory, large messages go through sockets: " +
+                                                error.what());
+      do_without_memory();
+      return nullptr;
+    }
+    if (rings_.size() > wire::rings_alive) rings_.erase(rings_.begin());
+    for (const auto& reader : readers_) {
+      if (reader.column != wire::no_column) answer(reader, "");
+    }
+    return rings_.back();
+  }
+
+  // Large messages go through sockets from now on, also to those that had a column.
+  void do_without_memory() {
+    unavailable_ = true;
+    for (auto& reader : readers_) {
+      if (reader.column == wire::no_column) continue;
+      for (const auto& ring : rings_) ring->free_column(reader.column);
+      reader.column = wire::no_column;
+      answer(reader, "");
+    }
+  }
+
+  std::shared_ptr<Outlets> outlets_;
+  const std::string topic_;
+  const std::uint64_t fingerprint_;
+  const std::uint8_t flags_;
+  const bool latch_;
+  const bool exact_;
+  const std::size_t inline_max_;
+  std::shared_ptr<net::Complaints> complaints_;
+  std::vector<Reader> readers_;
+  std::size_t lossy_readers_ = 0;
+  std::size_t strict_readers_ = 0;
+  std::vector<std::shared_ptr<Ring>> rings_;
+  std::uint32_t ring_count_ = 0;
+  std::shared_ptr<std::atomic<std::size_t>> private_bytes_ = std::make_shared<std::atomic<std::size_t>>(0);
+  bool unavailable_ = false;
+  std::uint64_t sequence_ = 0;
+  std::uint64_t told_ = 0;  // what readers know that `sequence_` was
+  std::string latched_;
+  PublisherCounters counters_;
+  std::int64_t refresh_at_ns_ = 0;
+  bool blocked_ = false;
+  bool is_late_ = false;
+  bool closed_ = false;
+};
+
+inline void Outlets::refresh() {
+  for (Outlet* outlet : {&lossy, &strict}) {
+    zmq::message_t event;
+    while (outlet->socket.recv(event, zmq::recv_flags::dontwait)) {
+      const auto bytes = net::bytes(event);
+      wire::AttachKey request;
+      if (bytes.empty()) continue;
+      const Span<const std::uint8_t> subscription(bytes.data() + 1, bytes.size() - 1);
+      if (!wire::read_key(subscription, request)) {
+        const auto resumed = publishers.find(wire::read_resume(subscription));
+        if (resumed != publishers.end() && outlet->strict && bytes[0] == 1) resumed->second->resume();
+        continue;
+      }
+      const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);
+      const auto publisher = publishers.find(request.source);
+      if (publisher == publishers.end()) {
+        attached.erase(key);
+      } else if (bytes[0] == 1) {
+        attached[key] = outlet;
+        publisher->second->attach(*outlet, key, request);
+      } else if (attached.erase(key) > 0) {
+        publisher->second->detach(key);
+      }
+    }
+  }
+}
+
+}  // namespace cortex::detail

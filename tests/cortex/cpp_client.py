@@ -1,0 +1,192 @@
+"""What the tests of the C++ client talk to and with: its test program, rich messages, a node that lies."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zmq
+from cpp_messages import Mode, Point, Rich, Scan
+
+from cortex import records, wire
+from cortex.host import host_id
+from cortex.schema import schema_of
+
+
+class Peer:
+    """A running `peer` program."""
+
+    def __init__(self, command: Sequence[object]) -> None:
+        self.process = subprocess.Popen(
+            [str(part) for part in command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        self._rest = b""
+        assert self.line() == "ready"
+
+    def has_line(self, timeout_s: float = 0.0) -> bool:
+        """Whether it has printed a line that was not taken yet."""
+        assert self.process.stdout is not None
+        deadline_s = time.monotonic() + timeout_s
+        while b"\n" not in self._rest:
+            left_s = max(0.0, deadline_s - time.monotonic())
+            if not select.select([self.process.stdout], [], [], left_s)[0]:
+                return False
+            chunk = os.read(self.process.stdout.fileno(), 65536)
+            assert chunk, "the C++ program has ended"
+            self._rest += chunk
+        return True
+
+    def line(self) -> str:
+        """The next line that it prints."""
+        assert self.has_line(20.0), "the C++ program is silent"
+        line, self._rest = self._rest.split(b"\n", 1)
+        return line.decode()
+
+    def end(self) -> str:
+        """Close its input, wait, and return what it wrote to standard error."""
+        try:
+            _, errors = self.process.communicate(timeout=20.0)
+        finally:
+            self.process.kill()
+            self.process.wait()
+        assert self.process.returncode in (0, -9), (self.process.returncode, errors)
+        return errors.decode()
+
+
+def _point(number: int) -> Point:
+    return Point(number / 4, f"point {number} " + "ü" * number, np.arange(number, dtype=np.float64))
+
+
+def make_rich(number: int, height: int, width: int) -> Rich:
+    rng = np.random.default_rng(number)
+    return Rich(
+        stamp_ns=number,
+        truth=number % 2 == 1,
+        tiny=-128,
+        small=65535,
+        middle=-(2**31),
+        large=2**64 - 1,
+        real=-0.1,
+        text="grüß 🚀" * number,
+        data=bytes(range(256)) * (number % 3),
+        mode=Mode.ACTIVE,
+        class_=-(2**63),
+        default=255,
+        point=_point(3),
+        maybe=None if number % 2 else 1e300,
+        maybe_point=_point(number) if number % 2 else None,
+        maybe_mode=Mode.NULL if number % 2 else None,
+        numbers=list(range(-number, number)),
+        truths=[True, False] * number,
+        words=["", "a", "long enough to leave the object of std::string"] * number,
+        points=[_point(k) for k in range(number)],
+        modes=[Mode.IDLE, Mode.ACTIVE] * number,
+        ragged=[np.arange(k, dtype=np.uint32) for k in range(number)],
+        pose=rng.standard_normal((3, 4)),
+        flags=np.array([True, False, True, True, False]),
+        plane=rng.standard_normal((16, 32)).astype(np.float32),
+        image=rng.integers(0, 255, (height, width, 3), np.uint8),
+        depth=rng.standard_normal((height, width)).astype(np.float16),
+        waves=rng.standard_normal(number) + 1j,
+        anything=rng.integers(-9, 9, (number, 2)).astype((np.int16, np.float64, np.complex64)[number % 3]),
+    )
+
+
+class Impostor:
+    """A node that speaks through raw sockets, so that it can say anything."""
+
+    SOURCE = 77
+
+    def __init__(self, directory: Path) -> None:
+        self.context = zmq.Context()
+        self.router = self.context.socket(zmq.ROUTER)
+        self.xpub = self.context.socket(zmq.XPUB)
+        self.control = f"ipc://{directory}/control"
+        data = f"ipc://{directory}/data"
+        self.router.bind(self.control)
+        self.xpub.bind(data)
+        endpoint = records.Endpoint("ipc", data, data, self.control, "")
+        schema = schema_of(Scan)
+        publisher = records.PublisherRecord(
+            "/scan", self.SOURCE, schema.name, schema.fingerprint, schema.to_json(), False
+        )
+        record = records.NodeRecord(5, "impostor", host_id(), 1, 1, 0, [endpoint], [publisher], [], [])
+        self.record = wire.control_frame(records.Changed(0, record))
+        self.stopping = False
+        self.thread = threading.Thread(target=self._answer)
+        self.thread.start()
+
+    def _answer(self) -> None:
+        """Say who we are, between frames of nonsense, to whoever asks."""
+        while not self.stopping:
+            if not self.router.poll(20):
+                continue
+            identity, *_ = self.router.recv_multipart()
+            for frame in (b"", b"CTX", self.record[:-3], self.record, b"\xff" * 200):
+                self.router.send_multipart([identity, frame])
+
+    def await_key(self) -> bytes:
+        """The attach key of the subscriber."""
+        while True:
+            assert self.xpub.poll(10_000)
+            event = self.xpub.recv()
+            if event[:5] == b"\x01CTXA":
+                return bytes(event[1:])
+
+    def close(self) -> None:
+        self.stopping = True
+        self.thread.join()
+        self.context.destroy(linger=0)
+
+
+def make_frame(
+    kind: bytes, sequence: int, body: bytes, *, size: int | None = None, aux: int = 0, **change: Any
+) -> bytes:
+    header = wire.Header(
+        kind,
+        Impostor.SOURCE,
+        schema_of(Scan).fingerprint,
+        sequence,
+        0,
+        0,
+        len(body) if size is None else size,
+        aux,
+    )
+    return wire.pack_header(header._replace(**change)) + body
+
+
+def bad_frames(good: bytes, key: bytes) -> Iterator[list[bytes]]:
+    """Frames of every kind that a subscriber must reject; all of them match its subscriptions."""
+    head = good[:16]
+    yield [head]
+    yield [good[:63]]
+    yield [good[:-1]]
+    yield [good + b"x"]
+    yield [make_frame(b"M", 9, good[64:], fingerprint=1)]
+    yield [make_frame(b"M", 9, good[64:], size=2**63)]
+    yield [make_frame(b"L", 9, b"", size=40)]
+    yield [make_frame(b"L", 9, b"", size=41), good[64:]]
+    yield [make_frame(b"L", 9, b"", size=2**40), good[64:]]
+    record = wire.RECORD.pack(0, 0, len(good) - 64, 0) + good[64:]
+    record += bytes(-len(record) % 8)
+    yield [make_frame(b"B", 9, record, aux=0)]
+    yield [make_frame(b"B", 9, record, aux=2)]
+    yield [make_frame(b"B", 9, record, aux=2**64 - 1)]
+    yield [make_frame(b"B", 2**64 - 1, record, aux=1)]
+    yield [make_frame(b"B", 9, record[:-8], aux=1)]
+    yield [make_frame(b"B", 9, wire.RECORD.pack(0, 0, 2**32 - 1, 0), aux=1)]
+    yield [make_frame(b"S", 9, bytes(7), size=40)]
+    yield [key + bytes(31)]
+    yield [key + wire._ANSWER.pack(0, 64, 0, 0, 0)]
+    yield [key + wire._ANSWER.pack(0, 0, 2**32 - 1, 0, 0)]
+    yield [key + wire._ANSWER.pack(0, 0, 0, 2**64 - 1, 0)]
