@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import itertools
 import logging
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 
 import pytest
 import zmq
@@ -269,6 +271,32 @@ def test_closing_is_quick(make_node):
     begin = time.monotonic()
     other.close()
     assert time.monotonic() - begin < 1.0
+
+
+def test_what_is_closed_is_forgotten(make_node):
+    """A node that opens and closes publishers, subscribers and services all day does not grow."""
+    node = make_node(registry="off")
+    gone = []
+    for _ in range(3):
+        publisher = node.publisher("/numbers", Number, coalesce=True)
+        subscribers = [
+            node.subscriber("/numbers", Number),
+            node.subscriber("/numbers", Number, lambda message: None),
+            node.subscriber("/numbers", OtherNumber),
+        ]
+        assert publisher.wait_for_subscribers(2)
+        publisher.publish(Number(0, 0))
+        gone += [weakref.ref(thing) for thing in (publisher, *subscribers)]
+        for thing in (*subscribers, publisher):
+            thing.close()
+        node.service("/double", Number, Number, lambda request: request)()
+    del publisher, subscribers, thing
+
+    def forgotten():
+        gc.collect()
+        return all(reference() is None for reference in gone)
+
+    wait_for(forgotten, every_s=0.02)
 
 
 def test_no_files_are_left(make_node):
