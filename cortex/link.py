@@ -235,6 +235,8 @@ class Link:
                 if self.advance(sequence):  # left out on purpose: the publisher held us to our share
                     self.counters.lost += 1
                 return []
+            if slot >= view.slots or size > view.slot_bytes:
+                raise MalformedMessage(f"a descriptor of slot {slot} with {size} bytes: the ring has no such")
             self.advance(sequence)
             return [Item(self, None, 0, size, sequence, stamp_ns, publish_ns, (view, slot))]
         try:

@@ -290,7 +290,10 @@ class Subscriber(Generic[T]):
             return item.buffer
         assert item.slot is not None
         view, slot = item.slot
-        copy = view.snapshot(slot, item.sequence, item.size)
+        try:
+            copy = view.snapshot(slot, item.sequence, item.size)
+        except ValueError:  # the ring was closed meanwhile
+            copy = None
         if copy is None:
             raise _Overwritten
         return copy
