@@ -332,7 +332,13 @@ class LargeSender:
             on_time = send_strict(outlet, head, SNDMORE)
         else:
             outlet.send(head, DONTWAIT | SNDMORE)
-        tracker = outlet.send(body.data, DONTWAIT, False, True)
+        if outlet.strict:  # who took the header gets the body, too
+            outlet.socket.setsockopt(zmq.XPUB_NODROP, 0)
+        try:
+            tracker = outlet.send(body.data, DONTWAIT, False, True)
+        finally:
+            if outlet.strict:
+                outlet.socket.setsockopt(zmq.XPUB_NODROP, 1)
         assert tracker is not None
         if ring is not None:
             ring.pin(slot.number)

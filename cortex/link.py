@@ -189,7 +189,7 @@ class Link:
             for ring in self._rings.values():
                 ring.heal(sequence)
             if self._policy.reliable:
-                key = resume_key(self.source, self._reader, stamped=self._stamped)
+                key = resume_key(self.source, self._reader, sequence, stamped=self._stamped)
                 self.socket.subscribe(key)
                 self.socket.unsubscribe(key)
         self.expected = sequence + count
@@ -326,6 +326,9 @@ class Link:
         first = not self.attached
         self.attached = True
         self._column = answer.column
+        if answer.column is None and not self._large_subscribed:
+            self.socket.subscribe(self._large_head)
+            self._large_subscribed = True
         if answer.column is not None:
             self._places = {place.ring: place for place in answer.rings}
             if self._places and self._open_ring(max(self._places)) is None:

@@ -30,8 +30,8 @@ class Attachable(Protocol):
         """A reader has left or died."""
         ...
 
-    def resume(self, outlet: Outlet) -> None:
-        """A reliable reader that was too late has seen what it lost, and reads again."""
+    def resume(self, outlet: Outlet, sequence: int) -> None:
+        """A reliable reader that was too late has seen what it lost, and reads from this sequence on."""
         ...
 
 
@@ -146,9 +146,9 @@ class Outlets:
         key = event[1:]
         request = parse_attach_key(key)
         if request is None:
-            resumed = self._publishers.get(parse_resume_key(key) or 0)
-            if resumed is not None and event[0] == 1:
-                resumed.resume(outlet)
+            resumed = parse_resume_key(key)
+            if resumed is not None and event[0] == 1 and resumed[0] in self._publishers:
+                self._publishers[resumed[0]].resume(outlet, resumed[1])
             return
         publisher = self._publishers.get(request.source)
         if publisher is None:

@@ -103,8 +103,10 @@ class Publisher(Generic[T]):
         self._refresh_ns = 0
         self._was_large = False
         self._told = 0
-        self._late: set[Outlet] = set()
-        """Strict outlets on which a reader was too late: libzmq sends it nothing until it has caught up."""
+        self._late: dict[Outlet, int] = {}
+        """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
+
+        libzmq sends it nothing until it has caught up."""
         self._blocked = False
         self._batch: list[bytes] = []
         self._batch_sequence = 0
@@ -283,7 +285,7 @@ class Publisher(Generic[T]):
                         logger.warning(
                             "%s: a reliable subscriber did not keep up and lost a message", self.topic
                         )
-                    self._late.add(outlet)
+                    self._late[outlet] = self._sequence
                     self._route()
                     outlet.send_anyway(frame, flags)
                     return False
@@ -424,14 +426,15 @@ class Publisher(Generic[T]):
             if reader.request.reader == request.reader and reader.outlet is outlet:
                 del self._readers[key]
                 self._large.dismiss(reader)
-                self._late.discard(outlet)
+                self._late.pop(outlet, None)
                 self._route()
                 return
 
-    def resume(self, outlet: Outlet) -> None:
-        """A reader that was too late has caught up; called under the outlets' lock."""
-        self._late.discard(outlet)
-        self._route()
+    def resume(self, outlet: Outlet, sequence: int) -> None:
+        """A reader that was too late has caught up to a sequence; called under the outlets' lock."""
+        if sequence >= self._late.get(outlet, 0):  # else it was too late once more since
+            self._late.pop(outlet, None)
+            self._route()
 
     def _route(self) -> None:
         """Work out where messages go, when readers or what is sent have changed."""

@@ -230,16 +230,16 @@ def parse_attach_key(data: bytes) -> AttachKey | None:
     )
 
 
-def resume_key(source: int, reader: int, *, stamped: bool) -> bytes:
-    """What a reliable reader subscribes to for a moment when it has seen a gap and reads again."""
-    return prefix(RESUME, source, stamped=stamped) + reader.to_bytes(8, "little")
+def resume_key(source: int, reader: int, sequence: int, *, stamped: bool) -> bytes:
+    """What a reliable reader subscribes to for a moment when it has seen a gap that ended with a sequence."""
+    return prefix(RESUME, source, stamped=stamped) + _KEY.pack(reader, sequence)
 
 
-def parse_resume_key(data: bytes) -> int | None:
-    """The source of a resume key; None if the subscription is something else."""
-    if len(data) != HEAD_SIZE or data[:4] != b"CTX" + RESUME:
+def parse_resume_key(data: bytes) -> tuple[int, int] | None:
+    """Source and sequence of a resume key; None if the subscription is something else."""
+    if len(data) != KEY_SIZE or data[:4] != b"CTX" + RESUME:
         return None
-    return int.from_bytes(data[8:16], "little")
+    return int.from_bytes(data[8:16], "little"), int.from_bytes(data[24:32], "little")
 
 
 def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:

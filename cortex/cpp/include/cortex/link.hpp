@@ -154,7 +154,7 @@ class Link {
       counters_->lost += sequence - expected_;
       for (auto& ring : rings_) ring.second->heal(sequence);
       if (policy_.is_reliable) {  // the publisher may have given us up
-        const std::string key = wire::pack_resume(source_, reader_, flags());
+        const std::string key = wire::pack_resume(source_, reader_, sequence, flags());
         socket_.set(zmq::sockopt::subscribe, key);
         socket_.set(zmq::sockopt::unsubscribe, key);
       }

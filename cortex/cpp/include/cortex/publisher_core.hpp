@@ -205,7 +205,9 @@ class PublisherCore {
   }
 
   // A reliable reader that was too late has seen what it lost, and reads again; called under the lock.
-  void resume() noexcept { is_late_ = false; }
+  void resume(std::uint64_t sequence) noexcept {
+    if (sequence >= late_until_) is_late_ = false;  // else it was too late once more since
+  }
 
   std::size_t reader_count() {
     const Lock lock(outlets_->mutex);
@@ -296,6 +298,7 @@ class PublisherCore {
     if (closed_ || outlets_->closed) return false;
     if (!sent) {
       complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
+      late_until_ = sequence_;
       is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
       outlet.send_anyway(share(frame), flags);
     }
@@ -467,6 +470,7 @@ class PublisherCore {
   std::int64_t refresh_at_ns_ = 0;
   bool blocked_ = false;
   bool is_late_ = false;
+  std::uint64_t late_until_ = 0;
   bool closed_ = false;
 };
 
@@ -479,8 +483,9 @@ inline void Outlets::refresh() {
       if (bytes.empty()) continue;
       const Span<const std::uint8_t> subscription(bytes.data() + 1, bytes.size() - 1);
       if (!wire::read_key(subscription, request)) {
-        const auto resumed = publishers.find(wire::read_resume(subscription));
-        if (resumed != publishers.end() && outlet->strict && bytes[0] == 1) resumed->second->resume();
+        std::uint64_t sequence = 0;
+        const auto resumed = publishers.find(wire::read_resume(subscription, sequence));
+        if (resumed != publishers.end() && outlet->strict && bytes[0] == 1) resumed->second->resume(sequence);
         continue;
       }
       const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);

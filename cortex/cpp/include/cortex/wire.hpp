@@ -29,7 +29,7 @@ constexpr std::uint8_t version = 1;
 constexpr std::size_t header_size = 64;
 constexpr std::size_t prefix_size = 16;  // of a header: what a ZeroMQ subscription matches
 constexpr std::size_t key_size = 32;     // of an attach key
-constexpr std::size_t resume_size = 24;  // of a resume key
+constexpr std::size_t resume_size = 32;  // of a resume key
 constexpr std::uint64_t jump_max = std::uint64_t{1} << 32;  // no source loses more messages at once
 constexpr std::uint8_t flag_stamp = 1;
 constexpr std::uint64_t body_limit = std::uint64_t{1} << 30;
@@ -170,17 +170,20 @@ inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
 }
 
 // What a reliable reader subscribes to, and at once gives up, when it has seen a gap: it reads again.
-inline std::string pack_resume(std::uint64_t source, std::uint64_t reader, std::uint8_t flags) {
+inline std::string pack_resume(std::uint64_t source, std::uint64_t reader, std::uint64_t sequence,
+                               std::uint8_t flags) {
   std::string bytes(resume_size, '\0');
   auto* out = reinterpret_cast<std::uint8_t*>(bytes.data());
   write_prefix(out, 'R', flags, source);
   store(out + 16, reader);
+  store(out + 24, sequence);
   return bytes;
 }
 
-// The source of a resume key, 0 if the subscription is something else.
-inline std::uint64_t read_resume(Span<const std::uint8_t> bytes) noexcept {
+// The source of a resume key and the sequence with which the gap ended; 0 if the subscription is something else.
+inline std::uint64_t read_resume(Span<const std::uint8_t> bytes, std::uint64_t& sequence) noexcept {
   if (bytes.size() != resume_size || std::memcmp(bytes.data(), "CTXR", 4) != 0) return 0;
+  sequence = load<std::uint64_t>(bytes.data() + 24);
   return load<std::uint64_t>(bytes.data() + 8);
 }
 
