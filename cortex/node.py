@@ -166,7 +166,8 @@ class Node:
             topic: Like "/front/image".
             message_type: A class made by `@message`.
             latch: Give the last message to subscribers that come later.
-            coalesce: Send the messages of a burst together: more of them per second, each up to 0.2 ms later.
+            coalesce: Send messages that follow each other within 15 us together: more of them per second,
+                each up to a millisecond later.
             inline_max: Bodies over this size go through shared memory where that is possible [bytes].
         """
         return self._add_publisher(

@@ -1,4 +1,4 @@
-# ruff: noqa: F821 - "n" names a dimension
+
 """The messages that the benchmark sends."""
 
 from cortex.message import Array, message

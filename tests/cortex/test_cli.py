@@ -44,7 +44,7 @@ class Mode(Enum):
 
 # Outside of a class, where nobody takes the names of dtypes and dimensions for those of types.
 Position = Annotated[Array[np.float64, 3], Unit("m", frame="world")]
-Ranges = Annotated[Array["float32", "n"], Unit("m")]  # noqa: F821
+Ranges = Annotated[Array["float32", "n"], Unit("m")]
 Field = Array["complex64", "k"]
 
 
