@@ -52,7 +52,7 @@ from cortex.wire import (
 )
 
 FRAMES = int(os.environ.get("CORTEX_FUZZ_FRAMES", "4000"))
-"""Mutated frames for a link, of all kinds together; a million takes about a minute."""
+"""Mutated frames for a link, of all kinds together; a million takes about five minutes."""
 
 u8, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (8, 32, 64))
 i64 = st.integers(-(2**63), 2**63 - 1)
