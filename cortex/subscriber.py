@@ -100,6 +100,7 @@ class Subscriber(Generic[T]):
         self._reader: LoopReader | None = None
         self._generation = 0
         self._first = 0
+        self._since_pause = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
         self._poll: select.poll | None = None
@@ -206,10 +207,15 @@ class Subscriber(Generic[T]):
         while True:
             item = self._take()
             if item is not None:
+                self._since_pause += 1
+                if self._since_pause >= DRAIN_MAX:  # other tasks of the loop want to run, too
+                    self._since_pause = 0
+                    await asyncio.sleep(0)
                 message: T = self._open(item, self._decode)
                 if message is not _LOST:
                     return message
                 continue
+            self._since_pause = 0
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
