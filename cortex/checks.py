@@ -61,7 +61,8 @@ def _check(
 def _check_enum(bound: type[Enum], value: Any, where: str) -> None:
     if type(value) is not bound:
         allowed = ", ".join(str(member) for member in bound)
-        raise TypeError(f"{where}: {value!r:.80} is no {bound.__name__}; allowed are {allowed}")
+        what = f"the {type(value).__name__} {value!r:.80} is no {bound.__name__}"
+        raise TypeError(f"{where}: {what}; use {bound.__name__}(value), allowed are {allowed}")
 
 
 def _check_array(

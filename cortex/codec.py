@@ -184,7 +184,7 @@ def codec_of(message_type: type) -> Codec:
     Raises:
         TypeError: It is not a message type.
     """
-    codec = _codecs.get(message_type)
+    codec = _codecs.get(message_type) if isinstance(message_type, type) else None
     if codec is None:
         created = Codec(message_type)
         with _lock:

@@ -214,6 +214,10 @@ class Node:
             policy: What to do when messages come faster than they are taken; None: `keep_last(64)`.
         """
         self._check_open()
+        if policy is not None and not isinstance(policy, Policy):
+            raise TypeError(f"policy must be a Policy such as latest() or reliable(), got {policy!r:.80}")
+        if callback is not None and not callable(callback):
+            raise TypeError(f"callback must be a function of one message, got {callback!r:.80}")
         subscriber: Subscriber[T] = Subscriber(
             check_topic(topic),
             None if message_type is None else codec_of(message_type),
@@ -242,6 +246,8 @@ class Node:
             A function that withdraws it.
         """
         self._check_open()
+        if not callable(handler):
+            raise TypeError(f"handler must be a function of one request, got {handler!r:.80}")
         number = service_number(check_topic(name), request_type, reply_type)
         service = Service(name, number, request_type, reply_type, handler)
         self._server.add(service)
@@ -451,7 +457,10 @@ class Node:
     def _on_change(self, _: frozenset[int]) -> None:
         with self._lock:
             for subscriber in self._subscribers:
-                self._match(subscriber)
+                try:
+                    self._match(subscriber)
+                except Exception:  # one that cannot be connected must not take the others along
+                    logger.exception("%s: cannot connect the subscriber of %s", self.name, subscriber.topic)
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
 
     def _match(self, subscriber: Subscriber[Any]) -> None:
@@ -519,6 +528,11 @@ class Node:
         for node in self._known().values():
             for service in node.services:
                 if service.name == name and service.service == number:
+                    if node.node == self.id and self._callbacks.is_current:
+                        raise RuntimeError(
+                            f"{name} is served by the thread that calls it: a callback or handler cannot "
+                            "call a service of its own node"
+                        )
                     place = self._reach_control(node)
                     return Place(node.node, place.address, place.local, place.secure)
                 if service.name == name:

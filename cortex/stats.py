@@ -38,7 +38,9 @@ class PublisherCounters:
     timeouts: int = 0
     """Messages that at least one reliable subscriber lost, because it held up the publisher for too long."""
     skipped: int = 0
-    """Large messages that at least one subscriber did not get, because it had not given back earlier ones."""
+    """Large messages of which some subscriber got no lease, because it had not given back earlier ones.
+
+    A `keep_last` subscriber copies them if it comes in time; else they are lost to it, and counted there."""
 
 
 def quantile_ns(histogram: Sequence[int], fraction: float) -> float:

@@ -101,6 +101,7 @@ class Subscriber(Generic[T]):
         self._generation = 0
         self._first = 0
         self._since_pause = 0
+        self._raised = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
         self._poll: select.poll | None = None
@@ -218,8 +219,12 @@ class Subscriber(Generic[T]):
             self._since_pause = 0
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
-                raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
+                raise TimeoutError(self._nothing_came(timeout_s))
             await reader.wait(min(left_s, WAIT_MAX_S))
+
+    def _nothing_came(self, timeout_s: float | None) -> str:
+        others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
+        return f"{self.topic}: no message within {timeout_s} s{others}"
 
     def _watched(self) -> tuple[int, list[int]]:
         with self._turn:
@@ -242,7 +247,7 @@ class Subscriber(Generic[T]):
             if deadline_s is not None:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0.0:
-                    raise TimeoutError(f"{self.topic}: no message within {timeout_s} s")
+                    raise TimeoutError(self._nothing_came(timeout_s))
             self._wait(min(left_s, WAIT_MAX_S))
 
     def _take(self, *, whole: bool = False, block: bool = False) -> Item | None:
@@ -596,15 +601,22 @@ class Subscriber(Generic[T]):
             try:
                 callback(messages.popleft())
             except Exception:
-                logger.exception("%s: the callback raised", self.topic)
+                self._log_raised()
         while items and not self._closed:
             message = self._open(items.popleft(), self._decode)
             if message is not _LOST:
                 try:
                     callback(message)
                 except Exception:
-                    logger.exception("%s: the callback raised", self.topic)
+                    self._log_raised()
         return more
+
+    def _log_raised(self) -> None:
+        """Log what a callback raised: the first ten times, then the 20th, 40th, 80th, and so on."""
+        self._raised += 1
+        count = self._raised
+        if count <= 10 or (count % 10 == 0 and (count // 10) & (count // 10 - 1) == 0):
+            logger.exception("%s: the callback raised (time %d)", self.topic, count)
 
     @property
     def has_one_socket(self) -> bool:

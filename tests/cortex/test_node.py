@@ -455,3 +455,34 @@ def test_a_jump_of_the_clock(make_node, monkeypatch):
             assert 0 < info.latency_ns < 10**9
     assert subscriber.counters.lost == 0
     assert len(one.nodes()) == 2
+
+
+@pytest.mark.parametrize("wrong", [{"policy": latest}, {"policy": "latest"}, {"callback": 3}])
+def test_what_is_no_policy_or_callback_is_refused_at_once(make_node, wrong):
+    """A forgotten pair of parentheses is said where it happens, and not in another thread later."""
+    node = make_node()
+    with pytest.raises(TypeError, match=next(iter(wrong))):
+        node.subscriber("/numbers", Number, **wrong)
+
+
+def test_a_message_in_place_of_its_type_is_refused(make_node):
+    node = make_node()
+    with pytest.raises(TypeError, match="not a message type"):
+        node.publisher("/scans", make(Scan, 0, 3))
+
+
+def test_a_callback_that_always_raises_does_not_flood_the_log(make_node, caplog):
+    node, called = make_node(), []
+
+    def fail(message):
+        called.append(message.value)
+        raise KeyError(message.value)
+
+    node.subscriber("/numbers", Number, fail, policy=reliable(64))
+    publisher = node.publisher("/numbers", Number)
+    assert publisher.wait_for_subscribers()
+    for value in range(100):
+        publisher.publish(Number(0, value))
+    wait_for(lambda: len(called) == 100)
+    assert len([r for r in caplog.records if "the callback raised" in r.getMessage()]) == 13
+    caplog.clear()
