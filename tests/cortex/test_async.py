@@ -1,0 +1,208 @@
+"""Receiving with asyncio: iteration, several tasks and loops, cancelling, and being woken in time."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+
+import numpy as np
+import pytest
+from peer import Number
+
+from cortex import latest, reliable
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+@pytest.fixture
+def numbers(node):
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    assert publisher.wait_for_subscribers()
+    return publisher, subscriber
+
+
+def test_async_iteration(numbers):
+    publisher, subscriber = numbers
+
+    async def collect():
+        values = []
+        async for message in subscriber:
+            values.append(message.value)
+            if message.value == 999:
+                return values
+
+    def publish():
+        for value in range(1000):
+            publisher.publish(Number(0, value))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    assert asyncio.run(asyncio.wait_for(collect(), 20.0)) == list(range(1000))
+    thread.join()
+
+
+def test_async_iteration_ends_at_close(numbers):
+    _, subscriber = numbers
+
+    async def run():
+        async def collect():
+            return [message async for message in subscriber]
+
+        task = asyncio.ensure_future(collect())
+        await asyncio.sleep(0)
+        asyncio.get_running_loop().call_later(0.02, subscriber.close)
+        begin = time.monotonic()
+        assert await asyncio.wait_for(task, 5.0) == []
+        return time.monotonic() - begin
+
+    assert asyncio.run(run()) < 1.0
+
+
+def test_two_subscribers_on_one_loop(node):
+    """Neither starves the other, nor the loop's other tasks."""
+    publishers = [node.publisher(f"/stream{k}", Number) for k in range(2)]
+    subscribers = [node.subscriber(f"/stream{k}", Number, policy=reliable(64, 10.0)) for k in range(2)]
+    assert all(publisher.wait_for_subscribers() for publisher in publishers)
+
+    def publish(publisher):
+        for value in range(2000):
+            assert publisher.publish(Number(0, value))
+
+    async def collect(subscriber):
+        values = []
+        while len(values) < 2000:
+            values.append((await subscriber.recv_async(10.0)).value)
+        return values
+
+    async def run():
+        ticks = 0
+
+        async def tick():
+            nonlocal ticks
+            while True:
+                ticks += 1
+                await asyncio.sleep(0)
+
+        ticking = asyncio.ensure_future(tick())
+        results = await asyncio.gather(*map(collect, subscribers))
+        ticking.cancel()
+        assert ticks > 10
+        return results
+
+    threads = [threading.Thread(target=publish, args=(publisher,)) for publisher in publishers]
+    for thread in threads:
+        thread.start()
+    assert asyncio.run(asyncio.wait_for(run(), 30.0)) == [list(range(2000))] * 2
+    for thread in threads:
+        thread.join()
+
+
+def test_two_tasks_on_one_subscriber(numbers):
+    """Both wait; each message goes to one, and neither sleeps for ever."""
+    publisher, subscriber = numbers
+
+    async def run():
+        tasks = [asyncio.ensure_future(subscriber.recv_async(5.0)) for _ in range(3)]
+        await asyncio.sleep(0.02)  # all of them wait now
+        for value in range(3):
+            publisher.publish(Number(0, value))
+        return sorted(message.value for message in await asyncio.gather(*tasks))
+
+    assert asyncio.run(asyncio.wait_for(run(), 10.0)) == [0, 1, 2]
+
+
+def test_a_cancelled_task_takes_nothing_along(numbers):
+    publisher, subscriber = numbers
+
+    async def run():
+        task = asyncio.ensure_future(subscriber.recv_async())
+        await asyncio.sleep(0.01)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        publisher.publish(Number(0, 1))
+        begin = time.monotonic()
+        assert (await subscriber.recv_async(5.0)).value == 1
+        assert time.monotonic() - begin < 1.0
+        with pytest.raises(TimeoutError):
+            await subscriber.recv_async(0.01)
+
+    asyncio.run(run())
+
+
+def test_one_loop_after_another(numbers):
+    """The second loop finds what the first did not take; then the blocking way works again."""
+    publisher, subscriber = numbers
+    for value in range(4):
+        publisher.publish(Number(0, value))
+
+    async def take():
+        first = (await subscriber.recv_async(2.0)).value
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(_until_forever(), 0.01)
+        return first
+
+    async def _until_forever():
+        await asyncio.get_running_loop().create_future()
+
+    assert [asyncio.run(take()) for _ in range(3)] == [0, 1, 2]
+    assert subscriber.recv(1.0).value == 3
+
+    async def wait_in_vain():
+        with pytest.raises(TimeoutError):
+            await subscriber.recv_async(0.01)
+
+    for _ in range(2):
+        asyncio.run(wait_in_vain())
+    publisher.publish(Number(0, 4))
+    assert subscriber.recv(1.0).value == 4
+
+
+def test_a_loop_is_woken_at_once(numbers):
+    """Waking by the descriptor, not by looking ten times a second."""
+    publisher, subscriber = numbers
+
+    async def run():
+        loop = asyncio.get_running_loop()
+        delays = []
+        for _ in range(20):
+            loop.call_later(0.003, lambda: publisher.publish(Number(time.monotonic_ns(), 0)))
+            sent_ns = (await subscriber.recv_async(5.0)).stamp_ns
+            delays.append(time.monotonic_ns() - sent_ns)
+        return delays
+
+    assert np.median(asyncio.run(run())) < 0.02e9
+
+
+def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
+    """Also if its descriptor has the number of one that was closed."""
+    subscriber = node.subscriber("/numbers", Number, policy=latest())
+
+    async def run():
+        delays = []
+        for _ in range(3):
+            publisher = node.publisher("/numbers", Number)
+            while not publisher.wait_for_subscribers(1, 0.0):
+                with pytest.raises(TimeoutError):
+                    await subscriber.recv_async(0.005)
+            for _ in range(5):
+                asyncio.get_running_loop().call_later(
+                    0.003, lambda p=publisher: p.publish(Number(time.monotonic_ns(), 0))
+                )
+                sent_ns = (await subscriber.recv_async(5.0)).stamp_ns
+                delays.append(time.monotonic_ns() - sent_ns)
+            publisher.close()
+            for link in list(subscriber._leaving):  # at once, instead of after two seconds
+                subscriber._leaving[link] = 0
+            while subscriber._links:
+                with pytest.raises(TimeoutError):
+                    await subscriber.recv_async(0.005)
+        return delays
+
+    delays = asyncio.run(run())
+    assert max(np.median(delays[k : k + 5]) for k in (0, 5, 10)) < 0.05e9

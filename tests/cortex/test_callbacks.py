@@ -1,0 +1,160 @@
+"""Callbacks of subscribers: their order, what they may do, and when there are no more of them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+import numpy as np
+import pytest
+from peer import Number, Scan
+from processes import wait_for
+
+from cortex import reliable
+from cortex.publisher import Closed
+
+LARGE = 100_000
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+def scan(number, size=LARGE):
+    return Scan(number, np.full(size, number, np.float32))
+
+
+def test_callbacks_are_called_in_order(node):
+    received = []
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number, received.append, policy=reliable(64, 5.0))
+    assert publisher.wait_for_subscribers()
+    for value in range(3000):
+        assert publisher.publish(Number(value, value))
+    wait_for(lambda: len(received) == 3000)
+    assert [message.value for message in received] == list(range(3000))
+    assert subscriber.counters.received == 3000
+    assert sum(subscriber.counters.latency) >= 3000 / 8
+
+
+def test_a_callback_that_raises_is_logged_and_called_again(node, caplog):
+    received = []
+
+    def fail(message):
+        received.append(message)
+        raise KeyError(message.stamp_ns)
+
+    publisher = node.publisher("/scans", Scan)
+    node.subscriber("/scans", Scan, fail)
+    assert publisher.wait_for_subscribers()
+    for number in range(3):
+        publisher.publish(scan(number, 1))
+    wait_for(lambda: len(received) == 3)
+    wait_for(lambda: sum(r.exc_info is not None and r.levelno == logging.ERROR for r in caplog.records) == 3)
+
+
+def test_callbacks_of_large_and_small_messages_keep_the_order(node):
+    received = []
+    publisher = node.publisher("/scans", Scan)
+    node.subscriber("/scans", Scan, lambda m: received.append(m.stamp_ns), policy=reliable(8, 5.0))
+    assert publisher.wait_for_subscribers()
+    for number in range(300):
+        assert publisher.publish(scan(number, LARGE if number % 3 == 0 else 5))
+    wait_for(lambda: len(received) == 300)
+    assert received == list(range(300))
+
+
+def test_no_callback_after_close(node):
+    """When `close` has returned, nothing more is called, and nothing is under way."""
+    state = {"running": False, "closed": False, "late": 0}
+    started = threading.Event()
+
+    def slow(message):
+        state["late"] += state["closed"]
+        state["running"] = True
+        started.set()
+        deadline = time.monotonic() + 0.02
+        while time.monotonic() < deadline:
+            time.sleep(1e-3)
+        state["running"] = False
+
+    publisher = node.publisher("/numbers", Number)
+    subscriber = node.subscriber("/numbers", Number, slow)
+    assert publisher.wait_for_subscribers()
+    for value in range(30):
+        publisher.publish(Number(value, value))
+    assert started.wait(5.0)
+    subscriber.close()
+    running, state["closed"] = state["running"], True
+    assert not running
+    done = threading.Event()
+    other = node.subscriber("/numbers", Number, lambda message: done.set())
+    assert publisher.wait_for_subscribers(1, 5.0)
+    wait_for(lambda: publisher.publish(Number(0, 0)) and done.wait(0.01))
+    assert state["late"] == 0
+    other.close()
+
+
+def test_a_callback_closes_its_subscriber(node):
+    """It is called no more, although messages were there already."""
+    received = []
+    subscribers = []
+
+    def once(message):
+        received.append(message.value)
+        subscribers[0].close()
+
+    publisher = node.publisher("/numbers", Number)
+    blocker, free = threading.Event(), threading.Event()
+    node.subscriber("/block", Number, lambda message: (blocker.set(), free.wait(5.0)))
+    block = node.publisher("/block", Number)
+    subscribers.append(node.subscriber("/numbers", Number, once))
+    assert publisher.wait_for_subscribers()
+    assert block.wait_for_subscribers()
+    block.publish(Number(0, 0))
+    assert blocker.wait(5.0)
+    for value in range(10):
+        publisher.publish(Number(0, value))
+    free.set()
+    wait_for(lambda: publisher.subscriber_count == 0)
+    assert received == [0]
+
+
+def test_a_callback_closes_its_node(make_node):
+    node = make_node(registry="off")
+    closed = threading.Event()
+
+    def close(message):
+        node.close()
+        closed.set()
+
+    publisher = node.publisher("/numbers", Number)
+    node.subscriber("/numbers", Number, close)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(Number(0, 0))
+    assert closed.wait(5.0)
+    with pytest.raises(Closed):
+        publisher.publish(Number(0, 0))
+
+
+def test_a_callback_publishes_and_subscribes(node):
+    """A pipeline in one node: the callback thread may call whatever other threads may."""
+    received = []
+    second = node.publisher("/second", Number)
+    extra = []
+
+    def forward(message):
+        if not extra:
+            extra.append(node.subscriber("/second", Number, received.append, policy=reliable()))
+        second.publish(Number(message.stamp_ns, message.value + 1))
+
+    first = node.publisher("/first", Number)
+    node.subscriber("/first", Number, forward, policy=reliable())
+    assert first.wait_for_subscribers()
+    first.publish(Number(0, 0))
+    assert second.wait_for_subscribers()
+    for value in range(1, 100):
+        first.publish(Number(0, value))
+    wait_for(lambda: received and received[-1].value == 100)

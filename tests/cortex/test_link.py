@@ -1,0 +1,350 @@
+"""A link that is fed by hand: what it does with frames that are not what they must be."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+import struct
+
+import numpy as np
+import pytest
+import zmq
+from peer import Number, Scan
+from processes import wait_for
+
+from cortex import keep_last
+from cortex.codec import codec_of
+from cortex.context import new_socket
+from cortex.link import Link
+from cortex.records import PublisherRecord
+from cortex.shm import Ring
+from cortex.subscriber import Subscriber
+from cortex.wire import (
+    ATTACH,
+    BATCH,
+    BODY_LIMIT,
+    HEADER_SIZE,
+    LARGE,
+    MESSAGE,
+    RECORD,
+    SLOT,
+    AttachAnswer,
+    Header,
+    RingPlace,
+    answer_frame,
+    pack_header,
+    parse_attach_key,
+)
+
+FRAMES = int(os.environ.get("CORTEX_FUZZ_FRAMES", "4000"))
+"""Mutated frames for a link, of all kinds together; a million takes about five minutes."""
+
+EXTREMES = [0, 1, 63, 64, 65, 2**31 - 1, 2**32 - 1, 2**63 - 1, 2**64 - 1]
+
+
+_numbers = itertools.count()
+
+
+class Feed:
+    """A raw XPUB socket in a publisher's place, and a subscriber that listens to it."""
+
+    SOURCE = 0x0123456789ABCDEF
+
+    def __init__(self, kind, *, shared=True):
+        self.codec = codec_of(kind)
+        self.socket = new_socket(zmq.XPUB, high_water_mark=0)
+        address = f"inproc://feed-{next(_numbers)}"
+        self.socket.bind(address)
+        record = PublisherRecord(
+            "/feed", self.SOURCE, kind.__name__, self.codec.fingerprint, self.codec.schema.to_json(), False
+        )
+        self.ring = Ring(self.SOURCE, 0, slots=4, slot_bytes=4096)
+        self.column = 5
+        self.sequence = -1
+        self.large = SLOT if shared else LARGE
+        self.subscriber = Subscriber("/feed", self.codec, keep_last(1000))
+        self.link = Link(
+            record,
+            self.codec,
+            address,
+            policy=self.subscriber.policy,
+            local=True,
+            shared_memory=True,
+            counters=self.subscriber.counters,
+            clock_offset_ns=0,
+        )
+        self.subscriber.connect(self.link)
+        self.key = wait_for(self._attach)
+        place = RingPlace(0, self.ring.slots, self.ring.slot_bytes, self.ring.pid, self.ring.fd)
+        answer = AttachAnswer(0, self.column, (place,), b"") if shared else AttachAnswer(0, None, (), b"")
+        self.answer = answer_frame(self.key, answer)
+        self.socket.send(self.answer)
+        assert self.subscriber.wait_for_publisher()
+
+    def _attach(self):
+        while self.socket.poll(0):
+            event = self.socket.recv()
+            if event[:1] == b"\1" and parse_attach_key(event[1:]) is not None:
+                return event[1:]
+        return None
+
+    def header(self, kind, size, aux=0):
+        """The header of the message that is made now."""
+        return pack_header(Header(kind, self.SOURCE, self.codec.fingerprint, self.sequence, 0, 0, size, aux))
+
+    def body(self, value):
+        made = (
+            Number(value, value) if self.codec.type is Number else Scan(value, np.full(9, value, np.float32))
+        )
+        body = self.codec.encode(made, 1 << 20)
+        assert body is not None
+        return body
+
+    def frames(self, kind, value):
+        """A good message of a kind, as its frames."""
+        self.sequence += 1
+        body = self.body(value)
+        if kind == MESSAGE:
+            return [self.header(kind, len(body)) + body]
+        if kind == LARGE:
+            return [self.header(kind, len(body)), body]
+        if kind == SLOT:
+            slot = self.ring.acquire()
+            assert slot >= 0, "no slot came back"
+            self.ring.buffer(slot)[: len(body)] = np.frombuffer(body, np.uint8)
+            self.ring.commit(slot, self.sequence, len(body), 1 << self.column)
+            return [self.header(kind, len(body), slot) + struct.pack("<Q", 1 << self.column)]
+        if kind == BATCH:
+            record = RECORD.pack(0, 0, len(body), 0) + body + bytes(-len(body) % 8)
+            return [self.header(kind, len(record), 1) + record]
+        return [self.answer]
+
+    def drain(self):
+        taken = []
+        while True:
+            try:
+                taken.append(self.subscriber.recv(0.0).stamp_ns)
+            except TimeoutError:
+                return taken
+
+    def still_lives(self, value):
+        """The next good messages arrive, one of each kind, and all slots come back."""
+        for kind in (MESSAGE, self.large, BATCH):
+            self.socket.send_multipart(self.frames(kind, value))
+            assert self.drain() == [value], kind
+        assert self.ring.outstanding(self.column) == 0
+
+    def close(self):
+        self.subscriber.close()
+        self.socket.close(0)
+        self.ring.close()
+
+
+@pytest.fixture(params=[Number, Scan], ids=lambda kind: kind.__name__)
+def feed(request, runtime):
+    """A link that shares memory."""
+    made = Feed(request.param)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_the_feed_is_what_a_publisher_sends(runtime, shared):
+    """Without this the tests below could pass by rejecting everything."""
+    feed = Feed(Number, shared=shared)
+    try:
+        feed.still_lives(7)
+        counters = feed.subscriber.counters
+        assert (counters.received, counters.lost, counters.rejected) == (3, 0, 0)
+    finally:
+        feed.close()
+
+
+BAD = {
+    "short header": lambda f: [f.header(MESSAGE, 0)[:40]],
+    "only the prefix": lambda f: [f.header(MESSAGE, 0)[:24]],
+    "wrong fingerprint": lambda f: [_with(f.frames(MESSAGE, 1)[0], 16, "<Q", 12345)],
+    "body too short": lambda f: [f.frames(MESSAGE, 1)[0][:-1]],
+    "body too long": lambda f: [f.frames(MESSAGE, 1)[0] + b"x"],
+    "size over the limit": lambda f: [_with(f.frames(MESSAGE, 1)[0], 48, "<Q", BODY_LIMIT + 1)],
+    "empty body": lambda f: [f.header(MESSAGE, 0)],
+    "large without body": lambda f: [f.header(LARGE, 10)],
+    "large of another size": lambda f: [f.header(LARGE, 10), b"123"],
+    "large over the limit": lambda f: [f.header(LARGE, BODY_LIMIT + 1), b"123"],
+    "large that does not decode": lambda f: [f.header(LARGE, 5), b"12345"],
+    "descriptor without mask": lambda f: [f.frames(SLOT, 1)[0][:-8]],
+    "descriptor with more": lambda f: [f.frames(SLOT, 1)[0] + b"x"],
+    "slot that does not exist": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 4)],
+    "slot far outside": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 0xFFFFFFFF)],
+    "slot of another size": lambda f: [_with(f.frames(SLOT, 1)[0], 48, "<Q", 17)],
+    "slot larger than it is": lambda f: [_with(f.frames(SLOT, 1)[0], 48, "<Q", 1 << 20)],
+    "copy of a slot that does not exist": lambda f: [_not_granted(f.frames(SLOT, 1)[0], 56, "<Q", 4)],
+    "copy of more than a slot holds": lambda f: [_not_granted(f.frames(SLOT, 1)[0], 48, "<Q", 4097)],
+    "batch of records that are not there": lambda f: [f.header(BATCH, 0, 2)],
+    "batch of records not counted": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 0)],
+    "batch of too many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2)],
+    "batch of a great many": lambda f: [_with(f.frames(BATCH, 1)[0], 56, "<Q", 2**63)],
+    "batch that ends early": lambda f: [f.frames(BATCH, 1)[0][:-8]],
+    "batch with a reserved number": lambda f: [_with(f.frames(BATCH, 1)[0], HEADER_SIZE + 20, "<I", 1)],
+    "batch with a record too long": lambda f: [
+        _with(f.frames(BATCH, 1)[0], HEADER_SIZE + 16, "<I", 2**32 - 1)
+    ],
+    "answer with too many rings": lambda f: [_with(f.answer, 44, "<I", 5)],
+    "answer with five rings": lambda f: [_with(f.answer, 44, "<I", 5) + 4 * f.answer[-32:]],
+    "answer with rings that are not there": lambda f: [_with(f.answer, 44, "<I", 2)],
+    "answer with a column too high": lambda f: [_with(f.answer, 40, "<I", 64)],
+    "answer cut short": lambda f: [f.answer[:50]],
+}
+
+
+def _with(frame, offset, form, value):
+    data = bytearray(frame)
+    struct.pack_into(form, data, offset, value)
+    return bytes(data)
+
+
+def _not_granted(frame, offset, form, value):
+    """A descriptor without the reader's bit: it may try to copy the slot."""
+    return _with(_with(frame, offset, form, value), HEADER_SIZE, "<Q", 0)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_frame_is_rejected_counted_and_logged_once(runtime, name, caplog):
+    feed = Feed(Number, shared=not name.startswith("large"))
+    caplog.set_level(logging.DEBUG)
+    try:
+        for _ in range(3):
+            feed.sequence += 1
+            feed.socket.send_multipart(BAD[name](feed))
+            assert feed.drain() == []
+        counters = feed.subscriber.counters
+        assert counters.rejected >= 3
+        assert counters.received == 0
+        logged = [record for record in caplog.records if record.name == "cortex.link"]
+        assert len(logged) == 1, logged
+        assert logged[0].levelno == logging.WARNING
+        assert "/feed" in logged[0].getMessage()
+        feed.still_lives(8)
+    finally:
+        feed.close()
+
+
+@pytest.mark.parametrize("kind", [MESSAGE, LARGE, BATCH])
+def test_the_same_fault_in_other_numbers_is_the_same_fault(runtime, kind, caplog):
+    """Or somebody who sends rubbish would fill the log."""
+    feed = Feed(Scan, shared=False)
+    try:
+        for more in range(1, 40):
+            frames = feed.frames(kind, 1)
+            feed.socket.send_multipart([*frames[:-1], frames[-1] + bytes(more)])
+            assert feed.drain() == []
+        assert feed.subscriber.counters.rejected == 39
+        assert len([record for record in caplog.records if record.name == "cortex.link"]) == 1
+    finally:
+        feed.close()
+
+
+@pytest.mark.parametrize("kind", [MESSAGE, LARGE, BATCH])
+def test_frames_that_follow_a_good_one_are_junk(runtime, kind):
+    """A message has its frames and no more; what is behind them is not taken for another message."""
+    feed = Feed(Number, shared=False)
+    try:
+        feed.socket.send_multipart([*feed.frames(kind, 1), b"junk", b""])
+        assert feed.drain() == [1]
+        assert feed.subscriber.counters.rejected == 2
+        feed.still_lives(9)
+    finally:
+        feed.close()
+
+
+def test_a_latched_message_that_is_none_is_rejected(runtime):
+    feed = Feed(Number)
+    try:
+        body = feed.body(3)
+        good = pack_header(Header(MESSAGE, feed.SOURCE, feed.codec.fingerprint, 4, 3, 0, len(body), 0)) + body
+        for latched in (b"x", good[:-1], _with(good, 8, "<Q", 1), _with(good, 16, "<Q", 1), good[:70]):
+            feed.link.expected, feed.link.attached = -1, False
+            feed.socket.send(answer_frame(feed.key, AttachAnswer(5, None, (), latched)))
+            assert feed.drain() == []
+        assert feed.subscriber.counters.rejected == 5
+        feed.link.expected, feed.link.attached = -1, False
+        feed.socket.send(answer_frame(feed.key, AttachAnswer(5, None, (), good)))
+        assert feed.drain() == [3]
+        assert feed.link.expected == 5
+    finally:
+        feed.close()
+
+
+def test_rings_that_cannot_be_mapped_are_done_without(feed):
+    """Memory that is not what the answer says: the link asks for the messages through the socket."""
+    bad = answer_frame(feed.key, AttachAnswer(0, 3, (RingPlace(9, 4, 4096, 1, 0),), b""))
+    feed.socket.send(bad)
+    assert feed.drain() == []
+    key = wait_for(feed._attach)
+    assert key != feed.key
+    assert not parse_attach_key(key).shared_memory
+    feed.socket.send(answer_frame(key, AttachAnswer(0, None, (), b"")))
+    for kind in (MESSAGE, LARGE, BATCH):
+        feed.socket.send_multipart(feed.frames(kind, 3))
+        assert feed.drain() == [3]
+
+
+@pytest.mark.parametrize("jump", [2**48, 2**63, 2**64 - 1])
+def test_a_number_from_nowhere_does_not_end_the_stream(feed, jump):
+    """A frame with an absurd sequence is not believed: or all that follow would count as seen before."""
+    feed.still_lives(1)
+    feed.socket.send(_with(feed.frames(MESSAGE, 2)[0], 24, "<Q", jump))
+    feed.drain()
+    feed.still_lives(3)
+    assert feed.subscriber.counters.lost < 2**40
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("type_", [Number, Scan])
+def test_mutated_frames_never_hurt(runtime, type_, shared):
+    """Whatever comes, the next good message arrives, and all slots come back."""
+    feed = Feed(type_, shared=shared)
+    generator = np.random.Generator(np.random.Philox(key=[shared, len(feed.codec.schema.fields[1].name)]))
+    kinds = (MESSAGE, feed.large, BATCH, ATTACH)
+    rejected = 0
+    try:
+        for count in range(FRAMES // 4):
+            kind = kinds[count % len(kinds)]
+            frames = mutate(feed.frames(kind, 5), generator)
+            if kind != ATTACH and generator.integers(5) == 0:
+                frames.insert(int(generator.integers(len(frames) + 1)), generator.bytes(8))
+            feed.socket.send_multipart(frames)
+            feed.drain()
+            if feed.socket.poll(0) or feed.link._column != (feed.column if shared else None):
+                rejected += feed.subscriber.counters.rejected
+                feed.close()  # an answer with another column or place was believed
+                feed = Feed(type_, shared=shared)
+            elif count % 8 == 7:
+                feed.sequence += 1  # a gap, so that slots are taken back whose descriptor did not make sense
+                feed.still_lives(6)
+        feed.still_lives(6)
+        assert rejected + feed.subscriber.counters.rejected > FRAMES // 40
+    finally:
+        feed.close()
+
+
+def mutate(frames, generator):
+    """Change one of the frames: shorter, longer, a bit, a byte or a number."""
+    place = int(generator.integers(len(frames)))
+    data = bytearray(frames[place])
+    action = generator.integers(5)
+    if action == 0:
+        del data[int(generator.integers(len(data))) :]
+    elif action == 1:
+        data += generator.bytes(int(generator.integers(1, 40)))
+    else:
+        # Not the number: a message with another number is a message.
+        at = int(generator.choice([p for p in range(len(data)) if place or not 24 <= p < 32]))
+        if action == 2:
+            data[at] ^= 1 << int(generator.integers(8))
+        elif action == 3 and at + 8 <= len(data) and not 17 <= at < 32:
+            struct.pack_into("<Q", data, at, EXTREMES[int(generator.integers(len(EXTREMES)))])
+        else:
+            data[at] = int(generator.integers(256))
+    return [*frames[:place], bytes(data), *frames[place + 1 :]]
