@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
                 seconds=min(options.seconds, _QUICK_SECONDS) if options.quick else options.seconds,
                 count_max=_QUICK_COUNT if options.quick else 0,
             )
-            results = _run_all(cases, settings)
+            results = _run_all(cases, settings, quick=options.quick)
     except ValueError as error:
         print(f"cortex bench: {error}", file=sys.stderr)
         return 2
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _run_all(cases: list[Case], settings: Settings) -> list[CaseResult]:
+def _run_all(cases: list[Case], settings: Settings, *, quick: bool) -> list[CaseResult]:
     print("\n".join(header()))
     print(
         f"{settings.repeats} repetitions of {settings.seconds:g} s, interleaved; median ± half of the range\n"
@@ -77,11 +77,11 @@ def _run_all(cases: list[Case], settings: Settings) -> list[CaseResult]:
         for case in cases:
             results.append(run_case(case, settings, progress=_progress))
             _progress("")
-            print("\n".join(case_lines(results[-1])), end="\n\n", flush=True)
+            print("\n".join(case_lines(results[-1], quick=quick)), end="\n\n", flush=True)
     except KeyboardInterrupt:
         _progress("")
         print("interrupted; what was measured until then:", end="\n\n")
-    for table in (threshold_lines(results), summary_lines(results)):
+    for table in (threshold_lines(results, quick=quick), summary_lines(results, quick=quick)):
         if text := "\n".join(table):
             print(text, end="\n\n")
     return results

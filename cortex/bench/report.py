@@ -42,35 +42,43 @@ def header() -> list[str]:
     ]
 
 
-def case_lines(result: CaseResult) -> Iterator[str]:
-    """Yield the block of one case: what each contestant did, then the case's bars."""
+def case_lines(result: CaseResult, *, quick: bool = False) -> Iterator[str]:
+    """Yield the block of one case: what each contestant did, then the case's bars, not judged if `quick`."""
     case = result.case
     yield f"{case.name}: {case.title}"
     yield f"  message: {case.message}; payload {4 * case.floats:,} B"
     for outcome in result.outcomes.values():
         yield from _outcome_lines(case, outcome)
     for verdict in result.verdicts():
-        yield _clip(f"  => {_measured(verdict):>13}  {_what(verdict)}; bar {_bound(verdict)}: {verdict.word}")
+        word = _word(verdict, quick)
+        yield _clip(f"  => {_measured(verdict):>13}  {_what(verdict)}; bar {_bound(verdict)}: {word}")
 
 
-def summary_lines(results: list[CaseResult]) -> Iterator[str]:
-    """Yield the table of all bars."""
+def summary_lines(results: list[CaseResult], *, quick: bool = False) -> Iterator[str]:
+    """Yield the table of all bars; if `quick`, none is judged."""
     verdicts = [(result.case.name, verdict) for result in results for verdict in result.verdicts()]
     if not verdicts:
         return
     yield f"{'case':<17}{'what':<49}{'measured':>13}  {'bar':<14}verdict"
     yield "-" * WIDTH
     for name, verdict in verdicts:
-        word = verdict.word.partition(" (")[0]  # the reason stands in the case's own block
+        word = _word(verdict, quick).partition(" (")[0]  # the reason stands in the case's own block
         yield f"{name:<17}{_what(verdict)[:48]:<49}{_measured(verdict):>13}  {_bound(verdict):<14}{word}"
-    words = [verdict.word for _, verdict in verdicts]
+    words = [_word(verdict, quick) for _, verdict in verdicts]
     yield "-" * WIDTH
+    if quick:
+        unmeasured = len(words) - words.count("quick")
+        yield f"a quick run judges nothing: {words.count('quick')} quick, {unmeasured} not measured"
+        return
     met, missed = words.count("met"), sum(word.startswith("missed") for word in words)
     yield f"{met} met, {missed} missed, {len(words) - met - missed} not measured"
 
 
-def threshold_lines(results: list[CaseResult]) -> Iterator[str]:
-    """Yield the sweep of sizes that `inline_max` is chosen by; nothing if it was not measured."""
+def threshold_lines(results: list[CaseResult], *, quick: bool = False) -> Iterator[str]:
+    """Yield the sweep of sizes that `inline_max` is chosen by, without the conclusion if `quick`.
+
+    Nothing if it was not measured.
+    """
     sweep = {
         4 * r.case.floats: _inline_and_shared(r) for r in results if r.case.name.startswith("threshold-")
     }
@@ -86,6 +94,8 @@ def threshold_lines(results: list[CaseResult]) -> Iterator[str]:
         ratio, rtt_ratio = shared / inline, shared_us / inline_us
         yield f"{size:>10,}{inline:>10,.0f}/s{shared:>10,.0f}/s{ratio:>18.2f}{rtt_ratio:>17.2f}"
         wins = [*wins, size] if ratio >= 1.0 else []
+    if quick:
+        return
     yield (
         f"shared memory carries more messages from {wins[0]:,} B on"
         if wins
@@ -164,6 +174,10 @@ def _figure(spread: Spread, unit: str) -> str:
 
 def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+def _word(verdict: Verdict, quick: bool) -> str:
+    return "quick" if quick and verdict.measured is not None else verdict.word
 
 
 def _what(verdict: Verdict) -> str:

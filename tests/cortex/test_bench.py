@@ -305,6 +305,14 @@ def test_summary_says_met_or_missed_and_counts():
     assert "1 met, 1 missed, 0 not measured" in text
 
 
+def test_a_quick_run_judges_nothing():
+    lines = [*case_lines(results()[0], quick=True), *summary_lines(results(), quick=True)]
+    lines += threshold_lines(sweep(0.8, 1.1), quick=True)
+    text = "\n".join(lines)
+    assert "a quick run judges nothing: 2 quick, 0 not measured" in text
+    assert not any(word in text for word in (" met", "missed", "carries more"))
+
+
 def sweep(*ratios: float) -> list[CaseResult]:
     """Return results of the first threshold cases: shared memory so many times as fast as inline."""
     found = []
@@ -395,8 +403,10 @@ def test_case(tiny_run: tuple[str, list[dict[str, str]]], name: str):
 def test_tiny_run_prints_every_bar(tiny_run: tuple[str, list[dict[str, str]]]):
     text = tiny_run[0]
     bars = sum(len(case.bars) for case in choose(TINY))
-    met, missed, unmeasured = (int(part.split()[0]) for part in text.strip().splitlines()[-1].split(", "))
-    assert met + missed + unmeasured == bars
+    quick, unmeasured = (
+        int(part.split()[0]) for part in text.strip().splitlines()[-1].partition(": ")[2].split(", ")
+    )
+    assert quick + unmeasured == bars
     assert max(len(line) for line in text.splitlines()) <= WIDTH
 
 
