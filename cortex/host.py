@@ -95,7 +95,12 @@ def _make_private(directory: Path) -> None:
     if not stat.S_ISDIR(status.st_mode):
         raise PermissionError(f"{directory} must be a directory, not a link or a file")
     if status.st_uid != os.getuid():
-        raise PermissionError(f"{directory} belongs to user {status.st_uid}, not to us ({os.getuid()})")
+        raise PermissionError(
+            f"{directory} belongs to user {status.st_uid}, not to us ({os.getuid()}): "
+            "choose a directory of your own"
+        )
+    if status.st_mode & stat.S_ISVTX and status.st_mode & 0o077:
+        raise PermissionError(f"{directory} is one that others use, too: choose a directory of your own")
     if status.st_mode & 0o077:
         raise PermissionError(
             f"{directory} has mode {stat.S_IMODE(status.st_mode):04o}, it must be 0700: chmod 700 {directory}"
