@@ -158,8 +158,7 @@ class Registry:
         path = self._directory / REGISTRY_LOCK
         taken = lock or FileLock.acquire(path)
         if taken is None:
-            who = path.read_text(encoding="ascii", errors="replace").strip() or "being started"
-            raise RegistryRunning(f"a registry (process {who}) serves domain {domain} in {self._directory}")
+            raise RegistryRunning(_who_serves(path, domain))
         self._lock = taken
         os.ftruncate(taken.descriptor, 0)
         os.pwrite(taken.descriptor, f"{os.getpid()}\n".encode(), 0)
@@ -360,6 +359,23 @@ class Registry:
         socket.send_multipart((identity, frame), zmq.NOBLOCK)
 
 
+def _who_serves(lock: Path, domain: int) -> str:
+    """Say which registry holds the lock of a domain, and how to be rid of it."""
+    process = lock.read_text(encoding="ascii", errors="replace").strip()
+    if not process:
+        return f"a registry that is just being started serves domain {domain}: try again"
+    try:
+        embedded = b"--embedded" in Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
+    except OSError:
+        embedded = False
+    if embedded:
+        return (
+            f"a registry started by a node (process {process}) serves domain {domain}; "
+            f"stop the nodes, or `kill {process}`"
+        )
+    return f"another registry (process {process}) serves domain {domain}; to replace it, `kill {process}`"
+
+
 def ensure_registry(domain: int, *, linger_s: float = LINGER_S) -> bool:
     """Start a registry in a process of its own, unless one runs or is being started; True if we started it.
 
@@ -423,7 +439,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--lock", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     level = logging.WARNING if options.embedded else logging.INFO
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    handler = logging.StreamHandler()
+    dated = logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # Until it serves, somebody waits for it at a terminal; what it says later is a log.
+    handler.setFormatter(dated if options.embedded else logging.Formatter("cortex discovery: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
     try:
         domain = domain_id(options.domain)
         lock = None
@@ -438,11 +458,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             lock=lock,
         )
     except (OSError, ValueError, RegistryRunning) as error:
-        logger.error("%s", error)
+        logger.error("%s", str(error).replace("insecure=True", "--insecure"))
         return 1
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: registry.stop())
-    logger.info("the registry of domain %d serves, on tcp: %s", domain, registry.address)
+    reach = f"this host and {registry.address}" if registry.address else "this host only"
+    logger.info("the registry of domain %d serves %s", domain, reach)
+    handler.setFormatter(dated)
     try:
         registry.run()
     finally:
