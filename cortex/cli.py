@@ -10,6 +10,7 @@ import math
 import os
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,6 +18,7 @@ from typing import Any, NoReturn
 INTERRUPTED = 130
 TERMINATED = 143
 BROKEN_PIPE = 141
+_HELP_WIDTH = 78
 
 _EXAMPLES = """examples:
   cortex topics                                what is published and subscribed
@@ -24,7 +26,7 @@ _EXAMPLES = """examples:
   cortex echo /scan                            messages as they come
   cortex hz /scan                              rate and regularity
   cortex record -o run.mcap --all              record everything until Ctrl-C
-  cortex play run.mcap --rate 0.5 --loop       play it at half the speed, again and again
+  cortex play run.mcap --rate 0.5 --loop       play it slowly, again and again
   cortex topics --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex
 """
 
@@ -70,7 +72,7 @@ def _call(options: argparse.Namespace) -> int:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError, RuntimeError) as error:
-        text = " ".join(str(error).split())
+        text = " ".join(str(error).split()).replace("insecure=True", "--insecure")
         if isinstance(error, OSError) and error.strerror and error.filename:
             text = f"{error.filename}: {error.strerror}"
         print(f"cortex {options.command}: {text}", file=sys.stderr)
@@ -101,6 +103,20 @@ def _terminate(number: int, frame: object) -> NoReturn:
     raise _Terminated
 
 
+class _Version(argparse.Action):
+    """Print the version of the package, which is looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            found = version("neurosim")
+        except PackageNotFoundError:
+            found = "of unknown version: the package is not installed"
+        print(f"cortex {found}")
+        parser.exit()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="cortex",
@@ -108,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(dest="command", metavar="command", required=True)
     _add_looking(commands)
     _add_watching(commands)
@@ -128,10 +145,11 @@ def _add(
     network: bool = True,
 ) -> argparse.ArgumentParser:
     shown = "examples:\n" + "\n".join(f"  {line}" for line in examples) if examples else None
+    description = f"{what[0].upper()}{what[1:]}. {details}".strip()
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=what,
-        description=f"{what[0].upper()}{what[1:]}. {details}".strip(),
+        description=textwrap.fill(description, _HELP_WIDTH) if examples else description,
         epilog=shown,
         formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,
     )
@@ -198,17 +216,22 @@ def _add_watching(commands: Any) -> None:
             "hz",
             "measure how often and how regularly a topic is published",
             "show_rate",
-            "Of the time between two messages, as they were published:",
+            "Of the time between two messages, as they were published: mean, standard deviation",
         ),
-        ("bw", "measure the bandwidth of a topic", "show_bandwidth", "Of the size of a message:"),
-        ("delay", "measure the time from publishing to receiving", "show_delay", "Of that time:"),
+        ("bw", "measure the bandwidth of a topic", "show_bandwidth", "Of the size of a message: mean"),
+        (
+            "delay",
+            "measure the time from publishing to receiving",
+            "show_delay",
+            "Of that time: mean, standard deviation",
+        ),
     ):
         watch = _add(
             commands,
             name,
             what,
             ("watch", run),
-            details=f"{details} mean, standard deviation, least, median, 99th percentile and most.",
+            details=f"{details}, least, median, 99th percentile and most.",
         )
         watch.add_argument("topic", type=_topic)
         watch.add_argument(
@@ -311,9 +334,12 @@ def _add_tools(commands: Any) -> None:
         network=False,
     )
     cpp.add_argument(
-        "type", nargs="+", metavar="module:Type", help="modules in this directory are found, too"
+        "type", nargs="*", metavar="module:Type", help="modules in this directory are found, too"
     )
     cpp.add_argument("--namespace", help="C++ namespace of the structs")
+    cpp.add_argument(
+        "--include-dir", action="store_true", help="print where the headers of Cortex are, and end"
+    )
     commands.add_parser(
         "bench",
         help="measure Cortex beside its peers on this machine (its options: cortex bench --help)",

@@ -10,8 +10,8 @@ import threading
 import time
 from pathlib import Path
 
-from cortex.commands.session import UsageError, hint, open_node
-from cortex.commands.text import bytes_of, plain, seconds, table
+from cortex.commands.session import Patience, UsageError, hint, open_node
+from cortex.commands.text import bytes_of, number_of, plain, seconds, table
 from cortex.log import Log, Player, Recorder, RecordStats, open_log
 from cortex.policy import keep_last
 
@@ -21,7 +21,7 @@ _NOTHING_S = 3.0
 
 
 def record(options: argparse.Namespace) -> int:
-    """`cortex record`; it ends with Ctrl-C, SIGTERM, or after `--duration`."""
+    """`cortex record`; it ends with Ctrl-C, SIGTERM, or after `--duration`, and fails if nothing came."""
     if not options.all and not options.topic:
         raise UsageError("say which topics to record, or --all")
     if options.all and options.topic:
@@ -41,29 +41,44 @@ def record(options: argparse.Namespace) -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         hint(f"recording into {options.output}; Ctrl-C ends it")
-        _wait_for_end(recorder, stop, options.duration)
+        missing = {topic: Patience(node, topic) for topic in options.topic}
+        _wait_for_end(recorder, stop, options.duration, missing)
         stats = recorder.close()
     _report(options.output, stats)
-    return 0
+    if stats.written:
+        return 0
+    hint(f"cortex record: nothing was recorded: no message of {_any_of(options.topic)} has come")
+    return 1
 
 
-def _wait_for_end(recorder: Recorder, stop: threading.Event, duration_s: float | None) -> None:
+def _any_of(topics: list[str]) -> str:
+    return " or ".join(topics) if topics else "any topic"
+
+
+def _wait_for_end(
+    recorder: Recorder, stop: threading.Event, duration_s: float | None, missing: dict[str, Patience]
+) -> None:
     began_s = report_s = time.monotonic()
     warned = False
     while recorder.running and not stop.wait(_TICK_S):
         now_s = time.monotonic()
         if duration_s is not None and now_s - began_s >= duration_s:
             break
+        for topic, patience in missing.items():
+            if (seen := recorder.stats.topics.get(topic)) is not None and seen.written:
+                patience.heard()
+            patience.check()
         if now_s - report_s >= _REPORT_S:
             report_s = now_s
             stats = recorder.stats
             if sys.stderr.isatty():
                 text = (
-                    f"{stats.duration_s:.0f} s  {bytes_of(stats.file_bytes)}  {len(stats.topics)} topics  "
-                    f"{stats.written:,} messages  {stats.lost:,} lost"
+                    f"{stats.duration_s:.0f} s  {bytes_of(stats.file_bytes)}  "
+                    f"{number_of(len(stats.topics), 'topic')}  {number_of(stats.written, 'message')}  "
+                    f"{stats.lost:,} lost"
                 )
                 print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-            if not stats.written and not warned and now_s - began_s > _NOTHING_S:
+            if not missing and not stats.written and not warned and now_s - began_s > _NOTHING_S:
                 warned = True
                 hint("nothing has come yet: `cortex topics` shows what is published")
     if sys.stderr.isatty():
@@ -78,11 +93,12 @@ def _report(path: Path, stats: RecordStats) -> None:
     if rows:
         for line in table(("topic", "messages", "size", "lost", "overtaken", "rejected"), rows):
             print(line)
-    print(f"{path}: {stats.written:,} messages in {stats.duration_s:.1f} s, {bytes_of(stats.file_bytes)}")
+    what = number_of(stats.written, "message")
+    print(f"{path}: {what} in {stats.duration_s:.1f} s, {bytes_of(stats.file_bytes)}")
 
 
 def play(options: argparse.Namespace) -> int:
-    """`cortex play`."""
+    """`cortex play`; with `--loop`, Ctrl-C is how it ends."""
     with open_log(options.file) as log:
         if log.cut:
             hint(f"{options.file}: {log.cut}; what is before can be read")
@@ -102,15 +118,18 @@ def play(options: argparse.Namespace) -> int:
                 hint("paused; Enter goes on and pauses again")
             progress = threading.Thread(target=_show_progress, args=(player, log), daemon=True)
             progress.start()
+            status = 0
             try:
-                count = player.run(
+                player.run(
                     rate=options.rate, start_s=options.start, duration_s=options.duration, loop=options.loop
                 )
+            except KeyboardInterrupt:
+                status = 0 if options.loop else int(options.interrupted)
             finally:
                 player.stop()
                 progress.join(1.0)
-            hint(f"{count:,} messages played" + _lateness(player, options.rate))
-    return 0
+            hint(f"{number_of(player.published, 'message')} played" + _lateness(player, options.rate))
+    return status
 
 
 def _lateness(player: Player, rate: float) -> str:
@@ -125,7 +144,7 @@ def _describe(log: Log) -> None:
     for line in table(("topic", "<type", "messages", "<from"), rows):
         print(line)
     began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(log.start_ns * 1e-9))
-    print(f"{log.path}: {log.message_count:,} messages, {log.duration_s:.3f} s from {began} on")
+    print(f"{log.path}: {number_of(log.message_count, 'message')}, {log.duration_s:.3f} s from {began} on")
 
 
 def _split(pair: str) -> tuple[str, str]:
@@ -145,6 +164,7 @@ def _show_progress(player: Player, log: Log) -> None:
         return
     while not player.wait_stopped(_TICK_S):
         state = "  paused" if player.paused else ""
-        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {player.published:,} messages{state}"
+        played = number_of(player.published, "message")
+        text = f"{player.position_s:.1f} of {log.duration_s:.1f} s  {played}{state}"
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
     print("\r\x1b[K", end="", file=sys.stderr, flush=True)

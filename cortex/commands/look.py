@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 
 from cortex.commands.session import CommandError, hint, look_around, say_empty
-from cortex.commands.text import bytes_of, is_terminal, plain, rate, seconds, table
+from cortex.commands.text import bytes_of, entries, is_terminal, number_of, plain, rate, seconds, table
 from cortex.node import Node, TopicInfo
 from cortex.records import NodeRecord, PublisherStats, StatsReply, SubscriberStats
 from cortex.schema import Schema, SchemaError, describe
@@ -17,6 +17,7 @@ from cortex.topic import check_topic
 
 _STATS_S = 0.5
 _ASKED_AT_ONCE = 16
+_PERIOD_S = 1.0
 _CLEAR = "\x1b[H\x1b[J"
 
 
@@ -30,8 +31,14 @@ def show_topics(options: argparse.Namespace) -> int:
     if not topics:
         _say_idle(options, node)
         return 0
+    several = _with_several_types(topics)
     rows = [
-        (info.topic, plain(info.type_name) or "any", _names(info.publishers), _names(info.subscribers))
+        (
+            info.topic,
+            _type(info.type_name, info.fingerprint, told=info.topic in several),
+            _names(info.publishers),
+            _names(info.subscribers),
+        )
         for info in topics
     ]
     for line in table(("topic", "<type", "<publishers", "<subscribers"), rows):
@@ -59,17 +66,9 @@ def show_nodes(options: argparse.Namespace) -> int:
         reach = sorted({endpoint.transport for endpoint in record.endpoints})
         remote = [endpoint.control for endpoint in record.endpoints if endpoint.transport == "tcp"]
         place = "this host" if record.host == own.host else ", ".join(remote) or "another host"
-        rows.append(
-            (
-                plain(record.name),
-                f"{record.node:016x}",
-                str(record.pid),
-                *map(str, counts),
-                plain(place),
-                plain(", ".join(reach)),
-            )
-        )
-    head = ("node", "<number", "process", "publishers", "subscribers", "services", "<where", "<transports")
+        where = f"{place} ({', '.join(reach)})" if record.host == own.host else place
+        rows.append((plain(record.name), str(record.pid), *map(str, counts), plain(where)))
+    head = ("node", "process", "publishers", "subscribers", "services", "<where")
     for line in table(head, rows):
         print(line)
     return 0
@@ -84,9 +83,13 @@ def show_info(options: argparse.Namespace) -> int:
     with node:
         before: _Counts | None = None
         live = not options.once
+        if options.once:  # rates take two looks
+            before = _Counts(node, topic)
+            if before.publishers or before.subscribers:
+                time.sleep(_PERIOD_S)
         while True:
             infos = [info for info in node.topics() if info.topic == topic]
-            if not infos and before is None:
+            if not infos and (before is None or options.once):
                 others = sorted({info.topic for info in node.topics()})
                 raise CommandError(
                     f"there is no topic {topic}; "
@@ -100,7 +103,7 @@ def show_info(options: argparse.Namespace) -> int:
             if not is_terminal():
                 print()
             before = counts
-            time.sleep(1.0)
+            time.sleep(_PERIOD_S)
 
 
 class _Counts:
@@ -111,8 +114,8 @@ class _Counts:
 
         self.at_s = time.monotonic()
         self.silent: list[str] = []
-        self.publishers: list[tuple[str, PublisherStats, bool]] = []
-        self.subscribers: list[tuple[str, int, SubscriberStats]] = []
+        self.publishers: list[tuple[NodeRecord, PublisherStats]] = []
+        self.subscribers: list[tuple[NodeRecord, int, SubscriberStats]] = []
         concerned = [record for record in node.nodes() if record.node != node.id and _is_on(record, topic)]
         with ThreadPoolExecutor(_ASKED_AT_ONCE) as pool:
             replies = list(pool.map(lambda record: _ask(node, record), concerned))
@@ -120,14 +123,9 @@ class _Counts:
             if reply is None:
                 self.silent.append(record.name)
                 continue
-            latched = {publisher.source for publisher in record.publishers if publisher.latch}
-            self.publishers += [
-                (record.name, stats, stats.source in latched)
-                for stats in reply.publishers
-                if stats.topic == topic
-            ]
+            self.publishers += [(record, stats) for stats in reply.publishers if stats.topic == topic]
             own = [stats for stats in reply.subscribers if stats.topic == topic]
-            self.subscribers += [(record.name, record.node + index, stats) for index, stats in enumerate(own)]
+            self.subscribers += [(record, index, stats) for index, stats in enumerate(own)]
 
 
 def _is_on(record: NodeRecord, topic: str) -> bool:
@@ -146,9 +144,10 @@ def _ask(node: Node, record: NodeRecord) -> StatsReply | None:
 def _info_lines(topic: str, infos: list[TopicInfo], counts: _Counts, before: _Counts | None) -> Iterator[str]:
     yield topic
     yield ""
-    yield from _publisher_table(counts, before)
+    told = topic in _with_several_types(infos)
+    yield from _publisher_table(counts, before, told)
     yield ""
-    yield from _subscriber_table(counts, before)
+    yield from _subscriber_table(counts, before, told)
     for name in counts.silent:
         yield f"node {plain(name)} did not answer"
     for info in infos:
@@ -162,50 +161,71 @@ def _info_lines(topic: str, infos: list[TopicInfo], counts: _Counts, before: _Co
             yield f"{plain(info.type_name)}: unreadable schema: {error}"
 
 
-def _publisher_table(counts: _Counts, before: _Counts | None) -> Iterator[str]:
-    last = {stats.source: stats for _, stats, _ in before.publishers} if before is not None else {}
+def _publisher_table(counts: _Counts, before: _Counts | None, told: bool) -> Iterator[str]:
+    last = {stats.source: stats for _, stats in before.publishers} if before is not None else {}
     elapsed_s = counts.at_s - before.at_s if before is not None else math.nan
     rows = []
-    for name, stats, latch in counts.publishers:
+    for record, stats in counts.publishers:
+        facts = [plain(record.name)]
+        for publisher in record.publishers:
+            if publisher.source == stats.source:
+                facts += [_type(publisher.type_name, publisher.fingerprint, told=True)] if told else []
+                facts += ["latched"] if publisher.latch else []
         earlier = last.get(stats.source)
-        rows.append(
-            (
-                plain(name),
-                f"{stats.published:,}",
-                rate((stats.published - earlier.published) / elapsed_s if earlier else math.nan),
-                f"{bytes_of((stats.bytes - earlier.bytes) / elapsed_s)}/s" if earlier else "-",
-                str(stats.subscribers),
-                f"{stats.timeouts:,}",
-                f"{stats.skipped:,}",
-                "yes" if latch else "no",
-            )
+        cells = (
+            f"{stats.published:,}",
+            rate((stats.published - earlier.published) / elapsed_s if earlier else math.nan),
+            f"{bytes_of((stats.bytes - earlier.bytes) / elapsed_s)}/s" if earlier else "-",
+            str(stats.subscribers),
+            f"{stats.timeouts:,}",
+            f"{stats.skipped:,}",
         )
-    head = ("publisher", "published", "rate", "bandwidth", "subscribers", "timeouts", "skipped", "latch")
-    yield from table(head, rows) if rows else ("no publisher",)
+        rows.append(("  ".join(facts), cells))
+    head = ("published", "rate", "bandwidth", "subscribers", "timeouts", "skipped")
+    yield from entries("publishers", head, rows) if rows else ("no publisher",)
 
 
-def _subscriber_table(counts: _Counts, before: _Counts | None) -> Iterator[str]:
-    last = {key: stats for _, key, stats in before.subscribers} if before is not None else {}
+def _subscriber_table(counts: _Counts, before: _Counts | None, told: bool) -> Iterator[str]:
+    last = {(record.node, index): stats for record, index, stats in before.subscribers} if before else {}
     elapsed_s = counts.at_s - before.at_s if before is not None else math.nan
     rows = []
-    for name, key, stats in counts.subscribers:
-        earlier = last.get(key)
+    for record, index, stats in counts.subscribers:
+        facts = [plain(record.name)]
+        # A node counts its subscribers in the order in which it announces them.
+        announced = [subscriber for subscriber in record.subscribers if subscriber.topic == stats.topic]
+        if told and index < len(announced):
+            facts.append(_type(announced[index].type_name, announced[index].fingerprint, told=True))
+        facts.append(plain(stats.policy))
+        earlier = last.get((record.node, index))
         latency = stats.latency_counts.tolist()
-        rows.append(
-            (
-                plain(name),
-                f"{stats.received:,}",
-                rate((stats.received - earlier.received) / elapsed_s if earlier else math.nan),
-                f"{stats.lost:,}",
-                f"{stats.overtaken:,}",
-                f"{stats.rejected:,}",
-                seconds(quantile_ns(latency, 0.5) * 1e-9),
-                seconds(quantile_ns(latency, 0.99) * 1e-9),
-                plain(stats.policy),
-            )
+        cells = (
+            f"{stats.received:,}",
+            rate((stats.received - earlier.received) / elapsed_s if earlier else math.nan),
+            f"{stats.lost:,}",
+            f"{stats.overtaken:,}",
+            f"{stats.rejected:,}",
+            seconds(quantile_ns(latency, 0.5) * 1e-9),
+            seconds(quantile_ns(latency, 0.99) * 1e-9),
         )
-    head = ("subscriber", "received", "rate", "lost", "overtaken", "rejected", "delay p50", "p99", "<policy")
-    yield from table(head, rows) if rows else ("no subscriber",)
+        rows.append(("  ".join(facts), cells))
+    head = ("received", "rate", "lost", "overtaken", "rejected", "delay p50", "p99")
+    yield from entries("subscribers", head, rows) if rows else ("no subscriber",)
+
+
+def _with_several_types(infos: list[TopicInfo]) -> set[str]:
+    """The topics that have several types; subscribers of any type have none."""
+    types: dict[str, set[int]] = {}
+    for info in infos:
+        if info.fingerprint:
+            types.setdefault(info.topic, set()).add(info.fingerprint)
+    return {topic for topic, fingerprints in types.items() if len(fingerprints) > 1}
+
+
+def _type(name: str, fingerprint: int, *, told: bool) -> str:
+    """The name of a type, with the first digits of its fingerprint where it must be told from others."""
+    if not fingerprint:
+        return "any"
+    return f"{plain(name)} {fingerprint:016x}"[: len(plain(name)) + 9] if told else plain(name)
 
 
 def _names(names: tuple[str, ...]) -> str:
@@ -218,6 +238,7 @@ def _names(names: tuple[str, ...]) -> str:
 def _say_idle(options: argparse.Namespace, node: Node) -> None:
     others = [record for record in node.nodes() if record.node != node.id]
     if others:
-        hint(f"{len(others)} nodes are running, but none publishes or subscribes (`cortex nodes` lists them)")
+        running = f"{number_of(len(others), 'node')} {'is' if len(others) == 1 else 'are'} running"
+        hint(f"{running}, but none publishes or subscribes (`cortex nodes` lists them)")
     else:
         say_empty(options)

@@ -63,6 +63,11 @@ def _digits(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 999.95 else f"{value:#.4g}"
 
 
+def number_of(count: int, what: str) -> str:
+    """A number of things, such as `1 topic` or `2,345 messages`."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
 def plain(text: str) -> str:
     """A text of somebody else without anything that a terminal would obey."""
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
@@ -78,17 +83,33 @@ def table(
 ) -> Iterator[str]:
     """Lines of a table with aligned columns; those after the first `left` are aligned to the right.
 
-    A head that begins with "<" is that of a further column aligned to the left.
+    A head that begins with "<" is that of a further column aligned to the left. Nothing is cut: in a table
+    that is too wide for the terminal the first column of each row has a line of its own.
     """
     align_left = [i < left or title.startswith("<") for i, title in enumerate(head)]
     shown = [tuple(title.lstrip("<") for title in head), *rows]
     widths = [max(len(row[i]) for row in shown) for i in range(len(head))]
+    folded = len(indent) + sum(widths) + 2 * (len(widths) - 1) > terminal_width()
     for row in shown:
         cells = [
             cell.ljust(width) if to_left else cell.rjust(width)
             for cell, width, to_left in zip(row, widths, align_left, strict=True)
         ]
-        yield shorten((indent + "  ".join(cells)).rstrip(), terminal_width())
+        if folded:
+            yield (indent + row[0]).rstrip()
+            cells[0] = ""
+        yield (indent + "  ".join(cells)).rstrip()
+
+
+def entries(title: str, head: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Iterator[str]:
+    """Lines of a table in which each row has a line for what it is about, and below its aligned numbers."""
+    yield title
+    below = [tuple(head), *(tuple(cells) for _, cells in rows)]
+    widths = [max(len(cells[i]) for cells in below) for i in range(len(head))]
+    for index, cells in enumerate(below):
+        if index:
+            yield rows[index - 1][0]
+        yield "  " + "  ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
 
 
 def message_lines(schema: Schema, message: Any, *, arrays: str = "short") -> Iterator[str]:

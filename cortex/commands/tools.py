@@ -6,10 +6,14 @@ import argparse
 import importlib
 import os
 import sys
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
 
 from cortex.commands.session import CommandError, UsageError, hint
 from cortex.cppgen import generate
 from cortex.message import is_message
+from cortex.schema import EnumType, FieldType, ListType, OptionalType, Schema, schema_of
 from cortex.security import AUTHORIZED_FILE, default_directory, new_keys
 
 
@@ -22,14 +26,23 @@ def make_keys(options: argparse.Namespace) -> int:
         raise CommandError(str(error)) from error
     print(keys.public)
     hint(
-        f"made in {directory}; the line above is the public key. Add it to {AUTHORIZED_FILE} of those that "
-        f"shall talk to us, and theirs to {directory / AUTHORIZED_FILE}, then use --keys {directory}"
+        f"The line above is the public key. The keys are in {directory}.\n"
+        f"1. Add it to the file {AUTHORIZED_FILE} of each that shall talk to us.\n"
+        f"2. Add their public keys to {directory / AUTHORIZED_FILE}.\n"
+        f"3. Use --keys {directory}."
     )
     return 0
 
 
 def write_cpp(options: argparse.Namespace) -> int:
     """`cortex cpp`."""
+    if options.include_dir:
+        if options.type:
+            raise UsageError(f"--include-dir takes no type, got {' '.join(options.type)}")
+        print(Path(__file__).resolve().parents[1] / "cpp" / "include")
+        return 0
+    if not options.type:
+        raise UsageError("name message types, like robot.messages:Scan, or give --include-dir")
     sys.path.insert(0, os.getcwd())
     sys.stdout.write(generate([_find_type(name) for name in options.type], namespace=options.namespace))
     return 0
@@ -46,11 +59,28 @@ def _find_type(name: str) -> type:
             raise
         raise CommandError(f"there is no module {module_name} here or on the path of Python") from error
     found = getattr(module, type_name, None)
-    if not isinstance(found, type) or not is_message(found):
-        known = sorted(
-            key for key, value in vars(module).items() if isinstance(value, type) and is_message(value)
-        )
+    if isinstance(found, type) and is_message(found):
+        return found
+    known = {
+        key: value for key, value in vars(module).items() if isinstance(value, type) and is_message(value)
+    }
+    if isinstance(found, type) and issubclass(found, Enum):
+        users = sorted(key for key, value in known.items() if type_name in _enums(schema_of(value)))
         raise CommandError(
-            f"{module_name} has no message type {type_name}; it has {', '.join(known) if known else 'none'}"
+            f"{type_name} is an enum, which comes with the messages that use it: "
+            + (f"name one of {', '.join(users)}" if users else f"in {module_name} none does")
         )
-    return found
+    raise CommandError(
+        f"{module_name} has no message type {type_name}; it has {', '.join(sorted(known)) or 'none'}"
+    )
+
+
+def _enums(kind: FieldType) -> Iterator[str]:
+    """The names of the enums in a type."""
+    if isinstance(kind, EnumType):
+        yield kind.name
+    elif isinstance(kind, Schema):
+        for field in kind.fields:
+            yield from _enums(field.type)
+    elif isinstance(kind, (OptionalType, ListType)):
+        yield from _enums(kind.item)

@@ -15,7 +15,7 @@ import numpy as np
 
 from cortex.codec import MalformedMessage, codec_of
 from cortex.commands.session import CommandError, Patience, hint, open_node
-from cortex.commands.text import bytes_of, message_lines, rate, seconds, to_plain
+from cortex.commands.text import bytes_of, message_lines, number_of, rate, seconds, to_plain
 from cortex.node import Node
 from cortex.policy import keep_last
 from cortex.schema import type_from_schema
@@ -25,7 +25,8 @@ _WAIT_S = 0.1
 _PERIOD_NS = 1_000_000_000
 _HEAD_EVERY = 20
 _QUEUE = 4096
-_COLUMN = 12
+_WIDTHS = (9, 8, 10, 8, 8, 8, 8, 6)
+"""Of the columns: 79 in all, with two blanks in between."""
 
 
 def echo(options: argparse.Namespace) -> int:
@@ -57,7 +58,7 @@ def echo(options: argparse.Namespace) -> int:
         finally:
             missed = subscriber.counters.overtaken + subscriber.counters.lost
             if missed:
-                hint(f"{missed:,} further messages came faster than they could be shown")
+                hint(f"{number_of(missed, 'further message')} came faster than they could be shown")
     return 0
 
 
@@ -131,8 +132,9 @@ def _watch(
         for printed, second in enumerate(_by_second(subscriber, measure, patience)):
             window.append(second)
             if printed % _HEAD_EVERY == 0:
-                print(_line("rate", "bandwidth", what, "std", "min", "p50", "p99", "max", "lost"))
-            print(_statistics(window, show), flush=True)
+                second_title = "bandwidth" if what == "size" else "std"
+                print(_line("rate", what, second_title, "min", "p50", "p99", "max", "lost"))
+            print(_statistics(window, show, with_bandwidth=what == "size"), flush=True)
             if printed + 1 == options.count:
                 break
     return 0
@@ -168,7 +170,7 @@ def _by_second(
             second.values.append(value)
 
 
-def _statistics(window: deque[_Second], show: Callable[[float], str]) -> str:
+def _statistics(window: deque[_Second], show: Callable[[float], str], *, with_bandwidth: bool) -> str:
     seen = sum(second.seen for second in window)
     missed = sum(second.missed for second in window)
     silence_s = (time.monotonic_ns() - window[-1].last_ns) * 1e-9
@@ -185,14 +187,15 @@ def _statistics(window: deque[_Second], show: Callable[[float], str]) -> str:
     low, middle, high, top = np.percentile(values, (0, 50, 99, 100))
     return _line(
         rate(published_hz),
-        f"{bytes_of(mean_bytes * published_hz)}/s",
-        *map(show, (float(values.mean()), float(values.std()), low, middle, high, top)),
+        show(float(values.mean())),
+        f"{bytes_of(mean_bytes * published_hz)}/s" if with_bandwidth else show(float(values.std())),
+        *map(show, (low, middle, high, top)),
         f"{missed:,}",
     )
 
 
 def _line(*cells: str) -> str:
-    return "".join(cell.rjust(_COLUMN) for cell in cells)
+    return "  ".join(cell.rjust(width) for cell, width in zip(cells, _WIDTHS, strict=True))
 
 
 def _subscribe(node: Node, topic: str, depth: int) -> Subscriber[Any]:

@@ -27,7 +27,7 @@ from processes import ROOT, SOON_S, wait_for
 from cortex import Array, Node, Publisher, Unit, keep_last, reliable
 from cortex.cli import main
 from cortex.commands import session
-from cortex.commands.text import bytes_of, message_lines, plain, rate, seconds, table, to_plain
+from cortex.commands.text import bytes_of, message_lines, number_of, plain, rate, seconds, table, to_plain
 from cortex.log import open_log
 from cortex.message import message
 from cortex.schema import schema_of
@@ -46,6 +46,7 @@ class Mode(Enum):
 Position = Annotated[Array[np.float64, 3], Unit("m", frame="world")]
 Ranges = Annotated[Array["float32", "n"], Unit("m")]
 Field = Array["complex64", "k"]
+_SCAN_TYPES = (("Scan", Scan), ("Number", Number))
 
 
 @message
@@ -185,9 +186,23 @@ def test_topics_and_nodes_are_listed(make_node: MakeNode) -> None:
     status, output, _ = cortex("nodes")
     assert status == 0
     assert [line.split() for line in output.splitlines()[1:]] == [
-        ["robot", f"{robot.id:016x}", str(os.getpid()), "2", "0", "0", "this", "host", "ipc"],
-        ["viewer", f"{viewer.id:016x}", str(os.getpid()), "0", "3", "0", "this", "host", "ipc"],
+        ["robot", str(os.getpid()), "2", "0", "0", "this", "host", "(ipc)"],
+        ["viewer", str(os.getpid()), "0", "3", "0", "this", "host", "(ipc)"],
     ]
+
+
+def test_two_types_on_one_topic_are_told_apart(make_node: MakeNode) -> None:
+    one, other = make_node("one"), make_node("other")
+    one.publisher("/scan", Scan)
+    other.publisher("/scan", Number)
+    other.subscriber("/scan", None)
+    wait_for(lambda: cortex("topics")[1].count("other") == 3)
+    marks = [f"{name} {schema_of(kind).fingerprint:016x}"[: len(name) + 9] for name, kind in _SCAN_TYPES]
+    _, output, errors = cortex("topics")
+    assert all(f"/scan  {mark}" in output for mark in marks)
+    assert "published with different types" in errors
+    _, output, _ = cortex("info", "/scan", "--once")
+    assert {f"one  {marks[0]}", f"other  {marks[1]}", "other  any  keep_last(64)"} <= set(output.splitlines())
 
 
 def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
@@ -201,15 +216,18 @@ def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
         publisher.publish(Scan(i, np.ones(3, np.float32)))
     wait_for(lambda: len(received) == 1234)
     wait_for(lambda: cortex("topics")[1].count("viewer (2)"))
-    status, output, errors = cortex("info", "/scan", "--once")
+    status, output, errors = cortex("info", "/scan", "--once", columns=80)
     assert (status, errors) == (0, "")
     lines = output.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in output
     assert lines[0] == "/scan"
-    assert lines[3].split() == ["robot", "1,234", "-", "-", "2", "0", "0", "yes"]
-    assert lines[6].split()[:6] == ["viewer", "1,234", "-", "0", "0", "0"]
-    assert lines[6].split()[7] in ("us", "ms")  # the delay
-    assert lines[6].endswith("  reliable(depth=8, timeout_s=1)")
-    assert lines[7].endswith("  keep_last(2)")
+    assert lines[4] == "robot  latched"
+    assert lines[5].split() == ["1,234", "0", "Hz", "0", "B/s", "2", "0", "0"]
+    assert lines[9] == "viewer  reliable(depth=8, timeout_s=1)"
+    assert lines[10].split()[:6] == ["1,234", "0", "Hz", "0", "0", "0"]
+    assert lines[10].split()[7] in ("us", "ms")  # the delay
+    assert lines[11] == "viewer  keep_last(2)"
     assert "  ranges    float32[n]" in lines
     status, output, errors = cortex("info", "/nothing", "--once")
     assert (status, output) == (1, "")
@@ -227,7 +245,7 @@ def test_info_goes_on_until_interrupted_and_shows_rates(make_node: MakeNode) -> 
             line = child.stdout.readline()
             assert line
             if line.startswith("robot"):
-                rates.append(line.split()[2])
+                rates.append(child.stdout.readline().split()[1])
         assert rates[0] == "-"
         assert float(rates[1]) == pytest.approx(100.0, rel=0.3)  # Hz; the machine may be busy
         status, _, errors = interrupt(child)
@@ -309,6 +327,7 @@ def test_rate_bandwidth_and_delay_are_measured(make_node: MakeNode) -> None:
         (_, hz, hz_errors), (_, bw, _), (_, delay, _), (_, age, _) = map(finish, (*children, stamped))
     assert hz_errors == ""
     assert len(hz.splitlines()) == 2
+    assert max(len(line) for line in (hz + bw + delay + age).splitlines()) <= 79
     assert float(column(hz, "rate").split()[0]) == pytest.approx(100.0, rel=0.3)  # the machine may be busy
     assert column(hz, "period").endswith(" ms")
     assert float(column(hz, "p50").split()[0]) == pytest.approx(10.0, rel=0.2)
@@ -369,9 +388,22 @@ def test_a_file_is_not_overwritten_unless_told(runtime: Path, tmp_path: Path) ->
     assert (status, output) == (1, "")
     assert errors == f"cortex record: {path} exists: choose another name, or --force to overwrite it\n"
     assert path.read_text() == "precious"
-    assert cortex("record", "-o", path, "/number", "--force", "--duration", 0.1, "--registry", "off")[0] == 0
+    status, _, errors = cortex(
+        "record", "-o", path, "/number", "--force", "--duration", 0.1, "--registry", "off"
+    )
+    assert status == 1
+    assert errors.endswith("cortex record: nothing was recorded: no message of /number has come\n")
     with open_log(path) as log:
         assert log.message_count == 0
+
+
+def test_recording_says_what_it_waits_for(make_node: MakeNode, tmp_path: Path) -> None:
+    make_node("robot").publisher("/other", Number)
+    child = start("record", "-o", tmp_path / "run.mcap", "/number")
+    assert child.stderr is not None
+    child.stderr.readline()
+    assert child.stderr.readline() == "waiting for a publisher of /number; published are: /other\n"
+    assert interrupt(child)[0] == 1
 
 
 def test_playing_can_be_interrupted(make_node: MakeNode, tmp_path: Path) -> None:
@@ -384,7 +416,13 @@ def test_playing_can_be_interrupted(make_node: MakeNode, tmp_path: Path) -> None
     values = [subscriber.recv(SOON_S).value for _ in range(15)]
     assert values == [50 + k % 10 for k in range(15)]
     status, output, errors = interrupt(child)
-    assert (status, output, errors) == (130, "", "")
+    assert (status, output) == (0, "")  # it ends in no other way
+    assert " messages played; the latest was " in errors
+    child = start("play", path, "--rate", 0.01)
+    assert subscriber.recv(SOON_S).value >= 0
+    status, _, errors = interrupt(child)
+    assert status == 130
+    assert " played; " in errors
 
 
 @pytest.mark.parametrize(
@@ -396,6 +434,8 @@ def test_playing_can_be_interrupted(make_node: MakeNode, tmp_path: Path) -> None
         ("play {}/run.mcap --start 9 --registry off", "cortex play: no message from 9 s to the end; {}/run"),
         ("topics --keys {}/none", "cortex topics: {}/none/key.secret does not exist: make keys with "),
         ("topics --domain 233", "cortex topics: domain must be an integer from 0 to 232, got 233"),
+        ("cpp test_cli:Mode", "cortex cpp: Mode is an enum, which comes with the messages that use it: name"),
+        ("topics --registry off --listen 0.0.0.0", "cortex topics: plain tcp on tcp://0.0.0.0:0 would be"),
         ("cpp peer:Missing", "cortex cpp: peer has no message type Missing; it has "),
         ("cpp no_such_module:Scan", "cortex cpp: there is no module no_such_module here or on the "),
     ],
@@ -417,6 +457,7 @@ def test_errors_are_one_line(
     assert output == ""
     assert errors.startswith(complaint.format(tmp_path))
     assert errors.count("\n") == 1
+    assert "=True" not in errors
 
 
 @contextmanager
@@ -444,6 +485,8 @@ def signals_kept() -> Iterator[None]:
         (["record", "-o", "x.mcap"], "say which topics to record, or --all"),
         (["record", "-o", "x.mcap", "--all", "/scan"], "leave out /scan"),
         (["cpp", "Scan"], "a type is named like robot.messages:Scan, got 'Scan'"),
+        (["cpp"], "name message types"),
+        (["cpp", "--include-dir", "a:B"], "--include-dir takes no type"),
         (["keys", "old"], "invalid choice: 'old'"),
     ],
 )
@@ -481,13 +524,25 @@ def test_wrong_use_is_told_from_failure(
         "discovery",
     ],
 )
-def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_help(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as end, signals_kept():
         main([*command.split(), "--help"])
     assert end.value.code == 0
     text = capsys.readouterr().out
     assert text.startswith(f"usage: cortex {command}".rstrip())
-    assert max(map(len, text.splitlines())) <= 120
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    from importlib.metadata import version
+
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"cortex {version('neurosim')}\n"
 
 
 def test_help_loads_no_sockets() -> None:
@@ -503,7 +558,8 @@ def test_keys_are_made_once(tmp_path: Path) -> None:
     assert status == 0
     assert output.strip() == (folder / "key.public").read_text().strip()
     assert stat.S_IMODE((folder / "key.secret").stat().st_mode) == 0o600
-    assert "authorized_keys" in errors
+    assert errors.count("authorized_keys") == 2
+    assert len(errors.splitlines()) == 4
     secret = (folder / "key.secret").read_text()
     assert secret.strip() not in output + errors
     status, output, errors = cortex("keys", "new", "--dir", folder)
@@ -522,6 +578,22 @@ def test_cpp_finds_modules_of_this_directory(tmp_path: Path) -> None:
     assert "namespace mine" in output
 
 
+def test_the_headers_are_where_it_says() -> None:
+    status, output, _ = cortex("cpp", "--include-dir")
+    assert status == 0
+    assert (Path(output.strip()) / "cortex" / "node.hpp").is_file()
+
+
+def test_a_registry_of_a_node_is_told_from_others(make_node: MakeNode) -> None:
+    make_node("robot")
+    wait_for(lambda: "robot" in cortex("nodes")[1])
+    status, output, errors = cortex("discovery")
+    assert (status, output) == (1, "")
+    assert errors.startswith("cortex discovery: a registry started by a node (process ")
+    assert "serves domain 0; stop the nodes, or `kill " in errors
+    assert errors.count("\n") == 1
+
+
 def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) -> None:
     child = start("discovery")
     wait_for(lambda: (runtime / "0" / "registry").exists())
@@ -529,8 +601,21 @@ def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) 
     wait_for(lambda: "/number" in cortex("topics")[1])
     status, output, errors = cortex("discovery")
     assert (status, output) == (1, "")
-    assert "serves domain 0" in errors
-    assert interrupt(child)[0] == 0
+    assert errors.startswith(f"cortex discovery: another registry (process {child.pid}) serves domain 0")
+    status, _, errors = interrupt(child)
+    assert status == 0
+    assert errors.startswith("cortex discovery: the registry of domain 0 serves this host only\n")
+
+
+def test_a_directory_of_others_is_not_to_be_closed_to_them(runtime: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    folder.chmod(0o1777)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CORTEX_RUNTIME_DIR", str(folder))
+        status, _, errors = cortex("topics")
+    assert status == 1
+    assert errors.endswith("is one that others use, too: choose a directory of your own\n")
 
 
 def test_a_registry_that_does_not_answer_is_an_error(
@@ -556,6 +641,8 @@ def test_a_registry_that_does_not_answer_is_an_error(
         (seconds(12345.0), "12,345 s"),
         (seconds(math.nan), "-"),
         (bytes_of(16), "16 B"),
+        (number_of(1, "topic"), "1 topic"),
+        (number_of(2345, "message"), "2,345 messages"),
         (bytes_of(999.99), "1.000 kB"),
         (bytes_of(23.7e6), "23.70 MB"),
         (rate(99.98), "99.98 Hz"),
@@ -574,6 +661,12 @@ def test_names_of_others_command_no_terminal() -> None:
 def test_tables_are_aligned() -> None:
     lines = list(table(("name", "count", "<what"), [("a", "1", "x"), ("long", "1,000", "")]))
     assert lines == ["name  count  what", "a         1  x", "long  1,000"]
+
+
+def test_a_table_that_is_too_wide_is_folded_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    lines = list(table(("name", "count", "<what"), [("n" * 12, "1", "reliable")]))
+    assert [line.split() for line in lines] == [["name"], ["count", "what"], ["n" * 12], ["1", "reliable"]]
 
 
 @given(
