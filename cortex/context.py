@@ -7,6 +7,8 @@ import threading
 
 import zmq
 
+from cortex.wire import BODY_LIMIT, CONTROL_LIMIT, HEADER_SIZE
+
 _lock = threading.Lock()
 _context: zmq.Context[zmq.Socket[bytes]] | None = None
 _owner = 0
@@ -16,10 +18,19 @@ LINGER_MS = 1000
 HEARTBEAT_MS = 500
 """Interval of ZMTP heartbeats over tcp; a peer silent for four of them is disconnected."""
 MAX_SOCKETS = 8192
+_FRAME_ROOM = 4096
+"""For what a frame holds besides header and body: CURVE, the places of rings in an attach answer [bytes]."""
+_FRAME_MAX: dict[int, int] = {
+    zmq.XPUB: 1024,  # a subscription has at most 33 bytes, the handshake of CURVE some 300
+    zmq.SUB: BODY_LIMIT + HEADER_SIZE + _FRAME_ROOM,
+    zmq.DEALER: CONTROL_LIMIT + HEADER_SIZE + _FRAME_ROOM,
+    zmq.ROUTER: CONTROL_LIMIT + HEADER_SIZE + _FRAME_ROOM,
+}
+"""Largest frame that each kind of socket takes in [bytes]; who sends a larger one is disconnected."""
 
 
 class Closed(RuntimeError):
-    """The publisher, subscriber or node was closed."""
+    """The publisher, subscriber, client or node was closed."""
 
 
 def context() -> zmq.Context[zmq.Socket[bytes]]:
@@ -33,7 +44,7 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
 
 
 def new_socket(kind: int, *, tcp: bool = False, high_water_mark: int = 1000) -> zmq.Socket[bytes]:
-    """A socket that never blocks its owner at close, and over tcp notices a peer that is gone.
+    """A socket that never blocks its owner at close, bounds what comes, and over tcp notices a peer's death.
 
     There are no heartbeats on ipc and inproc: the kernel reports a dead peer at once, and a stopped one may
     still hold leases of shared memory.
@@ -41,6 +52,7 @@ def new_socket(kind: int, *, tcp: bool = False, high_water_mark: int = 1000) -> 
     socket = context().socket(kind)
     socket.linger = LINGER_MS
     socket.rcvhwm = high_water_mark  # that for sending, which also holds a SUB's subscriptions, stays 1000
+    socket.setsockopt(zmq.MAXMSGSIZE, _FRAME_MAX[kind])
     socket.setsockopt(zmq.RECONNECT_IVL, 20)
     socket.setsockopt(zmq.RECONNECT_IVL_MAX, 500)
     if tcp:

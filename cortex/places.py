@@ -16,7 +16,6 @@ from cortex.host import NodeFiles
 from cortex.outlet import Outlet, Outlets, open_outlet
 from cortex.records import Endpoint, NodeRecord
 from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address
-from cortex.wire import CONTROL_LIMIT, HEADER_SIZE
 
 Secure = Callable[[zmq.Socket[bytes]], None]
 
@@ -105,7 +104,6 @@ class Places:
     def _router(self, *, tcp: bool) -> zmq.Socket[bytes]:
         router = new_socket(zmq.ROUTER, tcp=tcp)
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        router.setsockopt(zmq.MAXMSGSIZE, CONTROL_LIMIT + HEADER_SIZE)
         self.routers.append(router)
         return router
 
@@ -145,11 +143,17 @@ class Reach(NamedTuple):
         return socket
 
 
-def reach(node: NodeRecord, host: str, keys: Keys | None) -> Reach | None:
+def reach(node: NodeRecord, host: str, keys: Keys | None, *, insecure: bool = False) -> Reach | None:
     """Choose how to reach a node: inproc within the process, ipc on this host, else tcp.
 
+    Args:
+        node: The record that the node has sent; its addresses are not trusted.
+        host: This host, as records name it.
+        keys: For CURVE on tcp. With keys nothing beyond this host is spoken to in plain.
+        insecure: Without keys, allow plain tcp beyond this host.
+
     Returns:
-        None if it offers no address that this host can use.
+        None if it offers no address that this host can use, or may use.
     """
     for endpoint in node.endpoints:
         if endpoint.transport == "ipc" and node.host == host:
@@ -169,12 +173,22 @@ def reach(node: NodeRecord, host: str, keys: Keys | None) -> Reach | None:
     for endpoint in node.endpoints:
         if endpoint.transport == "tcp":
             if not endpoint.server_key:
-                return Reach(endpoint, False, None)
-            if keys is not None:
+                if _may_be_plain(endpoint, insecure=insecure and keys is None):
+                    return Reach(endpoint, False, None)
+            elif keys is not None:
                 return Reach(
                     endpoint, False, partial(apply_client, keys=keys, server_key=endpoint.server_key)
                 )
     return None
+
+
+def _may_be_plain(endpoint: Endpoint, *, insecure: bool) -> bool:
+    try:
+        for address in (endpoint.lossy, endpoint.strict, endpoint.control):
+            check_address(address, keys=None, insecure=insecure)
+    except ValueError:
+        return False
+    return True
 
 
 def _inproc(node: int, pid: int, role: str) -> str:

@@ -8,12 +8,17 @@ import shutil
 import subprocess
 
 import pytest
+import zmq
 from peer import Block, Number, Scan, is_whole, make, make_block
 from processes import SOON_S, wait_for
 
 import cortex.node
 from cortex import keep_last, reliable
+from cortex.context import new_socket
+from cortex.places import reach
+from cortex.records import Endpoint, NodeRecord
 from cortex.security import AUTHORIZED_FILE, load_keys, new_keys
+from cortex.wire import BODY_LIMIT, CONTROL_LIMIT, HEADER_SIZE
 
 SIZES = [0, 10, 4000, 16_384, 16_500, 100_000, 1_000_000, 30]
 """Bytes of content, on both sides of what goes inline."""
@@ -175,6 +180,30 @@ def test_plain_tcp_stays_on_this_host(runtime):
     assert not list(runtime.iterdir())
 
 
+def record_at(address, server_key="", **others):
+    places = {"lossy": address, "strict": address, "control": address, **others}
+    endpoint = Endpoint("tcp", server_key=server_key, **places)
+    return NodeRecord(1, "x", "elsewhere", 1, 1, 0, [endpoint], [], [], [])
+
+
+FAR, NEAR = "tcp://192.0.2.7:5", "tcp://127.0.0.1:5"
+
+
+def test_a_record_cannot_lead_to_plain_tcp_beyond_this_host(tmp_path):
+    """Its addresses are held to the same rule as our own."""
+    keys = new_keys(tmp_path)
+    assert reach(record_at(NEAR), "here", None) is not None
+    assert reach(record_at(NEAR), "here", keys) is not None
+    assert reach(record_at(FAR), "here", None) is None
+    assert reach(record_at(FAR), "here", None, insecure=True) is not None
+    assert reach(record_at(FAR), "here", keys) is None
+    assert reach(record_at(FAR), "here", keys, insecure=True) is None
+    for role in ("lossy", "strict", "control"):
+        assert reach(record_at(NEAR, **{role: FAR}), "here", None) is None
+    assert reach(record_at(FAR, keys.public), "here", keys).secure is not None
+    assert reach(record_at(FAR, keys.public), "here", None, insecure=True) is None
+
+
 @pytest.mark.parametrize("who", ["stranger", "without keys"])
 def test_who_is_not_let_in(make_node, start_child, tmp_path, who, runtime):
     """A node without our trust, or without keys, gets nothing; one with it does."""
@@ -195,6 +224,43 @@ def test_who_is_not_let_in(make_node, start_child, tmp_path, who, runtime):
     assert publisher.subscriber_count == 1
     assert refused.ask(do="receive", topic="/numbers", until=1, timeout_s=0.5)["count"] == 0
     assert stranger.public not in known
+
+
+# Limits of what comes in
+
+
+def disconnected(socket, action):
+    """Whether the other side cuts the connection after an action."""
+    monitor = socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+    try:
+        action()
+        return bool(monitor.poll(3000))
+    finally:
+        socket.disable_monitor()
+        monitor.close(0)
+
+
+@pytest.mark.parametrize("size", [33, 5000])
+def test_a_subscription_has_a_limit(make_node, size):
+    """Who subscribes to more than any reader asks for is disconnected; libzmq would keep a node a byte."""
+    node = make_node(registry="off")
+    address = next(e.lossy for e in node.nodes()[0].endpoints if e.transport == "ipc")
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.linger = 0
+        socket.connect(address)
+        cut = disconnected(socket, lambda: socket.subscribe(b"x" * size))
+    assert cut == (size > 33)
+    publisher, subscriber = node.publisher("/n", Number), node.subscriber("/n", Number)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(Number(1, 1))
+    assert subscriber.recv(SOON_S) == Number(1, 1)
+
+
+def test_frames_have_a_limit(runtime):
+    """Every kind of socket bounds what it takes in; the bodies that are allowed fit."""
+    for kind, least in ((zmq.SUB, BODY_LIMIT), (zmq.DEALER, CONTROL_LIMIT), (zmq.ROUTER, CONTROL_LIMIT)):
+        with new_socket(kind) as socket:
+            assert least + HEADER_SIZE < socket.maxmsgsize < least + HEADER_SIZE + 10_000
 
 
 # Without a registry
