@@ -174,7 +174,6 @@ class Codec:
         return self._drafter.finish(draft)
 
 
-_codecs: dict[type, Codec] = {}
 _lock = threading.Lock()
 
 
@@ -184,9 +183,13 @@ def codec_of(message_type: type) -> Codec:
     Raises:
         TypeError: It is not a message type.
     """
-    codec = _codecs.get(message_type) if isinstance(message_type, type) else None
-    if codec is None:
+    try:
+        # On the class itself, so that it lives as long: classes come and go with the schemas of others.
+        codec: Codec = message_type.__dict__["__cortex_codec__"]
+    except (AttributeError, KeyError):
         created = Codec(message_type)
         with _lock:
-            codec = _codecs.setdefault(message_type, created)
+            if "__cortex_codec__" not in vars(message_type):
+                message_type.__cortex_codec__ = created  # type: ignore[attr-defined]
+            codec = vars(message_type)["__cortex_codec__"]
     return codec

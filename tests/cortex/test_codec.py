@@ -424,3 +424,28 @@ def test_codecs_of_one_schema_read_each_other():
     copy = codec_of(twin).decode(body)
     assert type(copy) is not Everything
     assert codec_of(twin).encode(copy, 2**20) == body
+
+
+def test_codecs_die_with_their_classes():
+    """Who is sent ever new schemas keeps those of the last 256 only."""
+    from cortex import schema as schema_module
+    from cortex.schema import Field, Schema
+
+    codec = codec_of_schema(Schema("test/Passing", (Field("value", "int64"),)))
+    assert codec.decode(bytes(8)).value == 0
+    alive = weakref.ref(codec), weakref.ref(codec.type)
+    del codec
+    for number in range(schema_module._CACHE_LIMIT):
+        codec_of_schema(Schema(f"test/Passing{number}", (Field("value", "int64"),)))
+    gc.collect()
+    assert [reference() for reference in alive] == [None, None]
+
+
+def test_a_subclass_has_no_codec_of_its_base():
+    codec_of(Point)
+
+    class Derived(Point):
+        pass
+
+    with pytest.raises(TypeError, match="not a message type"):
+        codec_of(Derived)
