@@ -12,7 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import zmq
 
 from cortex.codec import MalformedMessage, codec_of
-from cortex.context import new_socket
+from cortex.context import Closed, new_socket
 from cortex.records import ServiceError
 from cortex.schema import fingerprint_of, schema_of
 from cortex.wire import (
@@ -106,6 +106,9 @@ class Server:
             raise MalformedMessage(f"kind {header.kind!r} where {REQUEST!r} was expected")
         check_body(header, len(frame))
         deadline_ns = time.monotonic_ns() + max(header.publish_ns, 0)
+        if header.stamp_ns is not None:  # of this host's clock: it also counts the time before we ran
+            deadline_ns = min(deadline_ns, header.stamp_ns)
+            header = header._replace(stamp_ns=None)  # it is no part of the reply
         with self._lock:
             service = self._services.get(header.aux)
             busy = self._pending >= PENDING_MAX
@@ -189,6 +192,7 @@ class Client(Generic[Request, Reply]):
         self._place: Place | None = None
         self._source = secrets.randbits(64) or 1
         self._calls = 0
+        self._closed = False
 
     def call(self, request: Request, timeout_s: float = 1.0) -> Reply:
         """Send a request and wait for its reply.
@@ -203,7 +207,9 @@ class Client(Generic[Request, Reply]):
             ServiceFailed: The handler raised.
             TypeMismatch: The service of this name has other types.
             TypeError: The request is of another type.
+            Closed: The client or its node was closed, before or meanwhile.
         """
+        self._check_open()
         if type(request) is not self._request_type:
             raise TypeError(f"{self.name} takes {self._request_type.__name__}, got {type(request).__name__}")
         body = codec_of(self._request_type).encode(request, CONTROL_LIMIT)
@@ -211,8 +217,10 @@ class Client(Generic[Request, Reply]):
             raise ValueError(f"the request to {self.name} is over the limit of {CONTROL_LIMIT} bytes")
         deadline_s = time.monotonic() + timeout_s
         if not self._lock.acquire(timeout=max(timeout_s, 0.0)):
+            self._check_open()
             raise ServiceTimeout(f"{self.name}: other calls took the {timeout_s} s")
         try:
+            self._check_open()
             place = self._connect(deadline_s, timeout_s)
             self._calls += 1
             header = Header(
@@ -220,7 +228,7 @@ class Client(Generic[Request, Reply]):
                 self._source,
                 schema_of(self._request_type).fingerprint,
                 self._calls,
-                None,
+                int(deadline_s * 1e9) if place.local else None,
                 int((deadline_s - time.monotonic()) * 1e9),
                 len(body),
                 self._number,
@@ -233,11 +241,16 @@ class Client(Generic[Request, Reply]):
         """Whether somebody offers the service now."""
         return self._find() is not None
 
+    def _check_open(self) -> None:
+        if self._closed:
+            raise Closed(f"the client of {self.name} was closed")
+
     def _connect(self, deadline_s: float, timeout_s: float) -> Place:
         while (place := self._find()) is None:
             if time.monotonic() >= deadline_s:
                 raise ServiceUnavailable(f"nobody offers {self.name} (waited {timeout_s} s)")
             time.sleep(2e-3)
+            self._check_open()
         if self._socket is None or place != self._place:
             self._disconnect()
             socket = new_socket(zmq.DEALER, tcp=not place.local)
@@ -262,6 +275,7 @@ class Client(Generic[Request, Reply]):
                 self._disconnect()  # a reply that comes late finds nobody
                 raise ServiceTimeout(f"{self.name}: no reply within {timeout_s} s")
             if not socket.poll(max(1, int(min(left_s, 0.05) * 1000.0))):
+                self._check_open()
                 now = self._find()
                 if now is None or now.node != place.node:
                     self._disconnect()
@@ -308,7 +322,8 @@ class Client(Generic[Request, Reply]):
             self._disconnect()
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect. A call that waits in another thread ends soon, with `Closed`."""
+        self._closed = True
         with self._lock:
             self._disconnect()
 

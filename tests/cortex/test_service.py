@@ -10,13 +10,23 @@ import zmq
 from peer import Number, OtherNumber, Scan
 from processes import wait_for
 
-from cortex import ServiceFailed, ServiceTimeout, ServiceUnavailable
+from cortex import Closed, ServiceFailed, ServiceTimeout, ServiceUnavailable
 from cortex.codec import codec_of
 from cortex.context import new_socket
 from cortex.message import message
+from cortex.records import ServiceError
 from cortex.schema import TypeMismatch
-from cortex.service import PENDING_MAX, Client, Place
-from cortex.wire import CONTROL_LIMIT, REPLY, pack_header, unpack_header
+from cortex.service import PENDING_MAX, Client, Place, Server, Service, service_number
+from cortex.wire import (
+    CONTROL_LIMIT,
+    ERROR,
+    HEADER_SIZE,
+    REPLY,
+    REQUEST,
+    Header,
+    pack_header,
+    unpack_header,
+)
 
 
 @message
@@ -209,6 +219,78 @@ def test_a_request_whose_time_is_over_is_not_acted_upon(node):
     assert seen == [1, 3]
     for client in clients:
         client.close()
+
+
+def test_a_request_that_was_sent_long_ago_is_not_acted_upon():
+    """A server that was stopped reads it late; the deadline of its host's clock tells."""
+    seen, replies = [], []
+    server = Server(lambda action: action())
+    number = service_number("/double", Number, Number)
+    server.add(Service("/double", number, Number, Number, lambda request: seen.append(request) or request))
+    body = codec_of(Number).encode(Number(0, 1), 1000)
+    fingerprint = codec_of(Number).fingerprint
+    for stamp_ns in (time.monotonic_ns() - 1, time.monotonic_ns() + 10**10, None):
+        header = Header(REQUEST, 1, fingerprint, 1, stamp_ns, 10**10, len(body), number)
+        server.handle(pack_header(header) + body, replies.append)
+    headers = [unpack_header(reply) for reply in replies]
+    assert [header.kind for header in headers] == [ERROR, REPLY, REPLY]
+    assert codec_of(ServiceError).decode(replies[0], HEADER_SIZE).kind == "late"
+    assert [header.stamp_ns for header in headers] == [None] * 3
+    assert len(seen) == 2
+
+
+@pytest.mark.parametrize("local", [True, False])
+def test_the_deadline_goes_along_within_a_host(runtime, local):
+    """The clocks of two hosts have nothing in common."""
+    with new_socket(zmq.ROUTER) as socket:
+        socket.bind("tcp://127.0.0.1:*")
+        address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        begin_ns = time.monotonic_ns()
+        client = Client("/double", Number, Number, lambda: Place(1, address, local, None))
+        with client, pytest.raises(ServiceTimeout):
+            client.call(Number(0, 0), timeout_s=0.3)
+        assert socket.poll(5000)
+        header = unpack_header(socket.recv_multipart()[1])
+    if local:
+        assert 0 <= header.stamp_ns - begin_ns - 300_000_000 < 200_000_000
+    else:
+        assert header.stamp_ns is None
+
+
+def test_a_client_that_is_closed(make_node):
+    """By itself or with its node, before or during a call: an error at once."""
+    server, caller = make_node("server"), make_node("caller")
+    entered, release = threading.Event(), threading.Event()
+
+    def handle(request):
+        entered.set()
+        release.wait(10.0)
+        return request
+
+    server.service("/hold", Number, Number, handle)
+    client, other = caller.client("/hold", Number, Number), caller.client("/hold", Number, Number)
+    other.close()
+    with pytest.raises(Closed, match="/hold"):
+        other.call(Number(0, 0))
+    ended = []
+
+    def call():
+        try:
+            client.call(Number(0, 0), timeout_s=20.0)
+        except Closed:
+            ended.append(True)
+
+    thread = threading.Thread(target=call)
+    thread.start()
+    assert entered.wait(10.0)
+    begin = time.monotonic()
+    caller.close()
+    thread.join(10.0)
+    release.set()
+    assert ended == [True]
+    assert time.monotonic() - begin < 5.0
+    with pytest.raises(Closed, match="/hold"):
+        client.call(Number(0, 0))
 
 
 def test_an_answer_to_another_call_is_not_taken(runtime):
