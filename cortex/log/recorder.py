@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import errno
 import json
 import logging
@@ -51,6 +52,7 @@ _TURN_MESSAGES = 64
 _TURN_BYTES = 8 << 20
 _CHANNELS_MAX = 60_000
 """MCAP numbers channels with 16 bits."""
+_U64_MAX = 2**64 - 1
 _COMPRESSIONS = ("none", "lz4", "zstd")
 
 
@@ -99,7 +101,8 @@ class Recorder:
 
     Should the process be killed, at most the last half second is missing and the file can still be read. If
     the disk is full, recording ends, the file holds whole messages up to there, `error` says so, and `close`
-    raises it. Memory is bounded: the subscribers' queues, and one chunk of 1 MiB or one message.
+    raises it; so it does after any other failure. Memory is bounded: the subscribers' queues, and one chunk
+    of 1 MiB or one message.
 
     Args:
         node: Where to subscribe; it stays open.
@@ -150,6 +153,8 @@ class Recorder:
         self._received = self._unwritten = 0
         self._log_ns = self._look_ns = self._flush_ns = self._chunk_end = 0
         self._stopping = False
+        self._is_whole = True
+        """Whether the writer's chunk holds whole messages only."""
         self._wakeup = Wakeup()
         self._start_ns = time.monotonic_ns()
         self._end_ns = 0
@@ -240,6 +245,12 @@ class Recorder:
             self._finish()
         except OSError as error:
             self._fail(error)
+        except Exception as error:  # what we did not think of must not end the recording in silence
+            logger.exception("%s: the recorder failed", self.path)
+            if self._is_whole:
+                with contextlib.suppress(Exception):
+                    self._finish()
+            self._fail(error)
         finally:
             self._end_ns = time.monotonic_ns()
             self._drop_subscribers()
@@ -311,14 +322,17 @@ class Recorder:
             stats.bytes += info.size
             self._pending[info.topic, info.size] += 1
             # Within a turn messages are in the order of publishing; time in a file must never run back.
-            self._log_ns = max(self._log_ns, info.publish_ns + info.latency_ns + self._wall_offset_ns)
+            received_ns = _clamp(info.publish_ns + info.latency_ns + self._wall_offset_ns)
+            self._log_ns = max(self._log_ns, received_ns)
+            self._is_whole = False
             self._writer.add_message(
                 channel,
                 log_time=self._log_ns,
                 data=cast(bytes, body),
-                publish_time=max(0, info.publish_ns + self._wall_offset_ns),
+                publish_time=_clamp(info.publish_ns + self._wall_offset_ns),
                 sequence=info.sequence & 0xFFFFFFFF,
             )
+            self._is_whole = True
             self._note_chunk()
         return len(taken)
 
@@ -390,24 +404,31 @@ class Recorder:
         self._writer.add_metadata(END, counts)
         self._writer.finish()
 
-    def _fail(self, error: OSError) -> None:
+    def _fail(self, error: Exception) -> None:
         self._note_chunk()
         for (topic, size), count in self._pending.items():
             self._topics[topic].written -= count
             self._topics[topic].bytes -= size * count
         self._unwritten = self._received - sum(stats.written for stats in self._topics.values())
-        why = os.strerror(error.errno) if error.errno else str(error)
+        number = (error.errno or errno.EIO) if isinstance(error, OSError) else errno.EIO
+        has_number = isinstance(error, OSError) and error.errno
+        why = os.strerror(number) if has_number else f"{type(error).__name__}: {error}"
         what = (
             f"recording ended after {self._sink.tell()} bytes, {self._unwritten} messages that had arrived "
             f"are not in the file: {why}"
         )
-        self.error = OSError(error.errno, what, str(self.path))
+        self.error = OSError(number, what, str(self.path))
         logger.debug("%s: %s", self.path, what)
 
     def _count_losses(self) -> None:
         for topic, counters in self._counters.copy().items():
             stats = self._topics[topic]
             stats.lost, stats.overtaken, stats.rejected = counters.lost, counters.overtaken, counters.rejected
+
+
+def _clamp(time_ns: int) -> int:
+    """A time as the file can hold it; that of a strange clock may be anything."""
+    return min(max(time_ns, 0), _U64_MAX)
 
 
 def _open_writer(sink: Sink, compression: str) -> Any:

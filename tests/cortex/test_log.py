@@ -346,6 +346,51 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(
         assert int(unwritten) > 0
 
 
+@pytest.mark.parametrize("offset_ns", [2**64, -(2**64)])
+def test_times_that_the_file_cannot_hold(node: Node, tmp_path: Path, offset_ns: int) -> None:
+    """A publisher's host may have any clock: its messages are recorded all the same."""
+    path = tmp_path / "run.mcap"
+    publisher = node.publisher("/number", Number)
+    with Recorder(node, path, ["/number"]) as recorder:
+        recorder._wall_offset_ns = offset_ns
+        assert publisher.wait_for_subscribers()
+        for i in range(10):
+            publisher.publish(Number(i, i))
+        wait_for(lambda: recorder.stats.written == 10)
+    with open_log(path) as log:
+        assert numbers(log) == list(range(10))
+        edge = 2**64 - 1 if offset_ns > 0 else 0
+        assert {(info.log_ns, info.publish_ns) for info, _, _ in log.raw()} == {(edge, edge)}
+
+
+@pytest.mark.parametrize("where", ["_flush_old", "add_message"])
+def test_any_failure_ends_the_recording_with_an_error(
+    node: Node, tmp_path: Path, where: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not in silence. The file is finished unless a message is torn within the writer."""
+    path = tmp_path / "run.mcap"
+    publisher = node.publisher("/number", Number)
+    recorder = Recorder(node, path, ["/number"])
+    assert publisher.wait_for_subscribers()
+    publisher.publish(Number(0, 0))
+    wait_for(lambda: recorder.stats.written == 1)
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("unforeseen")
+
+    setattr(recorder if where == "_flush_old" else recorder._writer, where, fail)
+    publisher.publish(Number(1, 1))
+    wait_for(lambda: not recorder.running)
+    with pytest.raises(OSError, match="RuntimeError: unforeseen"):
+        recorder.close()
+    assert any(record.exc_info for record in caplog.records)
+    with open_log(path) as log:
+        values = numbers(log)
+        assert log.cut == ("" if where == "_flush_old" else "it was not closed")
+    assert values == list(range(recorder.stats.written))
+    assert recorder.stats.unwritten == recorder._received - len(values)
+
+
 def test_a_write_that_fails_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The kernel may take a part of a record before it says that the disk is full."""
     from cortex.log.sink import Sink
