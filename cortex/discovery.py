@@ -17,6 +17,7 @@ from cortex.control import (
     HEARTBEAT_NS,
     LEASE_NS,
     NODES_MAX,
+    RECORD_BYTES_MAX,
     STALL_NS,
     control_types,
     make_control_socket,
@@ -254,7 +255,9 @@ class Directory:
         if isinstance(message, Hello):
             check_record(message.record)
             node = message.record.node
-            if node in self._inbound or len(self._inbound) < NODES_MAX:
+            if len(frame) > RECORD_BYTES_MAX:
+                reply = Refused(node, f"a record of {len(frame)} bytes, allowed are {RECORD_BYTES_MAX}")
+            elif node in self._inbound or len(self._inbound) < NODES_MAX:
                 self._inbound[node] = now_ns
                 self._put(_INBOUND, message.record)
                 reply = Changed(0, self._own)

@@ -215,14 +215,21 @@ class ServiceError:
     text: str
 
 
+CLOCK_OFFSET_MAX_NS = 2**62
+"""146 years: sums with times of CLOCK_MONOTONIC stay within 64 bits."""
+
+
 def check_record(record: NodeRecord) -> None:
     """Refuse a record that no node of ours would send.
 
     Raises:
-        MalformedMessage: If a number is 0, or a topic, a service or an address is not one.
+        MalformedMessage: If a number is 0, the clock is far from any real one, or a topic, a service or an
+            address is not one.
     """
     if not record.node or not record.revision or any(not p.source for p in record.publishers):
         raise MalformedMessage("a node, its revision and its sources must not be 0")
+    if abs(record.clock_offset_ns) >= CLOCK_OFFSET_MAX_NS:
+        raise MalformedMessage(f"a clock offset of {record.clock_offset_ns} ns is not one")
     topics = [p.topic for p in record.publishers] + [s.topic for s in record.subscribers]
     for topic in topics + [s.name for s in record.services]:
         try:

@@ -32,7 +32,7 @@ from directories import (
 )
 
 from cortex.codec import MalformedMessage
-from cortex.control import HEARTBEAT_NS
+from cortex.control import HEARTBEAT_NS, RECORD_BYTES_MAX
 from cortex.discovery import Directory
 from cortex.host import REGISTRY_LOCK, REGISTRY_SOCKET, NodeFiles, runtime_dir
 from cortex.records import (
@@ -41,7 +41,9 @@ from cortex.records import (
     Describe,
     Heartbeat,
     Hello,
+    Refused,
     Welcome,
+    check_record,
 )
 from cortex.wire import HEADER_SIZE, control_frame, parse_control
 
@@ -418,6 +420,18 @@ def test_describe_is_answered_and_other_frames_are_malformed(make):
             node.directory.answer(bad)
 
 
+def test_a_peer_whose_record_is_too_large_is_refused(make):
+    """As by a registry."""
+    node = make("one", registry="off")
+    large = dataclasses.replace(make_record("large"), revision=1)
+    schema = "x" * (RECORD_BYTES_MAX // 4)
+    for count in (5, 3):
+        record = dataclasses.replace(large, publishers=[publisher(f"/t{k}", schema) for k in range(count)])
+        answer, _ = parse_control(node.directory.answer(control_frame(Hello(False, record))), TYPES)
+        assert isinstance(answer, Refused if count == 5 else Changed)
+        assert (large.node in node.directory.nodes) == (count == 3)
+
+
 def test_a_node_that_was_stopped_does_not_judge_its_peers(make):
     listed = make("listed", registry="off", router=True)
     lister = make("lister", registry="off", peers=[listed.address])
@@ -465,3 +479,10 @@ def test_files_of_a_node_that_left_are_gone(base):
         with pytest.raises(FileExistsError):
             NodeFiles(0, 5)
     NodeFiles(0, 5).close()
+
+
+@pytest.mark.parametrize("offset_ns", [2**62, -(2**62), 2**63 - 1, -(2**63)])
+def test_a_clock_offset_that_is_none_is_malformed(offset_ns):
+    record = dataclasses.replace(make_record("x"), clock_offset_ns=offset_ns)
+    with pytest.raises(MalformedMessage, match="clock offset"):
+        check_record(record)
