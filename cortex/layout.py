@@ -19,7 +19,6 @@ from cortex.schema import (
     ListType,
     OptionalType,
     Schema,
-    SchemaError,
 )
 
 ITEM_ALIGNMENT = 8
@@ -98,8 +97,6 @@ def measure_fields(schema: Schema) -> tuple[tuple[int, ...], int, int]:
         position += size
         largest = max(largest, alignment)
     size = align(position, largest)
-    if size >= BODY_LIMIT:
-        raise SchemaError(f"{schema.name} has a fixed part of {size} bytes, a body must be shorter than 2^32")
     return tuple(offsets), size, largest
 
 

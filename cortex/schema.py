@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import threading
 from collections import OrderedDict
@@ -56,6 +57,8 @@ MAX_DEPTH = 8
 MAX_TEXT_BYTES = 1 << 20
 MAX_DIMENSIONS = 32
 MAX_LABEL = 64
+MAX_FIXED_BYTES = 1 << 30
+"""Largest fixed block, and so fixed array, of a message: what a body may have by default."""
 
 _FIELD_NAME = re.compile(r"(?!__)[A-Za-z_][A-Za-z0-9_]{0,63}")
 _TYPE_NAME = re.compile(r"[A-Za-z0-9_./]{1,128}")
@@ -119,6 +122,9 @@ class ArrayType:
                 _check_field_name(size, "dimension")
             elif type(size) is not int or not 1 <= size < 2**32:
                 raise SchemaError(f"array dimension {size!r}, allowed are names and 1 to 2^32 - 1")
+        if self.is_fixed:
+            size = math.prod(size for size in self.shape if isinstance(size, int))
+            _check_fixed_size("array of fixed size", size * np.dtype(self.dtype).itemsize)
 
     @property
     def is_fixed(self) -> bool:
@@ -187,6 +193,7 @@ class Schema:
             raise SchemaError(f"{self.name} defines a field twice: {', '.join(twice)}")
         if _depth(self) > MAX_DEPTH:
             raise SchemaError(f"{self.name} nests {_depth(self)} levels deep, allowed are {MAX_DEPTH}")
+        _check_fixed_size(self.name, _block_size(self))
         if len(self._text.encode()) > MAX_TEXT_BYTES:
             raise SchemaError(f"{self.name}: the schema is longer than {MAX_TEXT_BYTES} bytes")
 
@@ -310,6 +317,17 @@ def _check_nested(kind: FieldType) -> None:
     # A nested message without fields would occupy no byte: a list of them could claim any amount of memory.
     if isinstance(kind, Schema) and not kind.fields:
         raise SchemaError(f"{kind.name} has no fields; only the outermost message may be empty")
+
+
+def _check_fixed_size(what: str, size: int) -> None:
+    if size > MAX_FIXED_BYTES:
+        raise SchemaError(f"{what}: a fixed part of {size} bytes, allowed are {MAX_FIXED_BYTES}")
+
+
+def _block_size(schema: Schema) -> int:
+    from cortex.layout import block_size  # it needs the records of this module
+
+    return block_size(schema)
 
 
 def _depth(kind: FieldType) -> int:

@@ -181,10 +181,28 @@ def test_limits_are_inclusive():
         Schema("a", (field(EnumType("E", values)),))
 
 
-def test_a_fixed_part_beyond_4_gib_has_no_codec():
-    schema = Schema("a", (field(ArrayType("uint8", (2**31, 2))),))
-    with pytest.raises(SchemaError, match=r"shorter than 2\^32"):
-        codec_of(type_from_schema(schema))
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ArrayType("uint8", (2**30 + 1,)),
+        lambda: ArrayType("float64", (2**14, 2**14)),
+        lambda: ArrayType("complex128", (2**32 - 1,) * 32),
+        lambda: Schema("a", (field(ArrayType("uint8", (2**30,))), field(name="last"))),
+        lambda: Schema("a", (field(OptionalType(ArrayType("uint8", (2**30,)))),)),
+        lambda: Schema("a", tuple(field(ArrayType("uint8", (2**29,)), name=f"a{k}") for k in range(3))),
+    ],
+)
+def test_a_fixed_part_has_a_limit(make):
+    with pytest.raises(SchemaError, match="allowed are 1073741824"):
+        make()
+
+
+def test_a_fixed_part_at_the_limit_has_a_codec():
+    """Built without touching any of that memory; a dimension that is not fixed has its own limit."""
+    schema = Schema("a", (field(ArrayType("uint8", (2**15, 2**15))),))
+    codec = codec_of(type_from_schema(schema))
+    assert codec.record_dtype.itemsize == codec.fixed_size == 2**30
+    assert Schema("a", (field(ArrayType("uint8", (2**31, "n"))),))
 
 
 CHANGES = {
