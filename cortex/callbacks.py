@@ -91,18 +91,26 @@ class CallbackThread:
             alone = self._alone
             if alone is not None and alone.has_one_socket and self._dispatch(alone, block=True):
                 continue
-            ready = busy
-            for fd, _ in poll.poll(0 if busy else WAIT_MAX_S * 1000.0):
-                subscriber = owners.get(fd)
-                if subscriber is None:
-                    self._wakeup.clear()
-                    continue
-                if fd == subscriber.wakeup.fd:
-                    subscriber.wakeup.clear()
-                    self._changed = True
-                if subscriber not in ready:
-                    ready.append(subscriber)
+            ready = self._ready(poll, owners, busy)
             busy = [subscriber for subscriber in ready if self._dispatch(subscriber)]
+            ready, alone = busy, None  # what is closed meanwhile shall be forgotten while we wait
+
+    def _ready(
+        self, poll: select.poll, owners: dict[int, Subscriber[Any]], busy: list[Subscriber[Any]]
+    ) -> list[Subscriber[Any]]:
+        """Wait until a socket may have something, unless some subscriber is busy; returns whom to serve."""
+        ready = list(busy)
+        for fd, _ in poll.poll(0 if busy else WAIT_MAX_S * 1000.0):
+            subscriber = owners.get(fd)
+            if subscriber is None:
+                self._wakeup.clear()
+                continue
+            if fd == subscriber.wakeup.fd:
+                subscriber.wakeup.clear()
+                self._changed = True
+            if subscriber not in ready:
+                ready.append(subscriber)
+        return ready
 
     def _dispatch(self, subscriber: Subscriber[Any], *, block: bool = False) -> bool:
         self._running = subscriber

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import mmap
 import struct
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,9 +26,8 @@ from cortex.wire import (
     RingPlace,
     answer_frame,
     message_head,
+    pack_place,
 )
-
-logger = logging.getLogger(__name__)
 
 COLUMNS = 64
 RING_BYTES = 4 << 20
@@ -37,6 +36,8 @@ RING_BYTES_MAX = 2 << 30
 PRIVATE_BYTES = 64 << 20
 """Most memory outside rings that waits to be sent."""
 RINGS_ALIVE = 4
+RETRY_S = 5.0
+"""After a ring could not be made, none is tried for so long."""
 _SLOT_REST = struct.Struct(REST.format + "Q")
 """The rest of a descriptor's header, and the mask."""
 
@@ -80,6 +81,7 @@ class _Pin:
     ring: Ring | None
     slot: int
     size: int
+    strict: bool
 
 
 class LargeSender:
@@ -100,8 +102,8 @@ class LargeSender:
         self._columns: dict[int, Reader] = {}
         self._inline: list[Reader] = []
         self._pins: deque[_Pin] = deque()
-        self._private_bytes = 0
-        self._unavailable = False
+        self._private_bytes = {False: 0, True: 0}
+        self._unavailable_until_s = 0.0
         # What follows from who reads and from the ring in use; see `_plan`.
         self._shares = 1
         self._ring: Ring | None = None
@@ -109,13 +111,15 @@ class LargeSender:
         self._slots_wanted = 4
         self._grants: list[tuple[int, int, int, bool]] = []
         self._inline_strict = False
+        self._has_strict = False
         self._timeout_s = 0.0
         self._slot_outlets: list[Outlet] = []
         self._inline_outlets: list[Outlet] = []
 
     def _plan(self) -> None:
         """Work out what every message needs, when readers or the ring have changed."""
-        self._shares = max(1, len(self._columns) + bool(self._inline))
+        inline = {reader.request.strict for reader in self._inline}  # lossy and strict ones have a share each
+        self._shares = max(1, len(self._columns) + len(inline))
         ring = self._ring = self._rings[-1] if self._rings else None
         self._slots_wanted = 2 * self._shares + 2
         self._pin_quota = 0 if ring is None else max(1, (ring.slots - 1) // self._shares)
@@ -127,6 +131,7 @@ class LargeSender:
             (column, 1 << column, quota(reader), reader.request.strict)
             for column, reader in self._columns.items()
         ]
+        self._has_strict = any(r.request.strict for r in (*self._columns.values(), *self._inline))
         self._inline_strict = any(reader.request.strict for reader in self._inline)
         self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
         self._slot_outlets = list({reader.outlet for reader in self._columns.values()})
@@ -135,7 +140,7 @@ class LargeSender:
     def admit(self, key: bytes, request: AttachKey, outlet: Outlet) -> Reader:
         """Take a reader in, with a column of the lease table if it can map memory."""
         column = None
-        if request.shared_memory and outlet.local and not self._unavailable:
+        if request.shared_memory and outlet.local:
             column = next((c for c in range(COLUMNS) if c not in self._columns), None)
         reader = Reader(key, request, outlet, column)
         if column is None:
@@ -159,9 +164,7 @@ class LargeSender:
         """The frame that tells a reader its column and the rings."""
         rings: tuple[RingPlace, ...] = ()
         if reader.column is not None:
-            rings = tuple(
-                RingPlace(r.ring_id, r.slots, r.slot_bytes, r.pid, r.fd) for r in self._rings[-RINGS_ALIVE:]
-            )
+            rings = tuple(_place_of(ring) for ring in self._rings[-RINGS_ALIVE:])
         return answer_frame(reader.key, AttachAnswer(sequence, reader.column, rings, latched))
 
     def acquire(self, size: int, sequence: int, *, exact: bool) -> Slot | None:
@@ -211,9 +214,9 @@ class LargeSender:
             The mask of columns that get a lease, whether a reliable reader has no room, whether some reader
             with shared memory is passed over.
         """
-        full = bool(self._inline_strict) and self._inline_full(ring)
         if ring is None:
-            return 0, full, False
+            return 0, self._has_strict and self._private_bytes[True] > PRIVATE_BYTES // 2, False
+        full = self._inline_strict and self._pinned(ring, strict=True) >= self._pin_quota
         mask, passed_over = 0, False
         for column, bit, quota, strict in self._grants:
             if ring.has_room(column, quota):
@@ -227,10 +230,12 @@ class LargeSender:
         """Wait until every reliable reader can take one more; the lock is held, and let go while sleeping.
 
         Returns:
-            False if one could not within its time: it loses the message.
+            False if one could not within its own time: it loses the message.
         """
-        backoff = Backoff(self._timeout_s)
+        backoff, began_s = Backoff(self._timeout_s), time.monotonic()
         while self.grant(ring)[1]:
+            if ring is not None and not self._worth_waiting(ring, time.monotonic() - began_s):
+                return False
             self._outlets.lock.release()
             try:
                 more = backoff.wait()
@@ -241,6 +246,15 @@ class LargeSender:
             self._outlets.refresh()
             self._prune()
         return True
+
+    def _worth_waiting(self, ring: Ring, waited_s: float) -> bool:
+        """Whether a reader that has no room would have us wait for longer than this."""
+        if self._inline_strict and self._pinned(ring, strict=True) >= self._pin_quota:
+            return waited_s < self._timeout_s
+        return any(
+            strict and not ring.has_room(column, quota) and waited_s < self._columns[column].timeout_s
+            for column, _, quota, strict in self._grants
+        )
 
     def send(
         self,
@@ -266,19 +280,26 @@ class LargeSender:
         ring = slot.ring
         if ring is None:
             for outlet in {*self._slot_outlets, *self._inline_outlets}:
-                passed_over |= not self._send_joined(outlet, slot, size, stamps, send_strict)
+                sent = self._send_joined(outlet, slot, size, stamps, send_strict)
+                passed_over |= not sent
+                on_time &= sent or not outlet.strict
             return on_time, passed_over
         ring.commit(slot.number, stamps.sequence, size, mask)
         if self._slot_outlets:
             place = ring.ring_id << 32 | slot.number
-            frame = self._slot_head + _SLOT_REST.pack(*stamps, size, place, mask)
+            # The ring's place goes along: an announcement that was dropped on its way does no harm.
+            frame = (
+                self._slot_head + _SLOT_REST.pack(*stamps, size, place, mask) + pack_place(_place_of(ring))
+            )
             for outlet in self._slot_outlets:
                 if not outlet.strict:
                     outlet.send(frame, DONTWAIT)
                 elif not outlet.try_send(frame) and not send_strict(outlet, frame, 0):
                     on_time = False
         for outlet in self._inline_outlets:
-            passed_over |= not self._send_large(outlet, slot, size, REST.pack(*stamps, size, 0), send_strict)
+            sent = self._send_large(outlet, slot, size, REST.pack(*stamps, size, 0), send_strict)
+            passed_over |= not sent
+            on_time &= sent or not outlet.strict
         return on_time, passed_over
 
     def _send_joined(
@@ -294,7 +315,7 @@ class LargeSender:
         Returns:
             False if too much waits to be sent already, or a reliable reader has no room.
         """
-        if self._private_bytes + size > max(PRIVATE_BYTES, 4 * size):
+        if self._private_bytes[outlet.strict] + size > max(PRIVATE_BYTES, 4 * size):
             return False
         whole = slot.buffer.base
         assert whole is not None
@@ -306,8 +327,8 @@ class LargeSender:
         except zmq.Again:
             return send_strict(outlet, frame.tobytes(), 0)
         assert tracker is not None
-        self._private_bytes += size
-        self._pins.append(_Pin(tracker, None, 0, size))
+        self._private_bytes[outlet.strict] += size
+        self._pins.append(_Pin(tracker, None, 0, size, outlet.strict))
         return True
 
     def _send_large(
@@ -320,12 +341,12 @@ class LargeSender:
     ) -> bool:
         """Send header and body without a copy; False if too much waits to be sent already."""
         ring, body = slot.ring, slot.buffer[:size]
-        if ring is not None and self._pinned(ring) >= self._pin_quota:
+        if ring is not None and self._pinned(ring, strict=outlet.strict) >= self._pin_quota:
             ring, body = None, body.copy()
         if ring is None:
-            if self._private_bytes + size > max(PRIVATE_BYTES, 4 * size):
+            if self._private_bytes[outlet.strict] + size > max(PRIVATE_BYTES, 4 * size):
                 return False
-            self._private_bytes += size
+            self._private_bytes[outlet.strict] += size
         head = self._large_head + rest
         on_time = True
         if outlet.strict:
@@ -342,7 +363,7 @@ class LargeSender:
         assert tracker is not None
         if ring is not None:
             ring.pin(slot.number)
-        self._pins.append(_Pin(tracker, ring, slot.number, size))
+        self._pins.append(_Pin(tracker, ring, slot.number, size, outlet.strict))
         return on_time
 
     def prune(self) -> None:
@@ -359,20 +380,15 @@ class LargeSender:
             elif pin.ring is not None:
                 pin.ring.unpin(pin.slot)
             else:
-                self._private_bytes -= pin.size
+                self._private_bytes[pin.strict] -= pin.size
 
-    def _inline_full(self, ring: Ring | None) -> bool:
-        if ring is None:
-            return self._private_bytes > PRIVATE_BYTES // 2
-        return self._pinned(ring) >= self._pin_quota
-
-    def _pinned(self, ring: Ring) -> int:
-        return sum(pin.ring is ring for pin in self._pins)
+    def _pinned(self, ring: Ring, *, strict: bool) -> int:
+        return sum(pin.ring is ring and pin.strict is strict for pin in self._pins)
 
     def _ring_for(self, size: int, sequence: int, *, exact: bool) -> Ring | None:
-        if self._unavailable:
-            return None
         current, wanted, page = self._ring, self._slots_wanted, mmap.PAGESIZE
+        if time.monotonic() < self._unavailable_until_s:
+            return current if current is not None and current.slot_bytes >= size else None
         slot_bytes = size if exact else size + size // 4
         if current is not None:
             slot_bytes = max(slot_bytes, current.slot_bytes)
@@ -385,9 +401,10 @@ class LargeSender:
             ring = Ring(self._source, self._ring_count, slots=slots, slot_bytes=slot_bytes)
         except ShmUnavailable as error:
             if current is not None and current.slot_bytes >= size:
+                self._slots_wanted = current.slots  # make do with what there is
                 return current
-            self._unavailable = True
-            logger.warning("%s: no shared memory, large messages go through sockets: %s", self._topic, error)
+            self._unavailable_until_s = time.monotonic() + RETRY_S
+            self._outlets.note(f"{self._topic}: no shared memory, large messages go through sockets: {error}")
             return None
         self._ring_count += 1
         self._rings.append(ring)
@@ -400,8 +417,8 @@ class LargeSender:
             frame = self.answer(reader, sequence, b"")
             if not reader.outlet.strict:
                 reader.outlet.send(frame, DONTWAIT)
-            elif not reader.outlet.try_send(frame):
-                reader.outlet.send_anyway(frame)
+            else:
+                reader.outlet.try_send(frame)  # without it the first descriptor tells
         return ring
 
     @property
@@ -415,3 +432,7 @@ class LargeSender:
             ring.close()
         self._rings.clear()
         self._plan()
+
+
+def _place_of(ring: Ring) -> RingPlace:
+    return RingPlace(ring.ring_id, ring.slots, ring.slot_bytes, ring.pid, ring.fd)

@@ -28,6 +28,7 @@ from cortex.wire import (
     LARGE,
     MASK,
     MESSAGE,
+    PLACE_SIZE,
     RECORD,
     SLOT,
     TAIL,
@@ -37,6 +38,7 @@ from cortex.wire import (
     batch_records,
     message_head,
     parse_answer,
+    parse_place,
     prefix,
     resume_key,
 )
@@ -113,7 +115,6 @@ class Link:
         }
         self._large_head, self._slot_head, self.batch_head = list(self._handlers)[:3]
         self._rings: dict[int, RingView] = {}
-        self._places: dict[int, RingPlace] = {}
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
@@ -170,7 +171,14 @@ class Link:
         except MalformedMessage as error:
             self.reject(str(error))
             self._drop_parts()
+            if handler is not None and frame[3:4] in (LARGE, SLOT) and len(frame) >= HEADER_SIZE:
+                self.skip(TAIL.unpack_from(frame, 16)[1])
             return []
+
+    def skip(self, sequence: int) -> None:
+        """A message was rejected: it is accounted for, if it is the one that was to come."""
+        if sequence == self.expected:
+            self.expected = sequence + 1
 
     def _drop_parts(self) -> None:
         while self.socket.get(zmq.RCVMORE):
@@ -218,13 +226,18 @@ class Link:
 
     def _on_slot(self, frame: bytes) -> list[Item]:
         fingerprint, sequence, stamp_ns, publish_ns, size, aux = TAIL.unpack_from(frame, 16)
-        if len(frame) != HEADER_SIZE + MASK.size:
+        if len(frame) != HEADER_SIZE + MASK.size + PLACE_SIZE:
             raise MalformedMessage(f"a descriptor of {len(frame)} bytes")
         if fingerprint != self.codec.fingerprint:
             self._check(fingerprint, size)
         (mask,) = MASK.unpack_from(frame, HEADER_SIZE)
         ring, slot = aux >> 32, aux & 0xFFFFFFFF
-        view = self._rings.get(ring) or self._open_ring(ring)
+        view = self._rings.get(ring)
+        if view is None and self._column is not None:
+            place = parse_place(frame, HEADER_SIZE + MASK.size)
+            if place.ring != ring:
+                raise MalformedMessage(f"a descriptor for ring {ring} that places ring {place.ring}")
+            view = self._open_ring(place)
         if len(self._rings) > 1:
             self._forget_rings(ring)
         leased = self._column is not None and bool(mask >> self._column & 1)
@@ -330,10 +343,9 @@ class Link:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
         if answer.column is not None:
-            self._places = {place.ring: place for place in answer.rings}
-            if self._places and self._open_ring(max(self._places)) is None:
+            if answer.rings and self._open_ring(max(answer.rings)) is None:
                 return []
-            for number in self._rings.keys() - self._places.keys():
+            for number in self._rings.keys() - {place.ring for place in answer.rings}:
                 self._rings.pop(number).close()
             if self._large_subscribed:
                 self.socket.unsubscribe(self._large_head)
@@ -344,17 +356,16 @@ class Link:
         self.expected = answer.sequence
         return items
 
-    def _open_ring(self, number: int) -> RingView | None:
+    def _open_ring(self, place: RingPlace) -> RingView | None:
         """Map a ring that the publisher has told us of; without it, go on without shared memory."""
-        place = self._places.get(number)
-        if place is None or self._column is None or number in self._rings:
-            return self._rings.get(number)
+        if self._column is None or place.ring in self._rings:
+            return self._rings.get(place.ring)
         try:
             view = RingView(self.source, *place, self._column)
         except ShmUnavailable as error:
             self._do_without_shared_memory(error)
             return None
-        self._rings[number] = view
+        self._rings[place.ring] = view
         return view
 
     def _forget_rings(self, newest: int) -> None:
@@ -375,13 +386,13 @@ class Link:
 
     def _do_without_shared_memory(self, error: ShmUnavailable) -> None:
         logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, error)
+        self._close_rings()  # before the publisher can learn that our column is free
         if not self._large_subscribed:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
         self.socket.unsubscribe(self._slot_head)
         self.socket.unsubscribe(self._key)
         self._column = None
-        self._places.clear()
         self._ask(shared_memory=False)
 
     def close(self) -> None:
@@ -389,10 +400,13 @@ class Link:
 
         The end of the socket tells the publisher that it may write to our slots again: the rings close first.
         """
+        self._close_rings()
+        self.socket.close(0)
+
+    def _close_rings(self) -> None:
         for ring in self._rings.values():
             ring.close()
         self._rings.clear()
-        self.socket.close(0)
 
     def schema(self) -> Schema:
         """The structure of this publisher's messages."""

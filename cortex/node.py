@@ -112,6 +112,7 @@ class Node:
         self.domain = domain_id(domain)
         self.id = secrets.randbits(64) or 1
         self._keys = keys
+        self._insecure = insecure
         self._pid = os.getpid()
         self._lock = threading.RLock()
         self._outlets = Outlets()
@@ -344,6 +345,7 @@ class Node:
         self._wakeup.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(5.0)
+        self._outlets.emit_notes()
         self._outlets.close()
 
     def disown(self) -> None:
@@ -479,7 +481,8 @@ class Node:
         for source in present - wanted.keys():
             subscriber.forget(source)
         for source in wanted.keys() - present:
-            self._connect(subscriber, *wanted[source])
+            if not subscriber.revive(source):
+                self._connect(subscriber, *wanted[source])
 
     def _connect(self, subscriber: Subscriber[Any], node: NodeRecord, publisher: PublisherRecord) -> None:
         if publisher.source in subscriber.refused:
@@ -489,7 +492,7 @@ class Node:
             if schema.fingerprint != publisher.fingerprint:
                 raise SchemaError("its fingerprint is another")
             codec = subscriber.codec or codec_of(type_from_schema(schema))
-        except SchemaError as error:
+        except (SchemaError, ValueError, TypeError) as error:
             subscriber.refused.add(publisher.source)
             logger.warning("%s of %s: unreadable schema: %s", publisher.topic, node.name, error)
             return
@@ -500,7 +503,7 @@ class Node:
             )
             subscriber.complain(TypeMismatch(what, codec.schema, schema))
             return
-        place = reach(node, self._host, self._keys)
+        place = reach(node, self._host, self._keys, insecure=self._insecure)
         if place is None:
             logger.debug("%s of %s cannot be reached from here", publisher.topic, node.name)
             return
@@ -517,8 +520,7 @@ class Node:
                 clock_offset_ns=offset_ns,
                 secure=place.secure,
             )
-        except (zmq.ZMQError, PermissionError) as error:
-            subscriber.refused.add(publisher.source)
+        except (OSError, zmq.ZMQError) as error:  # tried again when something changes
             logger.warning("%s of %s: cannot connect: %s", publisher.topic, node.name, error)
             return
         subscriber.connect(link)
@@ -546,7 +548,7 @@ class Node:
         return None
 
     def _reach_control(self, node: NodeRecord) -> Any:
-        place = reach(node, self._host, self._keys)
+        place = reach(node, self._host, self._keys, insecure=self._insecure)
         if place is None:
             raise ConnectionError(f"node {node.name!r} cannot be reached from here")
         return place
@@ -586,15 +588,20 @@ class Node:
     # The control thread
 
     def _run(self) -> None:
-        try:
-            while not self._closed:
+        failures = 0
+        while not self._closed:
+            try:
                 self._step()
-        except Exception:
-            logger.exception("%s: the control thread has died", self.name)
-        finally:
-            self._send_replies()
-            self._directory.close()
-            self._places.close()
+            except Exception:  # heartbeats must go on whatever one of our many duties ran into
+                failures += 1
+                if failures & (failures - 1) == 0:
+                    logger.exception("%s: a step of the control thread failed (%d)", self.name, failures)
+                time.sleep(TICK_MS * 1e-3)
+        for end in (self._send_replies, self._directory.close, self._places.close):
+            try:
+                end()
+            except Exception:
+                logger.exception("%s: could not close in order", self.name)
 
     def _step(self) -> None:
         poller = zmq.Poller()
@@ -620,6 +627,7 @@ class Node:
         now_ns = time.monotonic_ns()
         self._directory.tick(now_ns)
         self._outlets.tick()
+        self._outlets.emit_notes()
         offset_ns = clock_offset_ns()
         if abs(offset_ns - self._clock_offset_ns) > CLOCK_STEP_NS:
             self._clock_offset_ns = offset_ns  # somebody has set the clock: tell the others

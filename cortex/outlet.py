@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,6 +18,8 @@ from cortex.wire import AttachKey, parse_attach_key, parse_resume_key
 logger = logging.getLogger(__name__)
 
 DONTWAIT, SNDMORE = int(zmq.DONTWAIT), int(zmq.SNDMORE)  # joined as enums they cost a microsecond
+
+ATTACHED_MAX = 16_384
 
 
 class Attachable(Protocol):
@@ -106,6 +109,7 @@ class Outlets:
         self._outlets: list[Outlet] = []
         self._publishers: dict[int, Attachable] = {}
         self._attached: dict[bytes, Outlet] = {}
+        self._notes: deque[str] = deque(maxlen=100)
         self.closed = False
 
     def add(self, outlet: Outlet) -> None:
@@ -133,6 +137,15 @@ class Outlets:
                     break
                 self._handle(outlet, event)
 
+    def note(self, text: str) -> None:
+        """Say that something goes wrong; the caller holds the lock, so no handler of a log may run."""
+        self._notes.append(text)
+
+    def emit_notes(self) -> None:
+        """Log what was noted; the caller holds no lock."""
+        while self._notes:
+            logger.warning("%s", self._notes.popleft())
+
     def tick(self) -> None:
         """Do `refresh`, unless a publisher is at it."""
         if self.lock.acquire(blocking=False):
@@ -154,6 +167,8 @@ class Outlets:
         if publisher is None:
             return
         if event[0] == 1:
+            if len(self._attached) >= ATTACHED_MAX:
+                return
             self._attached[key] = outlet
             publisher.attach(outlet, key, request)
         elif self._attached.pop(key, None) is not None:

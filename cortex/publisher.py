@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import secrets
 import threading
 import time
@@ -32,7 +31,6 @@ from cortex.wire import (
     prefix,
 )
 
-logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
 
 T = TypeVar("T")
@@ -41,6 +39,7 @@ INLINE_MAX = 16_384
 """Bodies up to this size travel in the frame; measured by `cortex bench threshold`."""
 REFRESH_NS = 1_000_000
 READERS_MAX = 1024
+SILENCE_MAX_NS = 30_000_000_000
 SILENCE_NS = 100_000_000
 """After so long without a message readers are told how many there have been."""
 LINGER_S = 0.5
@@ -102,7 +101,9 @@ class Publisher(Generic[T]):
         self._latched = b""
         self._refresh_ns = 0
         self._was_large = False
+        self._crowded = False
         self._told = 0
+        self._tell_after_ns = SILENCE_NS
         self._late: dict[Outlet, int] = {}
         """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
 
@@ -122,8 +123,9 @@ class Publisher(Generic[T]):
         """Send a message; what it refers to may be changed or freed afterwards.
 
         Returns:
-            False if a reliable subscriber lost it, because it held up the publisher for longer than its
-            `timeout_s`; True otherwise, also if there is no subscriber. A subscriber that was too late once
+            False if a reliable subscriber lost it, because it held up the publisher for too long: the longest
+            `timeout_s` of the topic's reliable subscribers for small messages, its own for those in shared
+            memory. True otherwise, also if there is no subscriber. A subscriber that was too late once
             holds up no further messages, and loses them, until it has read about half of what waits for it.
 
         Raises:
@@ -155,6 +157,7 @@ class Publisher(Generic[T]):
             if type(message) is not self._type:
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._readers and not self.latch:
+                self._flush()
                 self._sequence += 1
                 return True
             if self._was_large:  # the next is most likely large, too
@@ -180,7 +183,12 @@ class Publisher(Generic[T]):
         try:
             if slot is None:
                 return False
-            prepared.write(slot.buffer)
+            try:
+                prepared.write(slot.buffer)
+            except BaseException:
+                with self._lock:
+                    self._large.abandon(slot)
+                raise
             with self._lock:
                 return self._publish_slot(slot, prepared.size, stamp_ns, now_ns)
         finally:
@@ -282,8 +290,8 @@ class Publisher(Generic[T]):
                 self._outlets.refresh()
                 if not more:
                     if not self._timeouts:
-                        logger.warning(
-                            "%s: a reliable subscriber did not keep up and lost a message", self.topic
+                        self._outlets.note(
+                            f"{self.topic}: a reliable subscriber was too late and lost a message"
                         )
                     self._late[outlet] = self._sequence
                     self._route()
@@ -348,6 +356,7 @@ class Publisher(Generic[T]):
         """Find memory for a large message; both locks are held."""
         slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
         if slot is None:
+            self._flush()
             self._sequence += 1
             self._skipped += 1
         return slot
@@ -407,7 +416,9 @@ class Publisher(Generic[T]):
         if key in self._readers or self._closed:
             return
         if len(self._readers) >= READERS_MAX:
-            logger.warning("%s: more than %d subscribers, one is refused", self.topic, READERS_MAX)
+            if not self._crowded:
+                self._outlets.note(f"{self.topic}: has {READERS_MAX} subscribers, further ones are refused")
+            self._crowded = True
             return
         reader = self._large.admit(key, request, outlet)
         self._readers[key] = reader
@@ -450,21 +461,26 @@ class Publisher(Generic[T]):
             try:
                 if not self._closed:
                     self._large.prune()
-                    if self._told != self._sequence and now_ns - self._refresh_ns > SILENCE_NS:
+                    if self._told != self._sequence:
+                        self._told, self._tell_after_ns = self._sequence, SILENCE_NS
+                    if self._readers and now_ns - self._refresh_ns > self._tell_after_ns:
                         self._tell_sequence(now_ns)
             finally:
                 self._lock.release()
 
     def _tell_sequence(self, now_ns: int) -> None:
-        """Send a batch of nothing, so that readers learn of a loss at the end of a burst; lock held."""
+        """Send a batch of nothing, so that readers learn of a loss at the end of a burst; the lock is held.
+
+        It is sent again after ever longer times: where the queue is full, it gets lost like what it tells of.
+        """
         if self._batch or self._blocked:
             return
         frame = self._batch_head + REST.pack(self._sequence, 0, now_ns, 0, 0)
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
-        sent = [outlet.try_send(frame) for outlet in self._strict_outlets]
-        if all(sent) and not self._late:
-            self._told = self._sequence
+        for outlet in self._strict_outlets:
+            outlet.try_send(frame)
+        self._tell_after_ns = min(2 * self._tell_after_ns, now_ns - self._refresh_ns + SILENCE_MAX_NS)
 
     @property
     def counters(self) -> PublisherCounters:

@@ -118,7 +118,7 @@ class Subscriber(Generic[T]):
             Closed: The subscriber was closed.
         """
         message: T
-        if self.policy.reliable and (timeout_s is None or timeout_s >= BLOCK_S):
+        if self.policy.reliable and self.callback is None and (timeout_s is None or timeout_s >= BLOCK_S):
             with self._lock:
                 message = self._receive_decoded() if not self._queue else _LOST
                 if message is not _LOST:
@@ -166,36 +166,12 @@ class Subscriber(Generic[T]):
         return records
 
     def __iter__(self) -> Iterator[T]:
-        """Messages as they come, until the subscriber is closed."""
-        while True:
-            try:
-                message = self.recv()
-            except Closed:
-                return
-            yield message
+        """Messages as they come, until the subscriber is closed. An error ends it not: iterate again."""
+        return _Messages(self)
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
-        return self._stream()
-
-    async def _stream(self) -> AsyncIterator[T]:
-        since_pause = 0
-        while True:
-            try:
-                item = self._take()
-                if item is None:
-                    since_pause = 0
-                    yield await self.recv_async()
-                    continue
-                message = self._open(item, self._decode)
-            except Closed:
-                return
-            if message is not _LOST:
-                yield message
-            since_pause += 1
-            if since_pause >= DRAIN_MAX:  # other tasks of the loop want to run, too
-                since_pause = 0
-                await asyncio.sleep(0)
+        return _AsyncMessages(self)
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`."""
@@ -235,6 +211,8 @@ class Subscriber(Generic[T]):
             self.wakeup.clear()
 
     def _receive(self, timeout_s: float | None, use: Callable[[Item], Any], *, whole: bool = False) -> Any:
+        if self.callback is not None:
+            raise RuntimeError(f"{self.topic}: the messages of this subscriber go to its callback")
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         left_s = WAIT_MAX_S if timeout_s is None else timeout_s
         while True:
@@ -302,7 +280,8 @@ class Subscriber(Generic[T]):
         assert item.slot is not None
         view, slot = item.slot
         try:
-            copy = view.snapshot(slot, item.sequence, item.size)
+            with self._turn:
+                copy = view.snapshot(slot, item.sequence, item.size)
         except ValueError:  # the ring was closed meanwhile
             copy = None
         if copy is None:
@@ -433,6 +412,7 @@ class Subscriber(Generic[T]):
         sequence, stamp_ns, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
         if size != len(frame) - HEADER_SIZE:
             link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
+            link.skip(sequence)
             return
         if sequence == link.expected:
             link.expected = sequence + 1
@@ -494,6 +474,7 @@ class Subscriber(Generic[T]):
                 sequence, _, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
                 if size != len(frame) - HEADER_SIZE:
                     link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
+                    link.skip(sequence)
                     continue
                 if sequence == link.expected:
                     link.expected = sequence + 1
@@ -641,9 +622,8 @@ class Subscriber(Generic[T]):
         if now_ns - self._drained_ns > 20_000_000 and self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
-                    waiting = bool(self._queue)
                     self._drain()
-                    arrived = not waiting and bool(self._queue)
+                    arrived = bool(self._queue)
             finally:
                 self._lock.release()
             if not self._closed and arrived:
@@ -658,8 +638,11 @@ class Subscriber(Generic[T]):
                     raise Closed(f"the subscriber of {self.topic} is closed")
                 if len(self._queue) < self.policy.depth:
                     self._drain()
-                if any(link.attached for link in self._links):
-                    return True
+                attached = any(link.attached for link in self._links)
+                if self._queue:
+                    self.wakeup.set()  # whoever sleeps on the descriptors would not notice
+            if attached:
+                return True
             if time.monotonic() >= deadline_s:
                 return False
             time.sleep(0.5e-3)
@@ -685,6 +668,15 @@ class Subscriber(Generic[T]):
         """The publishers that are connected and have not left."""
         with self._turn:
             return {link.source for link in self._links if link not in self._leaving}
+
+    def revive(self, source: int) -> bool:
+        """A publisher that had left is back: keep its connection; False if there is none. For the node."""
+        with self._turn:
+            for link in list(self._leaving):
+                if link.source == source:
+                    del self._leaving[link]
+                    return True
+        return False
 
     def forget(self, source: int) -> None:
         """A publisher has left: read what is still on its way, then disconnect; for the node."""
@@ -756,6 +748,38 @@ class Subscriber(Generic[T]):
 def _count(item: Item) -> int:
     """Messages of an item."""
     return item.size if item.offset == WHOLE_BATCH else 1
+
+
+class _Messages(Generic[T]):
+    """Iterates; unlike a generator it goes on after an exception, such as one publisher's `TypeMismatch`."""
+
+    def __init__(self, subscriber: Subscriber[T]) -> None:
+        self._subscriber = subscriber
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        try:
+            return self._subscriber.recv()
+        except Closed:
+            raise StopIteration from None
+
+
+class _AsyncMessages(Generic[T]):
+    """Iterates on the running loop."""
+
+    def __init__(self, subscriber: Subscriber[T]) -> None:
+        self._subscriber = subscriber
+
+    def __aiter__(self) -> AsyncIterator[T]:
+        return self
+
+    async def __anext__(self) -> T:
+        try:
+            return await self._subscriber.recv_async()
+        except Closed:
+            raise StopAsyncIteration from None
 
 
 class _Lost:

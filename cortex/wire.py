@@ -32,6 +32,7 @@ REST = struct.Struct("<QqqQQ")
 RECORD = struct.Struct("<qqII")
 """Head of a batch's record: stamp_ns, publish_ns, body length, reserved."""
 MASK = struct.Struct("<Q")
+"""What follows a descriptor's header: the mask of columns; then the ring's place."""
 _KEY = struct.Struct("<QQ")
 _ANSWER = struct.Struct("<QIIQQ")
 _RING = struct.Struct("<IIQIiQ")
@@ -240,6 +241,19 @@ def parse_resume_key(data: bytes) -> tuple[int, int] | None:
     if len(data) != KEY_SIZE or data[:4] != b"CTX" + RESUME:
         return None
     return int.from_bytes(data[8:16], "little"), int.from_bytes(data[24:32], "little")
+
+
+def pack_place(place: RingPlace) -> bytes:
+    """The place of a ring as it travels: 32 bytes."""
+    return _RING.pack(*place, 0)
+
+
+def parse_place(data: bytes, offset: int) -> RingPlace:
+    """Read the place of a ring."""
+    return RingPlace(*_RING.unpack_from(data, offset)[:5])
+
+
+PLACE_SIZE = _RING.size
 
 
 def answer_frame(key: bytes, answer: AttachAnswer) -> bytes:

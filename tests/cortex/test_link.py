@@ -34,6 +34,7 @@ from cortex.wire import (
     RingPlace,
     answer_frame,
     pack_header,
+    pack_place,
     parse_attach_key,
 )
 
@@ -76,8 +77,9 @@ class Feed:
         )
         self.subscriber.connect(self.link)
         self.key = wait_for(self._attach)
-        place = RingPlace(0, self.ring.slots, self.ring.slot_bytes, self.ring.pid, self.ring.fd)
-        answer = AttachAnswer(0, self.column, (place,), b"") if shared else AttachAnswer(0, None, (), b"")
+        self.place = RingPlace(0, self.ring.slots, self.ring.slot_bytes, self.ring.pid, self.ring.fd)
+        shown = AttachAnswer(0, self.column, (self.place,), b"")
+        answer = shown if shared else AttachAnswer(0, None, (), b"")
         self.answer = answer_frame(self.key, answer)
         self.socket.send(self.answer)
         assert self.subscriber.wait_for_publisher()
@@ -114,7 +116,8 @@ class Feed:
             assert slot >= 0, "no slot came back"
             self.ring.buffer(slot)[: len(body)] = np.frombuffer(body, np.uint8)
             self.ring.commit(slot, self.sequence, len(body), 1 << self.column)
-            return [self.header(kind, len(body), slot) + struct.pack("<Q", 1 << self.column)]
+            mask = struct.pack("<Q", 1 << self.column)
+            return [self.header(kind, len(body), slot) + mask + pack_place(self.place)]
         if kind == BATCH:
             record = RECORD.pack(0, 0, len(body), 0) + body + bytes(-len(body) % 8)
             return [self.header(kind, len(record), 1) + record]
@@ -173,7 +176,7 @@ BAD = {
     "large of another size": lambda f: [f.header(LARGE, 10), b"123"],
     "large over the limit": lambda f: [f.header(LARGE, BODY_LIMIT + 1), b"123"],
     "large that does not decode": lambda f: [f.header(LARGE, 5), b"12345"],
-    "descriptor without mask": lambda f: [f.frames(SLOT, 1)[0][:-8]],
+    "descriptor without mask": lambda f: [f.frames(SLOT, 1)[0][:-40]],
     "descriptor with more": lambda f: [f.frames(SLOT, 1)[0] + b"x"],
     "slot that does not exist": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 4)],
     "slot far outside": lambda f: [_with(f.frames(SLOT, 1)[0], 56, "<Q", 0xFFFFFFFF)],

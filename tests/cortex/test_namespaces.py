@@ -157,7 +157,7 @@ def start(place):
 
 def serve(start, host: str, *options: str) -> tuple[Process, str]:
     registry = start(host, "-m", "cortex.discovery", *options)
-    match = registry.read(r"on tcp: tcp://[0-9.]+:([0-9]+)")
+    match = registry.read(r"serves .*tcp://[0-9.]+:([0-9]+)")
     assert match, registry.said
     return registry, match[1]
 

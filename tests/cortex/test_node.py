@@ -210,7 +210,7 @@ def test_closing_ends_everything(make_node):
     ):
         with pytest.raises(Closed):
             call()
-    with pytest.raises(ConnectionError):
+    with pytest.raises(Closed):
         client.call(Number(0, 0), timeout_s=0.05)
     client.close()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 import time
 
@@ -410,3 +411,27 @@ def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     subscriber.close()
     assert done.wait(5.0)
     thread.join()
+
+
+def test_a_log_that_travels_over_cortex(node):
+    """A handler that publishes what is logged may run while a publisher has something to say."""
+    log = node.publisher("/log", Number)
+    slow = node.publisher("/numbers", Number)
+    node.subscriber("/numbers", Number, policy=reliable(1, 0.01))
+    assert slow.wait_for_subscribers()
+
+    class Handler(logging.Handler):
+        def emit(self, record):
+            said.append(record.getMessage())
+            log.publish(Number(0, len(said)))
+
+    said: list[str] = []
+    handler = Handler()
+    logging.getLogger("cortex").addHandler(handler)
+    try:
+        number = 0
+        while slow.publish(Number(0, number)):
+            number += 1
+        wait_for(lambda: any("too late" in text for text in said))
+    finally:
+        logging.getLogger("cortex").removeHandler(handler)

@@ -475,3 +475,22 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
         return not subscriber.fds()
 
     wait_for(closed, 3.0)
+
+
+def test_iteration_goes_on_after_a_mismatch(node):
+    """One publisher of another type is an error once; the others' messages still come."""
+    subscriber = node.subscriber("/numbers", Number)
+    good, bad = node.publisher("/numbers", Number), node.publisher("/numbers", OtherNumber)
+    assert good.wait_for_subscribers()
+    good.publish(Number(0, 7))
+    messages = iter(subscriber)
+    with pytest.raises(TypeMismatch):
+        next(messages)
+    assert next(messages).value == 7
+    bad.close()
+
+
+def test_messages_for_a_callback_are_not_to_be_fetched(node):
+    subscriber = node.subscriber("/numbers", Number, lambda message: None)
+    with pytest.raises(RuntimeError, match="callback"):
+        subscriber.recv(0.01)

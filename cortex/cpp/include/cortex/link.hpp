@@ -219,9 +219,19 @@ class Link {
   }
 
   void on_slot(const wire::Header& header, Span<const std::uint8_t> bytes, std::deque<Item>& queue) {
-    if (bytes.size() != wire::header_size + 8) throw MalformedMessage("a descriptor of another size");
+    if (bytes.size() != wire::header_size + 8 + wire::place_size) throw MalformedMessage("a descriptor of another size");
     const auto mask = wire::load<std::uint64_t>(bytes.data() + wire::header_size);
-    const auto ring = rings_.find(static_cast<std::uint32_t>(header.aux >> 32));
+    auto ring = rings_.find(static_cast<std::uint32_t>(header.aux >> 32));
+    if (ring == rings_.end() && column_ != wire::no_column) {
+      const wire::RingPlace place = wire::load_place(bytes.data() + wire::header_size + 8);
+      if (place.ring != header.aux >> 32) throw MalformedMessage("a descriptor that places another ring");
+      try {
+        ring = rings_.emplace(place.ring, std::make_shared<RingView>(source_, place, column_)).first;
+      } catch (const ShmUnavailable& error) {
+        go_without_memory(error.what());
+        return;
+      }
+    }
     const auto slot = static_cast<std::uint32_t>(header.aux);
     const bool leased = column_ != wire::no_column && (mask >> column_ & 1) != 0;
     if (ring == rings_.end() || !leased) {

@@ -307,12 +307,13 @@ class PublisherCore {
 
   bool send_descriptor(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size,
                        std::uint64_t mask) {
-    zmq::message_t frame(wire::header_size + 8);
+    zmq::message_t frame(wire::header_size + 8 + wire::place_size);
     auto* out = static_cast<std::uint8_t*>(frame.data());
     const std::uint64_t aux =
         static_cast<std::uint64_t>(slot.ring->number()) << 32 | static_cast<std::uint32_t>(slot.index);
     write_header(out, 'S', sequence, stamp_ns, size, aux);
     wire::store(out + wire::header_size, mask);
+    wire::store_place(out + wire::header_size + 8, slot.ring->place());
     bool on_time = true;
     bool lossy = false;
     bool strict = false;

@@ -215,6 +215,22 @@ struct AttachAnswer {
   Span<const std::uint8_t> latched;
 };
 
+constexpr std::size_t place_size = 32;
+
+inline void store_place(std::uint8_t* out, const RingPlace& ring) noexcept {
+  store(out, ring.ring);
+  store(out + 4, ring.slots);
+  store(out + 8, ring.slot_bytes);
+  store(out + 16, ring.pid);
+  store(out + 20, ring.fd);
+  store(out + 24, std::uint64_t{0});
+}
+
+inline RingPlace load_place(const std::uint8_t* at) noexcept {
+  return {load<std::uint32_t>(at), load<std::uint32_t>(at + 4), load<std::uint64_t>(at + 8),
+          load<std::uint32_t>(at + 16), load<std::int32_t>(at + 20)};
+}
+
 inline std::string pack_answer(const std::string& key, const AttachAnswer& answer) {
   std::string frame(header_size + 32 * answer.rings.size(), '\0');
   std::memcpy(frame.data(), key.data(), key_size);
@@ -225,12 +241,8 @@ inline std::string pack_answer(const std::string& key, const AttachAnswer& answe
   store(out + 16, static_cast<std::uint64_t>(answer.latched.size()));
   out += 32;
   for (const auto& ring : answer.rings) {
-    store(out, ring.ring);
-    store(out + 4, ring.slots);
-    store(out + 8, ring.slot_bytes);
-    store(out + 16, ring.pid);
-    store(out + 20, ring.fd);
-    out += 32;
+    store_place(out, ring);
+    out += place_size;
   }
   frame.append(reinterpret_cast<const char*>(answer.latched.data()), answer.latched.size());
   return frame;
@@ -253,8 +265,7 @@ inline AttachAnswer read_answer(Span<const std::uint8_t> frame) {
   }
   at += 32;
   for (std::uint32_t index = 0; index < rings; ++index, at += 32) {
-    answer.rings.push_back({load<std::uint32_t>(at), load<std::uint32_t>(at + 4), load<std::uint64_t>(at + 8),
-                            load<std::uint32_t>(at + 16), load<std::int32_t>(at + 20)});
+    answer.rings.push_back(load_place(at));
   }
   answer.latched = {at, static_cast<std::size_t>(latched)};
   return answer;
