@@ -6,6 +6,7 @@ import csv
 import importlib.metadata
 import os
 import platform
+import textwrap
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -38,7 +39,7 @@ def header() -> list[str]:
     return [
         f"cortex bench, {datetime.now().astimezone():%Y-%m-%d %H:%M %Z}",
         f"{os.cpu_count()} cores, {_processor()}, {platform.system()} {platform.release()}, load {load}",
-        ", ".join(versions),
+        *textwrap.wrap(", ".join(versions), WIDTH),
     ]
 
 

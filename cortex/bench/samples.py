@@ -1,4 +1,3 @@
-
 """The messages that the benchmark sends."""
 
 from cortex.message import Array, message
