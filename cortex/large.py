@@ -235,7 +235,7 @@ class LargeSender:
         backoff, began_s = Backoff(self._timeout_s), time.monotonic()
         while self.grant(ring)[1]:
             if ring is not None and not self._worth_waiting(ring, time.monotonic() - began_s):
-                return False
+                return not self.grant(ring)[1]  # it may have made room since we looked
             self._outlets.lock.release()
             try:
                 more = backoff.wait()

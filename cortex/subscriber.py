@@ -242,7 +242,8 @@ class Subscriber(Generic[T]):
             if self._problems:
                 raise self._problems.popleft()
             if not self.policy.reliable and (
-                self.policy.depth < DRAIN_MAX
+                not queue
+                or self.policy.depth < DRAIN_MAX
                 or not self._exhausted
                 or monotonic_ns() - self._drained_ns > FRESH_NS
             ):

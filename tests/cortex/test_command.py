@@ -434,7 +434,7 @@ def test_playing_can_be_interrupted(make_node: MakeNode, tmp_path: Path) -> None
         ("play {}/run.mcap --start 9 --registry off", "cortex play: no message from 9 s to the end; {}/run"),
         ("topics --keys {}/none", "cortex topics: {}/none/key.secret does not exist: make keys with "),
         ("topics --domain 233", "cortex topics: domain must be an integer from 0 to 232, got 233"),
-        ("cpp test_command:Mode", "cortex cpp: Mode is an enum, which comes with the messages that use it: name"),
+        ("cpp test_command:Mode", "cortex cpp: Mode is an enum, which comes with the messages that use it"),
         ("topics --registry off --listen 0.0.0.0", "cortex topics: plain tcp on tcp://0.0.0.0:0 would be"),
         ("cpp peer:Missing", "cortex cpp: peer has no message type Missing; it has "),
         ("cpp no_such_module:Scan", "cortex cpp: there is no module no_such_module here or on the "),
