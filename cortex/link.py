@@ -97,7 +97,6 @@ class Link:
         self.expected = -1
         self.attached = False
         self.whole_batches = False
-        self.exhausted = True
         self.clock_offset_ns = clock_offset_ns
         """What to add to this publisher's clock to read it on ours [ns]."""
         self._policy = policy

@@ -13,7 +13,7 @@ import zmq
 
 from cortex.context import context, new_socket
 from cortex.host import NodeFiles
-from cortex.outlet import Outlet, Outlets, open_outlet
+from cortex.outlet import Outlets, open_outlet
 from cortex.records import Endpoint, NodeRecord
 from cortex.security import Authenticator, Keys, apply_client, apply_server, check_address
 
@@ -207,6 +207,3 @@ def _outward_address() -> str:
             return str(probe.getsockname()[0])
         except OSError:
             return "127.0.0.1"
-
-
-__all__ = ["Outlet", "Places", "Reach", "clock_offset_ns", "reach"]
