@@ -1,4 +1,4 @@
-"""The command `neurosim`: run | scene | view | bench."""
+"""The command `neurosim`: run | serve | fly | view | up | call | scene | bench."""
 
 from __future__ import annotations
 
@@ -65,14 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="fly, record, and draw a picture of it")
-    run.add_argument(
-        "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
-    )
-    run.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
-    run.add_argument("--seed", type=int, help="seed of the sensor noise")
-    run.add_argument("--device", help="auto, cpu, cuda:0, ...")
-    run.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-                     help="any setting by its dotted key, such as scene.seed=3; may be repeated")  # fmt: skip
+    _add_settings(run)
     run.add_argument(
         "--out", type=Path, metavar="DIR", help="where to leave the flight (default: ./flight, flight-2, ...)"
     )
@@ -83,6 +76,55 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
 
+    serve = commands.add_parser("serve", help="simulate for controllers in other processes, over Cortex")
+    _add_settings(serve)
+    _add_live(serve)
+    serve.set_defaults(command=_serve)
+
+    fly = commands.add_parser("fly", help="the controller that follows the path, as a process of its own")
+    _add_settings(fly)
+    fly.add_argument("--vehicle", metavar="NAME", help="fly only this one (default: all)")
+    fly.add_argument(
+        "--mode",
+        default="motor_speeds",
+        choices=["motor_speeds", "velocity", "position"],
+        help="what to command (default: motor_speeds)",
+    )
+    fly.add_argument(
+        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
+    )
+    fly.set_defaults(command=_fly)
+
+    up = commands.add_parser("up", help="simulator, controller and viewer together; Ctrl-C ends all")
+    _add_settings(up)
+    _add_live(up)
+    up.add_argument(
+        "--viewer",
+        default="auto",
+        metavar="HOW",
+        help="native, web, none, or a .rrd file; auto: native where there is a display, else web",
+    )
+    up.set_defaults(command=_up)
+
+    call = commands.add_parser("call", help="control a running simulator: reset, step, pause, resume, set")
+    requests = call.add_subparsers(required=True, metavar="WHAT", dest="what")
+    reset = requests.add_parser("reset", help="begin again at stamp 0")
+    reset.add_argument("--seed", type=int, help="seed of all noise (default: as configured)")
+    reset.add_argument("--vehicle", default="", metavar="NAME", help="which one starts elsewhere")
+    reset.add_argument("--position", type=float, nargs=3, metavar=("X", "Y", "Z"), help="in the world [m]")
+    step = requests.add_parser("step", help="let a paused run go on for some control periods")
+    step.add_argument("count", type=int, nargs="?", default=1)
+    requests.add_parser("pause", help="stop time")
+    requests.add_parser("resume", help="let time go on")
+    change = requests.add_parser("set", help="change settings while it runs")
+    change.add_argument(
+        "settings", nargs="+", metavar="KEY=VALUE", help="such as links.command.latency_s=0.008"
+    )
+    requests.add_parser("status", help="print how it is doing")
+    for request in requests.choices.values():
+        request.add_argument("--timeout", type=float, default=10.0, metavar="S", help="wait at most [s]")
+    call.set_defaults(command=_call)
+
     scene = commands.add_parser("scene", help="say what is in a scene file, and draw it")
     scene.add_argument("file", type=Path, help="glTF, GLB, OBJ, PLY or STL")
     scene.add_argument(
@@ -90,12 +132,28 @@ def _parser() -> argparse.ArgumentParser:
     )
     scene.set_defaults(command=_scene)
 
-    view = commands.add_parser("view", help="look at a flight in Rerun")
-    view.add_argument("flight", type=Path, help="folder that `neurosim run` left, or a flight.h5")
+    view = commands.add_parser("view", help="look at a running simulator, or at a flight, in Rerun")
+    view.add_argument(
+        "flight",
+        nargs="?",
+        type=Path,
+        help="folder that `neurosim run` left, or a flight.h5; default: what runs now",
+    )
     view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(
-        "--save", type=Path, metavar="RRD", help="write the Rerun file instead of opening a window"
+        "--save", type=Path, metavar="RRD", help="write a Rerun file instead of opening a window"
     )
+    view.add_argument(
+        "--only", metavar="NAMES", help="live: show only these sensors, such as events,imu; others stay off"
+    )
+    view.add_argument(
+        "--event-window", type=float, default=0.02, metavar="S", help="time in one picture of events [s]"
+    )
+    view.add_argument(
+        "--image-rate", type=float, default=15.0, metavar="HZ", help="live: most pictures a second [Hz]"
+    )
+    view.add_argument("--port", type=int, default=0, help="live, --web: port of the page (default: any)")
+    view.add_argument("--no-browser", action="store_true", help="live, --web: print the address only")
     view.set_defaults(command=_view)
 
     bench = commands.add_parser("bench", help="measure speed on this machine")
@@ -114,9 +172,36 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    from neurosim_core.config import load_config, to_yaml
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    """What decides about a run."""
+    parser.add_argument(
+        "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
+    parser.add_argument("--seed", type=int, help="seed of the sensor noise")
+    parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+                     help="any setting by its dotted key, such as scene.seed=3; may be repeated")  # fmt: skip
 
+
+def _add_live(parser: argparse.ArgumentParser) -> None:
+    """What a simulator needs to know besides."""
+    parser.add_argument(
+        "--lockstep", action="store_true", help="wait for the command of every control period"
+    )
+    parser.add_argument(
+        "--factor", type=float, metavar="F", help="real-time factor; 0: as fast as it can (default: 1)"
+    )
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record everything to DIR/flight.h5")
+    parser.add_argument("--overwrite", action="store_true", help="replace a flight that is already there")
+
+
+def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Settings of the command line, by dotted key.
+
+    Raises:
+        ValueError: One is not KEY=VALUE.
+    """
     overrides: dict[str, Any] = {}
     for setting in arguments.settings:
         key, separator, text = setting.partition("=")
@@ -130,7 +215,25 @@ def _run(arguments: argparse.Namespace) -> int:
     ):
         if value is not None:
             overrides[key] = value
-    config = load_config(arguments.config, overrides=overrides)
+    return overrides
+
+
+def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
+    """As `_overrides`, with what `_add_live` added."""
+    overrides = _overrides(arguments)
+    if arguments.lockstep:
+        overrides["live.mode"] = "lockstep"
+    if arguments.factor is not None:
+        overrides["live.real_time_factor"] = arguments.factor
+    if arguments.duration is not None:
+        overrides["live.run_on"] = False
+    return overrides
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from neurosim_core.config import load_config, to_yaml
+
+    config = load_config(arguments.config, overrides=_overrides(arguments))
     if arguments.print_config:
         print(to_yaml(config, comments=True), end="")
         return 0
@@ -140,6 +243,38 @@ def _run(arguments: argparse.Namespace) -> int:
     folder = new_folder(arguments.out, overwrite=arguments.overwrite)
     report = fly(config, folder, rerun=not arguments.no_rrd)
     return 130 if report.interrupted else 0
+
+
+def _serve(arguments: argparse.Namespace) -> int:
+    from neurosim_core.config import load_config
+    from neurosim_core.nodes.simulator import serve
+
+    config = load_config(arguments.config, overrides=_live_overrides(arguments))
+    return serve(config, record=arguments.record, overwrite=arguments.overwrite)
+
+
+def _fly(arguments: argparse.Namespace) -> int:
+    from neurosim_core.config import load_config
+    from neurosim_core.nodes.controller import fly
+
+    overrides = _overrides(arguments)
+    given = arguments.config is not None or overrides
+    config = load_config(arguments.config, overrides=overrides) if given else None
+    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
+
+
+def _up(arguments: argparse.Namespace) -> int:
+    from neurosim_core.config import load_config
+    from neurosim_core.nodes.stack import up
+
+    config = load_config(arguments.config, overrides=_live_overrides(arguments))
+    return up(config, viewer=arguments.viewer, record=arguments.record, overwrite=arguments.overwrite)
+
+
+def _call(arguments: argparse.Namespace) -> int:
+    from neurosim_core.nodes.call import call
+
+    return call(arguments)
 
 
 def _scene(arguments: argparse.Namespace) -> int:
@@ -167,6 +302,18 @@ def _bench(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    if arguments.flight is None:
+        from neurosim_core.nodes.viewer import view
+
+        return view(
+            how="save" if arguments.save else "web" if arguments.web else "native",
+            save=arguments.save,
+            only=None if arguments.only is None else arguments.only.split(","),
+            event_window_s=arguments.event_window,
+            image_rate_hz=arguments.image_rate,
+            port=arguments.port,
+            open_browser=not arguments.no_browser,
+        )
     from neurosim_core.flight import rerun_file
 
     file = rerun_file(arguments.flight, save=arguments.save)

@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from neurosim_core.control import Se3Config
+from neurosim_core.live import LinkConfig, LiveConfig
 from neurosim_core.render.renderer import RenderConfig, RendererName
 from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
@@ -88,6 +89,34 @@ def _default_sensors() -> dict[str, SensorConfig]:
 
 
 SceneConfig = Annotated[ApartmentConfig | MeshSceneConfig, Field(discriminator="kind")]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Sensors = dict[Name, SensorConfig]
+Links = dict[Name, LinkConfig]
+
+STREAMS = ("odometry", "rotor_speeds", "command")
+"""Links that every vehicle has besides those of its sensors."""
+_RESERVED = {
+    "collision": "collision reports",
+    "command": "commands",
+    "path": "the planned path",
+    "rotor_speeds": "the speeds of the rotors",
+}
+_SEED_STRIDE = 0x9E3779B97F4A7C15
+
+
+class FleetMember(Settings):
+    """One of several vehicles: what differs from the settings of the same name above it."""
+
+    vehicle: VehicleConfig | None = None
+    """The multirotor; null: the common one."""
+    path: PathConfig | None = None
+    """Where it flies; null: as the common one, a tour with a seed of its own."""
+    control: ControlConfig | None = None
+    """What flies it; null: as the common one."""
+    sensors: Sensors | None = None
+    """Its sensors; null: the common ones."""
+    links: Links | None = None
+    """Its links; null: the common ones."""
 
 
 class SimulationConfig(Settings):
@@ -116,11 +145,19 @@ class SimulationConfig(Settings):
     """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...}."""
     control: ControlConfig = ControlConfig()
     """What flies it."""
-    sensors: dict[Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")], SensorConfig] = Field(
-        default_factory=_default_sensors
-    )
+    sensors: Sensors = Field(default_factory=_default_sensors)
     """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
     exist."""
+    vehicles: Annotated[dict[Name, FleetMember], Field(min_length=1)] = Field(
+        default_factory=lambda: {"drone": FleetMember()}
+    )
+    """Vehicles by name. Several share the scene (`neurosim up`); they do not see each other. {drone: {}} is
+    one, with the settings above."""
+    live: LiveConfig = LiveConfig()
+    """How `neurosim serve` lets time pass."""
+    links: Links = Field(default_factory=dict)
+    """Simulated links of `neurosim serve` by what travels on them: the name of a sensor, odometry,
+    rotor_speeds or command, such as {command: {latency_s: 0.008}}."""
 
     @model_validator(mode="after")
     def _path_keeps_off_the_scene(self) -> SimulationConfig:
@@ -135,9 +172,55 @@ class SimulationConfig(Settings):
     @field_validator("sensors")
     @classmethod
     def _no_reserved_name(cls, sensors: dict[str, SensorConfig]) -> dict[str, SensorConfig]:
-        if "collision" in sensors:
-            raise ValueError("the sensor name 'collision' is taken by collision reports")
+        for name, sensor in sensors.items():
+            if name in _RESERVED:
+                raise ValueError(f"the sensor name {name!r} is taken by {_RESERVED[name]}")
+            if name == "odometry" and sensor.kind != "odometry":
+                raise ValueError(f"a sensor named 'odometry' must be of kind odometry, got {sensor.kind}")
         return sensors
+
+    @model_validator(mode="after")
+    def _links_have_ends(self) -> SimulationConfig:
+        for name, member in self.vehicles.items():
+            if member.control is not None and member.control.rate_hz != self.control.rate_hz:
+                raise ValueError(
+                    f"vehicles.{name}.control.rate_hz must be that of all, {self.control.rate_hz:g}, "
+                    f"got {member.control.rate_hz:g}"
+                )
+            sensors = self.sensors if member.sensors is None else member.sensors
+            self._no_reserved_name(sensors)
+            for link, settings in (self.links if member.links is None else member.links).items():
+                if link not in {*sensors, *STREAMS}:
+                    known = ", ".join(dict.fromkeys([*sensors, *STREAMS]))
+                    raise ValueError(f"links.{link}: vehicle {name!r} has no such link, known: {known}")
+                if link == "command" and (settings.clock_offset_s or settings.clock_drift_ppm):
+                    raise ValueError("links.command: a command has no clock of its own to be set off")
+        return self
+
+    def of(self, name: str) -> SimulationConfig:
+        """Return the settings of one vehicle, with all that differs from the common ones put in place.
+
+        The first vehicle keeps the seed, further ones get seeds of their own.
+
+        Raises:
+            KeyError: There is no vehicle of this name.
+        """
+        if name not in self.vehicles:
+            raise KeyError(f"unknown vehicle {name!r}, known: {', '.join(self.vehicles)}")
+        index = list(self.vehicles).index(name)
+        member = self.vehicles[name]
+        changes: dict[str, Any] = {
+            key: value for key in FleetMember.model_fields if (value := getattr(member, key)) is not None
+        }
+        if member.path is None and isinstance(self.path, TourConfig):
+            changes["path"] = self.path.model_copy(update={"seed": self.path.seed + index})
+        return self.model_copy(
+            update={
+                **changes,
+                "seed": (self.seed + index * _SEED_STRIDE) % 2**63,
+                "vehicles": {name: FleetMember()},
+            }
+        )
 
 
 def load_config(

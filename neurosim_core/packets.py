@@ -123,3 +123,13 @@ class Collision(Packet):
     """p_WB at the stamp [m], shape [3]."""
     clearance_m: float
     """Distance from the vehicle's centre to the nearest surface, minus its radius [m]; <= 0."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Delivery(Packet):
+    """What a simulated link did to one message; `sensor` is "<link>_link", `stamp_ns` when it was sent."""
+
+    delivered_ns: int
+    """When it arrives [ns]; -1: never."""
+    size_bytes: int
+    """Its size, as far as it takes bandwidth [bytes]."""

@@ -17,13 +17,25 @@ from cortex.messages.commands import (
 )
 from cortex.messages.sensors import CameraInfo, Events, Image, Imu, PointCloud
 from cortex.messages.session import Clock, Parameter, Parameters, Text
-from cortex.messages.state import Collision, Odometry, RotorSpeeds, Transform
+from cortex.messages.simulation import (
+    Delivery,
+    Reset,
+    SensorStatus,
+    Simulation,
+    SimulatorReply,
+    SimulatorStatus,
+    Step,
+    Trigger,
+    VehicleStatus,
+)
+from cortex.messages.state import Collision, Odometry, Path, RotorSpeeds, Transform
 
 __all__ = [
     "AttitudeCommand",
     "CameraInfo",
     "Clock",
     "Collision",
+    "Delivery",
     "Events",
     "Image",
     "Imu",
@@ -31,11 +43,20 @@ __all__ = [
     "Odometry",
     "Parameter",
     "Parameters",
+    "Path",
     "PointCloud",
     "PoseCommand",
     "RateThrustCommand",
+    "Reset",
     "RotorSpeeds",
+    "SensorStatus",
+    "Simulation",
+    "SimulatorReply",
+    "SimulatorStatus",
+    "Step",
     "Text",
     "Transform",
+    "Trigger",
+    "VehicleStatus",
     "VelocityCommand",
 ]

@@ -67,3 +67,19 @@ class Transform:
     """q_PC, xyzw, shape [4]."""
     sequence: UInt64 = 0
     """Counts the transforms of one sender from 0."""
+
+
+@message(name="cortex/Path")
+class Path:
+    """Where a vehicle is meant to fly."""
+
+    stamp_ns: Annotated[int, Unit("ns")]
+    """From when on it holds [ns]."""
+    time_ns: Annotated[Array["int64", "n"], Unit("ns")]
+    """When the vehicle is meant to be where [ns], shape [n]."""
+    position: Annotated[Array["float64", "n", 3], Unit("m", frame="world")]
+    """p_WB [m], shape [n, 3]."""
+    frame_id: str = ""
+    """Name of the world frame."""
+    sequence: UInt64 = 0
+    """Counts the paths of one sender from 0."""

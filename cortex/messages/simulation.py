@@ -1,0 +1,164 @@
+"""How a simulator is controlled, and what it says of itself."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from cortex.message import Array, Int64, UInt32, UInt64, Unit, message
+
+
+@message(name="cortex/Simulation")
+class Simulation:
+    """What does not change during a run; published once, for those who come later too."""
+
+    config: str
+    """All settings as YAML."""
+    version: str
+    """Version of the simulator."""
+    vehicles: list[str]
+    """Names of the vehicles; their topics begin with them."""
+    mode: str
+    """"lockstep" or "streaming"."""
+    control_rate_hz: Annotated[float, Unit("Hz")]
+    """Control periods a second [Hz]."""
+
+
+@message(name="cortex/Trigger")
+class Trigger:
+    """A request that needs no arguments: pause, resume."""
+
+    sequence: UInt64 = 0
+    """Counts the requests of one sender from 0."""
+
+
+@message(name="cortex/Reset")
+class Reset:
+    """Begin again at stamp 0; what is not given is as configured."""
+
+    seed: Int64 | None = None
+    """Seed of all noise."""
+    vehicle: str = ""
+    """Which vehicle starts elsewhere; empty: the only one."""
+    position: Annotated[Array["float64", 3], Unit("m", frame="world")] | None = None
+    """p_WB [m], shape [3]."""
+    orientation: Array["float64", 4] | None = None
+    """q_WB, xyzw, shape [4]."""
+    velocity: Annotated[Array["float64", 3], Unit("m/s", frame="world")] | None = None
+    """v_WB in the world frame [m/s], shape [3]."""
+    body_rate: Annotated[Array["float64", 3], Unit("rad/s", frame="body")] | None = None
+    """w_WB in the body frame [rad/s], shape [3]."""
+
+
+@message(name="cortex/Step")
+class Step:
+    """Let a paused run go on for some control periods; the answer comes when they are over."""
+
+    count: UInt32 = 1
+    """Control periods."""
+
+
+@message(name="cortex/SimulatorReply")
+class SimulatorReply:
+    """What a simulator answers to every request."""
+
+    accepted: bool
+    """Whether it did what was asked."""
+    reason: str
+    """Why not; empty if it did."""
+    stamp_ns: Annotated[int, Unit("ns")]
+    """Simulation time [ns]."""
+    phase: str
+    """As in `SimulatorStatus`."""
+
+
+@message(name="cortex/SensorStatus")
+class SensorStatus:
+    """One sensor of a vehicle."""
+
+    vehicle: str
+    name: str
+    active: bool
+    """Whether it is computed: somebody subscribes or records."""
+    subscriber_count: UInt32
+    published_count: UInt64
+    """Messages since the beginning of the run."""
+    dropped_count: UInt64
+    """Frames that were not rendered, because the machine was too slow, and messages that a link lost."""
+    injected_lost_count: UInt64 = 0
+    """Of these, messages that a link lost as configured."""
+
+
+@message(name="cortex/VehicleStatus")
+class VehicleStatus:
+    """How one vehicle is commanded."""
+
+    name: str
+    command_mode: str
+    """Mode of the command that holds; empty before the first one."""
+    command_count: UInt64
+    """Commands taken over."""
+    refused_count: UInt64
+    """Commands with numbers that are not finite, or of a wrong shape."""
+    superseded_count: UInt64
+    """Commands that a newer one replaced before they were due."""
+    lost_count: UInt64
+    """Commands that Cortex lost on the way, or a link as configured."""
+    command_age_ns: Annotated[int, Unit("ns")]
+    """Simulation time since the command that holds was taken over [ns]."""
+    fail_safe: bool
+    """Whether the command is stale, and the fail-safe flies."""
+    fail_safe_count: UInt64
+    """How often it set in."""
+    collision_count: UInt64
+
+
+@message(name="cortex/SimulatorStatus")
+class SimulatorStatus:
+    """How a simulator is doing; about five times a second, and when its phase changes."""
+
+    stamp_ns: Annotated[int, Unit("ns")]
+    """Simulation time [ns]."""
+    wall_ns: Annotated[int, Unit("ns", frame="CLOCK_REALTIME")]
+    """Wall-clock time, since 1970 [ns]."""
+    phase: str
+    """"waiting" for a first or a late command, "running", "paused" or "ended"."""
+    reason: str
+    """Why it waits or has ended; empty if there is nothing to say."""
+    mode: str
+    """"lockstep" or "streaming"."""
+    real_time_factor_wanted: float
+    """0: as fast as it can."""
+    real_time_factor: float
+    """Simulated over wall-clock time since the status before."""
+    step_count: UInt64
+    """Control periods since the beginning of the run."""
+    step_median_ns: Annotated[int, Unit("ns")]
+    """Wall-clock time to compute one, median since the status before [ns]."""
+    step_p99_ns: Annotated[int, Unit("ns")]
+    """Its 99th percentile [ns]."""
+    late_median_ns: Annotated[int, Unit("ns")]
+    """How late the wall clock was at the ends of control periods [ns]; 0 when time is not paced."""
+    late_p99_ns: Annotated[int, Unit("ns")]
+    """Its 99th percentile [ns]."""
+    overrun_count: UInt64
+    """Control periods that took longer than they had, since the beginning of the run."""
+    slipped_ns: Annotated[int, Unit("ns")]
+    """Wall-clock time by which the run has been held back, since its beginning [ns]."""
+    sensors: list[SensorStatus]
+    vehicles: list[VehicleStatus]
+    sequence: UInt64 = 0
+    """Counts the messages of one simulator from 0."""
+
+
+@message(name="cortex/Delivery")
+class Delivery:
+    """What a simulated link did to one message; of fixed size."""
+
+    stamp_ns: Annotated[int, Unit("ns")]
+    """When the message was sent [ns]."""
+    delivered_ns: Annotated[int, Unit("ns")]
+    """When it arrives [ns]; -1: never."""
+    size_bytes: UInt64
+    """Its size, as far as it takes bandwidth [bytes]."""
+    sequence: UInt64 = 0
+    """Counts the messages of the link from 0."""

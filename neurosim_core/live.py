@@ -1,0 +1,71 @@
+"""Settings of a simulator that flies for controllers outside of its process (`neurosim serve`)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from neurosim_core.settings import Settings
+
+LiveMode = Literal["lockstep", "streaming"]
+FailSafe = Literal["hover", "cut", "hold"]
+
+Seconds = Annotated[float, Field(ge=0.0, le=1e6)]
+
+
+class LiveConfig(Settings):
+    """How time passes, and what happens when a controller or the machine is too slow."""
+
+    mode: LiveMode = "streaming"
+    """streaming: time goes on whether commands come or not, and each is held until the next. lockstep: every
+    control period waits for its command, so a flight is the same to the last bit on any machine."""
+    real_time_factor: Annotated[float, Field(ge=0.0, le=1000.0)] = 1.0
+    """streaming: how much faster than the wall clock time passes; 0: as fast as it can."""
+    overrun: Literal["slow", "drop"] = "slow"
+    """streaming: what gives way when the machine is too slow. slow: time; drop: camera frames. Both are
+    counted in /status."""
+    command_timeout_s: Annotated[float, Field(gt=0.0, le=1e6)] = 0.2
+    """A command older than this is stale [simulated s], and the fail-safe takes over until the next one."""
+    fail_safe: FailSafe = "hover"
+    """hover: stay where the command became stale; cut: rotors at their lowest speed; hold: keep the stale
+    command."""
+    command_deadline_s: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
+    """lockstep: how long to wait for a command before the run ends with an error [wall-clock s]. The first
+    command of a run is waited for without limit."""
+    command_every: Annotated[int, Field(ge=1)] = 1
+    """lockstep: control periods for each command; 4 with a control rate of 200 Hz waits for 50 commands a
+    second, and the inner loops still run at 200 Hz."""
+    run_on: bool = True
+    """Go on after `duration_s`, until stopped. false: end there."""
+
+
+class LinkConfig(Settings):
+    """What a message meets between the simulator and its controller, in simulated time; seeded.
+
+    Messages of a link stay in their order: one that is held up holds up those behind it.
+    """
+
+    latency_s: Seconds = 0.0
+    """Delay of every message [s]."""
+    jitter_s: Seconds = 0.0
+    """Further delay, uniform in [0, jitter_s] [s]."""
+    loss: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Share of messages that never arrive."""
+    bandwidth_bytes_s: Annotated[float, Field(gt=0.0)] | None = None
+    """Bytes a second; a message occupies the link for its size over this. null: unlimited."""
+    clock_offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    """What the sensor's clock is ahead of simulated time at stamp 0 [s]; not for `command`."""
+    clock_drift_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
+    """How much faster the sensor's clock runs [1e-6]; not for `command`."""
+
+    @property
+    def delivers_at_once(self) -> bool:
+        """Whether messages arrive when they are sent, all of them."""
+        return not (self.latency_s or self.jitter_s or self.loss or self.bandwidth_bytes_s)
+
+    def clock_ns(self, stamp_ns: int) -> int:
+        """Return what the sensor's clock shows at a simulated time [ns], exact to the nearest nanosecond."""
+        if not (self.clock_offset_s or self.clock_drift_ppm):
+            return stamp_ns
+        return stamp_ns + round(self.clock_offset_s * 1e9) + round(stamp_ns * (self.clock_drift_ppm * 1e-6))

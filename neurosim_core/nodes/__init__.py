@@ -1,0 +1,1 @@
+"""The processes of the live stack, which talk over Cortex. Only modules in here import it."""

@@ -1,0 +1,94 @@
+"""Names of topics, services and frames.
+
+/simulation                       Simulation: settings, vehicles (latched)
+/status                           SimulatorStatus, five times a second
+/clock                            Clock, at every control tick
+/VEHICLE/odometry                 Odometry at every control tick, and at those of the sensor (latched)
+/VEHICLE/rotor_speeds             RotorSpeeds with it (latched)
+/VEHICLE/path                     Path, as planned (latched)
+/VEHICLE/collision                Collision
+/VEHICLE/SENSOR                   Events, Image, Imu or Odometry
+/VEHICLE/SENSOR/info              CameraInfo of a camera (latched)
+/VEHICLE/SENSOR/transform         Transform: where the sensor sits (latched)
+/VEHICLE/LINK/delivery            Delivery: what a simulated link did to each message
+/VEHICLE/command/MODE             what the vehicle is told to do; see COMMANDS
+/reset /step /pause /resume /set_parameters    services; see SERVICES
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cortex.messages import (
+    AttitudeCommand,
+    MotorCommand,
+    Parameters,
+    PoseCommand,
+    RateThrustCommand,
+    Reset,
+    SimulatorReply,
+    Step,
+    Trigger,
+    VelocityCommand,
+)
+
+SIMULATION = "/simulation"
+STATUS = "/status"
+CLOCK = "/clock"
+
+WORLD_FRAME = "world"
+
+COMMANDS: dict[str, type[Any]] = {
+    "motor_speeds": MotorCommand,
+    "rates": RateThrustCommand,
+    "attitude": AttitudeCommand,
+    "velocity": VelocityCommand,
+    "position": PoseCommand,
+}
+"""The message of each command mode that comes over Cortex; modes as in `control.modes.MODES`."""
+
+SERVICES: dict[str, tuple[type[Any], type[Any]]] = {
+    "/reset": (Reset, SimulatorReply),
+    "/step": (Step, SimulatorReply),
+    "/pause": (Trigger, SimulatorReply),
+    "/resume": (Trigger, SimulatorReply),
+    "/set_parameters": (Parameters, SimulatorReply),
+}
+"""Request and reply of each service."""
+
+
+def stream_topic(vehicle: str, name: str) -> str:
+    """Topic of a sensor, or of odometry, rotor_speeds, path, collision."""
+    return f"/{vehicle}/{name}"
+
+
+def info_topic(vehicle: str, sensor: str) -> str:
+    """Topic of the calibration of a camera."""
+    return f"/{vehicle}/{sensor}/info"
+
+
+def transform_topic(vehicle: str, sensor: str) -> str:
+    """Topic of where a sensor sits."""
+    return f"/{vehicle}/{sensor}/transform"
+
+
+def delivery_topic(vehicle: str, link: str) -> str:
+    """Topic of what a simulated link does."""
+    return f"/{vehicle}/{link}/delivery"
+
+
+def command_topic(vehicle: str, mode: str) -> str:
+    """Topic of the commands of one mode."""
+    return f"/{vehicle}/command/{mode}"
+
+
+def body_frame(vehicle: str) -> str:
+    """Name of a vehicle's body frame."""
+    return f"{vehicle}/base_link"
+
+
+def sensor_frame(vehicle: str, sensor: str, kind: str) -> str:
+    """Name of a sensor's frame; that of a camera is its optical frame, that of odometry the body."""
+    if kind == "odometry":
+        return body_frame(vehicle)
+    return f"{vehicle}/{sensor}" if kind == "imu" else f"{vehicle}/{sensor}_optical_frame"
