@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-PEER = Path(__file__).with_name("peer.py")
+PEER = ROOT / "tests" / "cortex" / "peer.py"
 SOON_S = 15.0
 """Deadline of what takes milliseconds, on a machine that does a lot besides."""
 

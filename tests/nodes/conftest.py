@@ -1,0 +1,7 @@
+"""Fixtures for tests of the live stack."""
+
+from __future__ import annotations
+
+from runtime_directory import runtime
+
+__all__ = ["runtime"]

@@ -1,0 +1,64 @@
+"""The fixture `runtime`: a directory of its own for the nodes of a test, and a check that nothing is left."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes import processes_with, shared_mappings, wait_for
+from zmq.utils.garbage import GarbageCollectorThread
+
+from cortex.host import REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET, sweep
+
+
+def _shared_files() -> set[str]:
+    return {name for name in os.listdir("/dev/shm") if "cortex" in name.lower() or "ctx" in name.lower()}
+
+
+def _threads() -> set[threading.Thread]:
+    """Threads, without the one that pyzmq starts with the first message that it sends without a copy."""
+    return {thread for thread in threading.enumerate() if not isinstance(thread, GarbageCollectorThread)}
+
+
+@pytest.fixture
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A runtime directory for the test; afterwards no process, thread, memory or file of it is left."""
+    base = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(base))
+    monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
+    threads, files = _threads(), _shared_files()
+    try:
+        yield base
+        _end_registries(base)
+        wait_for(lambda: not _threads() - threads)
+        gc.collect()
+        wait_for(lambda: not shared_mappings(), 5.0)
+        assert not _shared_files() - files
+        for domain in base.iterdir():
+            sweep(
+                domain
+            )  # of nodes that were killed; what is left then belongs to a node that was not closed
+            left = {path.name for path in domain.iterdir()}
+            assert left <= {REGISTRY_LOCK, REGISTRY_LOG, REGISTRY_SOCKET}
+    finally:
+        for pid in processes_with(str(base)):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        shutil.rmtree(base, ignore_errors=True)
+
+
+def _end_registries(base: Path) -> None:
+    """End the registries, which would wait for two seconds; anything else that still runs is a failure."""
+    for lock in base.glob(f"*/{REGISTRY_LOCK}"):
+        text = lock.read_text()
+        if text and int(text) in processes_with(str(base)):
+            os.kill(int(text), signal.SIGTERM)
+    wait_for(lambda: not processes_with(str(base)))
