@@ -10,6 +10,7 @@ import warp as wp
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
+from neurosim_core.render.synthetic_renderer import SyntheticRenderer, SyntheticScene
 from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer
 from neurosim_core.render.warp_renderer import upload_scene as upload_warp_scene
 from neurosim_core.scene.scene import Scene
@@ -24,10 +25,10 @@ __all__ = [
     "upload_scene",
 ]
 
-RendererName = Literal["warp", "pyrender"]
+RendererName = Literal["warp", "pyrender", "synthetic"]
 """Names of the renderers."""
 
-SceneOnDevice = SceneArrays | PyrenderScene
+SceneOnDevice = SceneArrays | PyrenderScene | SyntheticScene
 """A scene as one of the renderers keeps it, shared by all cameras."""
 
 
@@ -73,12 +74,15 @@ def upload_scene(
         config: Light, exposure and the like.
         device: Where Warp renders, and where light is baked.
         renderer: `warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only.
+            `synthetic`: a test card that costs next to nothing, on CPU and CUDA; the scene is not seen.
 
     Raises:
         PyrenderError: pyrender cannot be used here.
     """
     if renderer == "pyrender":
         return upload_pyrender_scene(scene, config, device=device)
+    if renderer == "synthetic":
+        return SyntheticScene(scene=scene, config=config, device=device)
     return upload_warp_scene(scene, config, device=device)
 
 
@@ -104,4 +108,8 @@ def make_renderer(
     """
     if isinstance(scene, PyrenderScene):
         return PyrenderRenderer(scene, lens, outputs=outputs, image_count=image_count)
+    if isinstance(scene, SyntheticScene):
+        return SyntheticRenderer(
+            scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count
+        )
     return WarpRenderer(scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count)
