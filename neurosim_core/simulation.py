@@ -8,6 +8,9 @@ scans them in one launch, and everything is read back once.
 On a CUDA device `run_model` launches the next batch before it reads one back, so the device always has work.
 Each batch under way has a lane: slots of the trace and buffers of the casts that no other batch writes to.
 What was launched beyond the end of a run is never read.
+
+Who commands from outside goes from one control period to the next: `step` flies one and returns its packets;
+`fly_period` flies one and leaves the cameras to another thread, which calls `see` or `skip` for its batches.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
@@ -27,8 +30,8 @@ from numpy.typing import ArrayLike
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig, load_config
-from neurosim_core.control import Controller, make_controller
-from neurosim_core.packets import Collision, Events, ImuSample, Odometry, Packet
+from neurosim_core.control import CommandMode, Controller, make_controller
+from neurosim_core.packets import Collision, ImuSample, Odometry, Packet
 from neurosim_core.render.renderer import SceneOnDevice, upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, make_free_space
@@ -38,7 +41,10 @@ from neurosim_core.schedule import Boundary, Schedule, batch_end_ns, boundaries,
 from neurosim_core.sensors.cast import (
     CastState,
     Instants,
+    close_eyes,
     flush_events,
+    is_due,
+    leave_out,
     make_cast_state,
     read_events,
     read_images,
@@ -90,17 +96,37 @@ class Model:
         return to_ns(self.config.duration_s)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
+class StartState:
+    """Where an episode starts, with rotors at hover; what is None is as configured: the start of the path."""
+
+    position: ArrayLike | None = None
+    """p_WB [m], shape [3]."""
+    orientation: ArrayLike | None = None
+    """q_WB, xyzw, shape [4]."""
+    velocity: ArrayLike | None = None
+    """v_WB in W [m/s], shape [3]."""
+    body_rate: ArrayLike | None = None
+    """w_WB in B [rad/s], shape [3]."""
+
+
+@dataclass(kw_only=True, eq=False)
 class Batch:
-    """A stretch of a run that was launched and has not been read."""
+    """A stretch of a run that was flown, and that cameras may have to look at."""
 
     boundaries: Sequence[Boundary]
     step_count: int
     """Steps of the integration."""
     command_count: int
+    number: int
+    """Counts the batches of a state."""
     slot: int
     """Slot of the first boundary in the trace."""
-    seen: Sequence[tuple[CastState, Instants]]
+    wanted: frozenset[str]
+    """Cameras that look."""
+    until_ns: int
+    """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
+    seen: Sequence[tuple[CastState, Instants]] = ()
 
 
 @dataclass(kw_only=True, eq=False)
@@ -115,14 +141,18 @@ class State:
     imu_copies: dict[str, tuple[HostCopy, HostCopy]]
     """Specific force and angular rate of each IMU on the host, in the slots of the trace."""
     lanes: Sequence[Milestone]
-    """For each batch that may be under way, the point where the device has finished it."""
+    """For each batch that cameras may look at, the point where the device has finished it."""
+    flight_lane_count: int
+    """The most batches that may be flown and not looked at."""
+    wanted: frozenset[str]
+    """Cameras that look, from the next batch on."""
     flight_stream: wp.Stream | None
     """Where the vehicle moves, ahead of the renderers."""
     render_stream: wp.Stream | None
     event_stream: wp.Stream | None
     """Where events are found, while the next batch is rendered."""
-    flown: Milestone
-    """End of the batch launched last on `flight_stream`."""
+    flown: Sequence[Milestone]
+    """For each batch that may be flown and not looked at, its end on `flight_stream`."""
     rendered: Milestone
     """End of the batch launched last on `render_stream`."""
     graphs: Graphs
@@ -131,7 +161,13 @@ class State:
     launched_ns: int = 0
     """How far the device has been told to go [ns]."""
     launched_count: int = 0
-    """Batches launched so far."""
+    """Batches flown so far."""
+    looked_count: int = 0
+    """Batches that cameras have looked at, or left out; written by the thread that does."""
+    last: Odometry | None = None
+    """The state at the end of what was flown and read."""
+    pilots: dict[str, Controller] = field(default_factory=dict)
+    """Controllers of the command modes that were used."""
     under_way: deque[Batch] = field(default_factory=deque)
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
@@ -159,11 +195,26 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
     """Load or generate the scene, plan the path and decide what has to be computed.
 
     Args:
-        config: What to fly.
+        config: What to fly; one vehicle.
         on_phase: Told the name of each part of the work when it begins.
 
     Raises:
-        ValueError: The scene cannot be loaded, no path exists, or the device is not there.
+        ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
+            not there.
+    """
+    if len(config.vehicles) > 1:
+        raise ValueError(
+            f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
+        )
+    return next(iter(make_fleet(config, on_phase=on_phase).values()))
+
+
+def make_fleet(
+    config: SimulationConfig, *, on_phase: Callable[[str], None] | None = None
+) -> dict[str, Model]:
+    """Return a model for each vehicle by name; they share the scene, its free space and its light.
+
+    Arguments and errors as for `make_model`.
     """
     setup_s: dict[str, float] = defaultdict(float)
 
@@ -177,14 +228,34 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
         scene = load_scene(config.scene)
     with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
-    airframe = config.vehicle.airframe()
+    members = {name: config.of(name) for name in config.vehicles}
     with phase("path"):
-        path = make_path(config.path, free_space, airframe, duration_s=config.duration_s)
-    casts = plan_casts(config.sensors)
+        paths = {
+            name: make_path(member.path, free_space, member.vehicle.airframe(), duration_s=member.duration_s)
+            for name, member in members.items()
+        }
+    seeing = any(plan_casts(member.sensors) for member in members.values())
     with phase("light"):
         scene_on_device = (
-            upload_scene(scene, config.render, device=device, renderer=config.renderer) if casts else None
+            upload_scene(scene, config.render, device=device, renderer=config.renderer) if seeing else None
         )
+    return {
+        name: _make_member(member, device, scene, free_space, paths[name], scene_on_device, setup_s)
+        for name, member in members.items()
+    }
+
+
+def _make_member(
+    config: SimulationConfig,
+    device: str,
+    scene: Scene,
+    free_space: FreeSpace,
+    path: Path,
+    scene_on_device: SceneOnDevice | None,
+    setup_s: Mapping[str, float],
+) -> Model:
+    """Return the model of one vehicle in a scene."""
+    casts = plan_casts(config.sensors)
     samplers = {
         n: s for n, s in config.sensors.items() if isinstance(s, ImuSensorConfig | OdometrySensorConfig)
     }
@@ -194,7 +265,7 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
         scene=scene,
         free_space=free_space,
         path=path,
-        airframe=airframe,
+        airframe=config.vehicle.airframe(),
         casts=casts,
         schedule=Schedule(
             control=Rate(config.control.rate_hz),
@@ -203,34 +274,58 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
             instants_per_launch=config.instants_per_launch,
         ),
         samplers=tuple(samplers),
-        scene_on_device=scene_on_device,
+        scene_on_device=scene_on_device if casts else None,
         setup_s=setup_s,
     )
 
 
-def make_state(model: Model, *, lane_count: int | None = None) -> State:
-    """Allocate everything a run needs, with the vehicle at rest at the start of the path.
+def make_state(
+    model: Model,
+    *,
+    lane_count: int | None = None,
+    flight_lane_count: int | None = None,
+    seed: int | None = None,
+    start: StartState | None = None,
+) -> State:
+    """Allocate everything an episode needs.
 
     Args:
         model: What does not change.
         lane_count: How many batches `run_model` keeps under way. By default 2 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
+        flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
+        seed: Seed of the sensor noise; None: as configured.
+        start: Where the vehicle starts; None: as configured.
+
+    Raises:
+        ValueError: The start is of a wrong shape or not finite.
     """
     config, device = model.config, model.device
     if lane_count is None:
         ahead = wp.get_device(device).is_cuda and config.renderer == "warp"
         lane_count = _LANES_ON_CUDA if ahead else 1
     vehicle = Multirotor(model.airframe, count=1, device=device, max_step_ns=to_ns(config.vehicle.max_step_s))
-    start = model.path.evaluate([0])
-    half_yaw = 0.5 * start.yaw[0]
+    begin = model.path.evaluate([0])
+    half_yaw = 0.5 * begin.yaw[0]
+    chosen = start or StartState()
     vehicle.reset(
-        position=start.position,
-        velocity=start.velocity,
-        orientation=[[0.0, 0.0, np.sin(half_yaw), np.cos(half_yaw)]],
+        position=begin.position if chosen.position is None else chosen.position,
+        velocity=begin.velocity if chosen.velocity is None else chosen.velocity,
+        orientation=[0.0, 0.0, np.sin(half_yaw), np.cos(half_yaw)]
+        if chosen.orientation is None
+        else chosen.orientation,
+        body_rate=chosen.body_rate,
     )
-    slot_count = lane_count * boundary_count_max(model.schedule)
+    flight_lane_count = max(lane_count, flight_lane_count or 0)
+    slot_count = flight_lane_count * boundary_count_max(model.schedule)
     imus = {
-        name: Imu(sensor, vehicle, seed=config.seed, name=name, slot_count=slot_count)
+        name: Imu(
+            sensor,
+            vehicle,
+            seed=config.seed if seed is None else seed,
+            name=name,
+            slot_count=slot_count,
+        )
         for name, sensor in config.sensors.items()
         if isinstance(sensor, ImuSensorConfig)
     }
@@ -260,10 +355,12 @@ def make_state(model: Model, *, lane_count: int | None = None) -> State:
         imus=imus,
         imu_copies={n: (HostCopy(i.specific_force), HostCopy(i.angular_rate)) for n, i in imus.items()},
         lanes=[Milestone(device) for _ in range(lane_count)],
+        flight_lane_count=flight_lane_count,
+        wanted=frozenset(name for cast in model.casts for name in cast.names),
         flight_stream=make_stream(device, urgent=True),
         render_stream=make_stream(device),
         event_stream=make_stream(device, urgent=True),
-        flown=Milestone(device),
+        flown=[Milestone(device) for _ in range(flight_lane_count)],
         rendered=Milestone(device),
         graphs=Graphs(device),
     )
@@ -287,7 +384,7 @@ def run_model(model: Model, state: State) -> Iterator[Packet]:
 
     Where the state has several lanes, the vehicle is up to as many batches ahead of the packets.
     """
-    if state.stamp_ns == 0:
+    if state.launched_count == 0:
         yield from start(model, state)
     while not state.ended:
         while len(state.under_way) < len(state.lanes) and state.launched_ns < model.duration_ns:
@@ -300,42 +397,145 @@ def run_model(model: Model, state: State) -> Iterator[Packet]:
     yield from finish(state)
 
 
-def step(model: Model, state: State, command: ArrayLike) -> list[Packet]:
+def step(
+    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+) -> list[Packet]:
     """Hold a command of an outside controller until the next tick of the control clock.
 
     Args:
         model: What does not change.
         state: Moved on by one control period.
-        command: Rotor speeds [rad/s], shape [R].
+        command: Setpoint row of the mode (`control.modes.MODES`), by default rotor speeds [rad/s], shape [R].
+            Modes above it are turned into rotor speeds once, at the beginning of the period. None: the rotor
+            speeds that hold now.
+        mode: What the command is.
 
     Returns:
         What the sensors yield in (stamp, next stamp], in the order of time; the first call also yields stamp
         0.
 
     Raises:
+        ValueError: The command is of a wrong shape or not finite.
         DynamicsError: The integration failed.
     """
-    packets = start(model, state) if state.stamp_ns == 0 else []
-    control = model.schedule.control
-    end_ns = control.stamp_ns(control.first_tick(state.stamp_ns + 1))
-    state.vehicle.command(command)
-    while state.stamp_ns < end_ns and not state.ended:
-        until_ns = batch_end_ns(model.schedule, state.stamp_ns, end_ns)
-        packets += advance(model, state, until_ns, closed_loop=False)
+    packets = start(model, state) if state.launched_count == 0 else []
+    _command(model, state, command, mode)
+    for end_ns in _parts_of_period(model, state):
+        packets += advance(model, state, end_ns, closed_loop=False)
         if state.failure is not None:
             raise state.failure
+        if state.ended:
+            break
     return packets
+
+
+def fly_period(
+    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+) -> tuple[list[Packet], list[Batch]]:
+    """Fly one control period like `step`, and leave the cameras for later.
+
+    Returns:
+        Packets of the IMU and of odometry, and collisions, in the order of time; and what the cameras have to
+        look at: each batch goes to `see` or `skip`, in order, from one thread at a time.
+
+    Raises:
+        RuntimeError: More batches wait for the cameras than there are lanes: see `free_lanes`.
+        ValueError: The command is of a wrong shape or not finite.
+        DynamicsError: The integration failed.
+    """
+    packets: list[Packet] = []
+    batches: list[Batch] = []
+
+    def fly(stretch: Sequence[Boundary]) -> None:
+        if free_lanes(state) < 1:
+            raise RuntimeError(f"{state.flight_lane_count} batches wait for see() or skip(): no lane is free")
+        batch = _fly_batch(model, state, stretch, closed_loop=False)
+        batches.append(batch)
+        packets.extend(_in_order(model, _read_flight(model, state, batch), state.stamp_ns))
+        if state.failure is not None:
+            raise state.failure
+
+    if state.launched_count == 0:
+        fly([_everything(model)])
+    _command(model, state, command, mode)
+    for end_ns in _parts_of_period(model, state):
+        fly(boundaries(model.schedule, state.launched_ns, end_ns))
+        if state.ended:
+            break
+    return packets, batches
+
+
+def free_lanes(state: State) -> int:
+    """Return how many batches `fly_period` can fly before one of those that wait was looked at."""
+    return state.flight_lane_count - (state.launched_count - state.looked_count)
+
+
+def see(model: Model, state: State, batch: Batch) -> list[Packet]:
+    """Render what the cameras see in a batch; return their packets in the order of time.
+
+    Args:
+        model: What does not change.
+        state: Only what belongs to the cameras changes, so that another thread may fly on.
+        batch: The oldest that was flown and not looked at.
+    """
+    _look(model, state, batch)
+    packets = _read_cameras(state, batch)
+    state.looked_count += 1
+    return _in_order(model, packets, batch.until_ns)
+
+
+def skip(model: Model, state: State, batch: Batch) -> int:
+    """Render nothing of a batch, in place of `see`.
+
+    The sequence of each image camera shows the gap; for an event camera log radiance is linear in time over
+    the gap, and a window of events that should have ended there is as much longer.
+
+    Returns:
+        How many instants of casts were left out.
+    """
+    count = 0
+    for index, cast in enumerate(state.casts):
+        stamps = [b.stamp_ns for b in batch.boundaries if index in b.casts]
+        due = [stamp_ns for stamp_ns in stamps if is_due(cast, stamp_ns, batch.wanted)]
+        leave_out(cast, due, batch.wanted)
+        count += len(due)
+    state.looked_count += 1
+    return count
+
+
+def want(model: Model, state: State, names: Collection[str]) -> None:
+    """Choose the cameras that look, from the next control period on; the others are not rendered.
+
+    An event camera that comes back takes the first instant that it sees as its reference, and its packets
+    count on.
+
+    Raises:
+        ValueError: There is no such camera.
+    """
+    known = {name for cast in model.casts for name in cast.names}
+    if not known.issuperset(names):
+        raise ValueError(f"unknown cameras {sorted(set(names) - known)}, known: {sorted(known)}")
+    state.wanted = frozenset(names)
+
+
+def observe(state: State) -> Odometry:
+    """Return the true state of the vehicle at the end of what was flown, as a packet named `odometry`."""
+    if state.last is None:
+        now = state.vehicle.state
+        state.last = Odometry(
+            sensor="odometry",
+            position=now.position[0],
+            orientation=now.orientation[0],
+            velocity=now.velocity[0],
+            body_rate=now.body_rate[0],
+            rotor_speed=now.rotor_speed[0],
+        )
+    return state.last
 
 
 def start(model: Model, state: State) -> list[Packet]:
     """Sample every sensor at stamp 0; event cameras take it as their reference."""
-    everything = Boundary(
-        stamp_ns=0,
-        control=True,
-        samplers=tuple(range(len(model.schedule.samplers))),
-        casts=tuple(range(len(model.casts))),
-    )
-    _launch(model, state, [everything], closed_loop=True)
+    _launch(model, state, [_everything(model)], closed_loop=True)
     return read(model, state)
 
 
@@ -378,31 +578,11 @@ def read(model: Model, state: State) -> list[Packet]:
         state: `stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or
             the integration failed (`failure`).
     """
-    lane = (state.launched_count - len(state.under_way)) % len(state.lanes)
     batch = state.under_way.popleft()
-    with timed(state.wall_s, "read-back"):
-        state.lanes[lane].wait()
-        rows = state.trace.numpy(batch.slot, len(batch.boundaries))
-    state.stamp_ns = batch.boundaries[-1].stamp_ns
-    state.counts["steps"] += batch.step_count
-    state.counts["commands"] += batch.command_count
-    state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
-    if rows.status[-1].any():
-        state.failure = _failure(state.vehicle)
-        state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
-    with timed(state.wall_s, "collision check"):
-        packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
-    with timed(state.wall_s, "events"):
-        for cast, instants in batch.seen:
-            packets += read_events(cast, instants, until_ns=state.stamp_ns)
-        state.counts["events dropped"] += sum(p.dropped_count for p in packets if isinstance(p, Events))
-    with timed(state.wall_s, "read-back"):
-        for cast, instants in batch.seen:
-            packets += read_images(cast, instants)
-        packets += _read_samplers(model, state, batch, rows)
-    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
-    kept = [packet for packet in packets if packet.stamp_ns <= state.stamp_ns]
-    return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))
+    packets = _read_flight(model, state, batch)  # may end the run before the end of the batch
+    packets += _read_cameras(state, batch)
+    state.looked_count += 1
+    return _in_order(model, packets, batch.until_ns)
 
 
 def finish(state: State) -> list[Packet]:
@@ -410,61 +590,87 @@ def finish(state: State) -> list[Packet]:
     return [packet for cast in state.casts for packet in flush_events(cast, until_ns=state.stamp_ns)]
 
 
-def _launch(model: Model, state: State, batch: Sequence[Boundary], *, closed_loop: bool) -> None:
-    """Fly a batch, let the cameras see it, and launch the copies to the host."""
-    lane = state.launched_count % len(state.lanes)
-    slot = lane * (state.trace.states.shape[0] // len(state.lanes))
-    stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in batch)]
+def _everything(model: Model) -> Boundary:
+    """Return the boundary at stamp 0."""
+    return Boundary(
+        stamp_ns=0,
+        control=True,
+        samplers=tuple(range(len(model.schedule.samplers))),
+        casts=tuple(range(len(model.casts))),
+    )
+
+
+def _parts_of_period(model: Model, state: State) -> Iterator[int]:
+    """Yield the ends of the batches that a control period is cut into, each when the one before was flown."""
+    control = model.schedule.control
+    end_ns = control.stamp_ns(control.first_tick(state.launched_ns + 1))
+    while state.launched_ns < end_ns:
+        yield batch_end_ns(model.schedule, state.launched_ns, end_ns)
+
+
+def _command(model: Model, state: State, command: ArrayLike | None, mode: CommandMode) -> None:
+    """Turn a setpoint into rotor speeds at the present state of the vehicle."""
+    if command is None:
+        return
+    with on(state.flight_stream):
+        if mode == "motor_speeds":
+            state.vehicle.command(command)
+            return
+        if mode not in state.pilots:
+            gains = model.config.control.gains
+            state.pilots[mode] = make_controller(mode, model.airframe, gains, device=model.device)
+        pilot = state.pilots[mode]
+        pilot.set(command)
+        pilot.update(state.vehicle.arrays)
+
+
+def _launch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool) -> None:
+    """Fly a stretch, let the cameras see it, and launch the copies to the host."""
+    batch = _fly_batch(model, state, stretch, closed_loop=closed_loop)
+    _look(model, state, batch)
+    state.under_way.append(batch)
+
+
+def _fly_batch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool) -> Batch:
+    """Move the vehicle through a stretch."""
+    number = state.launched_count
+    slot = number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count)
+    stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in stretch)]
     elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
     with timed(state.wall_s, "dynamics and control"), on(state.flight_stream):
         pattern = tuple(
             (span, boundary.control, boundary.samplers)
-            for span, boundary in zip(elapsed_ns, batch, strict=True)
+            for span, boundary in zip(elapsed_ns, stretch, strict=True)
         )
         state.graphs.run(
             (slot, closed_loop, pattern),
-            lambda: _fly(model, state, batch, elapsed_ns, slot=slot, closed_loop=closed_loop),
+            lambda: _fly(model, state, stretch, elapsed_ns, slot=slot, closed_loop=closed_loop),
         )
-        state.flown.set()
-    seen = []
-    with timed(state.wall_s, "render"), on(state.render_stream):
-        state.flown.hold()
-        for index, cast in enumerate(state.casts):
-            due = [place for place, boundary in enumerate(batch) if index in boundary.casts]
-            if due:
-                stamps_ns = [batch[place].stamp_ns for place in due]
-                slots = [slot + place for place in due]
-                seen.append((cast, render_instants(cast, state.trace, slots, stamps_ns, lane=lane)))
-        state.rendered.set()
-    with timed(state.wall_s, "events"), on(state.event_stream):
-        state.rendered.hold()
-        for cast, instants in seen:
-            scan_events(cast, instants)
-        state.lanes[lane].set()
-    state.under_way.append(
-        Batch(
-            boundaries=batch,
-            step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
-            command_count=sum(closed_loop and boundary.control for boundary in batch),
-            slot=slot,
-            seen=seen,
-        )
-    )
+        state.flown[number % state.flight_lane_count].set()
     state.launched_count += 1
-    state.launched_ns = batch[-1].stamp_ns
+    state.launched_ns = stretch[-1].stamp_ns
+    return Batch(
+        boundaries=stretch,
+        step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
+        command_count=sum(closed_loop and boundary.control for boundary in stretch),
+        number=number,
+        slot=slot,
+        wanted=state.wanted,
+        until_ns=state.launched_ns,
+    )
 
 
 def _fly(
     model: Model,
     state: State,
-    batch: Sequence[Boundary],
+    stretch: Sequence[Boundary],
     elapsed_ns: Sequence[int],
     *,
     slot: int,
     closed_loop: bool,
 ) -> None:
     """Move the vehicle from boundary to boundary and do what is due there, on the device only."""
-    for place, (boundary, span_ns) in enumerate(zip(batch, elapsed_ns, strict=True), slot):
+    for place, (boundary, span_ns) in enumerate(zip(stretch, elapsed_ns, strict=True), slot):
         if span_ns > 0:
             state.vehicle.advance(span_ns)
         state.trace.record(state.vehicle.arrays, place)
@@ -474,11 +680,87 @@ def _fly(
         if closed_loop and boundary.control:
             state.controller.update(state.vehicle.arrays)
     state.trace.check_room(
-        model.free_space.arrays, slot, len(batch), radius_m=model.config.vehicle.collision_radius_m
+        model.free_space.arrays, slot, len(stretch), radius_m=model.config.vehicle.collision_radius_m
     )
-    state.trace.fetch(slot, len(batch))
+    state.trace.fetch(slot, len(stretch))
     for copy in itertools.chain.from_iterable(state.imu_copies.values()):
-        copy.fetch(slot, len(batch))
+        copy.fetch(slot, len(stretch))
+
+
+def _look(model: Model, state: State, batch: Batch) -> None:
+    """Let the cameras that are wanted see a batch, and launch the copies to the host."""
+    lane = batch.number % len(state.lanes)
+    seen = []
+    with timed(state.wall_s, "render"), on(state.render_stream):
+        state.flown[batch.number % state.flight_lane_count].hold()
+        for index, cast in enumerate(state.casts):
+            close_eyes(cast, batch.wanted)
+            due = [
+                place
+                for place, boundary in enumerate(batch.boundaries)
+                if index in boundary.casts and is_due(cast, boundary.stamp_ns, batch.wanted)
+            ]
+            if due:
+                stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
+                slots = [batch.slot + place for place in due]
+                instants = render_instants(
+                    cast, state.trace, slots, stamps_ns, lane=lane, wanted=batch.wanted
+                )
+                seen.append((cast, instants))
+        state.rendered.set()
+    with timed(state.wall_s, "events"), on(state.event_stream):
+        state.rendered.hold()
+        for cast, instants in seen:
+            scan_events(cast, instants)
+        state.lanes[lane].set()
+    batch.seen = seen
+
+
+def _read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
+    """Wait until a batch is flown; return what was sampled on the way, and collisions."""
+    with timed(state.wall_s, "read-back"):
+        state.flown[batch.number % state.flight_lane_count].wait()
+        rows = state.trace.numpy(batch.slot, len(batch.boundaries))
+    state.stamp_ns = batch.boundaries[-1].stamp_ns
+    state.counts["steps"] += batch.step_count
+    state.counts["commands"] += batch.command_count
+    if rows.status[-1].any():
+        state.failure = _failure(state.vehicle)
+        state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
+    with timed(state.wall_s, "collision check"):
+        packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
+    batch.until_ns = state.stamp_ns
+    with timed(state.wall_s, "read-back"):
+        packets += _read_samplers(model, state, batch, rows)
+    reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
+    if reached:
+        header = {"stamp_ns": reached[-1], "sequence": 0, "sensor": "odometry"}
+        state.last = _odometry(rows.states[len(reached) - 1, 0], header)
+    return packets
+
+
+def _read_cameras(state: State, batch: Batch) -> list[Packet]:
+    """Wait until the cameras have seen a batch, and return what they yield."""
+    packets: list[Packet] = []
+    with timed(state.wall_s, "read-back"):
+        state.lanes[batch.number % len(state.lanes)].wait()
+    state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
+    with timed(state.wall_s, "events"):
+        for cast, instants in batch.seen:
+            events = read_events(cast, instants, until_ns=batch.until_ns)
+            state.counts["events dropped"] += sum(packet.dropped_count for packet in events)
+            packets += events
+    with timed(state.wall_s, "read-back"):
+        for cast, instants in batch.seen:
+            packets += read_images(cast, instants)
+    return packets
+
+
+def _in_order(model: Model, packets: list[Packet], until_ns: int) -> list[Packet]:
+    """Return packets up to a stamp in the order of time, those of one stamp in that of the rig."""
+    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
+    kept = [packet for packet in packets if packet.stamp_ns <= until_ns]
+    return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))
 
 
 def _failure(vehicle: Multirotor) -> DynamicsError:
@@ -488,6 +770,17 @@ def _failure(vehicle: Multirotor) -> DynamicsError:
     except DynamicsError as error:
         return error
     raise AssertionError("the status of a vehicle that is held does not change")
+
+
+def _odometry(row: Any, header: Mapping[str, Any]) -> Odometry:
+    return Odometry(
+        **header,
+        position=row[POSITION],
+        orientation=row[ORIENTATION],
+        velocity=row[VELOCITY],
+        body_rate=row[BODY_RATE],
+        rotor_speed=row[ROTOR_SPEED],
+    )
 
 
 def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
@@ -514,17 +807,7 @@ def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) ->
                     )
                 )
             else:
-                row = rows.states[place, 0]
-                packets.append(
-                    Odometry(
-                        **header,
-                        position=row[POSITION],
-                        orientation=row[ORIENTATION],
-                        velocity=row[VELOCITY],
-                        body_rate=row[BODY_RATE],
-                        rotor_speed=row[ROTOR_SPEED],
-                    )
-                )
+                packets.append(_odometry(rows.states[place, 0], header))
     return packets
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import trimesh
 
 import neurosim_core as ns
 from neurosim_core import simulation
+from neurosim_core.control import make_controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.vehicle import DynamicsError
 
@@ -302,3 +304,157 @@ def test_leaving_the_scene_is_no_collision(settings):
 def test_an_unknown_device_is_named(settings):
     with pytest.raises(ValueError, match="cuda:77"):
         fly(settings, device="cuda:77")
+
+
+# Flying for commands from outside
+
+
+@pytest.fixture
+def outside_model(settings) -> simulation.Model:
+    return simulation.make_model(ns.load_config(settings))
+
+
+def hover(model: simulation.Model) -> np.ndarray:
+    return np.full(model.airframe.rotor_count, model.airframe.hover_rotor_speed_rad_s)
+
+
+def test_cameras_in_another_thread_yield_the_same(outside_model):
+    """`fly_period` and `see` give the packets of `step`, however far the flight is ahead."""
+    model, command = outside_model, 1.01 * hover(outside_model)
+    together = simulation.make_state(model)
+    expected = [p for _ in range(10) for p in simulation.step(model, together, command)]
+    apart = simulation.make_state(model, flight_lane_count=32)
+    packets, waiting = [], []
+    for _ in range(10):
+        flown, batches = simulation.fly_period(model, apart, command)
+        packets += flown
+        waiting += batches
+    assert apart.counts["renders"] == 0
+    for batch in waiting:
+        packets += simulation.see(model, apart, batch)
+    rank = {name: index for index, name in enumerate([*model.config.sensors, simulation.COLLISION])}
+    packets.sort(key=lambda p: (p.stamp_ns, rank[p.sensor]))
+    assert content(packets) == content(expected)
+    assert simulation.observe(apart).position.tobytes() == simulation.observe(together).position.tobytes()
+
+
+def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
+    state = simulation.make_state(outside_model, flight_lane_count=3)
+    simulation.fly_period(outside_model, state, None)  # the start and one period
+    assert simulation.free_lanes(state) == 1
+    simulation.fly_period(outside_model, state, None)
+    with pytest.raises(RuntimeError, match="3 batches wait"):
+        simulation.fly_period(outside_model, state, None)
+
+
+def test_what_is_left_out_shows(outside_model):
+    """Pictures miss in the sequence; a window of events is longer, and what happened in it is not lost."""
+    model, command = outside_model, 1.02 * hover(outside_model)
+    state = simulation.make_state(model, flight_lane_count=32)
+    packets, left_out = [], 0
+    for period in range(24):
+        _, batches = simulation.fly_period(model, state, command)
+        for batch in batches:
+            if 8 <= period < 12:
+                left_out += simulation.skip(model, state, batch)
+            else:
+                packets += simulation.see(model, state, batch)
+    assert left_out > 0
+    windows = of(packets, "events")
+    assert all(a.stamp_ns == b.start_ns for a, b in itertools.pairwise(windows))
+    assert max(w.stamp_ns - w.start_ns for w in windows) > min(w.stamp_ns - w.start_ns for w in windows)
+    pictures = of(packets, "rgb")
+    assert [p.sequence for p in pictures] != list(range(len(pictures)))
+    assert all(p.stamp_ns == round(p.sequence * 1e9 / SENSORS["rgb"]["rate_hz"]) for p in pictures)
+
+
+def test_a_camera_that_nobody_wants_is_not_rendered(outside_model):
+    model = outside_model
+    state = simulation.make_state(model)
+    simulation.want(model, state, ())
+    for _ in range(4):
+        packets = simulation.step(model, state, None)
+        assert {p.sensor for p in packets} <= {"imu", "odometry"}
+    assert state.counts["renders"] == 0
+    simulation.want(model, state, ["rgb"])
+    pictures = [p for _ in range(20) for p in simulation.step(model, state, None) if p.sensor == "rgb"]
+    assert state.counts["renders"] == len(pictures) > 0
+    with pytest.raises(ValueError, match=r"unknown cameras \['nix'\], known: "):
+        simulation.want(model, state, ["nix"])
+
+
+def test_an_event_camera_that_comes_back_starts_from_what_it_sees(outside_model):
+    """Its first window begins at the first instant it saw; nothing of the time before is in it."""
+    model, command = outside_model, 1.05 * hover(outside_model)
+    state = simulation.make_state(model)
+    windows = of([p for _ in range(10) for p in simulation.step(model, state, command)], "events")
+    simulation.want(model, state, ())
+    for _ in range(5):
+        assert not of(simulation.step(model, state, command), "events")
+    away_until_ns = state.stamp_ns
+    simulation.want(model, state, ["events"])
+    later = of([p for _ in range(10) for p in simulation.step(model, state, command)], "events")
+    assert [p.sequence for p in later] == [len(windows) + k for k in range(len(later))]
+    assert later[0].start_ns > away_until_ns
+    assert all(a.stamp_ns == b.start_ns for a, b in itertools.pairwise(later))
+    t = np.concatenate([p.numpy().t for p in later])
+    assert len(t)
+    assert t.min() * 1000 > later[0].start_ns - 1000
+
+
+@pytest.mark.parametrize(
+    ("mode", "setpoint"),
+    [
+        ("rates", [5.5, 0.1, -0.2, 0.3]),
+        ("attitude", [5.5, 0.0, 0.05, 0.0, 1.0]),
+        ("velocity", [0.4, -0.2, 0.1, 0.5]),
+        ("position", [0.3, 0.2, 1.5, 0.4]),
+    ],
+)
+def test_a_setpoint_is_what_its_controller_makes_of_the_state(outside_model, mode, setpoint):
+    """Independent: the controller's host form computes rotor speeds, which are commanded as such."""
+    model = outside_model
+    direct, by_hand = simulation.make_state(model), simulation.make_state(model)
+    controller = make_controller(mode, model.airframe, model.config.control.gains, device="cpu")
+    for _ in range(6):
+        a = simulation.step(model, direct, setpoint, mode=mode)
+        now = simulation.observe(by_hand)
+        speeds = controller.command(
+            setpoint,
+            position=now.position,
+            velocity=now.velocity,
+            orientation=now.orientation,
+            body_rate=now.body_rate,
+            rotor_speed=now.rotor_speed,
+        )
+        b = simulation.step(model, by_hand, speeds[0])
+        assert content(a) == content(b)
+
+
+def test_an_episode_can_start_elsewhere_and_with_another_seed(settings):
+    sensors = {"imu": {"kind": "imu", "gyroscope_noise_density": 1e-3}, "odometry": {"kind": "odometry"}}
+    model = simulation.make_model(ns.load_config({**settings, "sensors": sensors}))
+    start = simulation.StartState(position=[0.5, 0.2, 1.1], velocity=[0.1, 0.0, 0.0])
+    first = [
+        simulation.step(model, simulation.make_state(model, seed=s, start=start), None) for s in (1, 1, 2)
+    ]
+    assert content(first[0]) == content(first[1])
+    assert content(of(first[0], "imu")) != content(of(first[2], "imu"))
+    assert of(first[0], "odometry")[0].position.tolist() == [0.5, 0.2, 1.1]
+    with pytest.raises(ValueError, match="position"):
+        simulation.make_state(model, start=simulation.StartState(position=[0.0, np.nan, 1.0]))
+
+
+def test_a_fleet_shares_its_scene(settings):
+    fleet = {"a": {}, "b": {"path": {"kind": "hover", "position_m": [0.5, 0.0, 1.0]}, "sensors": {}}}
+    config = ns.load_config({**settings, "vehicles": fleet})
+    models = simulation.make_fleet(config)
+    assert list(models) == ["a", "b"]
+    assert models["a"].scene is models["b"].scene
+    assert not models["b"].casts
+    alone = fly(settings)
+    assert content(list(simulation.run_model(models["a"], simulation.make_state(models["a"])))) == content(
+        alone
+    )
+    with pytest.raises(ValueError, match="one vehicle, got a, b"):
+        simulation.make_model(config)

@@ -6,7 +6,7 @@ has been read.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +34,10 @@ class EventChannel:
 
     camera: EventCamera
     packets: Rate
+    sequence: int = 0
+    """Number of the next packet."""
+    watching: bool = False
+    """It has a reference, and saw every instant that was rendered since."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -76,6 +80,8 @@ class Instants:
     """Stamps of the instants, at least one."""
     pictures: tuple[tuple[int, int, str], ...]
     """Stamp, image slot and camera of each picture."""
+    events: tuple[str, ...]
+    """Event cameras that see them."""
 
     @property
     def picture_slot_count(self) -> int:
@@ -157,8 +163,23 @@ def make_cast_state(
     )
 
 
+def is_due(cast: CastState, stamp_ns: int, wanted: Collection[str]) -> bool:
+    """Return whether a camera that is wanted sees the tick of a cast."""
+    return any(name in wanted for name in cast.events) or bool(_pictures_due(cast, stamp_ns, wanted))
+
+
+def _pictures_due(cast: CastState, stamp_ns: int, wanted: Collection[str]) -> list[str]:
+    return [name for name, image in cast.images.items() if name in wanted and image.rate.has_tick(stamp_ns)]
+
+
 def render_instants(
-    cast: CastState, trace: Trace, slots: Sequence[int], stamps_ns: Sequence[int], *, lane: int
+    cast: CastState,
+    trace: Trace,
+    slots: Sequence[int],
+    stamps_ns: Sequence[int],
+    *,
+    lane: int,
+    wanted: Collection[str],
 ) -> Instants:
     """Launch the rendering of the instants of a batch, and the copy of its pictures.
 
@@ -168,12 +189,13 @@ def render_instants(
         slots: Slots of the instants in the trace, at least one.
         stamps_ns: Their stamps.
         lane: Of the batch; the one that had it before has been read.
+        wanted: Names of the cameras that look.
     """
     pictures = []
     image_slots = []
     used = 0
     for stamp_ns in stamps_ns:
-        due = [name for name, image in cast.images.items() if image.rate.has_tick(stamp_ns)]
+        due = _pictures_due(cast, stamp_ns, wanted)
         pictures += [(stamp_ns, used, name) for name in due]
         image_slots.append(used if due else -1)
         used += bool(due)
@@ -191,26 +213,55 @@ def render_instants(
     )
     for copy in cast.picture_copies[lane].values():
         copy.fetch(0, used)
-    return Instants(lane=lane, stamps_ns=tuple(stamps_ns), pictures=tuple(pictures))
+    return Instants(
+        lane=lane,
+        stamps_ns=tuple(stamps_ns),
+        pictures=tuple(pictures),
+        events=tuple(name for name in cast.events if name in wanted),
+    )
+
+
+def close_eyes(cast: CastState, wanted: Collection[str]) -> None:
+    """Let event cameras that are not wanted forget what they have seen."""
+    for name, channel in cast.events.items():
+        channel.watching = channel.watching and name in wanted
+
+
+def leave_out(cast: CastState, stamps_ns: Iterable[int], wanted: Collection[str]) -> None:
+    """Note that ticks of a cast are not rendered: the sequence of its pictures shows the gap."""
+    for stamp_ns in stamps_ns:
+        for name in _pictures_due(cast, stamp_ns, wanted):
+            cast.images[name].sequence += 1
 
 
 def scan_events(cast: CastState, instants: Instants) -> None:
-    """Let every event camera see the instants just rendered; at stamp 0 they take them as their reference."""
+    """Let the event cameras see the instants just rendered.
+
+    One that has not seen the instants before takes the first as its reference.
+    """
     log_radiance = cast.renderers[instants.lane].log_radiance
-    for channel in cast.events.values():
-        if instants.stamps_ns[0] == 0:
-            channel.camera.reset(log_radiance[0], stamp_ns=0)
-        else:
-            channel.camera.feed_device(log_radiance, instants.stamps_ns)
+    for name in instants.events:
+        channel = cast.events[name]
+        first = 0
+        if not channel.watching:
+            channel.camera.reset(log_radiance[0], instants.stamps_ns[0], sequence=channel.sequence)
+            channel.watching = True
+            first = 1
+        if len(instants.stamps_ns) > first:
+            channel.camera.feed_device(log_radiance[first:], instants.stamps_ns[first:])
 
 
 def read_events(cast: CastState, instants: Instants, *, until_ns: int) -> list[Events]:
     """Return the packets of events whose windows ended in the batch, at most at a stamp."""
     packets: list[Events] = []
-    for channel in cast.events.values():
-        stamps = (stamp for stamp in instants.stamps_ns if 0 < stamp <= until_ns)
+    for name in instants.events:
+        channel = cast.events[name]
+        begun_ns = channel.camera.window_start_ns
+        stamps = (stamp for stamp in instants.stamps_ns if begun_ns < stamp <= until_ns)
         ends = [stamp for stamp in stamps if channel.packets.has_tick(stamp)]
-        packets += channel.camera.collect_windows(ends, scan_count=0 if instants.stamps_ns[0] == 0 else 1)
+        fed = instants.stamps_ns[-1] > channel.camera.stamp_ns
+        packets += channel.camera.collect_windows(ends, scan_count=int(fed))
+        channel.sequence += len(ends)
     return packets
 
 
@@ -219,9 +270,12 @@ def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     end_ns = cast.rate.stamp_ns(cast.rate.first_tick(until_ns + 1) - 1)
     packets: list[Events] = []
     for channel in cast.events.values():
-        begun_ns = channel.packets.stamp_ns(channel.packets.first_tick(end_ns) - 1)
-        if 0 <= begun_ns < end_ns and not channel.packets.has_tick(end_ns):
-            packets += channel.camera.collect_windows([end_ns], scan_count=0)
+        if not channel.watching:
+            continue
+        cut_ns = min(end_ns, channel.camera.stamp_ns)
+        if channel.camera.window_start_ns < cut_ns:
+            packets += channel.camera.collect_windows([cut_ns], scan_count=0)
+            channel.sequence += 1
     return packets
 
 

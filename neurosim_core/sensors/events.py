@@ -173,13 +173,28 @@ class EventCamera:
         self._state = 0
         self._forget()
 
-    def reset(self, log_radiance: Any, stamp_ns: int = 0) -> None:
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the last frame that was waited for [ns].
+
+        Raises:
+            RuntimeError: If the camera was not reset.
+        """
+        return self._require_reset()
+
+    @property
+    def window_start_ns(self) -> int:
+        """Start of the window that is open [ns]."""
+        return self._window_start_ns
+
+    def reset(self, log_radiance: Any, stamp_ns: int = 0, *, sequence: int = 0) -> None:
         """Start anew: every pixel's reference is its log radiance now, and earlier events are forgotten.
 
         Args:
             log_radiance: Natural logarithm of radiance, float32, shape [H, W]; NumPy, Warp or any array of
                 the camera's device with `__cuda_array_interface__`. It is copied.
             stamp_ns: Time of this frame [ns].
+            sequence: Number of the next packet.
 
         Raises:
             ValueError: If shape or dtype is wrong, or a value is not finite or beyond +-1000.
@@ -195,6 +210,7 @@ class EventCamera:
         self._crossed[0].zero_()
         self._now_ns = self._fed_ns = int(stamp_ns)
         self._forget()
+        self._sequence = sequence
 
     def feed(self, log_radiance: Any, stamps_ns: Any) -> Events:
         """Return the events up to the last of a stack of frames.
