@@ -134,7 +134,8 @@ class SimulationConfig(Settings):
     scene: SceneConfig = ApartmentConfig()
     """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
     renderer: RendererName = "warp"
-    """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only."""
+    """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only.
+    `synthetic`: a test card that costs next to nothing, to measure everything else."""
     render: RenderConfig = RenderConfig()
     """How the scene is lit and rendered."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()

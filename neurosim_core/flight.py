@@ -220,7 +220,7 @@ def _sinks(
 
 @contextlib.contextmanager
 def _stop_at_interrupt() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into an event: it must not break into the writing of a file. The second one does."""
+    """Turn Ctrl-C and `kill` into an event: they must not break into the writing of a file. The second does."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # only the main thread is told of signals
@@ -231,11 +231,12 @@ def _stop_at_interrupt() -> Iterator[threading.Event]:
             raise KeyboardInterrupt
         stop.set()
 
-    before = signal.signal(signal.SIGINT, on_interrupt)
+    before = {number: signal.signal(number, on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _log_clearance(logger: RerunLogger, model: Model, packet: Packet) -> None:

@@ -230,10 +230,7 @@ def make_fleet(
         free_space = make_free_space(scene, config.free_space, device=device)
     members = {name: config.of(name) for name in config.vehicles}
     with phase("path"):
-        paths = {
-            name: make_path(member.path, free_space, member.vehicle.airframe(), duration_s=member.duration_s)
-            for name, member in members.items()
-        }
+        paths = {name: _plan(member, free_space) for name, member in members.items()}
     seeing = any(plan_casts(member.sensors) for member in members.values())
     with phase("light"):
         scene_on_device = (
@@ -243,6 +240,26 @@ def make_fleet(
         name: _make_member(member, device, scene, free_space, paths[name], scene_on_device, setup_s)
         for name, member in members.items()
     }
+
+
+def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
+    """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
+
+    Args:
+        config: What to fly.
+        vehicles: Names; None: all.
+
+    Raises:
+        KeyError: There is no such vehicle.
+        ValueError: The scene cannot be loaded, or no path exists.
+    """
+    members = {name: config.of(name) for name in (vehicles or config.vehicles)}
+    free_space = make_free_space(load_scene(config.scene), config.free_space, device=_device(config.device))
+    return {name: _plan(member, free_space) for name, member in members.items()}
+
+
+def _plan(config: SimulationConfig, free_space: FreeSpace) -> Path:
+    return make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
 
 
 def _make_member(
@@ -302,7 +319,7 @@ def make_state(
     """
     config, device = model.config, model.device
     if lane_count is None:
-        ahead = wp.get_device(device).is_cuda and config.renderer == "warp"
+        ahead = wp.get_device(device).is_cuda and config.renderer != "pyrender"
         lane_count = _LANES_ON_CUDA if ahead else 1
     vehicle = Multirotor(model.airframe, count=1, device=device, max_step_ns=to_ns(config.vehicle.max_step_s))
     begin = model.path.evaluate([0])
