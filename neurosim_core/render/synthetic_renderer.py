@@ -35,6 +35,7 @@ _DEPTH_NEAR_M, _DEPTH_FAR_M = 2.0, 10.0
 _SQUARE_DEPTH_M = wp.constant(1.0)
 _SQUARE_SHARE = 30
 _METRE_PX = wp.constant(200.0)
+_LAUNCH_COUNT_MAX = 256
 _POSE_IN_RGB_PX = wp.constant(10)
 """Pixels of three bytes that hold seven floats."""
 _POSE_IN_DEPTH_PX = wp.constant(7)
@@ -203,12 +204,14 @@ class SyntheticRenderer:
             pictures = np.repeat(card[None], counts[name], axis=0)
             return wp.array(card, dtype=dtype, device=device), wp.array(pictures, dtype=dtype, device=device)
 
-        self._rgb_card, self.rgb = allocate("rgb")
-        self._depth_card, self.depth = allocate("depth")
-        self._log_card, self.log_radiance = allocate("log_radiance")
+        rgb_card, self.rgb = allocate("rgb")
+        depth_card, self.depth = allocate("depth")
+        log_card, self.log_radiance = allocate("log_radiance")
+        self._cards = [rgb_card, depth_card, log_card]
         self.normal = self.instance = None
         self._picture_place = wp.zeros(image_count, dtype=wp.vec2i, device=device)
         self._log_place = wp.zeros(instant_count, dtype=wp.vec2i, device=device)
+        self._launches: dict[tuple[int, ...], tuple[wp.Launch, wp.Launch]] = {}
 
     def render(
         self,
@@ -219,34 +222,41 @@ class SyntheticRenderer:
         instant_count: int,
     ) -> None:
         """Draw the cards of the first `instant_count` poses; see `Renderer.render`."""
+        key = (p_WC.ptr, q_WC.ptr, image_slot.ptr, instant_count)
+        launches = self._launches.get(key)
+        if launches is None:
+            if len(self._launches) >= _LAUNCH_COUNT_MAX:
+                del self._launches[next(iter(self._launches))]
+            launches = self._launches[key] = self._record(p_WC, q_WC, image_slot, instant_count)
+        for launch in launches:
+            launch.launch()
+
+    def _record(
+        self, p_WC: Any, q_WC: Any, image_slot: Any, instant_count: int
+    ) -> tuple[wp.Launch, wp.Launch]:
+        """Prepare the launches for these arrays: that costs several times what they do."""
         dim = (instant_count, self._side, self._side)
-        outputs = [self.rgb, self.depth, self.log_radiance]
-        cards = [self._rgb_card, self._depth_card, self._log_card]
         places = [self._picture_place, self._log_place]
-        wp.launch(
+        outputs = [self.rgb, self.depth, self.log_radiance]
+        restore = wp.launch(
             _restore,
             dim=dim,
-            inputs=[*cards, image_slot, *places],
+            inputs=[*self._cards, image_slot, *places],
             outputs=outputs,
             device=self._device,
+            record_cmd=True,
         )
-        wp.launch(
+        shape = [self._side, self._width, self._height, self._log_white]
+        poses = [p_WC, q_WC, _bytes_of(p_WC, 12), _bytes_of(q_WC, 16), image_slot]
+        draw = wp.launch(
             _draw,
             dim=dim,
-            inputs=[
-                self._side,
-                self._width,
-                self._height,
-                self._log_white,
-                p_WC,
-                q_WC,
-                _bytes_of(p_WC, 12),
-                _bytes_of(q_WC, 16),
-                image_slot,
-            ],
+            inputs=[*shape, *poses],
             outputs=[*places, *outputs],
             device=self._device,
+            record_cmd=True,
         )
+        return restore, draw
 
 
 def read_pose(data: NDArray[Any]) -> NDArray[np.float32]:
