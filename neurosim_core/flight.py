@@ -220,7 +220,7 @@ def _sinks(
 
 @contextlib.contextmanager
 def _stop_at_interrupt() -> Iterator[threading.Event]:
-    """Turn Ctrl-C and `kill` into an event: they must not break into the writing of a file. The second does."""
+    """Turn Ctrl-C and `kill` into an event, so that no file is broken off. The second one does."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # only the main thread is told of signals

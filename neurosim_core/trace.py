@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.scene.freespace import DistanceField, check_collision
+from neurosim_core.scene.freespace import DistanceField, collision_check
 from neurosim_core.streams import HostCopy
 
 wp.set_module_options({"enable_backward": False})
@@ -18,6 +18,8 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
+_SLOT_PARAMETER = 6
+_ROOM_CHECKS_MAX = 256
 
 
 @wp.kernel
@@ -96,6 +98,8 @@ class Trace:
         self.status = wp.zeros((capacity, vehicle_count), dtype=wp.int32, device=device)
         self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
         self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance)]
+        self._recording: tuple[Any, Any] = (None, None)
+        self._room_checks: dict[tuple[int, int, float], tuple[DistanceField, wp.Launch]] = {}
 
     def record(self, arrays: Any, slot: int) -> None:
         """Copy the present state and status of all vehicles into a slot.
@@ -104,21 +108,27 @@ class Trace:
             arrays: Device arrays of the vehicles (`Multirotor.arrays`).
             slot: Where to write, in [0, capacity).
         """
-        wp.launch(
-            _record_state,
-            dim=self.states.shape[1],
-            inputs=[
-                arrays.position,
-                arrays.orientation,
-                arrays.velocity,
-                arrays.body_rate,
-                arrays.rotor_speed,
-                arrays.status,
-                slot,
-            ],
-            outputs=[self.states, self.status],
-            device=self.states.device,
-        )
+        if self._recording[0] is not arrays:
+            launch = wp.launch(
+                _record_state,
+                dim=self.states.shape[1],
+                inputs=[
+                    arrays.position,
+                    arrays.orientation,
+                    arrays.velocity,
+                    arrays.body_rate,
+                    arrays.rotor_speed,
+                    arrays.status,
+                    slot,
+                ],
+                outputs=[self.states, self.status],
+                device=self.states.device,
+                record_cmd=True,
+            )
+            self._recording = (arrays, launch)
+        launch = self._recording[1]
+        launch.set_param_at_index(_SLOT_PARAMETER, slot)
+        launch.launch()
 
     def check_room(self, field: DistanceField, first: int, count: int, *, radius_m: float) -> None:
         """Write how much room vehicle 0 has in some slots to `clearance`; see `freespace.check_collision`.
@@ -129,15 +139,22 @@ class Trace:
             count: Number of slots, at least one.
             radius_m: Of the vehicle [m].
         """
-        stride = self.states.strides[0]
-        positions: Any = wp.array(
-            ptr=self.states.ptr + first * stride,
-            dtype=wp.vec3d,
-            shape=(count,),
-            strides=(stride,),
-            device=self.states.device,
-        )
-        check_collision(field, positions, self.clearance[first : first + count], radius_m=radius_m)
+        known_field, launch = self._room_checks.get((first, count, radius_m), (None, None))
+        if known_field is not field:
+            stride = self.states.strides[0]
+            positions: Any = wp.array(
+                ptr=self.states.ptr + first * stride,
+                dtype=wp.vec3d,
+                shape=(count,),
+                strides=(stride,),
+                device=self.states.device,
+            )
+            room = self.clearance[first : first + count]
+            launch = collision_check(field, positions, room, radius_m=radius_m)
+            if len(self._room_checks) >= _ROOM_CHECKS_MAX:
+                self._room_checks.clear()
+            self._room_checks[first, count, radius_m] = (field, launch)
+        launch.launch()
 
     def camera_poses(
         self,

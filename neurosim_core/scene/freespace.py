@@ -188,12 +188,19 @@ def check_collision(field: DistanceField, position: Any, clearance: Any, *, radi
             elsewhere.
         radius_m: Of the spheres [m].
     """
-    wp.launch(
+    collision_check(field, position, clearance, radius_m=radius_m).launch()
+
+
+def collision_check(field: DistanceField, position: Any, clearance: Any, *, radius_m: float) -> wp.Launch:
+    """Return `check_collision` as a launch that can be made again and again; arguments as there."""
+    launch: wp.Launch = wp.launch(
         _check_collision,
         dim=position.shape[0],
         inputs=[field, radius_m, radius_m + field.voxel, position, clearance],
         device=position.device,
+        record_cmd=True,
     )
+    return launch
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
