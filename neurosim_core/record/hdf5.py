@@ -19,7 +19,8 @@ and shuffle are used, which are part of HDF5 itself.
         start_ns, dropped_count    one row per packet: start of its window, events that were lost
       cameras
         data                 one row per picture, one picture per chunk; attribute encoding
-      all others             one array per field of the packet, one row per packet
+      all others             one array per field of the packet, one row per packet; float64, and int64 for
+                             the whole numbers of what a simulated link did (sensor "<link>_link")
     /events /ms_to_idx /t_offset    the same arrays (hard links) of the first event camera, so that readers
                                     of DSEC files work; they take the group of any other camera just as well
 
@@ -46,7 +47,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.packets import (
+    Collision,
+    Delivery,
+    EventArrays,
+    Events,
+    Image,
+    ImuSample,
+    Odometry,
+    Packet,
+)
 from neurosim_core.record.disk import Disk
 from neurosim_core.record.header import FlightHeader, Intrinsics, SensorDescription
 
@@ -56,9 +66,10 @@ FORMAT = "neurosim.flight"
 FORMAT_VERSION = 1
 
 _PACKET_TYPES: dict[str, type[Packet]] = {
-    t.__name__: t for t in (Events, Image, ImuSample, Odometry, Collision)
+    t.__name__: t for t in (Events, Image, ImuSample, Odometry, Collision, Delivery)
 }
 _HEADER_FIELDS = tuple(f.name for f in dataclasses.fields(Packet))
+_WHOLE_FIELDS = ("delivered_ns", "size_bytes")
 _EVENT_DTYPES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _EVENT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache, so appending never reads back
 _ROW_CHUNK = 1024
@@ -278,7 +289,7 @@ class _Stream:
             shapes = {name: np.shape(getattr(first, name)) for name in _body_fields(self._type)}
             self._constant = dict(shapes)
             for name, shape in shapes.items():
-                self._add(name, shape, np.float64)
+                self._add(name, shape, np.int64 if name in _WHOLE_FIELDS else np.float64)
         for name in ("width", "height", "encoding"):
             if name in self._constant:
                 group.attrs[name] = self._constant[name]
@@ -521,7 +532,7 @@ class Flight:
                 else:
                     packet_type = _PACKET_TYPES[kind]
                     values = {key: block[key][row] for key in _body_fields(packet_type)}
-                    header |= {k: float(v) if v.ndim == 0 else v.copy() for k, v in values.items()}
+                    header |= {k: v.item() if v.ndim == 0 else v.copy() for k, v in values.items()}
                     packet = packet_type(**header)
                 yield packet.stamp_ns, int(block["order"][row]), packet
 

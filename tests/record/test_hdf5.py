@@ -13,7 +13,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.links import Link
+from neurosim_core.live import LinkConfig
+from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, Intrinsics, SensorDescription
 
 HEADER = FlightHeader(config_yaml="duration_s: 1.0\n", seed=7, version="0.1.0", scene="flat")
@@ -80,6 +82,16 @@ def make_flight(seed: int, event_counts: list[int], *, images: int = 3, rotors: 
             rgb = rng.integers(0, 256, (5, 7, 3), dtype=np.uint8)
             packets.append(Image(stamp_ns=stamp_ns, sequence=k, sensor="rgb", data=rgb, encoding="rgb8"))
             packets.append(Image(stamp_ns=stamp_ns, sequence=k, sensor="depth", data=depth, encoding="32FC1"))
+        lost = k % 3 == 1
+        packets.append(
+            Delivery(
+                stamp_ns=stamp_ns,
+                sequence=k,
+                sensor="imu_link",
+                delivered_ns=-1 if lost else 2**60 + k,  # a float64 would round it
+                size_bytes=int(rng.integers(0, 2**40)),
+            )
+        )
     packets.append(
         Collision(
             stamp_ns=10**15, sequence=0, sensor="collision", position=rng.normal(size=3), clearance_m=-0.25
@@ -123,6 +135,22 @@ def test_round_trip_is_bitwise(tmp_path, seed, event_counts, images, rotors, flu
         assert flight.clean
         assert flight.notes == ()
         assert_same(list(flight.packets()), packets)
+
+
+def test_what_a_link_did_is_read_as_whole_numbers(tmp_path):
+    """As a column of int64 too, for who asks how late every command was."""
+    link = Link(LinkConfig(latency_s=0.008, loss=0.5), seed=0, name="command")
+    sent = [link.send(None, stamp_ns=2**60 + 10 * MS * k, size_bytes=90 + k) for k in range(50)]
+    write(tmp_path / "f.h5", sent)
+    with Flight(tmp_path / "f.h5") as flight:
+        assert flight.sensors == ("command_link",)
+        delivered_ns = flight.column("command_link", "delivered_ns")
+        assert delivered_ns.dtype == np.int64
+        assert flight.column("command_link", "size_bytes").tolist() == list(range(90, 140))
+        arrived = delivered_ns >= 0
+        assert (delivered_ns[arrived] - flight.column("command_link", "stamp_ns")[arrived] == 8 * MS).all()
+        assert (~arrived).sum() == link.lost_count > 0
+        assert_same(list(flight.packets("command_link")), sent)
 
 
 def test_many_packets_cross_chunks_and_blocks(tmp_path):
@@ -415,6 +443,8 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 sys.path.insert(0, sys.argv[2])
 import numpy as np
 from test_hdf5 import HEADER, image, make_events
+from neurosim_core.links import Link
+from neurosim_core.live import LinkConfig
 from neurosim_core.packets import Image
 from neurosim_core.record import FlightWriter
 rng = np.random.default_rng(0)
