@@ -1,0 +1,97 @@
+"""What the bridge asks of ROS 2: publishers and subscriptions of serialised messages (CDR)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+Buffer = bytes | bytearray | memoryview
+"""A message in CDR: little endian, with its header of four bytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Qos:
+    """Quality of service, as far as the bridge uses it."""
+
+    reliability: Literal["reliable", "best_effort"] = "reliable"
+    durability: Literal["volatile", "transient_local"] = "volatile"
+    depth: int = 10
+    """Messages kept for a subscriber that is not ready [>= 1]."""
+
+    def __post_init__(self) -> None:
+        if self.depth < 1:
+            raise ValueError(f"depth must be >= 1, got {self.depth}")
+
+
+class TopicInfo(NamedTuple):
+    """A topic that is seen on the ROS 2 side."""
+
+    topic: str
+    """Such as "/drone/imu"."""
+    type_name: str
+    """Such as "sensor_msgs/msg/Imu"."""
+    publisher_count: int
+    subscriber_count: int
+
+
+class RosPublisher(Protocol):
+    """Publishes on one topic."""
+
+    @property
+    def subscriber_count(self) -> int:
+        """Subscriptions that match now."""
+
+    def publish(self, message: Buffer) -> None:
+        """Send a message; never waits for subscribers.
+
+        Raises:
+            BackendError: It could not be sent.
+        """
+
+    def close(self) -> None:
+        """Withdraw the publisher."""
+
+
+class RosSubscription(Protocol):
+    """Receives from one topic."""
+
+    @property
+    def publisher_count(self) -> int:
+        """Publishers that match now."""
+
+    def close(self) -> None:
+        """Withdraw the subscription; its callback is not called any more."""
+
+
+class Backend(Protocol):
+    """One participant of a ROS 2 graph: a node."""
+
+    name: str
+    """Such as "dds"; shown to the user."""
+
+    def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
+        """Publish on a topic.
+
+        Raises:
+            ValueError: The type is unknown, or the topic's name is not valid.
+        """
+
+    def subscription(
+        self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
+    ) -> RosSubscription:
+        """Subscribe to a topic; the callback is called with every message, on a thread of the backend.
+
+        Raises:
+            ValueError: The type is unknown, or the topic's name is not valid.
+        """
+
+    def topics(self) -> list[TopicInfo]:
+        """Return what is seen on the other side now."""
+
+    def close(self) -> None:
+        """Leave the graph."""
+
+
+class BackendError(RuntimeError):
+    """ROS 2 cannot be reached, or refused a message."""
