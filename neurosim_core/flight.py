@@ -27,7 +27,9 @@ from neurosim_core.sensors.rig import Cast
 from neurosim_core.simulation import Model, State, load_scene, make_model, make_state, run_model
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.view.overview import FlightSummary, Track, save_overview
-from neurosim_core.view.rerun_log import RerunLogger, open_recording
+from neurosim_core.view.rerun_log import RerunLogger
+from neurosim_core.view.rerun_sdk import open_recording
+from neurosim_core.view.rerun_shapes import scene_shapes
 
 _LIBRARIES = {"h5py": "record", "rerun": "view", "matplotlib": "view"}
 """What a recording needs, and the extra that brings it."""
@@ -173,13 +175,14 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
         raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {flight}` makes one")
     with Flight(recorded) as source:
         header = source.header
+        config = load_config(yaml.safe_load(header.config_yaml))
         logger = RerunLogger(
             open_recording(save or made),
-            scene=load_scene(load_config(yaml.safe_load(header.config_yaml)).scene),
-            sensors=header.sensors,
-            path_position=header.path_position,
+            vehicles={next(iter(config.vehicles)): header.sensors},
+            scene=scene_shapes(load_scene(config.scene)),
         )
         with logger:
+            logger.log_path(header.path_position)
             for packet in source.packets():
                 logger.log(packet)
     return save or made
@@ -209,10 +212,10 @@ def _sinks(
         if rerun and _has("rerun", console, "flight.rrd"):
             logger = RerunLogger(
                 open_recording(folder / "flight.rrd"),
-                scene=model.scene,
-                sensors=describe_sensors(config.sensors),
-                path_position=path_position,
+                vehicles={next(iter(config.vehicles)): describe_sensors(config.sensors)},
+                scene=scene_shapes(model.scene),
             )
+            logger.log_path(path_position)
             sinks.append(stack.enter_context(logger).log)
             sinks.append(lambda packet: _log_clearance(logger, model, packet))
         yield sinks

@@ -3,108 +3,120 @@
 Rerun gets what eyes need: pictures as JPEG, depth as 16-bit PNG in millimetres, events as one picture per
 window. Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. Entities:
 
-    world/scene/{room,ceiling}/<n>   the scene, one mesh per material; what is close to its top can be hidden
-    world/path                       the planned path
-    world/trail                      where the vehicle was, one stroke per 50 ms
-    world/collisions                 where it touched the scene
-    world/vehicle                    its pose; below it one entity per camera, with frustum and picture
-    plots/<sensor>/<quantity>        IMU, speed, height, rotor speeds
-    plots/<name>                     what `log_scalar` was given
+    world/scene/{room,ceiling}/<n>          the scene, one mesh per material; the ceiling is hidden
+    world/vehicles/<vehicle>                its pose; below it one entity per camera, with frustum and picture
+    world/paths/<vehicle>                   the planned path
+    world/trails/<vehicle>                  where it was, one stroke per batch of poses
+    world/collisions/<vehicle>              where it touched the scene
+    plots/<vehicle>/<sensor>/<quantity>     IMU, speed, height, rotor speeds
+    plots/<vehicle>/command/<mode>          what it was told to do
+    plots/<vehicle>/<name>                  what `log_scalar` was given
+    simulator/<name>                        what `log_simulator` was given
+    status                                  what `log_status` was given
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
-from pathlib import Path
-from types import ModuleType, TracebackType
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import PIL.Image
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.header import SensorDescription
-from neurosim_core.scene.scene import Material, Scene
-from neurosim_core.scene.source import linear_to_srgb8
-from neurosim_core.view.event_picture import PALETTE, EventWindow, event_classes
+from neurosim_core.view.event_picture import EventWindow
+from neurosim_core.view.rerun_layout import make_blueprint
+from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
+from neurosim_core.view.rerun_shapes import SceneShapes, encode_events, encode_image
 
 if TYPE_CHECKING:
     import rerun as rr
 
-TIMELINE = "sim_time"
-_TEXTURE_MAX_PX = 256
 _BATCH_NS = 50_000_000
 _BATCH_ROWS = 1024
 _XYZ_COLORS = ((224, 49, 49), (47, 158, 68), (28, 126, 214))
-_TRAIL_COLOR = (253, 126, 20)
+_SERIES_COLORS = (
+    *_XYZ_COLORS,
+    (240, 140, 0),
+    (132, 94, 247),
+    (18, 184, 134),
+    (230, 73, 128),
+    (134, 142, 150),
+)
+_VEHICLE_COLORS = ((253, 126, 20), (132, 94, 247), (18, 184, 134), (230, 73, 128))
 _PATH_COLOR = (51, 154, 240)
-_NO_POINTS = np.zeros((0, 3))
+_COLLISION_COLOR = (255, 0, 0)
+_AXES_M = 0.25
+_FRUSTUM_M = 0.5
 
-
-def open_recording(path: str | Path | None = None) -> rr.RecordingStream:
-    """Open a recording of its own, independent of others in this process.
-
-    Args:
-        path: Write it to this .rrd file; None: the caller connects it (`serve_grpc`, `connect_grpc`, ...).
-
-    Raises:
-        OSError: The file cannot be written.
-        ImportError: Rerun is not installed.
-    """
-    rr = _import_rerun()
-    recording = rr.RecordingStream("neurosim")
-    recording.set_log_time_enabled(False)  # wall-clock time has no place in a simulation's recording
-    recording.set_log_tick_enabled(False)
-    if path is not None:
-        try:
-            Path(path).touch()
-            recording.save(path)
-        except (OSError, RuntimeError) as error:
-            raise OSError(f"cannot write {path}: {error}") from error
-    return recording  # type: ignore[no-any-return]
+_ROTOR = "rotor {} [rad/s]"
+_SETPOINT_NAMES = {
+    "rates": ("thrust [N]", "rate x [rad/s]", "rate y [rad/s]", "rate z [rad/s]"),
+    "attitude": ("thrust [N]", "roll [rad]", "pitch [rad]", "yaw [rad]"),
+    "velocity": ("x [m/s]", "y [m/s]", "z [m/s]", "yaw rate [rad/s]"),
+    "position": ("x [m]", "y [m]", "z [m]", "yaw [rad]"),
+}
 
 
 class RerunLogger:
-    """Logs the packets of one vehicle. A context manager that flushes at the end.
+    """Logs what vehicles measure. A context manager that flushes at the end.
 
     Memory is bounded: scalars and poses wait for at most 50 ms of simulated time or 1024 rows, events for one
-    window. A picture is logged at once.
+    window. Live, `send` is to be called now and then instead of the 50 ms. A picture is logged at once.
     """
 
     def __init__(
         self,
         recording: rr.RecordingStream,
         *,
-        scene: Scene | None = None,
-        sensors: tuple[SensorDescription, ...] = (),
-        path_position: NDArray[np.float64] = _NO_POINTS,
+        vehicles: Mapping[str, tuple[SensorDescription, ...]],
+        scene: SceneShapes | None = None,
         event_window_ns: int = 20_000_000,
         image_rate_max_hz: float | None = None,
+        live: bool = False,
+        keep_layout: bool = False,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Log what does not change, and the layout of the viewer.
 
         Args:
             recording: Where to log: `open_recording`.
+            vehicles: Descriptions of the sensors of each vehicle; packets of other sensors are shown without
+                frustum.
             scene: The scene to show.
-            sensors: Descriptions of the sensors; packets of other sensors are shown without frustum.
-            path_position: Planned p_WB [m], shape [n, 3].
             event_window_ns: How much time one picture of events shows [ns].
-            image_rate_max_hz: Log no more pictures per sensor and simulated second than this.
+            image_rate_max_hz: Log no more pictures per sensor and second than this: of simulated time, or,
+                live, by the wall clock, and then those of events, too.
+            live: This is a stream that may go on for hours.
+            keep_layout: Leave the layout as the viewer has it now, if it has one.
+            clock_ns: The wall clock [ns].
 
         Raises:
             ImportError: Rerun is not installed.
+            ValueError: There is no vehicle.
         """
-        self._rr = _import_rerun()
+        if not vehicles:
+            raise ValueError("there must be at least one vehicle to log")
+        self._rr = import_rerun()
         self._recording: Any = recording
+        self._vehicles = dict(vehicles)
+        self._first = next(iter(vehicles))
+        self._colors = {
+            name: _VEHICLE_COLORS[k % len(_VEHICLE_COLORS)] for k, name in enumerate(self._vehicles)
+        }
         self._event_window_ns = event_window_ns
-        self._image_period_ns = 0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz)
-        self._image_stamp_ns: dict[str, int] = {}
+        self._image_limit = _RateLimit(0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz))
+        self._live = live
+        self._keep_layout = keep_layout
+        self._clock_ns = clock_ns
         self._windows: dict[str, EventWindow] = {}
         self._tables: dict[str, _Table] = {}
-        self._trail_end: NDArray[np.float64] | None = None
-        self._log_of: dict[type[Packet], Callable[[Any], None]] = {
+        self._trail_end: dict[str, NDArray[np.float64]] = {}
+        self._pose_of: dict[str, str] = {}
+        self._log_of: dict[type[Packet], Callable[[str, Any], None]] = {
             Events: self._log_events,
             Image: self._log_image,
             ImuSample: self._log_imu,
@@ -112,21 +124,19 @@ class RerunLogger:
             Collision: self._log_collision,
         }
         recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        if scene is not None:
-            for entity, mesh in scene_meshes(scene):
-                recording.log(entity, mesh, static=True)
-        if len(path_position) > 1:
-            path = self._rr.LineStrips3D(
-                [path_position], colors=[_PATH_COLOR], radii=self._rr.Radius.ui_points(1.5)
-            )
-            recording.log("world/path", path, static=True)
-        recording.log("world/vehicle", self._rr.TransformAxes3D(0.25), static=True)
-        for sensor in sensors:
-            self._log_description(sensor)
-        recording.send_blueprint(make_blueprint(sensors, scene))
+        for name, sensors in self._vehicles.items():
+            recording.log(_body(name), self._rr.TransformAxes3D(_AXES_M), static=True)
+            for sensor in sensors:
+                self._log_description(name, sensor)
+        self._log_meshes(scene)
+        self._send_blueprint(scene)
 
-    def log(self, packet: Packet) -> None:
+    def log(self, packet: Packet, *, vehicle: str | None = None) -> None:
         """Log one packet.
+
+        Args:
+            packet: What a sensor yielded.
+            vehicle: Name of the vehicle; None: the first one.
 
         Raises:
             ValueError: The packet is of a type that cannot be shown.
@@ -134,22 +144,82 @@ class RerunLogger:
         if type(packet) not in self._log_of:
             known = sorted(t.__name__ for t in self._log_of)
             raise ValueError(f"cannot show a packet of type {type(packet).__name__!r}, known: {known}")
-        self._log_of[type(packet)](packet)
+        self._log_of[type(packet)](self._first if vehicle is None else vehicle, packet)
 
-    def log_scalar(self, name: str, stamp_ns: int, value: float) -> None:
+    def log_scene(self, scene: SceneShapes) -> None:
+        """Show a scene that was not there at the beginning, and look at it from above."""
+        self._log_meshes(scene)
+        self._send_blueprint(scene)
+
+    def log_path(self, position: NDArray[np.float64], *, vehicle: str | None = None) -> None:
+        """Show where a vehicle is meant to fly.
+
+        Args:
+            position: Planned p_WB [m], shape [n, 3].
+            vehicle: Name of the vehicle; None: the first one.
+        """
+        if len(position) > 1:
+            path = self._rr.LineStrips3D(
+                [position], colors=[_PATH_COLOR], radii=self._rr.Radius.ui_points(1.5)
+            )
+            self._recording.log(f"world/paths/{vehicle or self._first}", path, static=True)
+
+    def log_scalar(self, name: str, stamp_ns: int, value: float, *, vehicle: str | None = None) -> None:
         """Plot a quantity that no packet carries, such as the clearance [m].
 
         Args:
             name: Name of the plot; the blueprint shows `clearance`.
             stamp_ns: Time [ns].
             value: Value in SI units.
+            vehicle: Name of the vehicle; None: the first one.
         """
-        self._table(f"plots/{name}", {"scalars": 1}, self._send_scalars).append(stamp_ns, scalars=value)
+        self._plot(f"plots/{vehicle or self._first}/{name}", stamp_ns, value, (name,))
+
+    def log_command(
+        self, mode: str, stamp_ns: int, setpoint: ArrayLike, *, vehicle: str | None = None
+    ) -> None:
+        """Plot what a vehicle is told to do.
+
+        Args:
+            mode: motor_speeds, rates, attitude, velocity or position; see `control.modes`.
+            stamp_ns: Time of the state that the command answers [ns].
+            setpoint: Row of setpoints, laid out as in `control.modes`.
+            vehicle: Name of the vehicle; None: the first one.
+        """
+        row = np.asarray(setpoint, dtype=np.float64)
+        names = _SETPOINT_NAMES.get(mode) or tuple(_ROTOR.format(k) for k in range(len(row)))
+        if mode == "attitude":
+            row = np.array([row[0], *_roll_pitch_yaw(row[1:5])])
+        self._plot(f"plots/{vehicle or self._first}/command/{mode}", stamp_ns, row, names)
+
+    def log_simulator(self, name: str, stamp_ns: int, values: Mapping[str, float]) -> None:
+        """Plot how the simulator is doing.
+
+        Args:
+            name: Name of the plot; the blueprint shows `timing`, `real_time_factor` and `losses`.
+            stamp_ns: Time [ns].
+            values: One value for each line, by its name; the same names every time.
+        """
+        self._plot(f"simulator/{name}", stamp_ns, list(values.values()), tuple(values))
+
+    def log_status(self, stamp_ns: int, text: str) -> None:
+        """Show a text beside the pictures.
+
+        Args:
+            stamp_ns: From when on it holds [ns].
+            text: Markdown.
+        """
+        self._set_time(stamp_ns)
+        self._recording.log("status", self._rr.TextDocument(text, media_type="text/markdown"))
+
+    def send(self) -> None:
+        """Send what waits."""
+        for table in self._tables.values():
+            table.send()
 
     def flush(self) -> None:
         """Send what waits, and wait until it has left."""
-        for table in self._tables.values():
-            table.send()
+        self.send()
         self._recording.flush()
 
     def close(self) -> None:
@@ -165,18 +235,29 @@ class RerunLogger:
     ) -> None:
         self.close()
 
-    def _log_description(self, sensor: SensorDescription) -> None:
+    def _log_meshes(self, scene: SceneShapes | None) -> None:
+        for entity, mesh in () if scene is None else scene.meshes:
+            self._recording.log(entity, mesh, static=True)
+
+    def _send_blueprint(self, scene: SceneShapes | None) -> None:
+        bounds_m = None if scene is None else scene.bounds_m
+        layout = make_blueprint(self._vehicles, bounds_m, live=self._live)
+        self._recording.send_blueprint(layout, make_active=not self._keep_layout)
+
+    def _log_description(self, vehicle: str, sensor: SensorDescription) -> None:
         rr = self._rr
+        if sensor.kind == "odometry":
+            self._pose_of.setdefault(vehicle, sensor.name)
         if sensor.intrinsics is not None:
             lens = sensor.intrinsics
             self._recording.log(
-                f"world/vehicle/{sensor.name}",
+                f"{_body(vehicle)}/{sensor.name}",
                 rr.Transform3D(translation=sensor.position, quaternion=sensor.orientation),
                 rr.Pinhole(
                     image_from_camera=[[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]],
                     resolution=[lens.width, lens.height],
                     camera_xyz=rr.ViewCoordinates.RDF,
-                    image_plane_distance=0.5,
+                    image_plane_distance=_FRUSTUM_M,
                 ),
                 static=True,
             )
@@ -186,7 +267,7 @@ class RerunLogger:
 
     def _table(self, entity: str, widths: dict[str, int], send: Callable[..., None]) -> _Table:
         if entity not in self._tables:
-            self._tables[entity] = _Table(entity, widths, send)
+            self._tables[entity] = _Table(entity, widths, send, span_ns=None if self._live else _BATCH_NS)
         return self._tables[entity]
 
     def _send_scalars(self, entity: str, stamp_ns: NDArray[np.int64], scalars: NDArray[np.float64]) -> None:
@@ -195,26 +276,30 @@ class RerunLogger:
             entity, indexes=[times], columns=self._rr.Scalars.columns(scalars=scalars)
         )
 
-    def _plot(self, entity: str, stamp_ns: int, value: Any, names: tuple[str, ...]) -> None:
+    def _plot(self, entity: str, stamp_ns: int, value: Any, names: Sequence[str]) -> None:
         if entity not in self._tables:
-            colors = _XYZ_COLORS if len(names) == 3 else None
+            colors = None  # a single line shares its plot with those of other entities: the viewer chooses
+            if len(names) > 1:
+                colors = [_SERIES_COLORS[k % len(_SERIES_COLORS)] for k in range(len(names))]
             self._recording.log(entity, self._rr.SeriesLines(names=names, colors=colors), static=True)
         self._table(entity, {"scalars": len(names)}, self._send_scalars).append(stamp_ns, scalars=value)
 
-    def _log_imu(self, packet: ImuSample) -> None:
-        plot = f"plots/{packet.sensor}"
+    def _log_imu(self, vehicle: str, packet: ImuSample) -> None:
+        plot = f"plots/{vehicle}/{packet.sensor}"
         self._plot(f"{plot}/specific_force", packet.stamp_ns, packet.specific_force, ("x", "y", "z"))
         self._plot(f"{plot}/angular_rate", packet.stamp_ns, packet.angular_rate, ("x", "y", "z"))
 
-    def _log_odometry(self, packet: Odometry) -> None:
-        self._table("world/vehicle", {"translation": 3, "quaternion": 4}, self._send_poses).append(
-            packet.stamp_ns, translation=packet.position, quaternion=packet.orientation
-        )
-        plot = f"plots/{packet.sensor}"
+    def _log_odometry(self, vehicle: str, packet: Odometry) -> None:
+        if self._pose_of.setdefault(vehicle, packet.sensor) == packet.sensor:
+            self._table(_body(vehicle), {"translation": 3, "quaternion": 4}, self._send_poses).append(
+                packet.stamp_ns, translation=packet.position, quaternion=packet.orientation
+            )
+        plot = f"plots/{vehicle}/{packet.sensor}"
         self._plot(f"{plot}/speed", packet.stamp_ns, np.linalg.norm(packet.velocity), ("speed",))
         self._plot(f"{plot}/height", packet.stamp_ns, packet.position[2], ("height",))
-        rotors = tuple(f"rotor {k}" for k in range(len(packet.rotor_speed)))
-        self._plot(f"{plot}/rotor_speed", packet.stamp_ns, packet.rotor_speed, rotors)
+        if len(packet.rotor_speed):
+            rotors = tuple(f"rotor {k}" for k in range(len(packet.rotor_speed)))
+            self._plot(f"{plot}/rotor_speed", packet.stamp_ns, packet.rotor_speed, rotors)
 
     def _send_poses(
         self,
@@ -224,44 +309,84 @@ class RerunLogger:
         quaternion: NDArray[np.float64],
     ) -> None:
         rr = self._rr
+        vehicle = entity.removeprefix(_body(""))
         times = rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
         columns = rr.Transform3D.columns(translation=translation, quaternion=quaternion)
         self._recording.send_columns(entity, indexes=[times], columns=columns)
-        start = translation[:1] if self._trail_end is None else self._trail_end
-        stroke = np.concatenate([start, translation])
-        self._trail_end = translation[-1:]
+        stroke = np.concatenate([self._trail_end.get(vehicle, translation[:1]), translation])
+        self._trail_end[vehicle] = translation[-1:]
         self._set_time(int(stamp_ns[-1]))
-        line = rr.LineStrips3D([stroke], colors=[_TRAIL_COLOR], radii=rr.Radius.ui_points(3.0))
-        self._recording.log("world/trail", line)
+        line = rr.LineStrips3D([stroke], colors=[self._color(vehicle)], radii=rr.Radius.ui_points(3.0))
+        self._recording.log(f"world/trails/{vehicle}", line)
 
-    def _log_image(self, packet: Image) -> None:
-        last_ns = self._image_stamp_ns.get(packet.sensor)
-        if last_ns is not None and 0 <= packet.stamp_ns - last_ns < self._image_period_ns:
-            return
-        self._image_stamp_ns[packet.sensor] = packet.stamp_ns
-        self._set_time(packet.stamp_ns)
-        self._recording.log(f"world/vehicle/{packet.sensor}/image", encode_image(packet))
+    def _color(self, vehicle: str) -> tuple[int, int, int]:
+        return self._colors.get(vehicle, _VEHICLE_COLORS[0])
 
-    def _log_events(self, packet: Events) -> None:
-        window = self._windows.setdefault(packet.sensor, EventWindow(length_ns=self._event_window_ns))
+    def _shows_picture(self, entity: str, stamp_ns: int) -> bool:
+        return self._image_limit.passes(entity, self._clock_ns() if self._live else stamp_ns)
+
+    def _log_image(self, vehicle: str, packet: Image) -> None:
+        entity = f"{_body(vehicle)}/{packet.sensor}/image"
+        if self._shows_picture(entity, packet.stamp_ns):
+            self._set_time(packet.stamp_ns)
+            self._recording.log(entity, encode_image(packet))
+
+    def _log_events(self, vehicle: str, packet: Events) -> None:
+        entity = f"{_body(vehicle)}/{packet.sensor}/image"
+        window = self._windows.setdefault(entity, EventWindow(length_ns=self._event_window_ns))
         arrays = packet.numpy()
         for end_ns, events in window.add(arrays, start_ns=packet.start_ns, stamp_ns=packet.stamp_ns):
-            self._set_time(end_ns)
-            picture = encode_events(events, width=packet.width, height=packet.height)
-            self._recording.log(f"world/vehicle/{packet.sensor}/image", picture)
+            if not self._live or self._shows_picture(entity, end_ns):
+                self._set_time(end_ns)
+                picture = encode_events(events, width=packet.width, height=packet.height)
+                self._recording.log(entity, picture)
 
-    def _log_collision(self, packet: Collision) -> None:
+    def _log_collision(self, vehicle: str, packet: Collision) -> None:
         self._set_time(packet.stamp_ns)
-        point = self._rr.Points3D([packet.position], colors=[(255, 0, 0)], radii=[0.08])
-        self._recording.log("world/collisions", point)
+        point = self._rr.Points3D([packet.position], colors=[_COLLISION_COLOR], radii=[0.08])
+        self._recording.log(f"world/collisions/{vehicle}", point)
+
+
+def _body(vehicle: str) -> str:
+    """Entity of a vehicle's body frame."""
+    return f"world/vehicles/{vehicle}"
+
+
+def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Angles of q = yaw about z, then pitch about y, then roll about x [rad]; nan for no rotation at all."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x, y, z, w = quaternion / np.linalg.norm(quaternion)
+        roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return float(roll), float(pitch), float(yaw)
+
+
+class _RateLimit:
+    """Lets so many pass that their mean rate is as wanted, whatever rate they come at."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._due_ns: dict[str, int] = {}
+
+    def passes(self, key: str, now_ns: int) -> bool:
+        due_ns = self._due_ns.get(key, now_ns)
+        if due_ns - self._period_ns <= now_ns < due_ns:  # before that, time has begun again
+            return False
+        first = now_ns < due_ns
+        self._due_ns[key] = now_ns + self._period_ns if first else max(due_ns + self._period_ns, now_ns)
+        return True
 
 
 class _Table:
     """Rows of one entity that are sent together."""
 
-    def __init__(self, entity: str, widths: dict[str, int], send: Callable[..., None]) -> None:
+    def __init__(
+        self, entity: str, widths: dict[str, int], send: Callable[..., None], *, span_ns: int | None
+    ) -> None:
         self._entity = entity
         self._send = send
+        self._span_ns = span_ns
         self._stamp_ns: list[int] = []
         self._columns: dict[str, list[NDArray[np.float64]]] = {name: [] for name in widths}
         self._widths = widths
@@ -272,7 +397,9 @@ class _Table:
         self._stamp_ns.append(stamp_ns)
         for name, value in values.items():
             self._columns[name].append(np.array(value, dtype=np.float64).reshape(self._widths[name]))
-        if stamp_ns - self._stamp_ns[0] >= _BATCH_NS or len(self._stamp_ns) >= _BATCH_ROWS:
+        if len(self._stamp_ns) >= _BATCH_ROWS or (
+            self._span_ns is not None and stamp_ns - self._stamp_ns[0] >= self._span_ns
+        ):
             self.send()
 
     def send(self) -> None:
@@ -281,151 +408,3 @@ class _Table:
             self._send(self._entity, np.array(self._stamp_ns, dtype=np.int64), **columns)
             self._stamp_ns = []
             self._columns = {name: [] for name in self._columns}
-
-
-def encode_image(image: Image) -> Any:
-    """Return a picture as Rerun shows it.
-
-    rgb8 and mono8 become JPEG; 32FC1 becomes a depth image in millimetres up to 65 m, 0 where nothing is hit.
-
-    Raises:
-        ValueError: If another encoding is given.
-    """
-    rr = _import_rerun()
-    if image.encoding in ("rgb8", "mono8"):
-        return rr.Image(image.data).compress(jpeg_quality=90)
-    if image.encoding == "32FC1":
-        depth_mm = np.where(np.isfinite(image.data), np.minimum(image.data * 1000.0 + 0.5, 65535.0), 0.0)
-        return rr.EncodedDepthImage(
-            _png(PIL.Image.fromarray(depth_mm.astype(np.uint16))),
-            media_type="image/png",
-            meter=1000.0,
-            colormap=rr.components.Colormap.Turbo,
-        )
-    raise ValueError(f"cannot show a picture of encoding {image.encoding!r}, known: rgb8, mono8, 32FC1")
-
-
-def encode_events(events: EventArrays, *, width: int, height: int) -> Any:
-    """Return events as the picture of `event_picture`, losslessly compressed."""
-    picture = PIL.Image.fromarray(event_classes(events, width=width, height=height), mode="L")
-    picture.putpalette(PALETTE.tobytes())
-    return _import_rerun().EncodedImage(contents=_png(picture), media_type="image/png")
-
-
-def _png(picture: PIL.Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
-
-
-def scene_meshes(scene: Scene) -> list[tuple[str, Any]]:
-    """Return the scene as Rerun meshes, one per material, each with its entity path.
-
-    Faces that lie wholly in the highest 15 % go below `world/scene/ceiling`, so that they can be hidden.
-    Textures are reduced to 256 pixels.
-    """
-    rr = _import_rerun()
-    low_m, high_m = scene.bounds_m[:, 2]
-    top = scene.vertices[scene.faces, 2].min(axis=1) > low_m + 0.85 * (high_m - low_m)
-    meshes = []
-    for part, chosen in (("room", ~top), ("ceiling", top)):
-        for index, material in enumerate(scene.materials):
-            faces = scene.faces[chosen & (scene.face_material == index)]
-            if not len(faces):
-                continue
-            used, triangles = np.unique(faces, return_inverse=True)
-            texture = _texture(material)
-            mesh = rr.Mesh3D(
-                vertex_positions=scene.vertices[used],
-                vertex_normals=scene.normals[used],
-                triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
-                vertex_texcoords=None if texture is None else _image_coordinates(scene.uv[used]),
-                albedo_texture=texture,
-                albedo_factor=[*linear_to_srgb8(_albedo(material)), 255],
-            )
-            meshes.append((f"world/scene/{part}/{index}", mesh))
-    return meshes
-
-
-def _albedo(material: Material) -> NDArray[np.float64]:
-    color: NDArray[np.float64] = np.array(material.base_color) + np.array(material.emission)
-    return color.clip(0.0, 1.0)
-
-
-def _image_coordinates(uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Rerun counts v from the top row."""
-    return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
-
-
-def _texture(material: Material) -> NDArray[np.uint8] | None:
-    if material.texture is None:
-        return None
-    picture = PIL.Image.fromarray(material.texture.srgb)
-    picture.thumbnail((_TEXTURE_MAX_PX, _TEXTURE_MAX_PX))
-    return np.asarray(picture)
-
-
-def make_blueprint(sensors: tuple[SensorDescription, ...], scene: Scene | None = None) -> Any:
-    """Lay the viewer out: the scene large, pictures at its right, plots below."""
-    rrb = _import_rerun().blueprint
-    cameras = [sensor for sensor in sensors if sensor.intrinsics is not None]
-    cameras.sort(key=lambda sensor: ("rgb", "event_camera", "depth").index(sensor.kind))
-    until_now = rrb.VisibleTimeRanges(
-        rrb.VisibleTimeRange(
-            TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-        )
-    )
-    eye = None
-    if scene is not None:
-        low, high = scene.bounds_m
-        center, size = 0.5 * (low + high), high - low
-        away = np.array([-0.3 * size[0], -0.7 * max(size), 0.85 * max(size)])
-        eye = rrb.EyeControls3D(position=center + away, look_target=center, eye_up=(0.0, 0.0, 1.0))
-    space = rrb.Spatial3DView(
-        origin="world",
-        name="Scene",
-        # One frustum is enough where cameras share a place; the others' pictures are at the right.
-        contents=["$origin/**", *(f"- /world/vehicle/{camera.name}/**" for camera in cameras[1:])],
-        overrides={
-            "world/trail": until_now,
-            "world/collisions": until_now,
-            "world/scene/ceiling": rrb.EntityBehavior(visible=False),
-        },
-        eye_controls=eye,
-        line_grid=False,
-    )
-    pictures = [
-        rrb.Spatial2DView(origin=f"world/vehicle/{camera.name}", contents="$origin/image", name=camera.name)
-        for camera in cameras
-    ]
-    imus = [sensor.name for sensor in sensors if sensor.kind == "imu"]
-    plots = []
-    for name in imus:
-        plots += [
-            rrb.TimeSeriesView(origin=f"plots/{name}/specific_force", name=f"{name}: specific force [m/s²]"),
-            rrb.TimeSeriesView(origin=f"plots/{name}/angular_rate", name=f"{name}: angular rate [rad/s]"),
-        ]
-    for name in (sensor.name for sensor in sensors if sensor.kind == "odometry"):
-        motion = [f"/plots/{name}/speed", f"/plots/{name}/height", "/plots/clearance"]
-        plots += [
-            rrb.TimeSeriesView(origin="plots", contents=motion, name="speed [m/s], height, clearance [m]"),
-            rrb.TimeSeriesView(origin=f"plots/{name}/rotor_speed", name="rotor speed [rad/s]"),
-        ]
-    left = rrb.Vertical(space, rrb.Horizontal(*plots), row_shares=[3, 1]) if plots else space
-    layout = rrb.Horizontal(left, rrb.Vertical(*pictures), column_shares=[3, 1]) if pictures else left
-    return rrb.Blueprint(
-        layout,
-        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False,
-    )
-
-
-def _import_rerun() -> ModuleType:
-    try:
-        import rerun
-        import rerun.blueprint
-    except ImportError as error:
-        raise ImportError("the viewer needs Rerun: pip install 'neurosim[view]'") from error
-    return rerun

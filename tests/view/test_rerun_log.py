@@ -20,13 +20,9 @@ from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSamp
 from neurosim_core.record import Intrinsics, SensorDescription
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.view.event_picture import event_picture
-from neurosim_core.view.rerun_log import (
-    RerunLogger,
-    encode_events,
-    encode_image,
-    open_recording,
-    scene_meshes,
-)
+from neurosim_core.view.rerun_log import RerunLogger
+from neurosim_core.view.rerun_sdk import open_recording
+from neurosim_core.view.rerun_shapes import encode_events, encode_image, scene_shapes
 
 MS = 1_000_000
 LENS = Intrinsics(width=32, height=24, fx=30.0, fy=31.0, cx=16.0, cy=12.0)
@@ -50,6 +46,7 @@ SENSORS = (
     describe("imu", "imu"),
     describe("truth", "odometry"),
 )
+NOTHING: dict[str, tuple[SensorDescription, ...]] = {"drone": ()}
 
 
 def make_events(k: int, count: int = 50) -> Events:
@@ -113,7 +110,7 @@ def read(path: Path) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
 def record(
     path: Path, packets: list[Packet], **options: Any
 ) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
-    with RerunLogger(open_recording(path), sensors=SENSORS, **options) as logger:
+    with RerunLogger(open_recording(path), vehicles={"drone": SENSORS}, **options) as logger:
         for packet in packets:
             logger.log(packet)
     return read(path)
@@ -123,16 +120,16 @@ def test_scalars_and_poses_are_read_back(tmp_path):
     """Every sample, at its nanosecond."""
     packets: list[Packet] = [*(make_odometry(k) for k in range(50)), *(make_imu(k) for k in range(130))]
     rows = record(tmp_path / "f.rrd", sorted(packets, key=lambda p: p.stamp_ns))
-    force = [(t, v["scalars"]) for t, v in rows["/plots/imu/specific_force"] if t is not None]
+    force = [(t, v["scalars"]) for t, v in rows["/plots/drone/imu/specific_force"] if t is not None]
     assert force == [(k * 2 * MS + 1, [k, 0.0, 9.81]) for k in range(130)]
-    speed = [(t, v["scalars"]) for t, v in rows["/plots/truth/speed"] if t is not None]
+    speed = [(t, v["scalars"]) for t, v in rows["/plots/drone/truth/speed"] if t is not None]
     assert speed == [(k * 5 * MS + 1, [5.0]) for k in range(50)]
-    rotors = [v["scalars"] for t, v in rows["/plots/truth/rotor_speed"] if t is not None]
+    rotors = [v["scalars"] for t, v in rows["/plots/drone/truth/rotor_speed"] if t is not None]
     assert rotors == [[k, k + 1.0, k + 2.0, k + 3.0] for k in range(50)]
-    poses = [(t, v["translation"]) for t, v in rows["/world/vehicle"] if t is not None]
+    poses = [(t, v["translation"]) for t, v in rows["/world/vehicles/drone"] if t is not None]
     assert [t for t, _ in poses] == [k * 5 * MS + 1 for k in range(50)]
     assert np.array([p[0] for _, p in poses])[:, 0] == pytest.approx(0.1 * np.arange(50), rel=1e-6)  # float32
-    strokes = [v["strips"][0] for _, v in rows["/world/trail"]]
+    strokes = [v["strips"][0] for _, v in rows["/world/trails/drone"]]
     assert [stroke[0] for stroke in strokes[1:]] == [stroke[-1] for stroke in strokes[:-1]]
     trail = np.concatenate([stroke[1:] for stroke in strokes])
     assert trail[:, 0] == pytest.approx(0.1 * np.arange(50), rel=1e-6)
@@ -142,7 +139,7 @@ def test_scalars_and_poses_are_read_back(tmp_path):
 def test_events_become_one_picture_per_window(tmp_path):
     """Two packets of 10 ms make a window of 20 ms; its picture is the one of event_picture, without loss."""
     packets = [make_events(k) for k in range(6)]
-    rows = record(tmp_path / "f.rrd", list(packets))["/world/vehicle/dvs/image"]
+    rows = record(tmp_path / "f.rrd", list(packets))["/world/vehicles/drone/dvs/image"]
     assert [t for t, _ in rows] == [20 * MS, 40 * MS, 60 * MS]
     for k, (_, values) in enumerate(rows):
         joined = EventArrays(
@@ -159,7 +156,7 @@ def test_cameras_are_described(tmp_path):
     rows = record(tmp_path / "f.rrd", [])
     for name in ("dvs", "rgb", "z"):
         values: dict[str, Any] = {}
-        for stamp_ns, part in rows[f"/world/vehicle/{name}"]:
+        for stamp_ns, part in rows[f"/world/vehicles/drone/{name}"]:
             assert stamp_ns is None
             values |= {key: value for key, value in part.items() if value is not None}
         assert values["resolution"] == [[32.0, 24.0]]
@@ -175,21 +172,35 @@ def test_image_rate_is_limited_per_sensor(tmp_path):
     packets = [make_image(k * 10 * MS, sensor) for k in range(21) for sensor in ("rgb", "other")]
     packets.append(make_image(0))  # after a reset time starts again, and the first picture is shown
     rows = record(tmp_path / "f.rrd", list(packets), image_rate_max_hz=20.0)
-    assert [t for t, _ in rows["/world/vehicle/rgb/image"]] == [0, 0, 50 * MS, 100 * MS, 150 * MS, 200 * MS]
-    assert [t for t, _ in rows["/world/vehicle/other/image"]] == [0, 50 * MS, 100 * MS, 150 * MS, 200 * MS]
+    assert [t for t, _ in rows["/world/vehicles/drone/rgb/image"]] == [
+        0,
+        0,
+        50 * MS,
+        100 * MS,
+        150 * MS,
+        200 * MS,
+    ]
+    assert [t for t, _ in rows["/world/vehicles/drone/other/image"]] == [
+        0,
+        50 * MS,
+        100 * MS,
+        150 * MS,
+        200 * MS,
+    ]
 
 
 def test_collisions_clearance_and_path(tmp_path):
     path = np.arange(9.0).reshape(3, 3)
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), path_position=path) as logger:
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+        logger.log_path(path)
         logger.log(
             Collision(stamp_ns=7, sensor="collision", position=np.array([1.0, 2.0, 3.0]), clearance_m=-0.1)
         )
         logger.log_scalar("clearance", 5, 0.25)
     rows = read(tmp_path / "f.rrd")
-    assert [(t, v["positions"]) for t, v in rows["/world/collisions"]] == [(7, [[1.0, 2.0, 3.0]])]
-    assert [(t, v["scalars"]) for t, v in rows["/plots/clearance"]] == [(5, [0.25])]
-    assert rows["/world/path"][0][1]["strips"] == [path.tolist()]
+    assert [(t, v["positions"]) for t, v in rows["/world/collisions/drone"]] == [(7, [[1.0, 2.0, 3.0]])]
+    assert [(t, v["scalars"]) for t, v in rows["/plots/drone/clearance"] if t is not None] == [(5, [0.25])]
+    assert rows["/world/paths/drone"][0][1]["strips"] == [path.tolist()]
 
 
 def test_depth_is_in_millimetres_and_zero_is_nothing():
@@ -213,7 +224,9 @@ def test_scene_is_split_by_material_and_ceiling():
         materials=(Material(name="a", base_color=(1.0, 0.0, 0.0), texture=texture), Material(name="b")),
         face_material=np.repeat([0, 1], 12).astype(np.int32),
     )
-    meshes = dict(scene_meshes(scene))
+    shapes = scene_shapes(scene)
+    meshes = dict(shapes.meshes)
+    assert (shapes.bounds_m == scene.bounds_m).all()
     assert sorted(meshes) == ["world/scene/ceiling/1", "world/scene/room/0"]
     for part, first in (("world/scene/room/0", 0), ("world/scene/ceiling/1", 12)):
         vertices = np.array(meshes[part].vertex_positions.as_arrow_array().to_pylist())
@@ -228,7 +241,7 @@ def test_scene_is_split_by_material_and_ceiling():
 
 def test_memory_is_bounded(tmp_path):
     """Rows wait for at most 50 ms or 1024 rows."""
-    with RerunLogger(open_recording(tmp_path / "f.rrd")) as logger:
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         for k in range(3000):
             sample = make_imu(k)
             logger.log(
@@ -240,13 +253,13 @@ def test_memory_is_bounded(tmp_path):
                 )
             )
             assert all(len(table._stamp_ns) < 1024 for table in logger._tables.values())
-    rows = read(tmp_path / "f.rrd")["/plots/imu/specific_force"]
+    rows = read(tmp_path / "f.rrd")["/plots/drone/imu/specific_force"]
     assert [t for t, _ in rows if t is not None] == list(range(3000))
 
 
 def test_wrong_input_is_refused(tmp_path):
     with (
-        RerunLogger(open_recording(tmp_path / "f.rrd")) as logger,
+        RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger,
         pytest.raises(ValueError, match="type 'Packet'"),
     ):
         logger.log(Packet())

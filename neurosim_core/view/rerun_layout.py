@@ -1,0 +1,155 @@
+"""How the viewer is laid out: the scene large, pictures at its right, plots below."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurosim_core.record.header import SensorDescription
+from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
+
+LIVE_PLOT_S = 10.0
+"""How much time the plots of a stream show [s]."""
+LIVE_TRAIL_S = 30.0
+"""How much of its way a vehicle draws behind it, in a stream [s]."""
+_PICTURES = ("rgb", "event_camera", "depth")
+_PLOTS_PER_ROW = 3
+
+
+def make_blueprint(
+    vehicles: Mapping[str, tuple[SensorDescription, ...]],
+    bounds_m: NDArray[np.float64] | None = None,
+    *,
+    live: bool = False,
+) -> Any:
+    """Lay the viewer out; see `rerun_log` for the entities.
+
+    Args:
+        vehicles: Sensors of each vehicle.
+        bounds_m: Lowest and highest corner of the scene [m], shape [2, 3]; None: there is none.
+        live: Plots show the last seconds, and those of commands and of the simulator are there.
+    """
+    rrb = import_rerun().blueprint
+    many = len(vehicles) > 1
+    pictures, plots = [], []
+    for name, sensors in vehicles.items():
+        views = [
+            rrb.Spatial2DView(
+                origin=f"world/vehicles/{name}/{camera.name}", contents="$origin/image", name=camera.name
+            )
+            for camera in _cameras(sensors)
+        ]
+        if views:
+            pictures.append(rrb.Vertical(*views, name=name) if many else views)
+        views = _plots(name, sensors, live=live)
+        if views:
+            plots.append(rrb.Grid(*views, grid_columns=_PLOTS_PER_ROW, name=name))
+    if live:
+        plots.append(rrb.Horizontal(*_simulator_plots(), name="simulator"))
+    right = ([rrb.Tabs(*pictures)] if many and pictures else pictures[0] if pictures else []) + (
+        [rrb.TextDocumentView(origin="status", name="status")] if live else []
+    )
+    space = _space(vehicles, bounds_m, live=live)
+    below = rrb.Tabs(*plots) if len(plots) > 1 else plots[0] if plots else None
+    left = space if below is None else rrb.Vertical(space, below, row_shares=[5, 4] if live else [5, 3])
+    layout = rrb.Horizontal(left, rrb.Vertical(*right), column_shares=[3, 1]) if right else left
+    return rrb.Blueprint(
+        layout,
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following" if live else None),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+    )
+
+
+def _cameras(sensors: tuple[SensorDescription, ...]) -> list[SensorDescription]:
+    cameras = [sensor for sensor in sensors if sensor.intrinsics is not None]
+    return sorted(cameras, key=lambda sensor: _PICTURES.index(sensor.kind))
+
+
+def _space(
+    vehicles: Mapping[str, tuple[SensorDescription, ...]],
+    bounds_m: NDArray[np.float64] | None,
+    *,
+    live: bool,
+) -> Any:
+    rrb = import_rerun().blueprint
+    eye = None
+    if bounds_m is not None:
+        low, high = bounds_m
+        center, size = 0.5 * (low + high), high - low
+        away = np.array([-0.3 * size[0], -0.7 * max(size), 0.85 * max(size)])
+        eye = rrb.EyeControls3D(position=center + away, look_target=center, eye_up=(0.0, 0.0, 1.0))
+    until_now = _last_seconds(LIVE_TRAIL_S if live else None)
+    # One frustum is enough where cameras share a place; the others' pictures are at the right.
+    hidden = [
+        f"- /world/vehicles/{name}/{camera.name}/**"
+        for name, sensors in vehicles.items()
+        for camera in _cameras(sensors)[1:]
+    ]
+    return rrb.Spatial3DView(
+        origin="world",
+        name="scene",
+        contents=["$origin/**", *hidden],
+        overrides={
+            **{f"world/trails/{name}": until_now for name in vehicles},
+            **{f"world/collisions/{name}": until_now for name in vehicles},
+            "world/scene/ceiling": rrb.EntityBehavior(visible=False),
+        },
+        eye_controls=eye,
+        line_grid=False,
+    )
+
+
+def _last_seconds(seconds: float | None) -> Any:
+    """The data of the last seconds before the cursor, or of all time before it."""
+    rrb = import_rerun().blueprint
+    boundary = rrb.TimeRangeBoundary
+    start = boundary.infinite() if seconds is None else boundary.cursor_relative(seconds=-seconds)
+    return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=start, end=boundary.cursor_relative()))
+
+
+def _plot(name: str, origin: str, contents: list[str] | None = None, *, live: bool) -> Any:
+    rrb = import_rerun().blueprint
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=["$origin/**"] if contents is None else contents,
+        name=name,
+        time_ranges=_last_seconds(LIVE_PLOT_S) if live else None,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+    )
+
+
+def _plots(vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool) -> list[Any]:
+    root = f"plots/{vehicle}"
+    plots = []
+    for sensor in sensors:
+        at = f"{root}/{sensor.name}"
+        if sensor.kind == "imu":
+            plots += [
+                _plot(f"{sensor.name}: specific force [m/s²]", f"{at}/specific_force", live=live),
+                _plot(f"{sensor.name}: angular rate [rad/s]", f"{at}/angular_rate", live=live),
+            ]
+    for sensor in sensors:
+        at = f"{root}/{sensor.name}"
+        if sensor.kind == "odometry":
+            motion = [f"/{at}/speed", f"/{at}/height"] + ([] if live else [f"/{root}/clearance"])
+            name = "speed [m/s], height" + (" [m]" if live else ", clearance [m]")
+            plots += [
+                _plot(name, at, motion, live=live),
+                _plot("rotor speed [rad/s]", f"{at}/rotor_speed", live=live),
+            ]
+    if live:
+        plots.append(_plot("command", f"{root}/command", live=live))
+    return plots
+
+
+def _simulator_plots() -> list[Any]:
+    return [
+        _plot("loop timing [ms]", "simulator/timing", live=True),
+        _plot("real-time factor", "simulator/real_time_factor", live=True),
+        _plot("lost messages", "simulator/losses", live=True),
+    ]

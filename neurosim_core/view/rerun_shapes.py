@@ -1,0 +1,111 @@
+"""Pictures and meshes as Rerun shows them."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from neurosim_core.packets import EventArrays, Image
+from neurosim_core.scene.scene import Material, Scene
+from neurosim_core.scene.source import linear_to_srgb8
+from neurosim_core.view.event_picture import PALETTE, event_classes
+from neurosim_core.view.rerun_sdk import import_rerun
+
+_TEXTURE_MAX_PX = 256
+
+
+def encode_image(image: Image) -> Any:
+    """Return a picture as Rerun shows it.
+
+    rgb8 and mono8 become JPEG; 32FC1 becomes a depth image in millimetres up to 65 m, 0 where nothing is hit.
+
+    Raises:
+        ValueError: If another encoding is given.
+    """
+    rr = import_rerun()
+    if image.encoding in ("rgb8", "mono8"):
+        return rr.Image(image.data).compress(jpeg_quality=90)
+    if image.encoding == "32FC1":
+        depth_mm = np.where(np.isfinite(image.data), np.minimum(image.data * 1000.0 + 0.5, 65535.0), 0.0)
+        return rr.EncodedDepthImage(
+            _png(PIL.Image.fromarray(depth_mm.astype(np.uint16))),
+            media_type="image/png",
+            meter=1000.0,
+            colormap=rr.components.Colormap.Turbo,
+        )
+    raise ValueError(f"cannot show a picture of encoding {image.encoding!r}, known: rgb8, mono8, 32FC1")
+
+
+def encode_events(events: EventArrays, *, width: int, height: int) -> Any:
+    """Return events as the picture of `event_picture`, losslessly compressed."""
+    picture = PIL.Image.fromarray(event_classes(events, width=width, height=height), mode="L")
+    picture.putpalette(PALETTE.tobytes())
+    return import_rerun().EncodedImage(contents=_png(picture), media_type="image/png")
+
+
+def _png(picture: PIL.Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", compress_level=1)
+    return buffer.getvalue()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneShapes:
+    """A scene as Rerun shows it; made once, logged into as many recordings as need be."""
+
+    meshes: tuple[tuple[str, Any], ...]
+    """One mesh for each material, with its entity path."""
+    bounds_m: NDArray[np.float64]
+    """Lowest and highest corner of all vertices [m], shape [2, 3]."""
+
+
+def scene_shapes(scene: Scene) -> SceneShapes:
+    """Return the shapes of a scene: one mesh per material.
+
+    Faces that lie wholly in the highest 15 % go below `world/scene/ceiling`, so that they can be hidden.
+    Textures are reduced to 256 pixels.
+    """
+    rr = import_rerun()
+    low_m, high_m = scene.bounds_m[:, 2]
+    top = scene.vertices[scene.faces, 2].min(axis=1) > low_m + 0.85 * (high_m - low_m)
+    meshes = []
+    for part, chosen in (("room", ~top), ("ceiling", top)):
+        for index, material in enumerate(scene.materials):
+            faces = scene.faces[chosen & (scene.face_material == index)]
+            if not len(faces):
+                continue
+            used, triangles = np.unique(faces, return_inverse=True)
+            texture = _texture(material)
+            mesh = rr.Mesh3D(
+                vertex_positions=scene.vertices[used],
+                vertex_normals=scene.normals[used],
+                triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
+                vertex_texcoords=None if texture is None else _image_coordinates(scene.uv[used]),
+                albedo_texture=texture,
+                albedo_factor=[*linear_to_srgb8(_albedo(material)), 255],
+            )
+            meshes.append((f"world/scene/{part}/{index}", mesh))
+    return SceneShapes(meshes=tuple(meshes), bounds_m=np.array(scene.bounds_m, dtype=np.float64))
+
+
+def _albedo(material: Material) -> NDArray[np.float64]:
+    color: NDArray[np.float64] = np.array(material.base_color) + np.array(material.emission)
+    return color.clip(0.0, 1.0)
+
+
+def _image_coordinates(uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Rerun counts v from the top row."""
+    return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
+
+
+def _texture(material: Material) -> NDArray[np.uint8] | None:
+    if material.texture is None:
+        return None
+    picture = PIL.Image.fromarray(material.texture.srgb)
+    picture.thumbnail((_TEXTURE_MAX_PX, _TEXTURE_MAX_PX))
+    return np.asarray(picture)

@@ -1,0 +1,179 @@
+"""The Rerun viewer as a process of ours: a window, or a server of its page and data for this machine only.
+
+`rerun.serve_grpc` would do the second in this process, but listens on every network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib.util
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.parse
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from neurosim_core.view.rerun_sdk import import_rerun, open_recording
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+HOST = "127.0.0.1"
+_START_S = 20.0
+_END_S = 0.5
+_WINDOW_MEMORY = "2GB"
+_SERVER_MEMORY = "1GB"
+_PR_SET_PDEATHSIG = 1
+
+
+class ViewerEnded(RuntimeError):
+    """The viewer's process is gone; the message has its last words."""
+
+
+class RerunViewer:
+    """A viewer that recordings can be opened in. A context manager that ends it."""
+
+    def __init__(self, *, web: bool, port: int = 0, waiting: Callable[[], bool] = lambda: True) -> None:
+        """Start the viewer and wait until it listens.
+
+        Args:
+            web: Serve a page instead of opening a window.
+            port: Port of the page; 0: any that is free.
+            waiting: Asked now and then whether to go on waiting.
+
+        Raises:
+            ImportError: Rerun is not installed.
+            OSError: The port is taken.
+            ViewerEnded: It ended at once, or does not listen in time.
+        """
+        import_rerun()
+        data_port = _free_port()
+        options = ["--bind", HOST, "--port", str(data_port), "--server-memory-limit", _SERVER_MEMORY]
+        if web:
+            page_port = _free_port(port)
+            options += ["--serve-web", "--web-viewer-port", str(page_port)]
+        else:
+            options += ["--memory-limit", _WINDOW_MEMORY, "--hide-welcome-screen", "--expect-data-soon"]
+        self.data_url = f"rerun+http://{HOST}:{data_port}/proxy"
+        """Where recordings are sent to."""
+        self.page_url = ""
+        """Address of the page; empty for a window."""
+        if web:
+            query = urllib.parse.urlencode({"url": self.data_url}, safe=":/")
+            self.page_url = f"http://{HOST}:{page_port}/?{query}"
+        self._words = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
+        self._process = subprocess.Popen(
+            [_executable(), *options],
+            stdin=subprocess.DEVNULL,
+            stdout=self._words,
+            stderr=self._words,
+            env={**os.environ, "RERUN_APP_ONLY": "true"},
+            start_new_session=True,  # Ctrl-C is for us, and we end it
+            preexec_fn=_end_with_parent(),
+        )
+        try:
+            self._wait_for(data_port, waiting)
+            if web:
+                self._wait_for(page_port, waiting)
+        except BaseException:
+            self.close()
+            raise
+
+    def open(self, name: str) -> rr.RecordingStream:
+        """Open a recording in the viewer, which shows it at once.
+
+        Args:
+            name: What the viewer calls it.
+        """
+        recording = open_recording(name=name)
+        recording.connect_grpc(self.data_url)
+        return recording
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process is gone, because its window was closed or it failed."""
+        return self._process.poll() is not None
+
+    def check(self) -> None:
+        """See whether the viewer is still there.
+
+        Raises:
+            ViewerEnded: It failed.
+        """
+        if self._process.poll():
+            raise ViewerEnded(f"the viewer ended with status {self._process.poll()}:\n{self._last_words()}")
+
+    def close(self) -> None:
+        """End the process."""
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            if self._process.poll() is None:
+                self._process.send_signal(number)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_END_S)
+        self._process.wait()
+        self._words.close()
+
+    def __enter__(self) -> RerunViewer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _wait_for(self, port: int, waiting: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + _START_S
+        while waiting():
+            if self.ended:
+                raise ViewerEnded(
+                    f"the viewer ended at once, with status {self._process.poll()}:\n{self._last_words()}"
+                )
+            with contextlib.suppress(OSError), socket.create_connection((HOST, port), timeout=0.1):
+                return
+            if time.monotonic() > deadline_s:
+                raise ViewerEnded(f"the viewer does not listen on port {port} after {_START_S:g} s")
+            time.sleep(0.02)
+
+    def _last_words(self) -> str:
+        self._words.seek(0)
+        lines = self._words.read().decode(errors="replace").strip().splitlines()
+        return "\n".join(lines[-5:])
+
+
+def _executable() -> str:
+    """The viewer itself; the script `rerun` would start it as a process of its own."""
+    given = os.environ.get("RERUN_CLI_PATH")
+    if given:
+        return given
+    found = importlib.util.find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise ImportError("this Rerun has no viewer: pip install 'neurosim[view]'")
+    folder = Path(found.origin).parent
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    return str(bundled if bundled.exists() else folder / "rerun")
+
+
+def _free_port(wanted: int = 0) -> int:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, wanted))
+        except OSError as error:
+            raise OSError(f"port {wanted} cannot be used: {error.strerror}") from None
+        return int(probe.getsockname()[1])
+
+
+def _end_with_parent() -> Callable[[], None] | None:
+    """What the viewer does first: ask to be ended when this process is killed. Only Linux can."""
+    if sys.platform != "linux":
+        return None
+    prctl = ctypes.CDLL(None).prctl
+    return lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
