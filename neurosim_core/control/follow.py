@@ -55,6 +55,8 @@ class PathFollower:
             if mode == "motor_speeds"
             else None
         )
+        if self._controller is not None:
+            self._controller.update(self._feedback)  # compiled here rather than at the first command
 
     def command(
         self,
