@@ -176,6 +176,10 @@ class SimulationConfig(Settings):
         for name, sensor in sensors.items():
             if name in _RESERVED:
                 raise ValueError(f"the sensor name {name!r} is taken by {_RESERVED[name]}")
+            if name.endswith("_link"):
+                raise ValueError(
+                    f"a sensor's name must not end in '_link', as recordings of links do: {name!r}"
+                )
             if name == "odometry" and sensor.kind != "odometry":
                 raise ValueError(f"a sensor named 'odometry' must be of kind odometry, got {sensor.kind}")
         return sensors

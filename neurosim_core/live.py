@@ -54,6 +54,8 @@ class LinkConfig(Settings):
     """Share of messages that never arrive."""
     bandwidth_bytes_s: Annotated[float, Field(gt=0.0)] | None = None
     """Bytes a second; a message occupies the link for its size over this. null: unlimited."""
+    queue_s: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
+    """Longest that a message may wait for bandwidth [s]; one that would wait longer is lost at once."""
     clock_offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """What the sensor's clock is ahead of simulated time at stamp 0 [s]; not for `command`."""
     clock_drift_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0

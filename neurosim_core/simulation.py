@@ -19,7 +19,7 @@ import itertools
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
@@ -144,10 +144,12 @@ class State:
     """For each batch that cameras may look at, the point where the device has finished it."""
     flight_lane_count: int
     """The most batches that may be flown and not looked at."""
+    borrow_pictures: bool
+    """Pictures are views that the next batch of their lane overwrites."""
     wanted: frozenset[str]
     """Cameras that look, from the next batch on."""
     flight_stream: wp.Stream | None
-    """Where the vehicle moves, ahead of the renderers."""
+    """Where the vehicle moves, ahead of the renderers; with one lane nothing overlaps, one stream does."""
     render_stream: wp.Stream | None
     event_stream: wp.Stream | None
     """Where events are found, while the next batch is rendered."""
@@ -301,6 +303,7 @@ def make_state(
     *,
     lane_count: int | None = None,
     flight_lane_count: int | None = None,
+    borrow_pictures: bool = False,
     seed: int | None = None,
     start: StartState | None = None,
 ) -> State:
@@ -311,6 +314,7 @@ def make_state(
         lane_count: How many batches `run_model` keeps under way. By default 2 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
         flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
+        borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`.
         seed: Seed of the sensor noise; None: as configured.
         start: Where the vehicle starts; None: as configured.
 
@@ -373,10 +377,11 @@ def make_state(
         imu_copies={n: (HostCopy(i.specific_force), HostCopy(i.angular_rate)) for n, i in imus.items()},
         lanes=[Milestone(device) for _ in range(lane_count)],
         flight_lane_count=flight_lane_count,
+        borrow_pictures=borrow_pictures,
         wanted=frozenset(name for cast in model.casts for name in cast.names),
-        flight_stream=make_stream(device, urgent=True),
-        render_stream=make_stream(device),
-        event_stream=make_stream(device, urgent=True),
+        flight_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
+        render_stream=make_stream(device) if lane_count > 1 else None,
+        event_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
         flown=[Milestone(device) for _ in range(flight_lane_count)],
         rendered=Milestone(device),
         graphs=Graphs(device),
@@ -721,7 +726,13 @@ def _look(model: Model, state: State, batch: Batch) -> None:
                 stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
                 slots = [batch.slot + place for place in due]
                 instants = render_instants(
-                    cast, state.trace, slots, stamps_ns, lane=lane, wanted=batch.wanted
+                    cast,
+                    state.trace,
+                    slots,
+                    stamps_ns,
+                    lane=lane,
+                    wanted=batch.wanted,
+                    graphs=state.graphs,
                 )
                 seen.append((cast, instants))
         state.rendered.set()
@@ -769,7 +780,7 @@ def _read_cameras(state: State, batch: Batch) -> list[Packet]:
             packets += events
     with timed(state.wall_s, "read-back"):
         for cast, instants in batch.seen:
-            packets += read_images(cast, instants)
+            packets += read_images(cast, instants, borrow=state.borrow_pictures)
     return packets
 
 
@@ -853,14 +864,20 @@ def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[
     return packets
 
 
-@contextmanager
-def timed(wall_s: dict[str, float], phase: str) -> Iterator[None]:
-    """Add the wall-clock time of a block to a phase."""
-    begin = time.perf_counter()
-    try:
-        yield
-    finally:
-        wall_s[phase] += time.perf_counter() - begin
+class timed:
+    """Adds the wall-clock time of a block to a phase; a class, as it is entered ten times in a period."""
+
+    __slots__ = ("_begin", "_phase", "_wall_s")
+
+    def __init__(self, wall_s: dict[str, float], phase: str) -> None:
+        self._wall_s = wall_s
+        self._phase = phase
+
+    def __enter__(self) -> None:
+        self._begin = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._wall_s[self._phase] += time.perf_counter() - self._begin
 
 
 def _device(name: str) -> str:

@@ -64,31 +64,32 @@ class Graphs:
 
     def __init__(self, device: Any) -> None:
         self._device = wp.get_device(device)
-        self._graphs: dict[Hashable, Any] = {}
+        self._graphs: dict[Hashable, tuple[Any, Any]] = {}
 
-    def run(self, key: Hashable, launch: Callable[[], None]) -> None:
+    def run(self, key: Hashable, launch: Callable[[], Any]) -> None:
         """Do what `launch` does.
 
         Args:
             key: Same key, same launches with the same arguments.
-            launch: Called the first time, which compiles and warms up, and the second time to record it.
+            launch: Called the first time, which compiles and warms up, and the second time to record it. What
+                it returns is kept as long as the graph: arrays that nothing else holds.
         """
         if self._device.is_cpu:
             launch()
             return
-        graph = self._graphs.pop(key, None)
+        graph, kept = self._graphs.pop(key, (None, None))
         if graph is None:
             launch()
             graph = False
         else:
             if graph is False:
                 with wp.ScopedCapture(self._device) as capture:
-                    launch()
+                    kept = launch()
                 graph = capture.graph
             wp.capture_launch(graph)
         if len(self._graphs) >= _GRAPH_COUNT_MAX:
             del self._graphs[next(iter(self._graphs))]
-        self._graphs[key] = graph  # at the end: the one that was not used for longest goes first
+        self._graphs[key] = (graph, kept)  # at the end: the one that was not used for longest goes first
 
 
 class HostCopy:
@@ -113,4 +114,8 @@ class HostCopy:
 
     def rows(self, first: int, count: int) -> NDArray[Any]:
         """Return rows that were fetched, in memory of their own; waits for nothing."""
-        return np.array(self._rows[first : first + count])
+        return np.array(self.view(first, count))
+
+    def view(self, first: int, count: int) -> NDArray[Any]:
+        """Return rows that were fetched, where they are: valid until they are fetched again."""
+        return self._rows[first : first + count]

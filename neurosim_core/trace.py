@@ -19,7 +19,7 @@ BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
 _SLOT_PARAMETER = 6
-_ROOM_CHECKS_MAX = 256
+_LAUNCHES_MAX = 256
 
 
 @wp.kernel
@@ -100,6 +100,7 @@ class Trace:
         self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance)]
         self._recording: tuple[Any, Any] = (None, None)
         self._room_checks: dict[tuple[int, int, float], tuple[DistanceField, wp.Launch]] = {}
+        self._pose_launches: dict[tuple[int, int, int, int], tuple[Any, wp.Launch]] = {}
 
     def record(self, arrays: Any, slot: int) -> None:
         """Copy the present state and status of all vehicles into a slot.
@@ -151,7 +152,7 @@ class Trace:
             )
             room = self.clearance[first : first + count]
             launch = collision_check(field, positions, room, radius_m=radius_m)
-            if len(self._room_checks) >= _ROOM_CHECKS_MAX:
+            if len(self._room_checks) >= _LAUNCHES_MAX:
                 self._room_checks.clear()
             self._room_checks[first, count, radius_m] = (field, launch)
         launch.launch()
@@ -178,13 +179,21 @@ class Trace:
             q_WC: Orientations, shape [K]; overwritten.
             vehicle: Which vehicle carries the camera.
         """
-        wp.launch(
-            _camera_poses,
-            dim=count,
-            inputs=[p_BC, q_BC, self.states, vehicle, slots],
-            outputs=[p_WC, q_WC],
-            device=self.states.device,
-        )
+        key = (slots.ptr, count, p_WC.ptr, vehicle)
+        held, launch = self._pose_launches.get(key, (None, None))
+        if held is not slots:  # another list of slots may have its memory by now
+            launch = wp.launch(
+                _camera_poses,
+                dim=count,
+                inputs=[p_BC, q_BC, self.states, vehicle, slots],
+                outputs=[p_WC, q_WC],
+                device=self.states.device,
+                record_cmd=True,
+            )
+            if len(self._pose_launches) >= _LAUNCHES_MAX:
+                self._pose_launches.clear()
+            self._pose_launches[key] = (slots, launch)
+        launch.launch()
 
     def fetch(self, first: int, count: int) -> None:
         """Launch the copy of some slots to the host."""

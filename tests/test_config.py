@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
+from neurosim_core.live import LinkConfig
 from neurosim_core.settings import Settings
 
 
@@ -182,3 +183,48 @@ def test_any_value_is_taken_or_refused_by_name(key, value):
     except ConfigError as error:
         message = str(error)
     assert key in message or isinstance(config, SimulationConfig)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"links": {"nix": {}}}, "links.nix: vehicle 'drone' has no such link, known: events, rgb"),
+        ({"links": {"command": {"clock_offset_s": 1.0}}}, "a command has no clock of its own"),
+        ({"links": {"imu": {"loss": 1.5}}}, "links.imu.loss: .* less than or equal to 1, got 1.5"),
+        ({"vehicles": {}}, "vehicles: .* at least 1 item"),
+        ({"vehicles": {"b": {"sensors": {"path": {"kind": "imu"}}}}}, "'path' is taken by the planned path"),
+        (
+            {"vehicles": {"b": {"control": {"rate_hz": 50}}}},
+            r"vehicles.b.control.rate_hz must be .* 200, got 50",
+        ),
+        ({"sensors": {"odometry": {"kind": "imu"}}}, "named 'odometry' must be of kind odometry, got imu"),
+        ({"sensors": {"imu_link": {"kind": "imu"}}}, "must not end in '_link'"),
+    ],
+)
+def test_mistakes_in_a_live_configuration_are_explained(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(settings)
+
+
+def test_a_member_of_a_fleet_has_what_is_common_and_what_is_its_own():
+    own = {"path": {"kind": "hover"}, "links": {"command": {"latency_s": 0.008}}}
+    config = load_config({"seed": 5, "vehicles": {"a": {}, "b": own, "c": {}}})
+    a, b, c = (config.of(name) for name in "abc")
+    assert (a.seed, a.path, a.links) == (5, config.path, {})
+    assert b.path.kind == "hover"
+    assert b.links["command"].latency_s == 0.008
+    assert len({a.seed, b.seed, c.seed}) == 3
+    assert c.path == config.path.model_copy(update={"seed": 2})  # else it would fly inside the first
+    assert list(b.vehicles) == ["b"]
+    with pytest.raises(KeyError, match="unknown vehicle 'd', known: a, b, c"):
+        config.of("d")
+
+
+def test_the_clock_of_a_sensor_is_exact_to_the_nanosecond():
+    link = LinkConfig(clock_offset_s=0.003, clock_drift_ppm=40.0)
+    assert [link.clock_ns(s) for s in (0, 10**9, 3_600 * 10**9)] == [
+        3_000_000,
+        1_003_040_000,
+        3_600 * 10**9 + 3_000_000 + 144_000_000,
+    ]
+    assert LinkConfig().clock_ns(123) == 123

@@ -19,7 +19,7 @@ from neurosim_core.packets import Events, Image, ImageEncoding, Packet
 from neurosim_core.render.renderer import Renderer, SceneOnDevice, make_renderer
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig, SensorConfig
-from neurosim_core.streams import HostCopy
+from neurosim_core.streams import Graphs, HostCopy
 from neurosim_core.trace import Trace
 
 _ENCODING: dict[str, ImageEncoding] = {"rgb": "rgb8", "depth": "32FC1"}
@@ -180,6 +180,7 @@ def render_instants(
     *,
     lane: int,
     wanted: Collection[str],
+    graphs: Graphs,
 ) -> Instants:
     """Launch the rendering of the instants of a batch, and the copy of its pictures.
 
@@ -190,6 +191,7 @@ def render_instants(
         stamps_ns: Their stamps.
         lane: Of the batch; the one that had it before has been read.
         wanted: Names of the cameras that look.
+        graphs: Of the run.
     """
     pictures = []
     image_slots = []
@@ -199,20 +201,18 @@ def render_instants(
         pictures += [(stamp_ns, used, name) for name in due]
         image_slots.append(used if due else -1)
         used += bool(due)
-    count = len(slots)
-    trace.camera_poses(
-        _slots_on_device(cast, slots),
-        count=count,
-        p_BC=cast.p_BC,
-        q_BC=cast.q_BC,
-        p_WC=cast.p_WC,
-        q_WC=cast.q_WC,
-    )
-    cast.renderers[lane].render(
-        cast.p_WC, cast.q_WC, _slots_on_device(cast, image_slots), instant_count=count
-    )
-    for copy in cast.picture_copies[lane].values():
-        copy.fetch(0, used)
+    from_slots, to_slots = _slots_on_device(cast, slots), _slots_on_device(cast, image_slots)
+
+    def render() -> tuple[Any, Any]:
+        trace.camera_poses(
+            from_slots, count=len(slots), p_BC=cast.p_BC, q_BC=cast.q_BC, p_WC=cast.p_WC, q_WC=cast.q_WC
+        )
+        cast.renderers[lane].render(cast.p_WC, cast.q_WC, to_slots, instant_count=len(slots))
+        for copy in cast.picture_copies[lane].values():
+            copy.fetch(0, used)
+        return from_slots, to_slots
+
+    graphs.run((id(cast), lane, tuple(slots), tuple(image_slots)), render)
     return Instants(
         lane=lane,
         stamps_ns=tuple(stamps_ns),
@@ -279,15 +279,22 @@ def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     return packets
 
 
-def read_images(cast: CastState, instants: Instants) -> list[Packet]:
-    """Return the pictures of a batch that the device has finished with."""
+def read_images(cast: CastState, instants: Instants, *, borrow: bool = False) -> list[Packet]:
+    """Return the pictures of a batch that the device has finished with.
+
+    Args:
+        cast: Which cameras.
+        instants: What they have seen.
+        borrow: Return views that are valid until the lane's buffers are overwritten, not copies.
+    """
     read: dict[str, NDArray[Any]] = {}
     packets: list[Packet] = []
     for stamp_ns, slot, name in instants.pictures:
         image = cast.images[name]
         if image.output not in read:
             copy = cast.picture_copies[instants.lane][image.output]
-            read[image.output] = copy.rows(0, instants.picture_slot_count)
+            take = copy.view if borrow else copy.rows
+            read[image.output] = take(0, instants.picture_slot_count)
         packets.append(
             Image(
                 stamp_ns=stamp_ns,
