@@ -1,0 +1,220 @@
+"""What the cameras of a streaming run see, computed in a thread of its own while the vehicle flies on."""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import warp as wp
+
+from neurosim_core.packets import Packet
+from neurosim_core.schedule import batch_end_ns
+from neurosim_core.simulation import Batch, Model, State, free_lanes, see, skip
+
+_LAG_PERIODS = (2, 100)
+_DROP_LANES = 256
+
+
+@dataclass(kw_only=True, eq=False)
+class Job:
+    """A stretch of one vehicle's flight that its cameras have to look at."""
+
+    vehicle: str
+    model: Model
+    state: State
+    batch: Batch
+    left_out: bool = False
+    """The machine is too slow for it."""
+
+
+class Cameras:
+    """Looks at what was flown, in order, and collects the packets until somebody takes them.
+
+    On a CUDA device the thread that flies does it: launches take no time there, and the packets are read back
+    with the next ones.
+
+    Attributes:
+        dropped: Frames that were left out, by vehicle and sensor, since the last `clear`. Pictures count one
+            each, an event camera counts instants that it did not see.
+    """
+
+    def __init__(self, *, inline: bool, on_packets: Callable[[], object]) -> None:
+        """Start the thread, if one is needed.
+
+        Args:
+            inline: Do without a thread.
+            on_packets: Called, from the thread, when there is something to `take`.
+        """
+        self.dropped: dict[tuple[str, str], int] = defaultdict(int)
+        self._on_packets = on_packets
+        self._jobs: deque[Job] = deque()
+        self._seen: deque[tuple[str, list[Packet]]] = deque()
+        self._busy = False
+        self._closed = False
+        self._failure: BaseException | None = None
+        self._changed = threading.Condition()
+        self._thread = None
+        if not inline:
+            self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
+            self._thread.start()
+
+    def look(self, vehicle: str, model: Model, state: State, batches: Sequence[Batch]) -> None:
+        """Have batches looked at, after those before."""
+        jobs = [Job(vehicle=vehicle, model=model, state=state, batch=batch) for batch in batches]
+        if self._thread is None:
+            for job in jobs:
+                self._do(job)
+            return
+        with self._changed:
+            self._jobs.extend(jobs)
+            self._changed.notify_all()
+
+    def leave_out(self, until_ns: int) -> None:
+        """Do not render what waits and ended at a simulated time [ns] or before."""
+        with self._changed:
+            for job in self._jobs:
+                if job.batch.until_ns <= until_ns:
+                    job.left_out = True
+
+    def wait_for_room(self, state: State, count: int, stop: Callable[[], bool]) -> bool:
+        """Wait until so many batches of a vehicle can be flown.
+
+        Args:
+            state: Of the vehicle.
+            count: How many.
+            stop: Ends the wait; asked every 20 ms.
+
+        Returns:
+            Whether there was nothing to wait for.
+        """
+        self.check()
+        if free_lanes(state) >= count:
+            return True
+        with self._changed:
+            while free_lanes(state) < count and self._failure is None and not stop():
+                self._changed.wait(0.02)
+        self.check()
+        return False
+
+    def take(self) -> list[tuple[str, list[Packet]]]:
+        """Return what has been seen since the last time: vehicle and packets, in order."""
+        taken = []
+        while self._seen:
+            taken.append(self._seen.popleft())
+        return taken
+
+    @property
+    def has_packets(self) -> bool:
+        """Whether there is something to `take`."""
+        return bool(self._seen)
+
+    def finish(self, stop: Callable[[], bool]) -> None:
+        """Wait until everything has been looked at, or `stop` says so."""
+        with self._changed:
+            while (self._jobs or self._busy) and self._failure is None and not stop():
+                self._changed.wait(0.02)
+        self.check()
+
+    def clear(self) -> None:
+        """Forget what waits, and what was seen; waits for the batch in work, so its state is not in use."""
+        with self._changed:
+            self._jobs.clear()
+            while self._busy:
+                self._changed.wait(0.02)
+        self._seen.clear()
+        self.dropped.clear()
+
+    def check(self) -> None:
+        """Raise what went wrong in the thread.
+
+        Raises:
+            RuntimeError: The rendering failed.
+        """
+        if self._failure is not None:
+            raise RuntimeError(f"the cameras failed: {self._failure}") from self._failure
+
+    def close(self) -> None:
+        """Forget what waits and end the thread."""
+        with self._changed:
+            self._closed = True
+            self._jobs.clear()
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                while not self._jobs:
+                    if self._closed:
+                        return
+                    self._changed.wait()
+                job = self._jobs.popleft()
+                self._busy = True
+            try:
+                self._do(job)
+            except Exception as error:  # told to the thread that flies
+                with self._changed:
+                    self._failure, self._busy = error, False
+                    self._changed.notify_all()
+                return
+
+    def _do(self, job: Job) -> None:
+        if job.left_out:
+            self._count(job)
+            skip(job.model, job.state, job.batch)
+            return
+        packets = see(job.model, job.state, job.batch)
+        if packets:
+            self._seen.append((job.vehicle, packets))
+            self._on_packets()
+
+    def _count(self, job: Job) -> None:
+        """Count what a batch that is left out would have shown."""
+        for index, cast in enumerate(job.model.casts):
+            stamps = [b.stamp_ns for b in job.batch.boundaries if index in b.casts]
+            for name in job.batch.wanted.intersection(cast.event_cameras):
+                self.dropped[job.vehicle, name] += len(stamps)
+        for cast_state in job.state.casts:
+            for name in job.batch.wanted.intersection(cast_state.images):
+                rate = cast_state.images[name].rate
+                due = sum(rate.has_tick(boundary.stamp_ns) for boundary in job.batch.boundaries)
+                self.dropped[job.vehicle, name] += due
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lanes:
+    """How far the cameras of a vehicle may be behind its flight."""
+
+    batch_count: int
+    """The most batches in a control period."""
+    lag_ns: int
+    """How long a picture may take: as long as there is between two of the slowest camera [ns]."""
+    count: int
+    """Batches that may wait."""
+
+
+def plan_lanes(model: Model, *, drop: bool) -> Lanes:
+    """Return how far the cameras of a vehicle may be behind.
+
+    Args:
+        model: What is flown.
+        drop: Leave out what comes later than that, in place of waiting for it.
+    """
+    period_ns = model.schedule.control.stamp_ns(1)
+    batch_ns = batch_end_ns(model.schedule, 0, period_ns)
+    batch_count = -(-period_ns // max(batch_ns, 1)) + 1
+    least, most = _LAG_PERIODS
+    slowest_ns = max((cast.rate.stamp_ns(1) for cast in model.casts), default=0)
+    periods = min(max(-(-slowest_ns // period_ns), least), most)
+    count = batch_count * (_DROP_LANES if drop else periods)
+    return Lanes(batch_count=batch_count + 1, lag_ns=periods * period_ns, count=count)
+
+
+def sees_inline(device: str) -> bool:
+    """Return whether the thread that flies looks itself: where launches return at once."""
+    return bool(wp.get_device(device).is_cuda)

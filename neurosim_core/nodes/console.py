@@ -1,0 +1,143 @@
+"""What `neurosim serve` says to the people in front of it, and how they stop it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from rich.console import Console
+from rich.status import Status
+from rich.table import Table
+
+from cortex.messages import SimulatorStatus
+from neurosim_core.config import SimulationConfig
+from neurosim_core.nodes import topics
+from neurosim_core.nodes.craft import Craft
+
+
+@contextlib.contextmanager
+def stop_at_signals(stop: threading.Event) -> Iterator[None]:
+    """Turn SIGINT and SIGTERM into an event: they must not break into the writing of a file. A second may."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread is told of signals
+        return
+
+    def on_signal(_signal: int, _frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def print_plan(console: Console, crafts: Sequence[Craft], config: SimulationConfig) -> None:
+    """Say what is simulated, where it can be heard, and what it waits for."""
+    scene = crafts[0].model.scene
+    live = config.live
+    if live.mode == "lockstep":
+        pace = "lockstep: every control period waits for its command"
+    elif live.real_time_factor:
+        pace = f"streaming at {live.real_time_factor:g} x real time"
+    else:
+        pace = "streaming as fast as it can"
+    console.print(
+        f"[bold]{scene.name}[/], {len(scene.faces):,} triangles, on {crafts[0].model.device}; "
+        f"{config.control.rate_hz:g} control periods a second, {pace}",
+        highlight=False,
+    )
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for craft in crafts:
+        names = ", ".join([*craft.model.config.sensors, "odometry", "rotor_speeds"])
+        names = ", ".join(dict.fromkeys(names.split(", ")))
+        table.add_row(craft.model.config.vehicle.preset, f"/{craft.name}/: {names}")
+    console.print(table, highlight=False)
+    commands = ", ".join(topics.command_topic(craft.name, "*") for craft in crafts)
+    console.print(f"waiting for the first command on {commands}: `neurosim fly` sends them", highlight=False)
+
+
+class StatusLine:
+    """One line that tells how it is going; only on a terminal. A context manager.
+
+    Attributes:
+        last: The newest status; None if there was none.
+    """
+
+    def __init__(self, console: Console) -> None:
+        """Prepare the line.
+
+        Args:
+            console: Where to.
+        """
+        self.last: SimulatorStatus | None = None
+        self._console = console
+        self._line: Status | None = None
+
+    def show(self, status: SimulatorStatus) -> None:
+        """Update the line; where there is no terminal, say only why a run ended."""
+        before, self.last = self.last, status
+        if self._line is not None:
+            self._line.update(_summary(status))
+        if status.phase == "ended" and (before is None or before.phase != "ended"):
+            self._console.print(f"[yellow]ended:[/] {status.reason}", highlight=False, soft_wrap=True)
+
+    def __enter__(self) -> StatusLine:
+        if self._console.is_terminal:
+            self._line = self._console.status("")
+            self._line.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._line is not None:
+            self._line.stop()
+            self._line = None
+
+
+def print_end(console: Console, last: SimulatorStatus | None, record: Path | None) -> None:
+    """Say what has been simulated since the last reset."""
+    if last is None:
+        return
+    taken = sum(vehicle.command_count for vehicle in last.vehicles)
+    lost = sum(vehicle.lost_count for vehicle in last.vehicles)
+    refused = sum(vehicle.refused_count for vehicle in last.vehicles)
+    collisions = sum(vehicle.collision_count for vehicle in last.vehicles)
+    console.print(
+        f"simulated {last.stamp_ns / 1e9:.3f} s: {last.step_count:,} control periods, {taken:,} commands "
+        f"({lost:,} lost, {refused:,} refused), {collisions:,} collisions",
+        highlight=False,
+    )
+    if last.mode == "streaming":
+        dropped = sum(sensor.dropped_count for sensor in last.sensors)
+        console.print(
+            f"{last.overrun_count:,} periods took too long, time was held back by "
+            f"{last.slipped_ns / 1e9:.3f} s, {dropped:,} frames were left out or lost",
+            highlight=False,
+        )
+    if record is not None:
+        console.print(f"recorded to {record}/", highlight=False, soft_wrap=True)
+
+
+def _summary(status: SimulatorStatus) -> str:
+    text = f"{status.phase} {status.reason}" if status.phase != "running" else "running"
+    parts = [f"{text}, {status.stamp_ns / 1e9:.2f} s"]
+    if status.phase == "running":
+        parts.append(f"{status.real_time_factor:.2f} x real time")
+        if status.mode == "streaming":
+            parts.append(f"late {status.late_p99_ns / 1e6:.2f} ms (p99)")
+        lost = sum(v.lost_count for v in status.vehicles) + sum(s.dropped_count for s in status.sensors)
+        parts.append(f"{lost:,} lost")
+        if any(vehicle.fail_safe for vehicle in status.vehicles):
+            parts.append("[red]fail-safe[/]")
+    return ", ".join(parts)

@@ -1,0 +1,167 @@
+"""One vehicle of a live run: its simulation, who commands it, and what it publishes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from cortex import Node
+from neurosim_core.config import SimulationConfig
+from neurosim_core.nodes.cameras import Lanes, plan_lanes
+from neurosim_core.nodes.helm import Command, Helm
+from neurosim_core.nodes.inbox import Inbox
+from neurosim_core.nodes.outlet import NO_LINK, Outlet
+from neurosim_core.packets import Odometry, Packet
+from neurosim_core.simulation import (
+    Batch,
+    Model,
+    StartState,
+    State,
+    finish,
+    fly_period,
+    make_state,
+    observe,
+    step,
+    want,
+)
+
+
+class Craft:
+    """Everything that belongs to one vehicle. To be used by the thread that flies.
+
+    Attributes:
+        name: Of the vehicle.
+        model: What does not change.
+        state: What does.
+        inbox: Commands that come.
+        helm: The command that holds.
+        outlet: What is published.
+        lanes: How far its cameras may be behind.
+        answers_ns: Stamp of the odometry whose command the next control period waits for [ns]; None: it does
+            not wait, as that has come or no odometry has arrived.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        model: Model,
+        *,
+        record: Callable[[Packet], None] | None = None,
+    ) -> None:
+        """Open the topics of a vehicle; `begin` puts it into the world.
+
+        Args:
+            node: Whose topics they are.
+            name: Of the vehicle.
+            model: What is flown.
+            record: Takes every packet.
+        """
+        config = model.config
+        link = config.links.get("command", NO_LINK)
+        self.name = name
+        self.model = model
+        self.inbox = Inbox(node, name, rotor_count=model.airframe.rotor_count)
+        self.helm = Helm(config.live, link, airframe=model.airframe, seed=config.seed)
+        self.outlet = Outlet(node, name, model, record=record)
+        if not link.delivers_at_once:
+            self.outlet.announce_link("command")
+        self.answers_ns: int | None = None
+        self._before_reset_ns = 0
+        self._cameras = frozenset(name for cast in model.casts for name in cast.names)
+        self._active: frozenset[str] = frozenset()
+        self.lanes: Lanes = plan_lanes(model, drop=False)
+        self.state: State = self.make_state(seed=config.seed)
+
+    def make_state(self, *, seed: int, start: StartState | None = None) -> State:
+        """Return the beginning of an episode.
+
+        Raises:
+            ValueError: The start is of a wrong shape or not finite.
+        """
+        drop = self.model.config.live.overrun == "drop"
+        self.lanes = plan_lanes(self.model, drop=drop)
+        return make_state(self.model, flight_lane_count=self.lanes.count, seed=seed, start=start)
+
+    def begin(self, state: State, *, seed: int) -> None:
+        """Begin an episode: forget everything, and publish where the vehicle is."""
+        self.state = state
+        before_ns = self.outlet.streams["odometry"].delivered_ns
+        self._before_reset_ns = 0 if before_ns is None else before_ns
+        self.helm.reset(seed=seed)
+        self.inbox.reset()
+        self.outlet.reset(seed=seed)
+        want(self.model, self.state, self._active & self._cameras)
+        self.outlet.offer_state(observe(state))
+        self.answers_ns = self.outlet.streams["odometry"].delivered_ns
+
+    def look(self) -> tuple[int, ...]:
+        """See who listens and turn cameras on and off; return how many are on each topic."""
+        counts = self.outlet.look()
+        active = self.outlet.active()
+        if active != self._active:
+            self._active = active
+            want(self.model, self.state, active & self._cameras)
+        return (*counts, self.inbox.publisher_count)
+
+    def answers(self, command: Command, *, lockstep: bool) -> bool:
+        """Return whether the next control period may begin with a command.
+
+        In streaming, stamps are free; but a command that answers what was before a reset comes too late.
+        """
+        if lockstep:
+            return command.stamp_ns == self.answers_ns
+        assert self.answers_ns is not None
+        return not self.answers_ns < command.stamp_ns <= self._before_reset_ns
+
+    def obey(self, command: Command, stamp_ns: int) -> None:
+        """Send a command on its way at a tick [ns]."""
+        self.answers_ns = None
+        self.outlet.deliver(self.helm.send(command, stamp_ns=stamp_ns), "command")
+
+    def step(self, stamp_ns: int) -> None:
+        """Fly the control period that begins at a tick [ns], cameras included.
+
+        Raises:
+            DynamicsError: The integration failed.
+        """
+        mode, setpoint = self.helm.command_at(stamp_ns, self.observe)
+        self.outlet.offer(step(self.model, self.state, setpoint, mode=mode))
+        self.outlet.offer_state(self.observe())
+
+    def fly(self, stamp_ns: int) -> list[Batch]:
+        """Fly the control period that begins at a tick [ns]; return what its cameras have to look at.
+
+        Raises:
+            DynamicsError: The integration failed.
+        """
+        mode, setpoint = self.helm.command_at(stamp_ns, self.observe)
+        packets, batches = fly_period(self.model, self.state, setpoint, mode=mode)
+        self.outlet.offer(packets)
+        self.outlet.offer_state(self.observe())
+        return batches
+
+    def observe(self) -> Odometry:
+        """Return the true state at the end of what was flown."""
+        return observe(self.state)
+
+    def finish(self) -> None:
+        """Send on their way the events whose window has not ended."""
+        self.outlet.offer(finish(self.state))
+
+    def configure(self, config: SimulationConfig) -> None:
+        """Change links, gains and what is done without a controller.
+
+        Args:
+            config: Settings of this vehicle.
+        """
+        if config.control.gains != self.model.config.control.gains:
+            self.state.pilots.clear()
+        self.model = dataclasses.replace(self.model, config=config)
+        self.helm.live = config.live
+        channels = {name: stream.channel for name, stream in self.outlet.streams.items()}
+        for name, channel in (channels | {"command": self.helm.channel}).items():
+            link = config.links.get(name, NO_LINK)
+            if link != channel.config:
+                channel.configure(link)
+                self.outlet.announce_link(name)

@@ -1,0 +1,265 @@
+"""What a vehicle publishes: its sensors, its state, where they sit, and what links did to all that."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from cortex import Node, Publisher
+from cortex import messages as msg
+from neurosim_core.live import LinkConfig
+from neurosim_core.nodes import topics, translate
+from neurosim_core.nodes.channel import Channel, payload_bytes
+from neurosim_core.packets import Delivery, Odometry, Packet
+from neurosim_core.record import describe_sensors
+from neurosim_core.simulation import COLLISION, Model
+
+NO_LINK = LinkConfig()
+
+
+class Stream:
+    """One topic of packets, with the link in front of it.
+
+    Attributes:
+        name: Of the sensor, or odometry, rotor_speeds, collision.
+        channel: What is under way.
+        subscriber_count: As of the last look.
+        published_count: Messages since the last reset, for whoever may have listened.
+        delivered_ns: Stamp, as in the message, of what was published last [ns]; None if there was nothing.
+    """
+
+    def __init__(
+        self,
+        publisher: Publisher[Any],
+        channel: Channel,
+        *,
+        name: str,
+        translate: Callable[[Any, Callable[[int], int] | None], Any],
+    ) -> None:
+        """Wrap a publisher.
+
+        Args:
+            publisher: Where messages go.
+            channel: What is in their way.
+            name: Of the sensor.
+            translate: Makes the message of a packet, with the sensor's clock if that is not simulated time.
+        """
+        self.name = name
+        self.channel = channel
+        self.publisher = publisher
+        self.subscriber_count = 0
+        self.published_count = 0
+        self.delivered_ns: int | None = None
+        self._translate = translate
+
+    @property
+    def heard(self) -> bool:
+        """Whether a message would reach anybody, now or later."""
+        return self.subscriber_count > 0 or self.publisher.latch
+
+    def publish(self, packet: Packet) -> None:
+        """Publish a packet now, if anybody listens."""
+        if not self.heard:
+            return
+        config = self.channel.config
+        clocked = config.clock_offset_s or config.clock_drift_ppm
+        message = self._translate(packet, config.clock_ns if clocked else None)
+        self.publisher.publish(message)
+        self.published_count += 1
+        self.delivered_ns = message.stamp_ns
+
+    def reset(self, *, seed: int) -> None:
+        """Forget what is under way and begin again."""
+        self.channel.reset(seed=seed)
+        self.published_count = 0
+        self.delivered_ns = None
+
+
+class Outlet:
+    """Publishes what one vehicle measures, when simulated time says that it arrives.
+
+    Packets go in with `offer` as they are computed, and out with `publish_due`. To be used by one thread.
+
+    Attributes:
+        streams: The topics by name: sensors in the order of the rig, collision, rotor_speeds, odometry.
+    """
+
+    def __init__(
+        self, node: Node, vehicle: str, model: Model, *, record: Callable[[Packet], None] | None = None
+    ) -> None:
+        """Announce the topics of a vehicle, and publish what does not change.
+
+        Args:
+            node: Whose they are.
+            vehicle: Its name.
+            model: What is flown.
+            record: Takes every packet, and every delivery, too.
+        """
+        self.vehicle = vehicle
+        self.record = record
+        self._node = node
+        self._seed = model.config.seed
+        self._delivery_publishers: dict[str, Publisher[msg.Delivery]] = {}
+        self._odometry_count = 0
+        self._odometry_ns = -1
+        config = model.config
+        sensors = describe_sensors(config.sensors)
+        self.streams: dict[str, Stream] = {}
+        for sensor in sensors:
+            if sensor.name != "odometry":
+                frame = topics.sensor_frame(vehicle, sensor.name, sensor.kind)
+                self._add(sensor.name, translate.message_type(sensor.kind), config.links, frame_id=frame)
+        self._add(COLLISION, msg.Collision, {})
+        self._add(
+            "rotor_speeds",
+            msg.RotorSpeeds,
+            config.links,
+            latch=True,
+            convert=lambda packet, clock_ns: translate.rotor_speeds(packet, clock_ns=clock_ns),
+        )
+        self._add("odometry", msg.Odometry, config.links, latch=True)
+        self._stations = [self._describe(sensor, node) for sensor in sensors]
+        self._path = node.publisher(topics.stream_topic(vehicle, "path"), msg.Path, latch=True)
+        self._path.publish(translate.path_message(model.path, end_ns=model.duration_ns))
+        self._sensor_names = tuple(config.sensors)
+
+    def reset(self, *, seed: int) -> None:
+        """Begin a new run at stamp 0."""
+        self._seed = seed
+        self._odometry_count = 0
+        self._odometry_ns = -1
+        for stream in self.streams.values():
+            stream.reset(seed=seed)
+
+    def look(self) -> tuple[int, ...]:
+        """See who listens, and return how many subscribers each topic has."""
+        for stream in self.streams.values():
+            stream.subscriber_count = stream.publisher.subscriber_count
+        return tuple(stream.subscriber_count for stream in self.streams.values())
+
+    def active(self) -> frozenset[str]:
+        """Return the sensors that are listened to or recorded, as of the last look."""
+        if self.record is not None:
+            return frozenset(self._sensor_names)
+        return frozenset(name for name in self._sensor_names if self.streams[name].subscriber_count)
+
+    def offer(self, packets: Iterable[Packet]) -> None:
+        """Send packets of one control period on their way, in the order of time."""
+        for packet in packets:
+            if packet.sensor == "odometry" and isinstance(packet, Odometry):
+                self.offer_state(packet)
+                continue
+            self._send(self.streams[packet.sensor], packet)
+            if self.record is not None:
+                self.record(packet)
+
+    def offer_state(self, state: Odometry) -> None:
+        """Send the state of the vehicle on its way, unless that of this stamp has gone already.
+
+        The one of stamp 0 meets no link: it is what everybody knows before time begins.
+        """
+        if state.stamp_ns <= self._odometry_ns:
+            return
+        self._odometry_ns = state.stamp_ns
+        packet = dataclasses.replace(state, sensor="odometry", sequence=self._odometry_count)
+        self._odometry_count += 1
+        for name in ("rotor_speeds", "odometry"):
+            if packet.stamp_ns:
+                self._send(self.streams[name], packet)
+            else:
+                self.streams[name].publish(packet)
+        if self.record is not None:
+            self.record(packet)
+
+    def deliver(self, delivery: Delivery | None, link: str) -> None:
+        """Tell what a link did to a message."""
+        if delivery is None:
+            return
+        if self.record is not None:
+            self.record(delivery)
+        self.announce_link(link)
+        self._delivery_publishers[link].publish(
+            msg.Delivery(
+                stamp_ns=delivery.stamp_ns,
+                delivered_ns=delivery.delivered_ns,
+                size_bytes=delivery.size_bytes,
+                sequence=delivery.sequence,
+            )
+        )
+
+    def announce_link(self, link: str) -> None:
+        """Open the topic of what a link does, if it is not open yet."""
+        if link not in self._delivery_publishers:
+            self._delivery_publishers[link] = self._node.publisher(
+                topics.delivery_topic(self.vehicle, link), msg.Delivery
+            )
+
+    def publish_due(self, stamp_ns: int) -> int | None:
+        """Publish everything that has arrived by a simulated time [ns], in the order of arrival.
+
+        Returns:
+            Stamp of the newest odometry among it, as in the message [ns]; None if there is none.
+        """
+        arrived = [
+            (due_ns, rank, stream, packet)
+            for rank, stream in enumerate(self.streams.values())
+            for due_ns, packet in stream.channel.due(stamp_ns)
+        ]
+        arrived.sort(key=lambda entry: entry[:2])
+        newest_ns = None
+        for _, _, stream, packet in arrived:
+            stream.publish(packet)
+            if stream.name == "odometry":
+                newest_ns = stream.delivered_ns
+        return newest_ns
+
+    @property
+    def next_due_ns(self) -> int | None:
+        """When the next packet arrives [ns]; None if none is under way."""
+        dues = [due for s in self.streams.values() if (due := s.channel.next_due_ns) is not None]
+        return min(dues, default=None)
+
+    def _send(self, stream: Stream, packet: Packet) -> None:
+        channel = stream.channel
+        size_bytes = 0 if channel.config.delivers_at_once else payload_bytes(packet)
+        delivery = channel.send(packet, stamp_ns=packet.stamp_ns, size_bytes=size_bytes)
+        if delivery is not None:
+            self.deliver(delivery, stream.name)
+
+    def _add(
+        self,
+        name: str,
+        message: type[Any],
+        links: dict[str, LinkConfig],
+        *,
+        frame_id: str = "",
+        latch: bool = False,
+        convert: Callable[[Any, Callable[[int], int] | None], Any] | None = None,
+    ) -> None:
+        def to_message(packet: Packet, clock_ns: Callable[[int], int] | None) -> Any:
+            return translate.to_message(packet, frame_id=frame_id, clock_ns=clock_ns)
+
+        link = links.get(name, NO_LINK)
+        publisher = self._node.publisher(topics.stream_topic(self.vehicle, name), message, latch=latch)
+        self.streams[name] = Stream(
+            publisher,
+            Channel(name, link, seed=self._seed),
+            name=name,
+            translate=convert or to_message,
+        )
+        if not link.delivers_at_once:
+            self.announce_link(name)
+
+    def _describe(self, sensor: Any, node: Node) -> tuple[Publisher[Any], ...]:
+        """Publish where a sensor sits and, for a camera, how it projects."""
+        transform = node.publisher(
+            topics.transform_topic(self.vehicle, sensor.name), msg.Transform, latch=True
+        )
+        transform.publish(translate.mount_transform(self.vehicle, sensor))
+        info = translate.camera_info(self.vehicle, sensor)
+        if info is None:
+            return (transform,)
+        lens = node.publisher(topics.info_topic(self.vehicle, sensor.name), msg.CameraInfo, latch=True)
+        lens.publish(info)
+        return transform, lens

@@ -1,0 +1,122 @@
+"""How a simulator is doing: what it measures of itself, and the message that says so."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+from cortex.messages import SensorStatus, SimulatorStatus, VehicleStatus
+from neurosim_core.config import SimulationConfig
+from neurosim_core.nodes.craft import Craft
+from neurosim_core.pacing import Timings
+
+
+class Meter:
+    """What is measured besides what the vehicles count.
+
+    Attributes:
+        step_times: To compute a control period, since the last status [ns].
+        late_times: How late the wall clock was at its end [ns].
+        step_count: Control periods since the beginning of the run.
+        overrun_count: Those that took longer than they had.
+        slipped_ns: By how much the run was held back [ns].
+    """
+
+    def __init__(self) -> None:
+        self.step_times = Timings()
+        self.late_times = Timings()
+        self._sequence = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new run at stamp 0."""
+        self.step_times.take()
+        self.late_times.take()
+        self.step_count = 0
+        self.overrun_count = 0
+        self.slipped_ns = 0
+        self._stamp_ns = 0
+        self._wall_ns = time.monotonic_ns()
+
+    def status(
+        self,
+        crafts: Sequence[Craft],
+        dropped: Mapping[tuple[str, str], int],
+        config: SimulationConfig,
+        *,
+        stamp_ns: int,
+        phase: str,
+        reason: str,
+    ) -> SimulatorStatus:
+        """Return the message, and begin to measure anew.
+
+        Args:
+            crafts: The vehicles.
+            dropped: Frames that were not rendered, by vehicle and sensor.
+            config: Settings that hold.
+            stamp_ns: Simulated time [ns].
+            phase: As in the message.
+            reason: As in the message.
+        """
+        now_ns = time.monotonic_ns()
+        elapsed_ns = max(now_ns - self._wall_ns, 1)
+        factor = max(stamp_ns - self._stamp_ns, 0) / elapsed_ns
+        self._stamp_ns, self._wall_ns = stamp_ns, now_ns
+        steps, late = self.step_times.take(), self.late_times.take()
+        self._sequence += 1
+        streaming = config.live.mode == "streaming"
+        return SimulatorStatus(
+            stamp_ns=stamp_ns,
+            wall_ns=time.time_ns(),
+            phase=phase,
+            reason=reason,
+            mode=config.live.mode,
+            real_time_factor_wanted=config.live.real_time_factor if streaming else 0.0,
+            real_time_factor=factor,
+            step_count=self.step_count,
+            step_median_ns=steps.median_ns,
+            step_p99_ns=steps.p99_ns,
+            late_median_ns=late.median_ns,
+            late_p99_ns=late.p99_ns,
+            overrun_count=self.overrun_count,
+            slipped_ns=self.slipped_ns,
+            sensors=[entry for craft in crafts for entry in _sensors(craft, dropped)],
+            vehicles=[_vehicle(craft, stamp_ns) for craft in crafts],
+            sequence=self._sequence - 1,
+        )
+
+
+def _sensors(craft: Craft, dropped: Mapping[tuple[str, str], int]) -> list[SensorStatus]:
+    active = craft.outlet.active()
+    entries = []
+    for name in craft.model.config.sensors:
+        stream = craft.outlet.streams[name]
+        lost = stream.channel.lost_count
+        entries.append(
+            SensorStatus(
+                vehicle=craft.name,
+                name=name,
+                active=name in active,
+                subscriber_count=stream.subscriber_count,
+                published_count=stream.published_count,
+                dropped_count=dropped.get((craft.name, name), 0) + lost,
+                injected_lost_count=lost,
+            )
+        )
+    return entries
+
+
+def _vehicle(craft: Craft, stamp_ns: int) -> VehicleStatus:
+    helm, counts = craft.helm, craft.inbox.counts
+    return VehicleStatus(
+        name=craft.name,
+        command_mode="" if helm.holds is None else helm.holds.mode,
+        command_count=helm.counts.taken,
+        refused_count=counts.refused,
+        superseded_count=counts.superseded + helm.counts.superseded,
+        lost_count=counts.lost + helm.channel.lost_count,
+        command_age_ns=helm.age_ns(stamp_ns),
+        fail_safe=helm.fail_safe,
+        fail_safe_count=helm.counts.fail_safe,
+        collision_count=craft.state.counts["collisions"],
+    )
