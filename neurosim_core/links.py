@@ -23,10 +23,8 @@ class Link:
 
     A message waits until those before it have left, occupies the link for size / bandwidth, and then travels
     for latency + jitter. It never arrives before one that was sent earlier. A lost message occupies the link
-    as any other, since it is lost on the way, but holds nobody up by its jitter.
-
-    There is no limit to what waits: a stream that needs more than the bandwidth falls behind further and
-    further, and is kept in memory; `len` says how many messages are under way.
+    as any other, since it is lost on the way, but holds nobody up by its jitter. One that would wait too long
+    to leave is lost without occupying the link. `len` says how many messages are under way.
 
     Attributes:
         lost_count: Messages that will never arrive, since the beginning or the last reset.
@@ -60,6 +58,7 @@ class Link:
         """Change the settings for messages that are sent from now on; those under way stay as they are."""
         self._latency_ns = to_ns(config.latency_s)
         self._jitter_ns = to_ns(config.jitter_s)
+        self._queue_ns = to_ns(config.queue_s)
         self._lost_below = int(Fraction(config.loss) * 2**64)
         rate = config.bandwidth_bytes_s
         self._ns_per_byte = None if rate is None else NS_PER_S / Fraction(rate)
@@ -87,17 +86,17 @@ class Link:
         number = self._sent_count
         self._sent_count += 1
         self._sent_ns = stamp_ns
-        delivered_ns = self._occupy(stamp_ns, size_bytes) + self._latency_ns
-        lost = False
+        delay_ns, lost = self._latency_ns, self._wait_ns(stamp_ns) > self._queue_ns
+        left_ns = stamp_ns if lost else self._occupy(stamp_ns, size_bytes)
         if self._jitter_ns or self._lost_below:
             jitter_bits, loss_bits = self._random_bits(number)
-            delivered_ns += jitter_bits * (self._jitter_ns + 1) >> 64
-            lost = loss_bits < self._lost_below
+            delay_ns += jitter_bits * (self._jitter_ns + 1) >> 64
+            lost = lost or loss_bits < self._lost_below
         if lost:
             self.lost_count += 1
             delivered_ns = -1
         else:
-            delivered_ns = max(delivered_ns, self._last_delivered_ns)
+            delivered_ns = max(left_ns + delay_ns, self._last_delivered_ns)
             self._last_delivered_ns = delivered_ns
             self._pending.append((delivered_ns, item))
         return Delivery(
@@ -127,6 +126,10 @@ class Link:
         """Begin to count the bytes that follow each other without a gap: so no rounding adds up."""
         self._burst_start_ns = start_ns
         self._burst_bytes = 0
+
+    def _wait_ns(self, stamp_ns: int) -> int:
+        """How long a message that is sent now waits for those before it [ns]."""
+        return 0 if self._ns_per_byte is None else max(self._busy_until_ns - stamp_ns, 0)
 
     def _occupy(self, stamp_ns: int, size_bytes: int) -> int:
         """Put a message on the link after those before it; return when its last byte is on it [ns]."""

@@ -44,6 +44,7 @@ def by_brute_force(
     messages: list[tuple[int, int]],
     *,
     ns_per_byte: int,
+    queue_ns: int,
     latency_ns: int,
     jitter_ns: list[int],
     lost: list[bool],
@@ -59,7 +60,11 @@ def by_brute_force(
         while waiting and messages[waiting[0]][0] == now_ns:
             if not queue:
                 left_ns = messages[waiting[0]][1] * ns_per_byte
-            queue.append(waiting.popleft())
+            backlog_ns = left_ns + sum(messages[k][1] * ns_per_byte for k in list(queue)[1:])
+            if queue and backlog_ns > queue_ns:
+                waiting.popleft()
+            else:
+                queue.append(waiting.popleft())
         while queue and left_ns == 0:
             done = queue.popleft()
             if not lost[done]:
@@ -76,13 +81,14 @@ def by_brute_force(
 @given(
     gaps_sizes=st.lists(st.tuples(st.integers(0, 40), st.integers(0, 9)), min_size=1, max_size=25),
     ns_per_byte=st.integers(1, 8).map(lambda power: 2**power),  # 1e9 / this is a float without rounding
+    queue_ns=st.sampled_from([1, 100, 10**9]),
     latency_ns=st.integers(0, 50),
     jitter_ns=st.sampled_from([0, 1, 30, 200]),
     loss=st.sampled_from([0.0, 0.3, 1.0]),
     seed=st.integers(0, 2**64 - 1),
 )
 def test_arrivals_are_those_of_a_link_played_by_the_nanosecond(
-    gaps_sizes, ns_per_byte, latency_ns, jitter_ns, loss, seed
+    gaps_sizes, ns_per_byte, queue_ns, latency_ns, jitter_ns, loss, seed
 ):
     """Bandwidth, latency, jitter, loss and order together."""
     messages, now_ns = [], 0
@@ -90,7 +96,11 @@ def test_arrivals_are_those_of_a_link_played_by_the_nanosecond(
         now_ns += gap_ns
         messages.append((now_ns, size))
     config = LinkConfig(
-        latency_s=latency_ns * 1e-9, jitter_s=jitter_ns * 1e-9, loss=loss, bandwidth_bytes_s=1e9 / ns_per_byte
+        latency_s=latency_ns * 1e-9,
+        jitter_s=jitter_ns * 1e-9,
+        loss=loss,
+        bandwidth_bytes_s=1e9 / ns_per_byte,
+        queue_s=queue_ns * 1e-9,
     )
     link = Link(config, seed=seed, name="imu")
     found = [link.send(k, stamp_ns=t, size_bytes=size) for k, (t, size) in enumerate(messages)]
@@ -98,6 +108,7 @@ def test_arrivals_are_those_of_a_link_played_by_the_nanosecond(
     wanted = by_brute_force(
         messages,
         ns_per_byte=ns_per_byte,
+        queue_ns=queue_ns,
         latency_ns=latency_ns,
         jitter_ns=[int(u * (jitter_ns + 1)) for u, _ in uniform],
         lost=[v < loss for _, v in uniform],
@@ -135,7 +146,7 @@ def test_a_link_without_settings_delivers_at_once():
 @pytest.mark.parametrize(("rate", "numerator", "denominator"), [(3e9, 1, 3), (7e9, 1, 7), (0.3e9, 10, 3)])
 def test_no_rounding_adds_up(rate, numerator, denominator):
     """The k-th of many messages sent together leaves at k times its own time, rounded up once."""
-    link = Link(LinkConfig(bandwidth_bytes_s=rate), seed=0, name="imu")
+    link = Link(LinkConfig(bandwidth_bytes_s=rate, queue_s=1e6), seed=0, name="imu")
     for k in range(1, 20_001):
         delivered_ns = link.send(None, stamp_ns=0, size_bytes=1).delivered_ns
         assert delivered_ns == -(-k * numerator // denominator)
@@ -246,6 +257,26 @@ def test_a_lost_message_occupies_the_link_and_holds_up_nobody():
     assert link.send(1, stamp_ns=0, size_bytes=1).delivered_ns < MS // 10
 
 
+def test_what_would_wait_too_long_is_lost_and_memory_is_bounded():
+    """A stream of twice the bandwidth: every second message is lost, the others are 0.5 s late."""
+    link = Link(LinkConfig(bandwidth_bytes_s=1e6, queue_s=0.5), seed=0, name="rgb")
+    longest = 0
+    for k in range(2000):
+        sent = link.send(k, stamp_ns=k * 5 * MS, size_bytes=10_000)
+        assert sent.delivered_ns == -1 or sent.delivered_ns - sent.stamp_ns <= 510 * MS
+        longest = max(longest, len(link))
+        link.due(k * 5 * MS)
+    assert longest <= 52  # half a second and one, at 10 ms each
+    assert link.lost_count == pytest.approx((2000 - 100) / 2, abs=2)  # after a second, the queue is full
+
+
+def test_a_message_may_take_longer_than_the_longest_wait():
+    link = Link(LinkConfig(bandwidth_bytes_s=1e6, queue_s=0.001), seed=0, name="rgb")
+    assert link.send(0, stamp_ns=0, size_bytes=10_000).delivered_ns == 10 * MS
+    assert link.send(1, stamp_ns=9 * MS - 1, size_bytes=10_000).delivered_ns == -1
+    assert link.send(2, stamp_ns=9 * MS, size_bytes=10_000).delivered_ns == 20 * MS
+
+
 def test_reset_begins_anew():
     config = LinkConfig(loss=0.2, jitter_s=1e-2, latency_s=1e-3, bandwidth_bytes_s=1e5)
 
@@ -266,7 +297,7 @@ def test_reset_begins_anew():
 def test_settings_change_for_later_messages_only():
     link = Link(LinkConfig(latency_s=0.01, bandwidth_bytes_s=1e6), seed=0, name="command")
     assert link.send(0, stamp_ns=0, size_bytes=1000).delivered_ns == 11 * MS
-    link.configure(LinkConfig())
+    link.configure(LinkConfig(queue_s=0.0005))  # without a bandwidth nothing waits
     assert link.send(1, stamp_ns=0, size_bytes=1000).delivered_ns == 11 * MS  # behind the first
     assert link.send(2, stamp_ns=20 * MS, size_bytes=1000).delivered_ns == 20 * MS
     link.configure(LinkConfig(bandwidth_bytes_s=0.5e6))
