@@ -87,16 +87,16 @@ class Cameras:
             stop: Ends the wait; asked every 20 ms.
 
         Returns:
-            Whether there was nothing to wait for.
+            Whether there is room: not if `stop` ended the wait.
+
+        Raises:
+            RuntimeError: The rendering failed.
         """
-        self.check()
-        if free_lanes(state) >= count:
-            return True
         with self._changed:
-            while free_lanes(state) < count and self._failure is None and not stop():
+            while (has_room := free_lanes(state) >= count) is False and self._failure is None and not stop():
                 self._changed.wait(0.02)
         self.check()
-        return False
+        return has_room
 
     def take(self) -> list[tuple[str, list[Packet]]]:
         """Return what has been seen since the last time: vehicle and packets, in order."""

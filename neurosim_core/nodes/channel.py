@@ -40,7 +40,7 @@ class Channel:
         Returns:
             What the link does to it; None if there is nothing in its way.
         """
-        if self.config.delivers_at_once and not len(self._link):
+        if self.delivers_at_once:
             self._direct.append((stamp_ns, item))
             return None
         return self._link.send(item, stamp_ns=stamp_ns, size_bytes=size_bytes)
@@ -53,6 +53,11 @@ class Channel:
         if len(self._link):
             arrived += self._link.due(stamp_ns)
         return arrived
+
+    @property
+    def delivers_at_once(self) -> bool:
+        """Whether nothing is in the way of the next message."""
+        return self.config.delivers_at_once and not len(self._link)
 
     @property
     def next_due_ns(self) -> int | None:

@@ -53,14 +53,14 @@ def print_plan(console: Console, crafts: Sequence[Craft], config: SimulationConf
         f"[bold]{scene.name}[/], {len(scene.faces):,} triangles, on {crafts[0].model.device}; "
         f"{config.control.rate_hz:g} control periods a second, {pace}",
         highlight=False,
+        soft_wrap=True,
     )
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for craft in crafts:
-        names = ", ".join([*craft.model.config.sensors, "odometry", "rotor_speeds"])
-        names = ", ".join(dict.fromkeys(names.split(", ")))
-        table.add_row(craft.model.config.vehicle.preset, f"/{craft.name}/: {names}")
+        names = dict.fromkeys([*craft.model.config.sensors, "odometry", "rotor_speeds"])
+        table.add_row(craft.model.config.vehicle.preset, f"/{craft.name}/: {', '.join(names)}")
     console.print(table, highlight=False)
     commands = ", ".join(topics.command_topic(craft.name, "*") for craft in crafts)
     console.print(f"waiting for the first command on {commands}: `neurosim fly` sends them", highlight=False)
@@ -117,6 +117,7 @@ def print_end(console: Console, last: SimulatorStatus | None, record: Path | Non
         f"simulated {last.stamp_ns / 1e9:.3f} s: {last.step_count:,} control periods, {taken:,} commands "
         f"({lost:,} lost, {refused:,} refused), {collisions:,} collisions",
         highlight=False,
+        soft_wrap=True,
     )
     if last.mode == "streaming":
         dropped = sum(sensor.dropped_count for sensor in last.sensors)
@@ -124,6 +125,7 @@ def print_end(console: Console, last: SimulatorStatus | None, record: Path | Non
             f"{last.overrun_count:,} periods took too long, time was held back by "
             f"{last.slipped_ns / 1e9:.3f} s, {dropped:,} frames were left out or lost",
             highlight=False,
+            soft_wrap=True,
         )
     if record is not None:
         console.print(f"recorded to {record}/", highlight=False, soft_wrap=True)

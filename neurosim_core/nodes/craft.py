@@ -79,9 +79,16 @@ class Craft:
         Raises:
             ValueError: The start is of a wrong shape or not finite.
         """
-        drop = self.model.config.live.overrun == "drop"
-        self.lanes = plan_lanes(self.model, drop=drop)
-        return make_state(self.model, flight_lane_count=self.lanes.count, seed=seed, start=start)
+        live = self.model.config.live
+        self.lanes = plan_lanes(self.model, drop=live.overrun == "drop")
+        return make_state(
+            self.model,
+            lane_count=1,
+            flight_lane_count=1 if live.mode == "lockstep" else self.lanes.count,
+            borrow_pictures=live.mode == "lockstep",
+            seed=seed,
+            start=start,
+        )
 
     def begin(self, state: State, *, seed: int) -> None:
         """Begin an episode: forget everything, and publish where the vehicle is."""
@@ -113,6 +120,16 @@ class Craft:
             return command.stamp_ns == self.answers_ns
         assert self.answers_ns is not None
         return not self.answers_ns < command.stamp_ns <= self._before_reset_ns
+
+    def describe_silence(self) -> str:
+        """Say which command a control period of lockstep waits for, and what came in its place."""
+        mode = "any mode" if self.helm.holds is None else f"mode {self.helm.holds.mode}"
+        missed = self.inbox.missed
+        other = "" if missed is None else f"; the last other command answered {missed.stamp_ns} ns"
+        return (
+            f"it waits for a command of {mode} that answers the odometry of {self.answers_ns} ns, and "
+            f"{self.inbox.publisher_count} publisher(s) of its commands are connected{other}"
+        )
 
     def obey(self, command: Command, stamp_ns: int) -> None:
         """Send a command on its way at a tick [ns]."""

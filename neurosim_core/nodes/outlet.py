@@ -6,12 +6,14 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
+
 from cortex import Node, Publisher
 from cortex import messages as msg
 from neurosim_core.live import LinkConfig
 from neurosim_core.nodes import topics, translate
 from neurosim_core.nodes.channel import Channel, payload_bytes
-from neurosim_core.packets import Delivery, Odometry, Packet
+from neurosim_core.packets import Delivery, Image, Odometry, Packet
 from neurosim_core.record import describe_sensors
 from neurosim_core.simulation import COLLISION, Model
 
@@ -145,12 +147,18 @@ class Outlet:
         return frozenset(name for name in self._sensor_names if self.streams[name].subscriber_count)
 
     def offer(self, packets: Iterable[Packet]) -> None:
-        """Send packets of one control period on their way, in the order of time."""
+        """Send packets of one control period on their way, in the order of time.
+
+        Pictures may be views that hold until the next period: those that are kept longer are copied.
+        """
         for packet in packets:
             if packet.sensor == "odometry" and isinstance(packet, Odometry):
                 self.offer_state(packet)
                 continue
-            self._send(self.streams[packet.sensor], packet)
+            stream = self.streams[packet.sensor]
+            if isinstance(packet, Image) and (self.record is not None or not stream.channel.delivers_at_once):
+                packet = dataclasses.replace(packet, data=np.array(packet.data))  # the view is short-lived
+            self._send(stream, packet)
             if self.record is not None:
                 self.record(packet)
 

@@ -48,6 +48,41 @@ class Request:
         return self._reason
 
 
+class Steps:
+    """Leave of a paused run to go on for some control periods; true as long as some are left."""
+
+    def __init__(self) -> None:
+        self._request: Request | None = None
+        self._left = 0
+
+    def __bool__(self) -> bool:
+        return self._left > 0
+
+    def start(self, request: Request) -> None:
+        """Give leave for as many as a request asks for; the answer comes when they are over."""
+        self._request, self._left = request, request.message.count
+        if not self._left:
+            self.stop()
+
+    def count(self) -> None:
+        """Note that a control period is over."""
+        if self._left:
+            self._left -= 1
+            if not self._left:
+                self.stop()
+
+    def stop(self, reason: str = "") -> None:
+        """Answer the request, if there is one: they are over, or there is a reason why not."""
+        request, self._request, self._left = self._request, None, 0
+        if request is not None:
+            request.answer(reason)
+
+    def check(self) -> None:
+        """Stop if nobody waits for the answer any more."""
+        if self._request is not None and self._request.abandoned:
+            self.stop()
+
+
 class Requests:
     """Offers the services, and hands what is asked to one loop.
 

@@ -17,36 +17,27 @@ from types import TracebackType
 from rich.console import Console
 
 from cortex import Node
-from cortex.messages import Clock, Reset, Simulation, SimulatorStatus, Step
-from neurosim_core import __version__
+from cortex.messages import Reset, SimulatorStatus
 from neurosim_core.clock import to_ns
-from neurosim_core.config import SimulationConfig, to_yaml
-from neurosim_core.nodes import topics
+from neurosim_core.config import SimulationConfig
+from neurosim_core.nodes.audience import Audience
 from neurosim_core.nodes.cameras import Cameras, sees_inline
 from neurosim_core.nodes.console import StatusLine, print_end, print_plan, stop_at_signals
 from neurosim_core.nodes.craft import Craft
+from neurosim_core.nodes.episode import Episode, make_episode
 from neurosim_core.nodes.helm import Command
 from neurosim_core.nodes.meetings import Meetings
 from neurosim_core.nodes.recorder import Recorder, open_folders
-from neurosim_core.nodes.requests import Request, Requests
-from neurosim_core.nodes.status import Meter
+from neurosim_core.nodes.requests import Request, Requests, Steps
+from neurosim_core.nodes.status import Board, Meter
+from neurosim_core.nodes.streaming import Streaming
 from neurosim_core.pacing import Pacer
 from neurosim_core.packets import Packet
-from neurosim_core.simulation import Model, StartState, State, make_fleet
+from neurosim_core.simulation import Model, make_fleet
 from neurosim_core.vehicle import DynamicsError
 
-STATUS_INTERVAL_S = 0.2
-LOOK_INTERVAL_S = 0.005
-"""How often it is looked who listens, at most [s]."""
-SETTLE_S = 0.1
-"""For so long nobody must have come or gone before time begins [s]."""
-SETTLE_MAX_S = 2.0
 LATE_S = 0.1
 """A command that takes longer than this is said to be waited for [s]."""
-HICCUP_NS = 10_000_000
-"""The machine may be this late, or a control period if that is longer, and catch up [ns]."""
-BEHIND_MAX_NS = 500_000_000
-"""How far the machine may be behind where camera frames give way [ns]."""
 
 
 class Simulator:
@@ -58,7 +49,7 @@ class Simulator:
         config: Settings that hold now.
         crafts: The vehicles.
         stamp_ns: Simulated time [ns].
-        on_status: Called with every status, about five times a second; None: nobody wants to know.
+        board: What it says of itself.
     """
 
     def __init__(
@@ -93,7 +84,6 @@ class Simulator:
         if on_phase is not None:
             on_phase("kernels (compiled on the first run, then cached)")
         self.stamp_ns = 0
-        self.on_status: Callable[[SimulatorStatus], None] | None = None
         self._control = next(iter(models.values())).schedule.control
         self._stop = threading.Event()
         self._bell = threading.Event()
@@ -103,11 +93,7 @@ class Simulator:
         self._ended = False
         self._exit: int | None = None
         self._reason = ""
-        self._stepping: Request | None = None
-        self._steps_left = 0
-        self._listeners: tuple[int, ...] = ()
-        self._changed_s = self._looked_s = self._told_s = 0.0
-        self._told_phase = ""
+        self._steps = Steps()
         self._meter = Meter()
         self._meetings = Meetings()
         self._pacer = Pacer(config.live.real_time_factor, sleep=self._bell.wait)
@@ -124,19 +110,11 @@ class Simulator:
             inline = config.live.mode == "lockstep" or sees_inline(device)
             self._cameras = Cameras(inline=inline, on_packets=self._bell.set)
             stack.callback(self._cameras.close)
-            self._clock = node.publisher(topics.CLOCK, Clock)
-            self._status = node.publisher(topics.STATUS, SimulatorStatus)
-            self._simulation = node.publisher(topics.SIMULATION, Simulation, latch=True)
-            self._begin({craft.name: craft.state for craft in self.crafts}, self._seeds(None))
-            self._simulation.publish(
-                Simulation(
-                    config=to_yaml(config),
-                    version=__version__,
-                    vehicles=list(models),
-                    mode=config.live.mode,
-                    control_rate_hz=config.control.rate_hz,
-                )
-            )
+            self.board = Board(node)
+            self._audience = Audience(self.crafts)
+            self._streaming = Streaming(self.crafts, self._cameras, self._pacer, self._meter, bell=self._bell)
+            self._begin(make_episode(self.crafts, config, Reset()))
+            self.board.announce(config)
             self._requests = Requests(
                 services,
                 node,
@@ -152,7 +130,7 @@ class Simulator:
         """What it does: "waiting", "running", "paused" or "ended"."""
         if self._ended:
             return "ended"
-        if self._paused and not self._steps_left:
+        if self._paused and not self._steps:
             return "paused"
         return "waiting" if self._reason or self._tick == 0 else "running"
 
@@ -179,9 +157,9 @@ class Simulator:
         self._stop = stop
         while not stop.is_set() and self._exit is None:
             self._answer_requests()
-            self._look()
+            self._audience.look()
             self._tell()
-            if self._ended or (self._paused and not self._steps_left):
+            if self._ended or (self._paused and not self._steps):
                 self._bell.wait(0.02)
                 self._bell.clear()
             elif self._receive():
@@ -222,12 +200,12 @@ class Simulator:
                 if command is not None:
                     craft.obey(command, self.stamp_ns)
             elif craft.answers_ns is not None and self._tick % live.command_every == 0:
-                command = self._wait_for_command(craft, craft.answers_ns)
+                command = self._wait_for_command(craft)
                 if command is None:
                     return False
                 craft.obey(command, self.stamp_ns)
         if first:
-            self._settle()
+            self._audience.settle(self._stop)
             self._pacer.start(0)
         return True
 
@@ -235,59 +213,25 @@ class Simulator:
         """Fly a control period, and publish what arrives in it."""
         begin_ns = time.monotonic_ns()
         end_ns = self._control.stamp_ns(self._tick + 1)
+        live = self.config.live
+        streaming = live.mode == "streaming"
         try:
-            if self.config.live.mode == "lockstep":
+            if not streaming:
                 for craft in self.crafts:
                     craft.step(self.stamp_ns)
-            else:
-                self._fly_ahead()
+            elif not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
+                return
         except DynamicsError as error:
             self._end(f"the motion of {self._culprit(error)} cannot be computed: {error}")
             return
         self._meetings.check(self.crafts)
         self._meter.step_times.add(time.monotonic_ns() - begin_ns)
-        if self.config.live.mode == "streaming" and not self._publish_on_time(end_ns):
+        period_ns = end_ns - self.stamp_ns
+        if streaming and not self._streaming.publish_until(end_ns, period_ns, live, self._stop.is_set):
             return
         for craft in self.crafts:
-            newest_ns = craft.outlet.publish_due(end_ns)
-            craft.answers_ns = newest_ns
+            craft.answers_ns = craft.outlet.publish_due(end_ns)
         self._end_period(end_ns)
-
-    def _fly_ahead(self) -> None:
-        """Fly a control period and leave the cameras to their thread."""
-        drop = self.config.live.overrun == "drop" and self._pacer.factor > 0.0
-        for craft in self.crafts:
-            if drop:
-                self._cameras.leave_out(self.stamp_ns - craft.lanes.lag_ns)
-            self._cameras.wait_for_room(craft.state, craft.lanes.batch_count, self._stop.is_set)
-            self._cameras.look(craft.name, craft.model, craft.state, craft.fly(self.stamp_ns))
-
-    def _publish_on_time(self, end_ns: int) -> bool:
-        """Publish what arrives in a control period when the wall clock says so, and wait for its end [ns].
-
-        Returns:
-            Whether it came to the end.
-        """
-        late_ns = self._pacer.lateness_ns(end_ns)
-        if late_ns > 0:
-            self._meter.overrun_count += 1
-            wall_ns = self._pacer.wall_ns(end_ns) - self._pacer.wall_ns(self.stamp_ns)
-            slow = self.config.live.overrun == "slow"
-            if late_ns > (max(wall_ns, HICCUP_NS) if slow else BEHIND_MAX_NS):
-                self._meter.slipped_ns += self._pacer.slip(end_ns)
-        while not self._stop.is_set():
-            self._bell.clear()
-            self._offer_seen()
-            due_ns = min([end_ns, *(d for c in self.crafts if (d := c.outlet.next_due_ns) is not None)])
-            late_ns = self._pacer.wait_until(due_ns, self._is_called)
-            if late_ns < 0:
-                continue
-            if due_ns == end_ns:
-                self._meter.late_times.add(late_ns)
-                return True
-            for craft in self.crafts:
-                craft.outlet.publish_due(due_ns)
-        return False
 
     def _end_period(self, end_ns: int) -> None:
         """Move time on to a tick [ns], and see whether that was the last."""
@@ -295,18 +239,8 @@ class Simulator:
         self.stamp_ns = end_ns
         self._meter.step_count += 1
         live = self.config.live
-        self._clock.publish(
-            Clock(
-                stamp_ns=end_ns,
-                wall_ns=time.time_ns(),
-                real_time_factor=live.real_time_factor if live.mode == "streaming" else 0.0,
-                sequence=self._tick - 1,
-            )
-        )
-        if self._steps_left:
-            self._steps_left -= 1
-            if not self._steps_left:
-                self._stop_stepping()
+        self.board.strike(end_ns, live, sequence=self._tick - 1)
+        self._steps.count()
         ended = next((craft for craft in self.crafts if craft.state.ended), None)
         if ended is not None:
             self._end(f"{ended.name} collided at {ended.state.stamp_ns / 1e9:.3f} s")
@@ -315,7 +249,7 @@ class Simulator:
 
     # Waiting
 
-    def _wait_for_command(self, craft: Craft, stamp_ns: int) -> Command | None:
+    def _wait_for_command(self, craft: Craft) -> Command | None:
         """Wait for the command that the control period needs; None if something else has to be done first."""
         live = self.config.live
         begin_s = time.monotonic()
@@ -324,8 +258,8 @@ class Simulator:
 
         def wake() -> bool:
             if limited and time.monotonic() - begin_s > LATE_S:
-                self._reason = f"for the command of {craft.name} that answers {stamp_ns} ns"
-            self._look()
+                self._reason = f"for the command of {craft.name} that answers {craft.answers_ns} ns"
+            self._audience.look()
             self._tell()
             return self._is_called()
 
@@ -336,84 +270,48 @@ class Simulator:
         )
         self._reason = ""
         if command is None and deadline_s is not None and time.monotonic() >= deadline_s:
-            self._fail(self._why_no_command(craft, stamp_ns))
+            self._fail(
+                f"no command for {craft.name} within {live.command_deadline_s:g} s at control period "
+                f"{self._tick}: {craft.describe_silence()}"
+            )
         return command
-
-    def _why_no_command(self, craft: Craft, stamp_ns: int) -> str:
-        """Say which command did not come, and what did."""
-        mode = "any mode" if craft.helm.holds is None else f"mode {craft.helm.holds.mode}"
-        count = craft.inbox.publisher_count
-        missed = craft.inbox.missed
-        other = "" if missed is None else f"; the last other command answered {missed.stamp_ns} ns"
-        return (
-            f"no command for {craft.name} within {self.config.live.command_deadline_s:g} s: control period "
-            f"{self._tick} waits for one of {mode} that answers the odometry of {stamp_ns} ns, and "
-            f"{count} publisher(s) of its commands are connected{other}"
-        )
-
-    def _settle(self) -> None:
-        """Wait until nobody comes or goes any more: who sends the first command may have just subscribed."""
-        give_up_s = time.monotonic() + SETTLE_MAX_S
-        while not self._stop.is_set() and time.monotonic() < give_up_s:
-            self._look(at_once=True)
-            left_s = self._changed_s + SETTLE_S - time.monotonic()
-            if left_s <= 0.0:
-                return
-            self._stop.wait(min(left_s, LOOK_INTERVAL_S))
 
     def _is_called(self) -> bool:
         """Whether something has to be done before what is waited for."""
-        return self._stop.is_set() or bool(self._requests) or self._cameras.has_packets
-
-    def _look(self, *, at_once: bool = False) -> None:
-        """See who listens."""
-        now_s = time.monotonic()
-        if not at_once and now_s - self._looked_s < LOOK_INTERVAL_S:
-            return
-        self._looked_s = now_s
-        listeners = tuple(count for craft in self.crafts for count in craft.look())
-        if listeners != self._listeners:
-            self._listeners, self._changed_s = listeners, now_s
+        return self._stop.is_set() or bool(self._requests)
 
     def _tell(self, *, at_once: bool = False) -> None:
-        """Publish the status, if it is time."""
-        now_s = time.monotonic()
-        phase = self.phase
-        if not at_once and phase == self._told_phase and now_s - self._told_s < STATUS_INTERVAL_S:
-            return
-        self._told_s, self._told_phase = now_s, phase
-        if self.on_status is None and not self._status.subscriber_count:
-            return
-        status = self._meter.status(
+        """Say how it is going, if it is time."""
+        self.board.tell(self.phase, self._make_status, at_once=at_once)
+
+    def _make_status(self) -> SimulatorStatus:
+        return self._meter.status(
             self.crafts,
             self._cameras.dropped,
             self.config,
             stamp_ns=self.stamp_ns,
-            phase=phase,
+            phase=self.phase,
             reason=self.reason,
         )
-        self._status.publish(status)
-        if self.on_status is not None:
-            self.on_status(status)
 
     # Beginning and end
 
-    def _begin(self, states: Mapping[str, State], seeds: Mapping[str, int]) -> None:
+    def _begin(self, episode: Episode) -> None:
         """Begin a run at stamp 0, and publish where everybody is."""
         self._cameras.clear()
         if self._recorder is not None:
-            self._recorder.begin(seeds, replace=self._tick == 0)
+            self._recorder.begin(episode.seeds, replace=self._tick == 0)
         self._tick = self.stamp_ns = 0
         self._ended, self._reason = False, ""
         self._meter.reset()
         self._meetings.reset()
         for craft in self.crafts:
-            craft.begin(states[craft.name], seed=seeds[craft.name])
+            craft.begin(episode.states[craft.name], seed=episode.seeds[craft.name])
 
     def _end(self, reason: str) -> None:
         """End the run, but not the simulator, unless that was all there was to do."""
         self._ended, self._reason = True, reason
-        self._stop_stepping(f"the run has ended: {reason}")
+        self._steps.stop(f"the run has ended: {reason}")
         self._cameras.finish(self._stop.is_set)
         self._flush()
         if not self.config.live.run_on:
@@ -426,23 +324,13 @@ class Simulator:
 
     def _flush(self) -> None:
         """Publish what is known up to now, events of a window that has only begun included."""
-        self._offer_seen()
+        self._streaming.offer_seen()
         for craft in self.crafts:
             craft.finish()
             craft.outlet.publish_due(max(self.stamp_ns, craft.state.stamp_ns))
 
-    def _offer_seen(self) -> None:
-        """Send on their way what the cameras have seen."""
-        for name, packets in self._cameras.take():
-            next(craft for craft in self.crafts if craft.name == name).outlet.offer(packets)
-
     def _culprit(self, error: DynamicsError) -> str:
         return next(craft.name for craft in self.crafts if craft.state.failure is error)
-
-    def _seeds(self, seed: int | None) -> dict[str, int]:
-        """Return the seed of each vehicle, for a common one or that of the settings."""
-        config = self.config if seed is None else self.config.model_copy(update={"seed": seed})
-        return {craft.name: config.of(craft.name).seed for craft in self.crafts}
 
     def _record(self, vehicle: str) -> Callable[[Packet], None] | None:
         return None if self._recorder is None else functools.partial(self._recorder.write, vehicle)
@@ -451,8 +339,7 @@ class Simulator:
 
     def _answer_requests(self) -> None:
         """Do what has been asked for."""
-        if self._stepping is not None and self._stepping.abandoned:
-            self._stop_stepping("nobody waits for it any more")
+        self._steps.check()
         while (request := self._requests.take()) is not None:
             if request.service == "/step":
                 self._start_steps(request)
@@ -464,62 +351,32 @@ class Simulator:
                 self._pause(paused=request.service == "/pause")
                 request.answer()
 
-    def _reset(self, message: Reset) -> str:
+    def _reset(self, request: Reset) -> str:
         """Begin again; return why not, empty if it was done."""
-        names = [craft.name for craft in self.crafts]
-        start = StartState(
-            position=message.position,
-            orientation=message.orientation,
-            velocity=message.velocity,
-            body_rate=message.body_rate,
-        )
-        moved = start != StartState()
-        if message.vehicle and message.vehicle not in names:
-            return f"unknown vehicle {message.vehicle!r}, known: {', '.join(names)}"
-        if moved and not message.vehicle and len(names) > 1:
-            return f"say which vehicle starts elsewhere: one of {', '.join(names)}"
-        if message.seed is not None and message.seed < 0:
-            return f"seed must be 0 or more, got {message.seed}"
-        seeds = self._seeds(message.seed)
         try:
-            states = {
-                craft.name: craft.make_state(
-                    seed=seeds[craft.name],
-                    start=start if moved and message.vehicle in ("", craft.name) else None,
-                )
-                for craft in self.crafts
-            }
+            episode = make_episode(self.crafts, self.config, request)
         except ValueError as error:
             return str(error)
-        self._stop_stepping("the run was reset")
-        self._begin(states, seeds)
+        self._steps.stop("the run was reset")
+        self._begin(episode)
         return ""
 
     def _pause(self, *, paused: bool) -> None:
         """Stop time, or let it go on."""
-        self._stop_stepping("paused" if paused else "resumed")
+        self._steps.stop("paused" if paused else "resumed")
         if self._paused and not paused:
             self._pacer.start(self.stamp_ns)
         self._paused = paused
 
     def _start_steps(self, request: Request) -> None:
-        """Let a paused run go on for some control periods; the answer comes when they are over."""
-        step: Step = request.message
+        """Let a paused run go on for some control periods."""
         if self._ended:
             request.answer(f"the run has ended: {self._reason}")
         elif not self._paused:
             request.answer("it is not paused: call /pause first")
-        elif not step.count:
-            request.answer()
         else:
-            self._stepping, self._steps_left = request, step.count
             self._pacer.start(self.stamp_ns)
-
-    def _stop_stepping(self, reason: str = "") -> None:
-        """Answer the request for steps, if there is one: they are over, or there is a reason why not."""
-        request, self._stepping, self._steps_left = self._stepping, None, 0
-        if request is not None:
-            request.answer(reason)
+            self._steps.start(request)
 
     def _change(self, config: SimulationConfig | None) -> str:
         """Change settings; return why not, empty if it was done."""
@@ -549,18 +406,17 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
     """
     console = Console()
     stop = threading.Event()
-    with stop_at_signals(stop):
-        with console.status("preparing") as status:
-            simulator = Simulator(
-                config,
-                record=record,
-                overwrite=overwrite,
-                on_phase=lambda phase: status.update(f"preparing: {phase}"),
-            )
-        with simulator:
-            print_plan(console, simulator.crafts, config)
-            with StatusLine(console) as line:
-                simulator.on_status = line.show
-                code = simulator.run(stop)
-            print_end(console, line.last, record)
+    with console.status("preparing") as status:
+        simulator = Simulator(
+            config,
+            record=record,
+            overwrite=overwrite,
+            on_phase=lambda phase: status.update(f"preparing: {phase}"),
+        )
+    with stop_at_signals(stop), simulator:
+        print_plan(console, simulator.crafts, config)
+        with StatusLine(console) as line:
+            simulator.board.on_status = line.show
+            code = simulator.run(stop)
+        print_end(console, line.last, record)
     return 130 if stop.is_set() else code

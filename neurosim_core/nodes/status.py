@@ -1,14 +1,79 @@
-"""How a simulator is doing: what it measures of itself, and the message that says so."""
+"""What a simulator says of itself: what it flies, what time it is, and how it is doing."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from cortex.messages import SensorStatus, SimulatorStatus, VehicleStatus
-from neurosim_core.config import SimulationConfig
+from cortex import Node
+from cortex.messages import Clock, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
+from neurosim_core import __version__
+from neurosim_core.config import SimulationConfig, to_yaml
+from neurosim_core.live import LiveConfig
+from neurosim_core.nodes import topics
 from neurosim_core.nodes.craft import Craft
 from neurosim_core.pacing import Timings
+
+STATUS_INTERVAL_S = 0.2
+
+
+class Board:
+    """The topics /simulation, /clock and /status.
+
+    Attributes:
+        on_status: Called with every status; None: nobody but subscribers wants to know.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Open the topics.
+
+        Args:
+            node: Whose they are.
+        """
+        self.on_status: Callable[[SimulatorStatus], None] | None = None
+        self._simulation = node.publisher(topics.SIMULATION, Simulation, latch=True)
+        self._clock = node.publisher(topics.CLOCK, Clock)
+        self._status = node.publisher(topics.STATUS, SimulatorStatus)
+        self._told_s = 0.0
+        self._told_phase = ""
+
+    def announce(self, config: SimulationConfig) -> None:
+        """Say what is flown."""
+        self._simulation.publish(
+            Simulation(
+                config=to_yaml(config),
+                version=__version__,
+                vehicles=list(config.vehicles),
+                mode=config.live.mode,
+                control_rate_hz=config.control.rate_hz,
+            )
+        )
+
+    def strike(self, stamp_ns: int, live: LiveConfig, *, sequence: int) -> None:
+        """Say what time it is: at a tick [ns]."""
+        factor = live.real_time_factor if live.mode == "streaming" else 0.0
+        self._clock.publish(
+            Clock(stamp_ns=stamp_ns, wall_ns=time.time_ns(), real_time_factor=factor, sequence=sequence)
+        )
+
+    def tell(self, phase: str, status: Callable[[], SimulatorStatus], *, at_once: bool = False) -> None:
+        """Say how it is going, if it is time or the phase has changed, and somebody listens.
+
+        Args:
+            phase: As in the message.
+            status: Makes the message.
+            at_once: It is time.
+        """
+        now_s = time.monotonic()
+        if not at_once and phase == self._told_phase and now_s - self._told_s < STATUS_INTERVAL_S:
+            return
+        self._told_s, self._told_phase = now_s, phase
+        if self.on_status is None and not self._status.subscriber_count:
+            return
+        message = status()
+        self._status.publish(message)
+        if self.on_status is not None:
+            self.on_status(message)
 
 
 class Meter:

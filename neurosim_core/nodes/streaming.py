@@ -1,0 +1,119 @@
+"""Time that goes on by the wall clock: a control period of a streaming run, and what gives way when late."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+
+from neurosim_core.live import LiveConfig
+from neurosim_core.nodes.cameras import Cameras
+from neurosim_core.nodes.craft import Craft
+from neurosim_core.nodes.status import Meter
+from neurosim_core.pacing import Pacer
+
+HICCUP_NS = 10_000_000
+"""The machine may be this late, or a control period if that is longer, and catch up [ns]."""
+BEHIND_MAX_NS = 500_000_000
+"""How far the machine may be behind where camera frames give way [ns]."""
+
+
+class Streaming:
+    """Flies control periods ahead of the wall clock, and publishes when it says so.
+
+    A period is computed when it begins, and what it yields is published at its own stamps, so the machine has
+    the period to compute it. What it is late by is made up for; if that does not work, `live.overrun` says
+    whether time is put off or frames are left out, and `meter` counts both.
+    """
+
+    def __init__(
+        self,
+        crafts: Sequence[Craft],
+        cameras: Cameras,
+        pacer: Pacer,
+        meter: Meter,
+        *,
+        bell: threading.Event,
+    ) -> None:
+        """Take what is needed.
+
+        Args:
+            crafts: The vehicles.
+            cameras: Looks at what they fly past.
+            pacer: Says when a stamp is due; sleeps on `bell`.
+            meter: Takes note of how late it is.
+            bell: Rung when the cameras have seen something.
+        """
+        self._crafts = crafts
+        self._cameras = cameras
+        self._pacer = pacer
+        self._meter = meter
+        self._bell = bell
+
+    def fly(self, stamp_ns: int, live: LiveConfig, stop: Callable[[], bool]) -> bool:
+        """Fly the control period that begins at a tick [ns], and leave its pictures to the cameras.
+
+        Args:
+            stamp_ns: The tick.
+            live: Says what gives way when the cameras are late.
+            stop: Ends the wait for them.
+
+        Returns:
+            Whether it was flown: not if `stop` ended the wait.
+
+        Raises:
+            DynamicsError: The integration failed.
+            RuntimeError: The cameras failed.
+        """
+        for craft in self._crafts:
+            if live.overrun == "drop" and self._pacer.factor > 0.0:
+                self._cameras.leave_out(stamp_ns - craft.lanes.lag_ns)
+            if not self._cameras.wait_for_room(craft.state, craft.lanes.batch_count, stop):
+                return False
+            self._cameras.look(craft.name, craft.model, craft.state, craft.fly(stamp_ns))
+        return True
+
+    def publish_until(self, end_ns: int, period_ns: int, live: LiveConfig, stop: Callable[[], bool]) -> bool:
+        """Publish what arrives before the end of a control period, each when it is due, and wait for the end.
+
+        Args:
+            end_ns: End of the period [ns].
+            period_ns: Its length [ns].
+            live: Says what gives way when the machine is late.
+            stop: Ends the wait.
+
+        Returns:
+            Whether it came to the end.
+        """
+
+        def interrupted() -> bool:
+            return stop() or self._cameras.has_packets
+
+        self._make_way(end_ns, period_ns, live)
+        while not stop():
+            self._bell.clear()
+            self.offer_seen()
+            due_ns = min([end_ns, *(d for c in self._crafts if (d := c.outlet.next_due_ns) is not None)])
+            late_ns = self._pacer.wait_until(due_ns, interrupted)
+            if late_ns < 0:
+                continue
+            if due_ns == end_ns:
+                self._meter.late_times.add(late_ns)
+                return True
+            for craft in self._crafts:
+                craft.outlet.publish_due(due_ns)
+        return False
+
+    def offer_seen(self) -> None:
+        """Send on their way what the cameras have seen."""
+        for name, packets in self._cameras.take():
+            next(craft for craft in self._crafts if craft.name == name).outlet.offer(packets)
+
+    def _make_way(self, end_ns: int, period_ns: int, live: LiveConfig) -> None:
+        """Put time off if a period was computed after its end [ns] and that cannot be made up for."""
+        late_ns = self._pacer.lateness_ns(end_ns)
+        if late_ns <= 0:
+            return
+        self._meter.overrun_count += 1
+        had_ns = period_ns / self._pacer.factor
+        if late_ns > (max(had_ns, HICCUP_NS) if live.overrun == "slow" else BEHIND_MAX_NS):
+            self._meter.slipped_ns += self._pacer.slip(end_ns)
