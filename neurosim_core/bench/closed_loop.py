@@ -1,0 +1,346 @@
+"""The closed loop between processes: how long a command takes to be seen, and how many images a second come.
+
+For each rate a simulator and a controller, two processes, fly twice. *Lockstep*: the simulator waits for each
+command, so the time from command to image is what Cortex, the dynamics and the renderer take. *Streaming*:
+time passes at the pace of the wall clock, as long as the machine keeps up with the rate that was asked for.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib.util
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from neurosim_core.bench.loop_trace import (
+    LoopTrace,
+    felt_commands,
+    loop_latency_ns,
+    received_hz,
+    transport_ns,
+)
+from neurosim_core.bench.machine import describe_machine
+from neurosim_core.bench.processes import NeurosimProcess, own_runtime
+from neurosim_core.config import SimulationConfig, load_config, to_yaml
+from neurosim_core.nodes.probe import answer_images
+
+LoopMode = Literal["lockstep", "streaming"]
+
+RATES_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
+TRANSPORT_BAR_S = (0.2e-3, 0.5e-3)
+"""What the median and the 99th percentile of the transport are to stay under [s]."""
+_CAMERA = "camera"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopResult:
+    """What was measured at one rate; times are wall-clock, and nan where nothing could be measured."""
+
+    mode: LoopMode
+    requested_hz: float
+    """Commands and images a second of simulated time [Hz]."""
+    received_hz: float
+    """Images a second that the controller got [Hz]."""
+    image_count: int
+    image_bytes: int
+    latency_median_s: float
+    """From sending a command to having the first image that felt it [s]."""
+    latency_p99_s: float
+    transport_median_s: float
+    """From publishing an image to having it in the controller's hands [s]."""
+    transport_p99_s: float
+    lost_count: int
+    """Images that never arrived."""
+    overtaken_count: int
+    """Images that gave way to newer ones before the controller looked."""
+    unfelt_count: int
+    """Commands sent that no image showed: a newer one took their place, or the measurement was over."""
+
+
+def loop_config(
+    mode: LoopMode,
+    rate_hz: float,
+    *,
+    renderer: str = "synthetic",
+    width: int = 640,
+    height: int = 480,
+    device: str = "auto",
+    scene: Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> SimulationConfig:
+    """Return the settings of a loop: one RGB camera, at the rate of the commands.
+
+    Args:
+        mode: Whether the simulator waits for commands.
+        rate_hz: Of commands and images [Hz].
+        renderer: Who draws the images.
+        width: Columns of an image [px].
+        height: Rows [px].
+        device: Where to compute.
+        scene: A mesh file; None: the generated apartment.
+        settings: Further ones, by dotted key.
+
+    Raises:
+        ValueError: Something is out of range.
+    """
+    lens = {"width": width, "height": height, "horizontal_fov_rad": 1.5}
+    base: dict[str, Any] = {
+        "device": device,
+        "renderer": renderer,
+        "instants_per_launch": 1,
+        "path": {"kind": "hover"},
+        "vehicle": {"on_collision": "report"},
+        "control": {"rate_hz": rate_hz},
+        "sensors": {_CAMERA: {"kind": "rgb", "rate_hz": rate_hz, "lens": lens}},
+        "live": {"mode": mode, "command_timeout_s": 60.0, "fail_safe": "hold"},
+    }
+    if scene is not None:
+        base["scene"] = {"kind": "mesh", "file": str(scene.resolve())}
+    return load_config(base, overrides=settings)
+
+
+def measure_loop(
+    config: SimulationConfig,
+    *,
+    seconds: float,
+    warm_up_s: float | None = None,
+    python: Sequence[str] = (sys.executable,),
+) -> LoopResult:
+    """Start a simulator, close the loop over Cortex, and measure.
+
+    Args:
+        config: `loop_config`.
+        seconds: How long to measure [wall-clock s].
+        warm_up_s: How long to fly before that [wall-clock s]; None: half as long, at most 1 s.
+        python: How to start the interpreter of the simulator, such as under a profiler.
+
+    Raises:
+        ProcessEnded: The simulator ended.
+        ProbeError: It was silent.
+    """
+    if not 0.0 < seconds <= 3600.0:  # also refuses nan
+        raise ValueError(f"seconds must be > 0 and <= 3600, got {seconds}")
+    airframe = config.vehicle.airframe()
+    hover_rad_s = airframe.hover_rotor_speed_rad_s
+    with own_runtime() as folder:
+        file = folder / "loop.yaml"
+        file.write_text(to_yaml(config), encoding="utf-8")
+        with NeurosimProcess("serve", str(file), log=folder / "serve.log", python=python) as simulator:
+            trace = answer_images(
+                vehicle=next(iter(config.vehicles)),
+                camera=_CAMERA,
+                hover_rad_s=hover_rad_s,
+                rotor_count=airframe.rotor_count,
+                seconds=seconds,
+                warm_up_s=min(0.5 * seconds, 1.0) if warm_up_s is None else warm_up_s,
+                check=simulator.check,
+            )
+    return summarise(
+        trace,
+        mode=config.live.mode,
+        requested_hz=config.control.rate_hz,
+        hover_rad_s=hover_rad_s,
+        motor_time_constant_s=airframe.motor_time_constant_s,
+    )
+
+
+def summarise(
+    trace: LoopTrace,
+    *,
+    mode: LoopMode,
+    requested_hz: float,
+    hover_rad_s: float,
+    motor_time_constant_s: float,
+) -> LoopResult:
+    """Return the figures of a trace; arguments as in `felt_commands`."""
+    felt = felt_commands(trace, hover_rad_s=hover_rad_s, motor_time_constant_s=motor_time_constant_s)
+    latency_s = 1e-9 * loop_latency_ns(trace, felt)
+    transport_s = 1e-9 * transport_ns(trace)
+    return LoopResult(
+        mode=mode,
+        requested_hz=requested_hz,
+        received_hz=received_hz(trace),
+        image_count=len(trace.received_ns) - trace.begin,
+        image_bytes=trace.image_bytes,
+        latency_median_s=_quantile(latency_s, 0.5),
+        latency_p99_s=_quantile(latency_s, 0.99),
+        transport_median_s=_quantile(transport_s, 0.5),
+        transport_p99_s=_quantile(transport_s, 0.99),
+        lost_count=trace.lost_count,
+        overtaken_count=trace.overtaken_count,
+        unfelt_count=len(trace.sent_ns) - len(np.unique(felt[felt >= 0])),
+    )
+
+
+def _quantile(values: NDArray[np.floating[Any]], share: float) -> float:
+    return float(np.quantile(values, share)) if len(values) else float("nan")
+
+
+def sweep(
+    rates_hz: Iterable[float] = RATES_HZ,
+    *,
+    seconds: float = 3.0,
+    on_case: Callable[[LoopMode, float], None] | None = None,
+    **options: Any,
+) -> list[LoopResult]:
+    """Measure every rate in both modes.
+
+    Args:
+        rates_hz: Of commands and images [Hz].
+        seconds: How long to measure each [wall-clock s].
+        on_case: Told what is measured next.
+        options: As for `loop_config`.
+    """
+    modes: tuple[LoopMode, ...] = ("lockstep", "streaming")
+    configs = [loop_config(mode, rate_hz, **options) for mode in modes for rate_hz in rates_hz]
+    results = []
+    for config in configs:  # all have been checked before the first is flown
+        if on_case is not None:
+            on_case(config.live.mode, config.control.rate_hz)
+        results.append(measure_loop(config, seconds=seconds))
+    return results
+
+
+def print_sweep(results: Sequence[LoopResult], console: Console) -> None:
+    """Print a sweep as a table, and what its transport is to be judged by."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in (
+        "mode",
+        "requested",
+        "received",
+        "end to end",
+        "p99",
+        "transport",
+        "p99",
+        "lost",
+        "overtaken",
+    ):
+        table.add_column(name, justify="left" if name == "mode" else "right")
+    for r in results:
+        table.add_row(
+            r.mode,
+            f"{r.requested_hz:g} Hz",
+            f"{r.received_hz:,.0f} Hz",
+            *(_ms(t) for t in (r.latency_median_s, r.latency_p99_s, r.transport_median_s, r.transport_p99_s)),
+            f"{r.lost_count}",
+            f"{r.overtaken_count}",
+        )
+    console.print(table, highlight=False)
+    worst = [max(r.transport_median_s for r in results), max(r.transport_p99_s for r in results)]
+    met = all(value < bar for value, bar in zip(worst, TRANSPORT_BAR_S, strict=True))
+    console.print(
+        f"transport of {results[0].image_bytes / 1e6:.2f} MB at every rate: median {_ms(worst[0])} or less, "
+        f"p99 {_ms(worst[1])} or less; bar {_ms(TRANSPORT_BAR_S[0])} and {_ms(TRANSPORT_BAR_S[1])}: "
+        + ("met" if met else "missed"),
+        highlight=False,
+    )
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.3f} ms"
+
+
+def save_csv(results: Sequence[LoopResult], file: Path) -> None:
+    """Write one row for each rate and mode; times in seconds."""
+    with file.open("w", newline="", encoding="utf-8") as out:
+        writer = csv.DictWriter(out, [field.name for field in dataclasses.fields(LoopResult)])
+        writer.writeheader()
+        writer.writerows(dataclasses.asdict(result) for result in results)
+
+
+def save_plot(results: Sequence[LoopResult], file: Path, *, title: str, notes: Sequence[str]) -> None:
+    """Draw latency against rate, and received against requested rate.
+
+    Args:
+        results: What was measured.
+        file: Where to.
+        title: What was flown.
+        notes: Lines on machine and versions, below the panels.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 5))
+    rates = np.array(sorted({r.requested_hz for r in results}))
+    for mode, marker in (("lockstep", "o"), ("streaming", "s")):
+        chosen = [r for r in results if r.mode == mode]
+        if not chosen:
+            continue
+        x = [r.requested_hz for r in chosen]
+        median, p99 = ([1e3 * t for t in times] for times in zip(*_latencies(chosen), strict=True))
+        (line,) = left.plot(x, median, marker=marker, label=f"command to image, {mode}")
+        left.plot(x, p99, ":", color=line.get_color(), label="its 99th percentile")
+        left.plot(
+            x,
+            [1e3 * r.transport_median_s for r in chosen],
+            "--",
+            color=line.get_color(),
+            label="of which transport",
+        )
+        right.plot(x, [r.received_hz for r in chosen], marker=marker, label=mode)
+    left.plot(rates, 1e3 / rates, color="0.7", label="one period")
+    right.plot(rates, rates, color="0.7", label="as requested")
+    left.set(xlabel="controller and image rate [Hz]", ylabel="wall-clock time [ms]", title="(i) latency")
+    right.set(xlabel="requested [Hz]", ylabel="images received a second", title="(ii) rate")
+    for axes in (left, right):
+        axes.set(xscale="log", yscale="log")
+        axes.grid(which="both", alpha=0.3)
+        axes.legend(fontsize=7)
+    figure.suptitle(title, fontsize=10)
+    figure.text(0.01, 0.01, "\n".join(notes), fontsize=6, va="bottom", family="monospace")
+    figure.tight_layout(rect=(0.0, 0.03 + 0.02 * len(notes), 1.0, 1.0))
+    figure.savefig(file, dpi=150)
+    pyplot.close(figure)
+
+
+def _latencies(results: Sequence[LoopResult]) -> list[tuple[float, float]]:
+    return [(r.latency_median_s, r.latency_p99_s) for r in results]
+
+
+def bench_closed_loop(
+    out: Path, console: Console, *, rates_hz: Sequence[float] = RATES_HZ, seconds: float = 3.0, **options: Any
+) -> list[LoopResult]:
+    """Measure, print, and leave closed-loop.csv and closed-loop.png.
+
+    Args:
+        out: Folder, made if need be; files of these names are replaced.
+        console: Where to print.
+        rates_hz: Of commands and images [Hz].
+        seconds: How long to measure each rate in each mode [wall-clock s].
+        options: As for `loop_config`.
+    """
+    config = loop_config("lockstep", max(rates_hz), **options)
+    out.mkdir(parents=True, exist_ok=True)
+    lens = config.sensors[_CAMERA].lens  # type: ignore[union-attr]
+    where = "the generated apartment" if config.scene.kind == "apartment" else Path(config.scene.file).name
+    title = f"closed loop, RGB {lens.width}x{lens.height}, {config.renderer} renderer, hover in {where}"
+    notes = describe_machine(None if config.device == "auto" else config.device)
+    with console.status("closed loop") as status:
+        results = sweep(
+            rates_hz,
+            seconds=seconds,
+            on_case=lambda mode, rate_hz: status.update(f"{mode}, {rate_hz:g} Hz"),
+            **options,
+        )
+    console.print("\n".join([title, *notes]), highlight=False, soft_wrap=True)
+    print_sweep(results, console)
+    save_csv(results, out / "closed-loop.csv")
+    made = [out / "closed-loop.csv"]
+    if importlib.util.find_spec("matplotlib") is None:
+        console.print("[yellow]closed-loop.png is left out: pip install 'neurosim\\[view]'[/]")
+    else:
+        save_plot(results, out / "closed-loop.png", title=title, notes=notes)
+        made.append(out / "closed-loop.png")
+    console.print(f"left in {', '.join(map(str, made))}", highlight=False, soft_wrap=True)
+    return results

@@ -1,0 +1,105 @@
+"""The processes of the live stack, started to be measured, among themselves and ended again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+_RUNTIME = "CORTEX_RUNTIME_DIR"
+_PARENT_MAX = 40
+"""Longest directory of temporary files [characters]: paths of sockets end at 107."""
+_STOP_S = 5.0
+_TAIL_LINES = 5
+
+
+class ProcessEnded(RuntimeError):
+    """A process ended while it was needed; the message has the last lines that it said."""
+
+
+@contextlib.contextmanager
+def own_runtime() -> Iterator[Path]:
+    """Keep the nodes that are started within from meeting others of this user.
+
+    Yields:
+        A folder for logs and settings, removed at the end.
+    """
+    parent = tempfile.gettempdir()
+    folder = Path(tempfile.mkdtemp(prefix="nsb-", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"))
+    before = os.environ.get(_RUNTIME)
+    os.environ[_RUNTIME] = str(folder / "cortex")
+    try:
+        yield folder
+    finally:
+        if before is None:
+            del os.environ[_RUNTIME]
+        else:
+            os.environ[_RUNTIME] = before
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class NeurosimProcess:
+    """A command of `neurosim` as a process of its own; leaving the `with` block ends it."""
+
+    def __init__(self, *arguments: str, log: Path, python: Sequence[str] = (sys.executable,)) -> None:
+        """Start it.
+
+        Args:
+            arguments: What follows `neurosim` on the command line.
+            log: File for what it says.
+            python: How to start the interpreter, such as under a profiler.
+        """
+        self.arguments = arguments
+        self._log = log
+        with log.open("wb") as out:
+            self._process = subprocess.Popen(
+                [*python, "-m", "neurosim_core", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+            )
+
+    def check(self) -> None:
+        """Raise if it has ended.
+
+        Raises:
+            ProcessEnded: It has.
+        """
+        status = self._process.poll()
+        if status is not None:
+            lines = self._log.read_text(errors="replace").strip().splitlines()[-_TAIL_LINES:]
+            said = "\n".join(f"  {line}" for line in lines) or "  (nothing)"
+            raise ProcessEnded(f"`neurosim {self.arguments[0]}` ended with status {status}; it said:\n{said}")
+
+    def resident_bytes(self) -> int:
+        """Return the memory that it holds, shared pages included; -1 where the system does not say."""
+        try:
+            pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[1])
+        except (OSError, IndexError):
+            return -1
+        return pages * os.sysconf("SC_PAGE_SIZE")
+
+    def stop(self) -> None:
+        """End it as Ctrl-C does, and kill it if that takes long."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+        self._process.wait()
+
+    def __enter__(self) -> NeurosimProcess:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
