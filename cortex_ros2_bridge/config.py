@@ -1,0 +1,260 @@
+"""Settings of the bridge: a YAML file -> one frozen `BridgeConfig`. Every key is documented in README.md."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import yaml
+
+from cortex_ros2_bridge.backend.base import Qos
+
+_ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_ROS_TYPE = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
+_SHORT_TYPE = re.compile(r"([a-z][a-z0-9_]*)/([A-Z][A-Za-z0-9]*)")
+
+QOS: Mapping[str, Qos] = MappingProxyType(
+    {
+        "default": Qos(),
+        "sensor_data": Qos(reliability="best_effort", depth=5),
+        "latched": Qos(durability="transient_local", depth=1),
+    }
+)
+"""Quality of service by the names that YAML may use."""
+
+
+class ConfigError(ValueError):
+    """The settings are wrong; the message names the key, its value and what is allowed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RouteChange:
+    """One entry of `routes`: what is different for the routes that it fits, or a route of its own."""
+
+    cortex: str
+    """Cortex topic, or a pattern with * and ?."""
+    type: str | None = None
+    """Only routes of this ROS type; where there is none by default, it is added."""
+    ros: str | None = None
+    """ROS topic instead of the default one; {topic} stands for the Cortex topic."""
+    qos: Mapping[str, Any] = field(default_factory=dict)
+    """Elements of the quality of service that are different."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the conversion, see README.md."""
+    enabled: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class BridgeConfig:
+    """What the bridge does."""
+
+    backend: str = "auto"
+    """auto, rclpy, dds, or the name of a bag: run.mcap."""
+    distro: str | None = None
+    """ROS distribution, such as jazzy; None: ROS_DISTRO, or what the other nodes show."""
+    domain: int | None = None
+    """Cortex domain; None: CORTEX_DOMAIN. That of ROS is ROS_DOMAIN_ID."""
+    node: str = "cortex_bridge"
+    """Name of the ROS node."""
+    namespace: str = ""
+    """Goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics."""
+    frames: Mapping[str, Any] = field(default_factory=dict)
+    """Names of frames in ROS; see `frames.FrameNames`."""
+    defaults: bool = True
+    """Whether topics have routes that no entry of `routes` asks for."""
+    include: tuple[str, ...] = ("*",)
+    """Cortex topics that may have routes: patterns with * and ?."""
+    exclude: tuple[str, ...] = ()
+    """Cortex topics that may not."""
+    rename: Mapping[str, str] = field(default_factory=dict)
+    """Beginnings of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
+    routes: tuple[RouteChange, ...] = ()
+    """Changes, in order; later ones win."""
+
+
+def load(source: str | Path | Mapping[str, Any] | None) -> BridgeConfig:
+    """Read settings and check them.
+
+    Args:
+        source: A YAML file, a mapping with the same keys, or None for the defaults.
+
+    Raises:
+        ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is not what it must be.
+    """
+    if isinstance(source, str | Path):
+        try:
+            raw = yaml.safe_load(Path(source).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise ConfigError(f"cannot read {source}: {reason}") from None
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source} is not YAML: {' '.join(str(error).split())}") from None
+    else:
+        raw = source
+    try:
+        return _bridge_config({} if raw is None else raw)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}" if isinstance(source, str | Path) else str(error)) from None
+
+
+def check_namespace(value: object) -> str:
+    """Return a namespace with a slash in front and none behind.
+
+    Raises:
+        ConfigError: ROS allows no such name.
+    """
+    text = _text("namespace", value).strip("/")
+    return _ros_name("namespace", f"/{text}") if text else ""
+
+
+def is_ros_name(name: str) -> bool:
+    """Return whether ROS allows an absolute topic of this name."""
+    return _ROS_NAME.fullmatch(name) is not None and "__" not in name and not name.endswith("_")
+
+
+def to_ros_type(key: str, value: object) -> str:
+    """Return a type as ROS 2 writes it: sensor_msgs/msg/Imu, also for sensor_msgs/Imu.
+
+    Raises:
+        ConfigError: It is not the name of a message type.
+    """
+    text = _SHORT_TYPE.sub(r"\1/msg/\2", _text(key, value)) if str(value).count("/") == 1 else value
+    if not isinstance(text, str) or not _ROS_TYPE.fullmatch(text):
+        raise ConfigError(f"{key} must be a ROS type such as sensor_msgs/msg/Imu, got {value!r}")
+    return text
+
+
+def qos_changes(key: str, value: object) -> dict[str, Any]:
+    """Return the elements of a quality of service that YAML sets: a name of `QOS`, or a mapping.
+
+    Raises:
+        ConfigError: It is neither, or an element is not what it must be.
+    """
+    if isinstance(value, str):
+        if value not in QOS:
+            raise ConfigError(f"{key}: unknown quality of service {value!r}, known: {', '.join(QOS)}")
+        return {name.name: getattr(QOS[value], name.name) for name in fields(Qos)}
+    changes = _mapping(key, value)
+    allowed: dict[str, tuple[str, ...] | None] = {
+        "reliability": ("reliable", "best_effort"),
+        "durability": ("volatile", "transient_local"),
+        "depth": None,
+    }
+    _refuse_unknown(key, changes, allowed)
+    for name, element in changes.items():
+        known = allowed[name]
+        if known is None:
+            if isinstance(element, bool) or not isinstance(element, int) or not 1 <= element <= 100_000:
+                raise ConfigError(f"{key}.{name} must be an integer from 1 to 100000, got {element!r}")
+        elif element not in known:
+            raise ConfigError(f"{key}.{name} must be one of {', '.join(known)}, got {element!r}")
+    return dict(changes)
+
+
+def _bridge_config(raw: object) -> BridgeConfig:
+    given = dict(_mapping("the settings", raw))
+    _refuse_unknown("", given, [f.name for f in fields(BridgeConfig)])
+    checked: dict[str, Any] = {}
+    for key, value in given.items():
+        if value is None:
+            continue
+        if key in ("backend", "node", "distro"):
+            checked[key] = _text(key, value)
+        elif key == "domain":
+            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                raise ConfigError(f"domain must be an integer >= 0, got {value!r}")
+            checked[key] = value
+        elif key == "namespace":
+            checked[key] = check_namespace(value)
+        elif key == "frames":
+            checked[key] = _mapping(key, value)
+        elif key == "defaults":
+            checked[key] = _flag(key, value)
+        elif key in ("include", "exclude"):
+            checked[key] = tuple(_topic_pattern(f"{key}[{n}]", item) for n, item in _items(key, value))
+        elif key == "rename":
+            pairs = _mapping(key, value).items()
+            checked[key] = {_ros_name(key, old): _ros_name(f"{key}.{old}", new) for old, new in pairs}
+        else:
+            checked[key] = tuple(_route_change(f"routes[{n}]", item) for n, item in _items(key, value))
+    return BridgeConfig(**checked)
+
+
+def _route_change(key: str, value: object) -> RouteChange:
+    given = _mapping(key, value)
+    _refuse_unknown(key, given, [f.name for f in fields(RouteChange)])
+    if "cortex" not in given:
+        raise ConfigError(f"{key}: `cortex` is missing: the topic, or a pattern such as '/*/imu'")
+    checked: dict[str, Any] = {"cortex": _topic_pattern(f"{key}.cortex", given["cortex"])}
+    if given.get("type") is not None:
+        checked["type"] = to_ros_type(f"{key}.type", given["type"])
+    if given.get("ros") is not None:
+        name = _text(f"{key}.ros", given["ros"])
+        _ros_name(f"{key}.ros", name.replace("{topic}", "/topic"))
+        if "{topic}" not in name and any(c in checked["cortex"] for c in "*?["):
+            raise ConfigError(
+                f"{key}.ros: a pattern fits several topics, so the name must contain {{topic}}, got {name!r}"
+            )
+        checked["ros"] = name
+    if given.get("qos") is not None:
+        checked["qos"] = qos_changes(f"{key}.qos", given["qos"])
+    if given.get("options") is not None:
+        checked["options"] = dict(_mapping(f"{key}.options", given["options"]))
+    if given.get("enabled") is not None:
+        checked["enabled"] = _flag(f"{key}.enabled", given["enabled"])
+    return RouteChange(**checked)
+
+
+def _refuse_unknown(key: str, given: Mapping[str, Any], known: Iterable[str]) -> None:
+    names = list(known)
+    for name in given:
+        if name not in names:
+            near = difflib.get_close_matches(str(name), names, 1)
+            hint = f", did you mean {near[0]!r}?" if near else ""
+            where = f"{key}: " if key else ""
+            raise ConfigError(f"{where}unknown key {name!r}, known: {', '.join(names)}{hint}")
+
+
+def _mapping(key: str, value: object) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{key} must be a mapping, got {value!r:.80}")
+    return value
+
+
+def _items(key: str, value: object) -> Iterable[tuple[int, object]]:
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"{key} must be a list, got {value!r:.80}")
+    return enumerate(value)
+
+
+def _text(key: str, value: object) -> str:
+    if not isinstance(value, str) or not value:
+        raise ConfigError(f"{key} must be a text that is not empty, got {value!r:.80}")
+    return value
+
+
+def _flag(key: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise ConfigError(f"{key} must be true or false, got {value!r:.80}")
+    return value
+
+
+def _topic_pattern(key: str, value: object) -> str:
+    text = _text(key, value)
+    if not text.startswith(("/", "*")):
+        raise ConfigError(f"{key} must be a Cortex topic such as '/drone/imu' or a pattern, got {text!r}")
+    return text
+
+
+def _ros_name(key: str, value: object) -> str:
+    text = _text(key, value)
+    if not is_ros_name(text):
+        raise ConfigError(
+            f"{key} must be a ROS name such as '/drone/imu', parts begin with a letter, got {text!r}"
+        )
+    return text

@@ -1,0 +1,378 @@
+"""Which Cortex topic goes where in ROS 2, and back: one table of rules, and what settings change.
+
+Routes follow from the types of the topics that Cortex's discovery shows, so that no configuration is needed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Any, Literal, NamedTuple
+
+import cortex.messages
+from cortex import Node
+from cortex.schema import schema_of
+from cortex.service import service_number
+from cortex_ros2_bridge.backend.base import Qos
+from cortex_ros2_bridge.config import QOS, BridgeConfig, RouteChange, is_ros_name
+
+Direction = Literal["out", "in", "call"]
+"""out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+
+CORTEX_TYPES: Mapping[str, type[Any]] = {
+    schema_of(kind).name: kind
+    for kind in (getattr(cortex.messages, name) for name in cortex.messages.__all__)
+}
+"""The standard messages of Cortex by the names that discovery shows."""
+
+ROOTED = frozenset({"/clock", "/tf", "/tf_static", "/diagnostics"})
+"""ROS topics that every node expects under these very names: no namespace goes before them."""
+SHARED = frozenset({"/tf", "/tf_static"})
+"""ROS topics that several routes may publish on."""
+INFO = "/info"
+"""The calibration of a camera T is on T/info."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Route:
+    """One way for messages."""
+
+    cortex_topic: str
+    """Topic, or the name of the service that is called."""
+    cortex_type: str
+    """Such as "cortex/Imu"; of a service, its request."""
+    ros_topic: str
+    ros_type: str
+    """Such as "sensor_msgs/msg/Imu"."""
+    direction: Direction
+    qos: Qos = field(default_factory=Qos)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the conversion."""
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What tells routes apart."""
+        return self.cortex_topic, self.cortex_type, self.ros_topic, self.ros_type
+
+    def __str__(self) -> str:
+        arrow = "->" if self.direction == "out" else "<-"
+        return f"{self.cortex_topic} {arrow} {self.ros_topic}"
+
+
+class Rule(NamedTuple):
+    """What happens by default to a topic of a type; `{topic}`, `{parent}` and `{base}` as in `_name`."""
+
+    cortex_type: str
+    ros_type: str
+    direction: Direction
+    name: str
+    qos: Qos = Qos()
+    default: bool = True
+    """False: only where the settings ask for it."""
+
+
+STREAM = Qos(depth=100)
+"""Many small messages: a subscriber may sleep for a tenth of a second."""
+FRAMES = Qos(depth=5)
+"""Few large messages."""
+NEWEST = Qos(depth=1)
+
+RULES: tuple[Rule, ...] = (
+    Rule("cortex/Clock", "rosgraph_msgs/msg/Clock", "out", "{topic}"),
+    Rule("cortex/Imu", "sensor_msgs/msg/Imu", "out", "{topic}", STREAM),
+    Rule("cortex/Odometry", "nav_msgs/msg/Odometry", "out", "{topic}", STREAM),
+    Rule("cortex/Odometry", "tf2_msgs/msg/TFMessage", "out", "/tf", STREAM),
+    Rule("cortex/Transform", "tf2_msgs/msg/TFMessage", "out", "/tf_static", QOS["latched"]),
+    Rule("cortex/Image", "sensor_msgs/msg/Image", "out", "{topic}/image_raw", FRAMES),
+    Rule("cortex/Image", "sensor_msgs/msg/CameraInfo", "out", "{topic}/camera_info"),
+    Rule("cortex/Events", "event_camera_msgs/msg/EventPacket", "out", "{topic}", STREAM),
+    Rule("cortex/Events", "sensor_msgs/msg/Image", "out", "{topic}/image", FRAMES),
+    Rule("cortex/Events", "dvs_msgs/msg/EventArray", "out", "{topic}/event_array", STREAM, default=False),
+    Rule("cortex/CameraInfo", "sensor_msgs/msg/CameraInfo", "out", "{parent}/camera_info", QOS["latched"]),
+    Rule("cortex/PointCloud", "sensor_msgs/msg/PointCloud2", "out", "{topic}", FRAMES),
+    Rule("cortex/RotorSpeeds", "actuator_msgs/msg/Actuators", "out", "{topic}", STREAM),
+    Rule("cortex/Path", "nav_msgs/msg/Path", "out", "{topic}", QOS["latched"]),
+    Rule("cortex/Text", "std_msgs/msg/String", "out", "{topic}"),
+    Rule("cortex/MotorCommand", "actuator_msgs/msg/Actuators", "in", "{base}/actuators", NEWEST),
+    Rule(
+        "cortex/RateThrustCommand", "mavros_msgs/msg/AttitudeTarget", "in", "{base}/attitude_target", NEWEST
+    ),
+    Rule("cortex/AttitudeCommand", "mavros_msgs/msg/AttitudeTarget", "in", "{base}/attitude_target", NEWEST),
+    Rule("cortex/VelocityCommand", "geometry_msgs/msg/Twist", "in", "{base}/cmd_vel", NEWEST),
+    Rule("cortex/VelocityCommand", "geometry_msgs/msg/TwistStamped", "in", "{base}/command_velocity", NEWEST),
+    Rule("cortex/PoseCommand", "geometry_msgs/msg/PoseStamped", "in", "{base}/command_pose", NEWEST),
+    Rule(
+        "cortex/PoseCommand",
+        "trajectory_msgs/msg/MultiDOFJointTrajectory",
+        "in",
+        "{base}/command_trajectory",
+        NEWEST,
+    ),
+    Rule("cortex/Reset", "std_msgs/msg/Empty", "call", "{topic}", NEWEST),
+    Rule("cortex/Step", "std_msgs/msg/UInt32", "call", "{topic}", NEWEST),
+    Rule("cortex/Trigger", "std_msgs/msg/Empty", "call", "{topic}", NEWEST),
+)
+"""The table. A row for a service has the type of its request."""
+
+_TF_SOURCES = ("odometry", "odom")
+"""Odometry on topics of these names moves the vehicle in tf; another one of the same vehicle does not."""
+
+
+class SeenTopic(NamedTuple):
+    """A topic that other Cortex nodes have."""
+
+    topic: str
+    type_name: str
+    fingerprint: int
+    published: bool
+    latched: bool = False
+    """Whether a publisher gives its last message to whoever comes later."""
+
+
+class Seen(NamedTuple):
+    """What other Cortex nodes have now."""
+
+    topics: tuple[SeenTopic, ...] = ()
+    services: tuple[tuple[str, str], ...] = ()
+    """Names of services, and the types of their requests, such as ("/step", "cortex/Step")."""
+
+
+def look(node: Node) -> Seen:
+    """Return what the other Cortex nodes publish, subscribe to and serve now."""
+    topics: dict[tuple[str, int, bool], SeenTopic] = {}
+    services = set()
+    for record in node.nodes():
+        if record.node == node.id:
+            continue
+        for publisher in record.publishers:
+            key = publisher.topic, publisher.fingerprint, True
+            before = topics.get(key)
+            latched = publisher.latch or (before is not None and before.latched)
+            topics[key] = SeenTopic(
+                publisher.topic, publisher.type_name, publisher.fingerprint, True, latched
+            )
+        for subscriber in record.subscribers:
+            if subscriber.fingerprint:  # else it takes any type: a recorder
+                key = subscriber.topic, subscriber.fingerprint, False
+                topics[key] = SeenTopic(subscriber.topic, subscriber.type_name, subscriber.fingerprint, False)
+        for service in record.services:
+            request = _request_type(service.name, service.service)
+            if request is not None:
+                services.add((service.name, request))
+    return Seen(tuple(topics[key] for key in sorted(topics)), tuple(sorted(services)))
+
+
+def default_routes(seen: Seen) -> list[Route]:
+    """Return the routes of the standard topics, without what settings change."""
+    return [route for route, rule in _candidates(seen) if rule.default]
+
+
+def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str]]:
+    """Return the routes that there are now, and what is wrong with others.
+
+    Args:
+        seen: What Cortex shows.
+        config: Selects and changes routes.
+
+    Returns:
+        Routes in the order of their topics, and a sentence for each topic or setting that has none.
+    """
+    problems = _unknown_types(seen, config)
+    routes: list[Route] = []
+    images: dict[str, str] = {}
+    for route, rule in _candidates(seen):
+        if not _wanted(route.cortex_topic, config):
+            continue
+        fitting = [change for change in config.routes if _fits(change, route)]
+        asked = any(change.type is not None for change in fitting)
+        there = asked or (rule.default and (config.defaults or bool(fitting)))
+        if there and (not fitting or fitting[-1].enabled):
+            routes.append(_changed(route, fitting, config, images))
+    problems += _useless(seen, config)
+    return _without_conflicts(routes, problems), problems
+
+
+def vehicle_of(topic: str) -> str:
+    """Return whose topic it is: "drone" for /drone/imu, /drone/rgb/info or /drone/command/rates."""
+    for end in (INFO, "/transform"):
+        topic = topic.removesuffix(end)
+    base, command, _ = topic.rpartition("/command/")
+    return (base if command else topic.rpartition("/")[0]).strip("/")
+
+
+def _candidates(seen: Seen) -> list[tuple[Route, Rule]]:
+    found = []
+    images = {topic.topic for topic in seen.topics if topic.type_name == "cortex/Image"}
+    for topic in seen.topics:
+        if not _is_known(topic):
+            continue
+        for rule in RULES:
+            if rule.cortex_type != topic.type_name or rule.direction == "call":
+                continue
+            if (rule.direction == "out") != topic.published:
+                continue
+            if rule.cortex_type == "cortex/CameraInfo" and topic.topic.removesuffix(INFO) in images:
+                continue  # goes with each image, and with its stamp
+            if rule.name == "/tf" and topic.topic.rpartition("/")[2] not in _TF_SOURCES:
+                continue
+            found.append((_route(rule, topic.topic), rule))
+    for name, request in seen.services:
+        found += [
+            (_route(rule, name), rule)
+            for rule in RULES
+            if (rule.cortex_type, rule.direction) == (request, "call")
+        ]
+    return found
+
+
+def _route(rule: Rule, topic: str) -> Route:
+    return Route(
+        cortex_topic=topic,
+        cortex_type=rule.cortex_type,
+        ros_topic=_name(rule.name, topic),
+        ros_type=rule.ros_type,
+        direction=rule.direction,
+        qos=rule.qos,
+    )
+
+
+def _name(pattern: str, topic: str) -> str:
+    """Fill in a name: {topic} itself, {parent} what it is /info of, {base} what it is a command for."""
+    if "{parent}" in pattern and not topic.endswith(INFO):
+        return topic
+    base, command, _ = topic.rpartition("/command/")
+    base = base if command else topic.rpartition("/")[0]
+    return pattern.format(topic=topic, parent=topic.removesuffix(INFO), base=base)
+
+
+def _is_known(topic: SeenTopic) -> bool:
+    kind = CORTEX_TYPES.get(topic.type_name)
+    return kind is not None and schema_of(kind).fingerprint == topic.fingerprint
+
+
+def _wanted(topic: str, config: BridgeConfig) -> bool:
+    return any(fnmatchcase(topic, pattern) for pattern in config.include) and not any(
+        fnmatchcase(topic, pattern) for pattern in config.exclude
+    )
+
+
+def _fits(change: RouteChange, route: Route) -> bool:
+    return fnmatchcase(route.cortex_topic, change.cortex) and change.type in (None, route.ros_type)
+
+
+def _changed(
+    route: Route, changes: Sequence[RouteChange], config: BridgeConfig, images: dict[str, str]
+) -> Route:
+    """Apply the settings to a route.
+
+    Args:
+        route: As by default.
+        changes: What fits it.
+        config: All settings.
+        images: ROS topics of the images that have been named so far, by Cortex topic; added to.
+    """
+    name, named = route.ros_topic, False
+    qos: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+    for change in changes:
+        qos |= change.qos
+        options |= change.options
+        if change.ros is not None and (change.type is not None or _is_main(route)):
+            name, named = change.ros.format(topic=route.cortex_topic), True
+    if named and route.ros_type == "sensor_msgs/msg/Image":
+        images[route.cortex_topic] = name
+    if not named and route.ros_type == "sensor_msgs/msg/CameraInfo" and route.cortex_topic in images:
+        name, named = images[route.cortex_topic].rpartition("/")[0] + "/camera_info", True
+    if not named:
+        old = max((o for o in config.rename if name == o or name.startswith(o + "/")), key=len, default=None)
+        name = name if old is None else config.rename[old] + name[len(old) :]
+    if name not in ROOTED:
+        name = config.namespace + name
+    return dataclasses.replace(
+        route, ros_topic=name, qos=dataclasses.replace(route.qos, **qos), options=options
+    )
+
+
+def _is_main(route: Route) -> bool:
+    """Whether it is the first of the routes that a topic has."""
+    return next(rule for rule in RULES if rule.cortex_type == route.cortex_type).ros_type == route.ros_type
+
+
+def _without_conflicts(routes: Iterable[Route], problems: list[str]) -> list[Route]:
+    """Leave out what ROS would not allow or what would make a circle, and say so."""
+    kept: dict[str, Route] = {}
+    found: dict[tuple[str, str, str, str], Route] = {}
+    for route in routes:
+        other = kept.get(route.ros_topic)
+        reason = ""
+        if not is_ros_name(route.ros_topic):
+            reason = "ROS allows no such name; rename it"
+        elif other is not None and other.ros_type != route.ros_type:
+            reason = f"{other} has that topic already, with type {other.ros_type}"
+        elif other is not None and other.direction != route.direction:
+            reason = f"{other} goes the other way on that topic"
+        elif (
+            other is not None
+            and other.direction == "out"
+            and other.cortex_topic != route.cortex_topic
+            and route.ros_topic not in SHARED
+        ):
+            reason = f"{other} has that topic already; rename one of them"
+        elif other is not None and other.qos != route.qos:
+            reason = f"{other} has that topic already, with another quality of service"
+        if reason:
+            problems.append(f"no route {route} ({route.ros_type}): {reason}")
+            continue
+        kept.setdefault(route.ros_topic, route)
+        found.setdefault(route.key, route)
+    return list(found.values())
+
+
+def _unknown_types(seen: Seen, config: BridgeConfig) -> list[str]:
+    """Say which published topics cannot be converted."""
+    problems = []
+    for topic in seen.topics:
+        if not topic.published or _is_known(topic) or not _wanted(topic.topic, config):
+            continue
+        if topic.type_name in CORTEX_TYPES:
+            what = f"its {topic.type_name} is of another version ({topic.fingerprint:016x}) than ours"
+        else:
+            what = f"nothing converts its type {topic.type_name}"
+        problems.append(f"no route for {topic.topic}: {what}")
+    return problems
+
+
+def _useless(seen: Seen, config: BridgeConfig) -> list[str]:
+    """Say which settings name a topic that is there, and a ROS type that it cannot have."""
+    problems = []
+    for change in config.routes:
+        if change.type is None:
+            continue
+        types = sorted({rule.ros_type for rule in RULES})
+        if change.type not in types:
+            problems.append(f"routes: nothing converts to or from {change.type}, known: {', '.join(types)}")
+            continue
+        there = [
+            topic for topic in seen.topics if _is_known(topic) and fnmatchcase(topic.topic, change.cortex)
+        ]
+        fitting = {rule.cortex_type for rule in RULES if rule.ros_type == change.type}
+        if there and not any(topic.type_name in fitting for topic in there) and "*" not in change.cortex:
+            known = sorted({r.ros_type for r in RULES if r.cortex_type == there[0].type_name})
+            problems.append(
+                f"routes: {change.cortex} is a {there[0].type_name}, which does not become a {change.type}, "
+                f"but: {', '.join(known)}"
+            )
+    return problems
+
+
+@functools.cache
+def _request_type(name: str, number: int) -> str | None:
+    """Return the type of a service's request, if it is one that the bridge calls."""
+    reply = cortex.messages.SimulatorReply
+    for rule in RULES:
+        if rule.direction == "call" and service_number(name, CORTEX_TYPES[rule.cortex_type], reply) == number:
+            return rule.cortex_type
+    return None
