@@ -8,11 +8,12 @@ forward). Quaternions are xyzw and `q_WB` takes body coordinates to world coordi
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.settings import Settings
@@ -59,6 +60,16 @@ def quaternion_exp(rotation: wp.vec3d) -> wp.quatd:
         )
     v = scale * rotation
     return wp.quatd(v[0], v[1], v[2], wp.cos(half))
+
+
+def heading_rad(q_WB: ArrayLike) -> float:
+    """Return the yaw of a Z-X-Y sequence [rad]: y_B is orthogonal to (cos yaw, sin yaw, 0).
+
+    Args:
+        q_WB: Unit quaternion, xyzw, shape [4].
+    """
+    x, y, z, w = np.asarray(q_WB, dtype=np.float64).tolist()
+    return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
 
 
 def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.control.modes import make_controller
 from neurosim_core.control.se3 import Se3Config
+from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
 from neurosim_core.vehicle.multirotor import MultirotorConfig
 
@@ -111,19 +112,13 @@ class PathFollower:
         speed_m_s = math.hypot(*correction)
         if speed_m_s > gains.correction_speed_max_m_s:
             correction *= gains.correction_speed_max_m_s / speed_m_s
-        turn_rad = math.remainder(float(point["yaw"]) - _yaw_rad(orientation), math.tau)
+        turn_rad = math.remainder(float(point["yaw"]) - heading_rad(orientation), math.tau)
         yaw_rate_rad_s = float(point["yaw_rate"]) + _YAW_RATE_PER_RAD * turn_rad
         return np.array([*(point["velocity"] + correction), yaw_rate_rad_s])
 
 
 _YAW_RATE_PER_RAD = 2.0
 """How fast an error of the heading is closed in mode velocity [1/s]."""
-
-
-def _yaw_rad(orientation: ArrayLike) -> float:
-    """Return the yaw of a Z-X-Y sequence: y_B is orthogonal to (cos yaw, sin yaw, 0)."""
-    x, y, z, w = np.asarray(orientation, dtype=np.float64).tolist()
-    return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
 
 
 class _Feedback:
