@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from runtime_directory import runtime
+from runtime_directory import runtime, shared_runtime
 
-__all__ = ["runtime"]
+__all__ = ["runtime", "shared_runtime"]

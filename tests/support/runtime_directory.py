@@ -31,6 +31,20 @@ def _threads() -> set[threading.Thread]:
 @pytest.fixture
 def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A runtime directory for the test; afterwards no process, thread, memory or file of it is left."""
+    with own_directory(monkeypatch) as base:
+        yield base
+
+
+@pytest.fixture(scope="module")
+def shared_runtime() -> Iterator[Path]:
+    """As `runtime`, for all tests of a module: they start one registry, not one each."""
+    with pytest.MonkeyPatch.context() as monkeypatch, own_directory(monkeypatch) as base:
+        yield base
+
+
+@contextlib.contextmanager
+def own_directory(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Let nodes meet in a directory of their own; check at the end that nothing is left of them."""
     base = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
     monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(base))
     monkeypatch.delenv("CORTEX_DOMAIN", raising=False)
