@@ -1,0 +1,90 @@
+"""Message definitions: those of a ROS 2 distribution, as `rosbags` has them, and those in `definitions/`."""
+
+from __future__ import annotations
+
+import functools
+from importlib.resources import files
+
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+DISTROS = {
+    "humble": Stores.ROS2_HUMBLE,
+    "iron": Stores.ROS2_IRON,
+    "jazzy": Stores.ROS2_JAZZY,
+    "kilted": Stores.ROS2_KILTED,
+    "rolling": Stores.LATEST,
+}
+"""Distributions that are known. The messages that the bridge sends are the same in all of them."""
+DEFAULT_DISTRO = "jazzy"
+
+
+class UnknownTypeError(ValueError):
+    """No message type has this name."""
+
+
+@functools.cache
+def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
+    """Return the message types of a distribution, and ours; always the same object.
+
+    Raises:
+        ValueError: The distribution is unknown.
+    """
+    if distro not in DISTROS:
+        raise ValueError(f"unknown ROS distribution {distro!r}, known: {', '.join(DISTROS)}")
+    store = get_typestore(DISTROS[distro])
+    for name, text in definitions().items():
+        try:
+            store.register(get_types_from_msg(text, name))
+        except TypesysError as error:
+            raise RuntimeError(f"definition of {name}: {error}") from error
+    return store
+
+
+@functools.cache
+def definitions() -> dict[str, str]:
+    """Return the text of each definition that the bridge brings along, by its type's name."""
+    found = {}
+    for package in files("cortex_ros2_bridge").joinpath("definitions").iterdir():
+        for path in package.joinpath("msg").iterdir():
+            if path.name.endswith(".msg"):
+                name = f"{package.name}/msg/{path.name.removesuffix('.msg')}"
+                found[name] = path.read_text(encoding="utf-8")
+    return dict(sorted(found.items()))
+
+
+def check_type(type_name: str, distro: str = DEFAULT_DISTRO) -> None:
+    """Raise `UnknownTypeError` unless a distribution has a message type of this name."""
+    known = typestore(distro).fielddefs
+    if type_name in known:
+        return
+    package, _, base = type_name.rpartition("/")
+    near = sorted(name for name in known if name.rpartition("/")[2] == base)
+    hint = f"; is it {' or '.join(near)}?" if near else "; a .msg file in definitions/ would define it"
+    if not package.endswith("/msg"):
+        hint = f"; names are written such as sensor_msgs/msg/Imu{hint}"
+    raise UnknownTypeError(f"unknown message type {type_name!r} in ROS {distro}{hint}")
+
+
+def dds_type_name(type_name: str) -> str:
+    """Return what DDS calls a message type: sensor_msgs/msg/Imu is sensor_msgs::msg::dds_::Imu_.
+
+    Raises:
+        ValueError: It is no name of a message type.
+    """
+    parts = type_name.split("/")
+    if len(parts) != 3 or not all(parts):
+        raise ValueError(f"{type_name!r} is no message type; names are written such as sensor_msgs/msg/Imu")
+    package, kind, name = parts
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+@functools.cache
+def type_hash(type_name: str, distro: str = DEFAULT_DISTRO) -> str:
+    """Return the hash by which nodes since Iron recognise a message type, such as "RIHS01_7d9a...".
+
+    Raises:
+        UnknownTypeError: There is no such type.
+    """
+    check_type(type_name, distro)
+    return typestore(distro).hash_rihs01(type_name)
