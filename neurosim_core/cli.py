@@ -160,20 +160,90 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("--no-browser", action="store_true", help="live, --web: print the address only")
     view.set_defaults(command=_view)
 
-    bench = commands.add_parser("bench", help="measure speed on this machine")
-    bench.add_argument("what", choices=["step"], help="step: whole steps a second with one event camera")
-    bench.add_argument(
+    _add_bench(commands.add_parser("bench", help="measure speed on this machine"))
+    return parser
+
+
+def _add_bench(parser: argparse.ArgumentParser) -> None:
+    """What can be measured."""
+    questions = parser.add_subparsers(required=True, metavar="WHAT")
+
+    step = questions.add_parser("step", help="whole steps a second with one event camera")
+    _add_view(step, width=640, height=480, camera="event camera")
+    step.add_argument("--instants", type=int, default=16, metavar="K", help="renders per launch")
+    step.add_argument("--steps", type=int, default=1600, metavar="N", help="renders per repetition (of five)")
+    step.set_defaults(command=_bench_step)
+
+    loop = questions.add_parser(
+        "closed-loop",
+        help="simulator and controller as processes: from command to image, images a second",
+        description="Fly a simulator from another process at several rates, in lockstep and in real time; "
+        "leave closed-loop.csv and closed-loop.png.",
+    )
+    loop.add_argument(
+        "--rates",
+        type=_rates,
+        default="100,200,500,1000,2000,5000",
+        metavar="HZ,...",
+        help="commands and images a second (default: %(default)s)",
+    )
+    loop.add_argument(
+        "--renderer",
+        default="synthetic",
+        choices=["synthetic", "warp"],
+        help="synthetic: a test card, to measure all but rendering; warp: the scene",
+    )
+    _add_view(loop, width=640, height=480, camera="camera")
+    loop.add_argument(
+        "--seconds", type=float, default=3.0, metavar="S", help="how long to measure each rate [s]"
+    )
+    _add_out(loop, "closed-loop")
+    loop.set_defaults(command=_bench_closed_loop)
+
+    streaming = questions.add_parser(
+        "streaming",
+        help="a flight in real time: how punctual an IMU is beside an event camera",
+        description="Fly in real time with an IMU at 1 kHz and an event camera that is rendered as often as "
+        "this machine can; leave streaming.csv, arrivals.csv and streaming.png.",
+    )
+    _add_view(streaming, width=346, height=260, camera="event camera")
+    streaming.add_argument(
+        "--sampling-rate",
+        type=float,
+        metavar="HZ",
+        help="renders of the event camera a second (default: as this machine can)",
+    )
+    streaming.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S", help="how long to measure [s] (default: 60)"
+    )
+    _add_out(streaming, "streaming")
+    streaming.set_defaults(command=_bench_streaming)
+
+
+def _add_view(parser: argparse.ArgumentParser, *, width: int, height: int, camera: str) -> None:
+    """What is looked at, by what, and where that is computed."""
+    parser.add_argument(
         "--scene", type=Path, metavar="FILE", help="mesh file; default: the generated apartment"
     )
-    bench.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
-    bench.add_argument("--width", type=int, default=640, metavar="PX", help="columns of the event camera")
-    bench.add_argument("--height", type=int, default=480, metavar="PX", help="rows of the event camera")
-    bench.add_argument("--instants", type=int, default=16, metavar="K", help="renders per launch")
-    bench.add_argument(
-        "--steps", type=int, default=1600, metavar="N", help="renders per repetition (of five)"
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
+    parser.add_argument("--width", type=int, default=width, metavar="PX", help=f"columns of the {camera}")
+    parser.add_argument("--height", type=int, default=height, metavar="PX", help=f"rows of the {camera}")
+
+
+def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    parser.add_argument(
+        "--out", type=Path, default=Path(folder), metavar="DIR", help=f"where to leave files (./{folder})"
     )
-    bench.set_defaults(command=_bench)
-    return parser
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+                     help="any further setting by its dotted key, such as scene.rooms=2")  # fmt: skip
+
+
+def _rates(text: str) -> list[float]:
+    """Read rates that are separated by commas [Hz]."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"takes numbers, such as 100,1000, got {text!r}") from None
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -206,12 +276,7 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     Raises:
         ValueError: One is not KEY=VALUE.
     """
-    overrides: dict[str, Any] = {}
-    for setting in arguments.settings:
-        key, separator, text = setting.partition("=")
-        if not separator or not key:
-            raise ValueError(f"--set takes KEY=VALUE, got {setting!r}")
-        overrides[key] = yaml.safe_load(text)
+    overrides = _settings(arguments)
     for key, value in (
         ("duration_s", arguments.duration),
         ("seed", arguments.seed),
@@ -220,6 +285,21 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
         if value is not None:
             overrides[key] = value
     return overrides
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What `--set` gave, by dotted key.
+
+    Raises:
+        ValueError: One is not KEY=VALUE.
+    """
+    settings: dict[str, Any] = {}
+    for setting in arguments.settings:
+        key, separator, text = setting.partition("=")
+        if not separator or not key:
+            raise ValueError(f"--set takes KEY=VALUE, got {setting!r}")
+        settings[key] = yaml.safe_load(text)
+    return settings
 
 
 def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -288,7 +368,7 @@ def _scene(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _bench(arguments: argparse.Namespace) -> int:
+def _bench_step(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from neurosim_core.bench.step import measure_steps, print_steps
@@ -302,6 +382,45 @@ def _bench(arguments: argparse.Namespace) -> int:
         step_count=arguments.steps,
     )
     print_steps(times, Console())
+    return 0
+
+
+def _bench_closed_loop(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.closed_loop import bench_closed_loop
+
+    bench_closed_loop(
+        arguments.out,
+        Console(),
+        rates_hz=arguments.rates,
+        seconds=arguments.seconds,
+        renderer=arguments.renderer,
+        width=arguments.width,
+        height=arguments.height,
+        device=arguments.device,
+        scene=arguments.scene,
+        settings=_settings(arguments),
+    )
+    return 0
+
+
+def _bench_streaming(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.streaming import bench_streaming
+
+    bench_streaming(
+        arguments.out,
+        Console(),
+        seconds=arguments.seconds,
+        width=arguments.width,
+        height=arguments.height,
+        device=arguments.device,
+        scene=arguments.scene,
+        sampling_rate_hz=arguments.sampling_rate,
+        settings=_settings(arguments),
+    )
     return 0
 
 

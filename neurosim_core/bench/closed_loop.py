@@ -31,11 +31,10 @@ from neurosim_core.bench.loop_trace import (
 from neurosim_core.bench.machine import describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
-from neurosim_core.nodes.probe import answer_images
+from neurosim_core.nodes.probe import ProbeError, answer_images
 
 LoopMode = Literal["lockstep", "streaming"]
 
-RATES_HZ = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 TRANSPORT_BAR_S = (0.2e-3, 0.5e-3)
 """What the median and the 99th percentile of the transport are to stay under [s]."""
 _CAMERA = "camera"
@@ -135,15 +134,18 @@ def measure_loop(
         file = folder / "loop.yaml"
         file.write_text(to_yaml(config), encoding="utf-8")
         with NeurosimProcess("serve", str(file), log=folder / "serve.log", python=python) as simulator:
-            trace = answer_images(
-                vehicle=next(iter(config.vehicles)),
-                camera=_CAMERA,
-                hover_rad_s=hover_rad_s,
-                rotor_count=airframe.rotor_count,
-                seconds=seconds,
-                warm_up_s=min(0.5 * seconds, 1.0) if warm_up_s is None else warm_up_s,
-                check=simulator.check,
-            )
+            try:
+                trace = answer_images(
+                    vehicle=next(iter(config.vehicles)),
+                    camera=_CAMERA,
+                    hover_rad_s=hover_rad_s,
+                    rotor_count=airframe.rotor_count,
+                    seconds=seconds,
+                    warm_up_s=min(0.5 * seconds, 1.0) if warm_up_s is None else warm_up_s,
+                    check=simulator.check,
+                )
+            except ProbeError as error:
+                raise ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None
     return summarise(
         trace,
         mode=config.live.mode,
@@ -186,7 +188,7 @@ def _quantile(values: NDArray[np.floating[Any]], share: float) -> float:
 
 
 def sweep(
-    rates_hz: Iterable[float] = RATES_HZ,
+    rates_hz: Iterable[float],
     *,
     seconds: float = 3.0,
     on_case: Callable[[LoopMode, float], None] | None = None,
@@ -213,24 +215,25 @@ def sweep(
 def print_sweep(results: Sequence[LoopResult], console: Console) -> None:
     """Print a sweep as a table, and what its transport is to be judged by."""
     table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("mode")
     for name in (
-        "mode",
-        "requested",
-        "received",
-        "end to end",
-        "p99",
-        "transport",
-        "p99",
+        "requested\n[Hz]",
+        "received\n[Hz]",
+        "loop\n[ms]",
+        "its p99\n[ms]",
+        "transport\n[ms]",
+        "its p99\n[ms]",
         "lost",
-        "overtaken",
+        "over-\ntaken",
     ):
-        table.add_column(name, justify="left" if name == "mode" else "right")
+        table.add_column(name, justify="right")
     for r in results:
+        times_s = (r.latency_median_s, r.latency_p99_s, r.transport_median_s, r.transport_p99_s)
         table.add_row(
             r.mode,
-            f"{r.requested_hz:g} Hz",
-            f"{r.received_hz:,.0f} Hz",
-            *(_ms(t) for t in (r.latency_median_s, r.latency_p99_s, r.transport_median_s, r.transport_p99_s)),
+            f"{r.requested_hz:g}",
+            f"{r.received_hz:.0f}",
+            *(f"{1e3 * time_s:.3f}" for time_s in times_s),
             f"{r.lost_count}",
             f"{r.overtaken_count}",
         )
@@ -242,6 +245,7 @@ def print_sweep(results: Sequence[LoopResult], console: Console) -> None:
         f"p99 {_ms(worst[1])} or less; bar {_ms(TRANSPORT_BAR_S[0])} and {_ms(TRANSPORT_BAR_S[1])}: "
         + ("met" if met else "missed"),
         highlight=False,
+        soft_wrap=True,
     )
 
 
@@ -297,6 +301,7 @@ def save_plot(results: Sequence[LoopResult], file: Path, *, title: str, notes: S
         axes.set(xscale="log", yscale="log")
         axes.grid(which="both", alpha=0.3)
         axes.legend(fontsize=7)
+    left.set_ylim(top=8.0 * left.get_ylim()[1])  # room for the legend
     figure.suptitle(title, fontsize=10)
     figure.text(0.01, 0.01, "\n".join(notes), fontsize=6, va="bottom", family="monospace")
     figure.tight_layout(rect=(0.0, 0.03 + 0.02 * len(notes), 1.0, 1.0))
@@ -309,7 +314,7 @@ def _latencies(results: Sequence[LoopResult]) -> list[tuple[float, float]]:
 
 
 def bench_closed_loop(
-    out: Path, console: Console, *, rates_hz: Sequence[float] = RATES_HZ, seconds: float = 3.0, **options: Any
+    out: Path, console: Console, *, rates_hz: Sequence[float], seconds: float = 3.0, **options: Any
 ) -> list[LoopResult]:
     """Measure, print, and leave closed-loop.csv and closed-loop.png.
 

@@ -17,6 +17,7 @@ Times = NDArray[np.int64]
 CODES = 4096
 """Commands whose numbers can be told apart: far more than are under way at a time."""
 _CODE_STEP = 1e-10
+_MIDDLE = 0.5 * (CODES - 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,8 +49,8 @@ class LoopTrace:
 
 
 def command_speed(number: int, hover_rad_s: float) -> float:
-    """Return the rotor speed that carries the number of a command [rad/s]; on average that of hover."""
-    return hover_rad_s * (1.0 + _CODE_STEP * (number % CODES - CODES // 2))
+    """Return the rotor speed that carries the number of a command [rad/s]; on average, and never, hover."""
+    return hover_rad_s * (1.0 + _CODE_STEP * (number % CODES - _MIDDLE))
 
 
 def felt_commands(trace: LoopTrace, *, hover_rad_s: float, motor_time_constant_s: float) -> Times:
@@ -66,22 +67,22 @@ def felt_commands(trace: LoopTrace, *, hover_rad_s: float, motor_time_constant_s
     Returns:
         Index into `sent_ns`, -1 where no single command of ours held, shape [reports - 1].
     """
-    span_s = np.diff(trace.rotor_stamp_ns) * 1e-9
+    single = np.diff(trace.rotor_sequence) == 1  # else two commands may have held in between
+    span_s = np.where(single, np.diff(trace.rotor_stamp_ns), 1) * 1e-9
     lagging = motor_time_constant_s > 0.0
     decay = np.exp(-span_s / motor_time_constant_s) if lagging else np.zeros_like(span_s)
     speed = trace.rotor_speed
     asked = (speed[1:] - decay * speed[:-1]) / (1.0 - decay)
-    place = (asked / hover_rad_s - 1.0) / _CODE_STEP + CODES // 2
+    place = (asked / hover_rad_s - 1.0) / _CODE_STEP + _MIDDLE
     code = np.rint(place)
-    certain = (np.abs(place - code) < 0.25) & (code >= 0) & (code < CODES)
-    certain &= np.diff(trace.rotor_sequence) == 1  # else two commands may have held in between
+    certain = single & (np.abs(place - code) < 0.25) & (code >= 0) & (code < CODES)
     felt = np.full(len(code), -1, dtype=np.int64)
     number = 0
     for index in np.flatnonzero(certain):
-        number += (int(code[index]) - number) % CODES  # commands are obeyed in the order of their numbers
-        if number >= len(trace.sent_ns):
-            break
-        felt[index] = number
+        ahead = (int(code[index]) - number) % CODES  # commands are obeyed in the order of their numbers
+        if number + ahead < len(trace.sent_ns):
+            number += ahead
+            felt[index] = number
     return felt
 
 

@@ -74,9 +74,14 @@ class NeurosimProcess:
         """
         status = self._process.poll()
         if status is not None:
-            lines = self._log.read_text(errors="replace").strip().splitlines()[-_TAIL_LINES:]
-            said = "\n".join(f"  {line}" for line in lines) or "  (nothing)"
-            raise ProcessEnded(f"`neurosim {self.arguments[0]}` ended with status {status}; it said:\n{said}")
+            raise ProcessEnded(
+                f"`neurosim {self.arguments[0]}` ended with status {status}; {self.last_words()}"
+            )
+
+    def last_words(self) -> str:
+        """Return the last lines that it said, for an error message."""
+        lines = self._log.read_text(errors="replace").strip().splitlines()[-_TAIL_LINES:]
+        return "it said:\n" + ("\n".join(f"  {line}" for line in lines) or "  (nothing)")
 
     def resident_bytes(self) -> int:
         """Return the memory that it holds, shared pages included; -1 where the system does not say."""

@@ -80,10 +80,20 @@ def answer_images(
         command(first.stamp_ns)
         begin, image_bytes, end_ns, warm_ns = 0, 0, 0, 0
         before = (0, 0)
+        answered_ns = first.stamp_ns
+
+        def idle() -> None:
+            """Answer what the rotors say where an image was lost: in lockstep nothing would go on."""
+            reports.extend(_reports(rotors))
+            if reports[-1][0] > answered_ns:
+                command(reports[-1][0])
+            check()
+
         while not end_ns or time.monotonic_ns() < end_ns or len(images) - begin < _IMAGES_MIN:
-            image, info = _receive(pictures, check, _SILENCE_S if images else _START_S)
-            if image.stamp_ns > 0:  # that of stamp 0 was answered before it came
-                command(image.stamp_ns)
+            image, info = _receive(pictures, idle, _SILENCE_S if images else _START_S)
+            if image.stamp_ns > answered_ns:
+                answered_ns = image.stamp_ns
+                command(answered_ns)
             images.append((image.stamp_ns, info.publish_ns, info.publish_ns + info.latency_ns))
             reports += _reports(rotors)  # while the simulator is busy with the next image
             if not warm_ns:
@@ -160,7 +170,7 @@ class StreamTrace:
     packet_count: int
     """Packets of events."""
     event_count: int
-    event_lost_count: int
+    packet_lost_count: int
     """Packets of events that never came."""
     event_dropped_count: int
     """Events that did not fit into the simulator's buffer."""
@@ -251,7 +261,7 @@ class StreamProbe:
             imu_lost_count=gaps.count,
             packet_count=self._packets,
             event_count=self._events,
-            event_lost_count=self._camera_gaps.count,
+            packet_lost_count=self._camera_gaps.count,
             event_dropped_count=self._dropped,
             status=self._status,
             resident_bytes=np.array(memory, dtype=np.int64),
