@@ -35,6 +35,13 @@ class TopicInfo(NamedTuple):
     subscriber_count: int
 
 
+class Trigger(NamedTuple):
+    """Answer of a service of type std_srvs/srv/Trigger."""
+
+    success: bool
+    message: str
+
+
 class RosPublisher(Protocol):
     """Publishes on one topic."""
 
@@ -43,10 +50,10 @@ class RosPublisher(Protocol):
         """Subscriptions that match now."""
 
     def publish(self, message: Buffer) -> None:
-        """Send a message; never waits for subscribers.
+        """Send a message; never waits for subscribers, and keeps no reference to it.
 
         Raises:
-            BackendError: It could not be sent.
+            BackendError: It could not be sent: it is not a message of this type, or the publisher is closed.
         """
 
     def close(self) -> None:
@@ -60,15 +67,42 @@ class RosSubscription(Protocol):
     def publisher_count(self) -> int:
         """Publishers that match now."""
 
+    @property
+    def lost_count(self) -> int:
+        """Messages known to be lost on the way; what a newer one has overtaken is not counted."""
+
+    @property
+    def error_count(self) -> int:
+        """Messages with which the callback raised; each is logged, and the subscription goes on."""
+
     def close(self) -> None:
-        """Withdraw the subscription; its callback is not called any more."""
+        """Withdraw the subscription; its callback is not called any more once this returns.
+
+        May be called from the callback, which then is the last call.
+        """
+
+
+class RosService(Protocol):
+    """Answers the requests to one service."""
+
+    @property
+    def error_count(self) -> int:
+        """Requests with which the callback raised; each is logged, and answered with its error."""
+
+    def close(self) -> None:
+        """Withdraw the service."""
 
 
 class Backend(Protocol):
-    """One participant of a ROS 2 graph: a node."""
+    """One participant of a ROS 2 graph: a node.
+
+    All functions may be called from any thread.
+    """
 
     name: str
     """Such as "dds"; shown to the user."""
+    distro: str
+    """Distribution whose message definitions are spoken, such as "jazzy"."""
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
         """Publish on a topic.
@@ -82,15 +116,26 @@ class Backend(Protocol):
     ) -> RosSubscription:
         """Subscribe to a topic; the callback is called with every message, on a thread of the backend.
 
+        At most `qos.depth` messages wait for a callback that is busy; newer ones push out the oldest.
+
         Raises:
             ValueError: The type is unknown, or the topic's name is not valid.
         """
 
+    def service(self, name: str, callback: Callable[[], Trigger]) -> RosService | None:
+        """Answer requests to a service of type std_srvs/srv/Trigger, on a thread of the backend.
+
+        None: this backend has no services.
+
+        Raises:
+            ValueError: The name is not valid.
+        """
+
     def topics(self) -> list[TopicInfo]:
-        """Return what is seen on the other side now."""
+        """Return what is seen on the other side now, in order of names; own endpoints do not count."""
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Leave the graph, with all publishers, subscriptions and services; harmless if done before."""
 
 
 class BackendError(RuntimeError):

@@ -1,0 +1,63 @@
+"""Types of ROS messages for Cyclone DDS, made at run time from their definitions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cyclonedds import idl
+from rosbags.interfaces import Nodetype
+
+from cortex_ros2_bridge.typestore import check_type, dds_type_name, typestore
+
+types: Any = idl.types
+"""Types of fields; mypy does not see that they take parameters."""
+_structs: dict[tuple[str, str], Any] = {}
+
+
+def idl_struct(type_name: str, distro: str) -> Any:
+    """Return the class of cyclonedds for a message, as a distribution defines it.
+
+    Raises:
+        ValueError: The type is unknown, or has a field for which DDS has no type.
+    """
+    key = type_name, distro
+    if key not in _structs:
+        check_type(type_name, distro)
+        definition = typestore(distro).fielddefs[type_name][1]
+        fields = {name: _field(description, distro) for name, description in definition}
+        _structs[key] = make_struct(dds_type_name(type_name), fields)
+    return _structs[key]
+
+
+def make_struct(dds_name: str, fields: dict[str, Any]) -> Any:
+    """Return a class of cyclonedds with a name such as "std_srvs::srv::dds_::Trigger_Request_"."""
+    return idl.make_idl_struct(dds_name.rpartition("::")[2], dds_name.replace("::", "."), fields)
+
+
+def _field(description: Any, distro: str) -> Any:
+    kind, detail = description
+    if kind == Nodetype.BASE:
+        base, bound = detail
+        if base == "string":
+            return types.bounded_str[bound] if bound else str
+        if base not in _SCALARS:
+            raise ValueError(f"fields of type {base} are not supported")
+        return getattr(types, _SCALARS[base]) if base != "bool" else bool
+    if kind == Nodetype.NAME:
+        return idl_struct(detail, distro)
+    element, count = detail
+    inner = _field(element, distro)
+    if kind == Nodetype.ARRAY:
+        return types.array[inner, count]
+    return types.sequence[inner, count] if count else types.sequence[inner]
+
+
+_SCALARS = {
+    **{name: name for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")},
+    "float32": "float32",
+    "float64": "float64",
+    "byte": "uint8",
+    "char": "uint8",
+    "octet": "uint8",
+    "bool": "bool",
+}

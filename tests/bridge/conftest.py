@@ -1,0 +1,47 @@
+"""Fixtures for tests of the bridge: a runtime directory of Cortex and a DDS domain, both of the test alone."""
+
+from __future__ import annotations
+
+import random
+import threading
+import uuid
+from collections.abc import Iterator
+
+import pytest
+from processes import processes_with, wait_for
+from runtime_directory import runtime
+
+__all__ = ["dds_domain", "runtime"]
+
+# `lo` has no multicast, so processes find each other by the ports of 127.0.0.1. The tag keeps apart what has the
+# same number of domain by accident. Killed processes are missed after the lease.
+_CONFIG = """<CycloneDDS><Domain>
+  <General>
+    <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+    <AllowMulticast>false</AllowMulticast>
+  </General>
+  <Discovery>
+    <ParticipantIndex>auto</ParticipantIndex>
+    <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+    <Peers><Peer address="127.0.0.1"/></Peers>
+    <Tag>{tag}</Tag>
+    <LeaseDuration>1 s</LeaseDuration>
+  </Discovery>
+</Domain></CycloneDDS>"""
+
+
+@pytest.fixture
+def dds_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """The number of a DDS domain on loopback that nobody else is in; processes of the test inherit it.
+
+    Afterwards no process and no thread of the test may be left.
+    """
+    number, tag = random.randrange(1, 102), f"test-{uuid.uuid4().hex}"
+    for name in ("ROS_DISTRO", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+    monkeypatch.setenv("CYCLONEDDS_URI", _CONFIG.format(tag=tag))
+    threads = set(threading.enumerate())
+    yield number
+    wait_for(lambda: not processes_with(tag))
+    wait_for(lambda: not set(threading.enumerate()) - threads)
