@@ -51,7 +51,7 @@ def ask(*words: str) -> int:
 
 
 @pytest.fixture
-def asked(runtime) -> Iterator[Callable[..., list[Any]]]:
+def asked(shared_runtime) -> Iterator[Callable[..., list[Any]]]:
     """A simulator that notes what it is asked, and does it, or refuses for a reason."""
     requests: list[Any] = []
     with Node("simulator") as node:
@@ -94,12 +94,12 @@ def test_a_refusal_is_said_and_fails(asked, capsys):
 
 
 @pytest.mark.parametrize("words", [["pause"], ["status"]])
-def test_nobody_is_there(runtime, words):
+def test_nobody_is_there(shared_runtime, words):
     with pytest.raises(RuntimeError, match=r"no simulator answers \(waited 0.3 s\): start one with"):
         call(_parser().parse_args(["call", *words, "--timeout", "0.3"]))
 
 
-def test_an_answer_that_does_not_come(runtime):
+def test_an_answer_that_does_not_come(shared_runtime):
     done = threading.Event()
     with Node("simulator") as node:
 
@@ -115,7 +115,7 @@ def test_an_answer_that_does_not_come(runtime):
             done.set()
 
 
-def test_status(runtime, capsys):
+def test_status(shared_runtime, capsys):
     """Every figure of the message is there, in words and units for people."""
     stop = threading.Event()
     with Node("simulator") as node:
@@ -168,7 +168,7 @@ def test_settings_that_are_none_are_refused(setting, text):
         parameters_of([setting])
 
 
-def test_wrong_numbers_are_refused(runtime):
+def test_wrong_numbers_are_refused(shared_runtime):
     for words, text in (
         (["step", "0"], "control periods must be >= 1, got 0"),
         (["pause", "--timeout", "nan"], "--timeout must be > 0, got nan"),

@@ -84,13 +84,13 @@ class Stage:
 
 
 @pytest.fixture
-def stage(runtime) -> Iterator[Stage]:
+def stage(shared_runtime) -> Iterator[Stage]:
     with Node("simulator") as node:
         yield Stage(node)
 
 
 @pytest.fixture
-def start_pilot(runtime) -> Iterator[Callable[..., PathPilot]]:
+def start_pilot(shared_runtime) -> Iterator[Callable[..., PathPilot]]:
     """Starts pilots in threads, and ends them."""
     with contextlib.ExitStack() as stack:
         node = stack.enter_context(Node("controller"))
@@ -113,7 +113,7 @@ def expected(tick: int, mode: Any = "motor_speeds", **changes: Any) -> tuple[int
 
 
 @pytest.mark.parametrize("mode", ["motor_speeds", "velocity", "position"])
-def test_every_odometry_is_answered(runtime, start_pilot, mode):
+def test_every_odometry_is_answered(shared_runtime, start_pilot, mode):
     """All at once, and in their order, with the bits of the same follower in-process."""
     with Node("simulator") as node:
         stage = Stage(node, mode=mode)
@@ -207,7 +207,7 @@ def test_a_pilot_ends_while_it_sleeps(stage, start_pilot):
     pilot.close()  # the fixture joins its thread
 
 
-def test_vehicles_do_not_wait_for_each_other(runtime, start_pilot):
+def test_vehicles_do_not_wait_for_each_other(shared_runtime, start_pilot):
     with Node("simulator") as node:
         red, blue = Stage(node, "red"), Stage(node, "blue")
         start_pilot("red")
@@ -289,7 +289,7 @@ class Fly:
 
 
 @pytest.fixture
-def start_fly(runtime, tmp_path) -> Iterator[Callable[..., Fly]]:
+def start_fly(shared_runtime, tmp_path) -> Iterator[Callable[..., Fly]]:
     """Starts `neurosim fly`, and ends it."""
     with contextlib.ExitStack() as stack:
 
@@ -346,7 +346,7 @@ def test_fly_takes_the_vehicles_that_it_is_told(start_fly, tmp_path):
     assert "interrupted" in process.said
 
 
-def test_wrong_use_is_refused(runtime):
+def test_wrong_use_is_refused(shared_runtime):
     for arguments, text in (
         ({"mode": "rates"}, "unknown mode 'rates', known: motor_speeds, velocity, position"),
         ({"delay_s": -1.0}, "delay_s must be >= 0, got -1.0"),
