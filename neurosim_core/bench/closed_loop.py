@@ -11,7 +11,7 @@ import csv
 import dataclasses
 import importlib.util
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -126,8 +126,7 @@ def measure_loop(
         ProcessEnded: The simulator ended.
         ProbeError: It was silent.
     """
-    if not 0.0 < seconds <= 3600.0:  # also refuses nan
-        raise ValueError(f"seconds must be > 0 and <= 3600, got {seconds}")
+    _check_seconds(seconds)
     airframe = config.vehicle.airframe()
     hover_rad_s = airframe.hover_rotor_speed_rad_s
     with own_runtime() as folder:
@@ -153,6 +152,11 @@ def measure_loop(
         hover_rad_s=hover_rad_s,
         motor_time_constant_s=airframe.motor_time_constant_s,
     )
+
+
+def _check_seconds(seconds: float) -> None:
+    if not 0.0 < seconds <= 3600.0:  # also refuses nan
+        raise ValueError(f"seconds must be > 0 and <= 3600, got {seconds}")
 
 
 def summarise(
@@ -188,24 +192,20 @@ def _quantile(values: NDArray[np.floating[Any]], share: float) -> float:
 
 
 def sweep(
-    rates_hz: Iterable[float],
+    configs: Sequence[SimulationConfig],
     *,
-    seconds: float = 3.0,
+    seconds: float,
     on_case: Callable[[LoopMode, float], None] | None = None,
-    **options: Any,
 ) -> list[LoopResult]:
-    """Measure every rate in both modes.
+    """Measure one loop after the other.
 
     Args:
-        rates_hz: Of commands and images [Hz].
+        configs: `loop_config` of each.
         seconds: How long to measure each [wall-clock s].
-        on_case: Told what is measured next.
-        options: As for `loop_config`.
+        on_case: Told mode and rate [Hz] of what is measured next.
     """
-    modes: tuple[LoopMode, ...] = ("lockstep", "streaming")
-    configs = [loop_config(mode, rate_hz, **options) for mode in modes for rate_hz in rates_hz]
     results = []
-    for config in configs:  # all have been checked before the first is flown
+    for config in configs:
         if on_case is not None:
             on_case(config.live.mode, config.control.rate_hz)
         results.append(measure_loop(config, seconds=seconds))
@@ -325,18 +325,20 @@ def bench_closed_loop(
         seconds: How long to measure each rate in each mode [wall-clock s].
         options: As for `loop_config`.
     """
-    config = loop_config("lockstep", max(rates_hz), **options)
+    modes: tuple[LoopMode, ...] = ("lockstep", "streaming")
+    configs = [loop_config(mode, rate_hz, **options) for mode in modes for rate_hz in rates_hz]
+    _check_seconds(seconds)
     out.mkdir(parents=True, exist_ok=True)
+    config = configs[0]
     lens = config.sensors[_CAMERA].lens  # type: ignore[union-attr]
     where = "the generated apartment" if config.scene.kind == "apartment" else Path(config.scene.file).name
     title = f"closed loop, RGB {lens.width}x{lens.height}, {config.renderer} renderer, hover in {where}"
     notes = describe_machine(None if config.device == "auto" else config.device)
     with console.status("closed loop") as status:
         results = sweep(
-            rates_hz,
+            configs,
             seconds=seconds,
-            on_case=lambda mode, rate_hz: status.update(f"{mode}, {rate_hz:g} Hz"),
-            **options,
+            on_case=lambda mode, rate_hz: status.update(f"closed loop: {mode}, {rate_hz:g} Hz"),
         )
     console.print("\n".join([title, *notes]), highlight=False, soft_wrap=True)
     print_sweep(results, console)

@@ -48,19 +48,22 @@ def own_runtime() -> Iterator[Path]:
 class NeurosimProcess:
     """A command of `neurosim` as a process of its own; leaving the `with` block ends it."""
 
-    def __init__(self, *arguments: str, log: Path, python: Sequence[str] = (sys.executable,)) -> None:
+    def __init__(
+        self, command: str, *arguments: str, log: Path, python: Sequence[str] = (sys.executable,)
+    ) -> None:
         """Start it.
 
         Args:
-            arguments: What follows `neurosim` on the command line.
+            command: What follows `neurosim` on the command line.
+            arguments: What follows that.
             log: File for what it says.
             python: How to start the interpreter, such as under a profiler.
         """
-        self.arguments = arguments
+        self._command = command
         self._log = log
         with log.open("wb") as out:
             self._process = subprocess.Popen(
-                [*python, "-m", "neurosim_core", *arguments],
+                [*python, "-m", "neurosim_core", command, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
@@ -74,9 +77,7 @@ class NeurosimProcess:
         """
         status = self._process.poll()
         if status is not None:
-            raise ProcessEnded(
-                f"`neurosim {self.arguments[0]}` ended with status {status}; {self.last_words()}"
-            )
+            raise ProcessEnded(f"`neurosim {self._command}` ended with status {status}; {self.last_words()}")
 
     def last_words(self) -> str:
         """Return the last lines that it said, for an error message."""

@@ -139,7 +139,12 @@ def stream_config(
         device: Where to compute.
         scene: A mesh file; None: the generated apartment.
         settings: Further ones, by dotted key.
+
+    Raises:
+        ValueError: Something is out of range.
     """
+    if not 0.0 < seconds <= 86_400.0:  # also refuses nan
+        raise ValueError(f"seconds must be > 0 and <= 86400, got {seconds}")
     lens = {"width": width, "height": height, "horizontal_fov_rad": 1.5}
     camera = {"kind": "event_camera", "lens": lens, "sampling_rate_hz": sampling_rate_hz}
     base: dict[str, Any] = {
@@ -165,8 +170,6 @@ def measure_stream(config: SimulationConfig, *, seconds: float) -> StreamTrace:
         ProcessEnded: Simulator or controller ended.
         ProbeError: The simulator was silent.
     """
-    if not 0.0 < seconds <= 86_400.0:  # also refuses nan
-        raise ValueError(f"seconds must be > 0 and <= 86400, got {seconds}")
     vehicle = next(iter(config.vehicles))
     with own_runtime() as folder:
         file = folder / "stream.yaml"
