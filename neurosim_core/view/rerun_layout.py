@@ -16,7 +16,8 @@ LIVE_PLOT_S = 10.0
 LIVE_TRAIL_S = 30.0
 """How much of its way a vehicle draws behind it, in a stream [s]."""
 _PICTURES = ("rgb", "event_camera", "depth")
-_PLOTS_PER_ROW = 3
+_PLOTS_PER_ROW = (3, 4)
+"""For up to six plots, and for more."""
 
 
 def make_blueprint(
@@ -24,6 +25,7 @@ def make_blueprint(
     bounds_m: NDArray[np.float64] | None = None,
     *,
     live: bool = False,
+    links: bool = False,
 ) -> Any:
     """Lay the viewer out; see `rerun_log` for the entities.
 
@@ -31,10 +33,13 @@ def make_blueprint(
         vehicles: Sensors of each vehicle.
         bounds_m: Lowest and highest corner of the scene [m], shape [2, 3]; None: there is none.
         live: Plots show the last seconds, and those of commands and of the simulator are there.
+        links: The plot of link delays is there.
     """
     rrb = import_rerun().blueprint
     many = len(vehicles) > 1
-    pictures, plots = [], []
+    pictures: list[Any] = []
+    plots: list[Any] = []
+    camera_count = 0
     for name, sensors in vehicles.items():
         views = [
             rrb.Spatial2DView(
@@ -42,20 +47,27 @@ def make_blueprint(
             )
             for camera in _cameras(sensors)
         ]
+        camera_count = max(camera_count, len(views))
+        if views and many:
+            pictures.append(rrb.Vertical(*views, name=name))
+        elif views:
+            pictures = views
+        views = _plots(name, sensors, live=live, links=links)
         if views:
-            pictures.append(rrb.Vertical(*views, name=name) if many else views)
-        views = _plots(name, sensors, live=live)
-        if views:
-            plots.append(rrb.Grid(*views, grid_columns=_PLOTS_PER_ROW, name=name))
+            columns = _PLOTS_PER_ROW[len(views) > 6]
+            plots.append(rrb.Grid(*views, grid_columns=columns, name=name))
     if live:
         plots.append(rrb.Horizontal(*_simulator_plots(), name="simulator"))
-    right = ([rrb.Tabs(*pictures)] if many and pictures else pictures[0] if pictures else []) + (
-        [rrb.TextDocumentView(origin="status", name="status")] if live else []
-    )
+    right = [rrb.Tabs(*pictures)] if many and pictures else pictures
+    shares = [3 * camera_count] if many and pictures else [3] * len(right)
+    if live:
+        right, shares = [*right, rrb.TextDocumentView(origin="status", name="status")], [*shares, 4]
     space = _space(vehicles, bounds_m, live=live)
     below = rrb.Tabs(*plots) if len(plots) > 1 else plots[0] if plots else None
     left = space if below is None else rrb.Vertical(space, below, row_shares=[5, 4] if live else [5, 3])
-    layout = rrb.Horizontal(left, rrb.Vertical(*right), column_shares=[3, 1]) if right else left
+    layout = (
+        rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 1]) if right else left
+    )
     return rrb.Blueprint(
         layout,
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following" if live else None),
@@ -81,7 +93,7 @@ def _space(
     if bounds_m is not None:
         low, high = bounds_m
         center, size = 0.5 * (low + high), high - low
-        away = np.array([-0.3 * size[0], -0.7 * max(size), 0.85 * max(size)])
+        away = np.array([-0.2 * size[0], -0.6 * max(size), 0.75 * max(size)])
         eye = rrb.EyeControls3D(position=center + away, look_target=center, eye_up=(0.0, 0.0, 1.0))
     until_now = _last_seconds(LIVE_TRAIL_S if live else None)
     # One frustum is enough where cameras share a place; the others' pictures are at the right.
@@ -123,7 +135,7 @@ def _plot(name: str, origin: str, contents: list[str] | None = None, *, live: bo
     )
 
 
-def _plots(vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool) -> list[Any]:
+def _plots(vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool, links: bool) -> list[Any]:
     root = f"plots/{vehicle}"
     plots = []
     for sensor in sensors:
@@ -143,13 +155,20 @@ def _plots(vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool) 
                 _plot("rotor speed [rad/s]", f"{at}/rotor_speed", live=live),
             ]
     if live:
-        plots.append(_plot("command", f"{root}/command", live=live))
+        plots.append(_plot("command", f"{root}/command", live=True))
+        plots.append(_timing_plot())
+    if links:
+        plots.append(_plot("link delay [ms]", f"{root}/links", live=live))
     return plots
+
+
+def _timing_plot() -> Any:
+    return _plot("loop timing [ms]", "simulator/timing", live=True)
 
 
 def _simulator_plots() -> list[Any]:
     return [
-        _plot("loop timing [ms]", "simulator/timing", live=True),
+        _timing_plot(),
         _plot("real-time factor", "simulator/real_time_factor", live=True),
         _plot("lost messages", "simulator/losses", live=True),
     ]

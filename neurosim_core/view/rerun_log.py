@@ -10,6 +10,7 @@ window. Exact values are in the HDF5 recording. All data is on the timeline `sim
     world/collisions/<vehicle>              where it touched the scene
     plots/<vehicle>/<sensor>/<quantity>     IMU, speed, height, rotor speeds
     plots/<vehicle>/command/<mode>          what it was told to do
+    plots/<vehicle>/links/<link>            delay of each message [ms]; a gap where one was lost
     plots/<vehicle>/<name>                  what `log_scalar` was given
     simulator/<name>                        what `log_simulator` was given
     status                                  what `log_status` was given
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.view.event_picture import EventWindow
 from neurosim_core.view.rerun_layout import make_blueprint
@@ -52,7 +53,6 @@ _COLLISION_COLOR = (255, 0, 0)
 _AXES_M = 0.25
 _FRUSTUM_M = 0.5
 
-_ROTOR = "rotor {} [rad/s]"
 _SETPOINT_NAMES = {
     "rates": ("thrust [N]", "rate x [rad/s]", "rate y [rad/s]", "rate z [rad/s]"),
     "attitude": ("thrust [N]", "roll [rad]", "pitch [rad]", "yaw [rad]"),
@@ -76,6 +76,7 @@ class RerunLogger:
         scene: SceneShapes | None = None,
         event_window_ns: int = 20_000_000,
         image_rate_max_hz: float | None = None,
+        links: bool = False,
         live: bool = False,
         keep_layout: bool = False,
         clock_ns: Callable[[], int] = time.monotonic_ns,
@@ -90,6 +91,7 @@ class RerunLogger:
             event_window_ns: How much time one picture of events shows [ns].
             image_rate_max_hz: Log no more pictures per sensor and second than this: of simulated time, or,
                 live, by the wall clock, and then those of events, too.
+            links: Deliveries of links will come.
             live: This is a stream that may go on for hours.
             keep_layout: Leave the layout as the viewer has it now, if it has one.
             clock_ns: The wall clock [ns].
@@ -109,6 +111,7 @@ class RerunLogger:
         }
         self._event_window_ns = event_window_ns
         self._image_limit = _RateLimit(0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz))
+        self._links = links
         self._live = live
         self._keep_layout = keep_layout
         self._clock_ns = clock_ns
@@ -122,6 +125,7 @@ class RerunLogger:
             ImuSample: self._log_imu,
             Odometry: self._log_odometry,
             Collision: self._log_collision,
+            Delivery: self._log_delivery,
         }
         recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for name, sensors in self._vehicles.items():
@@ -175,6 +179,20 @@ class RerunLogger:
         """
         self._plot(f"plots/{vehicle or self._first}/{name}", stamp_ns, value, (name,))
 
+    def log_rotor_speeds(
+        self, sensor: str, stamp_ns: int, speed: NDArray[np.float64], *, vehicle: str | None = None
+    ) -> None:
+        """Plot rotor speeds that do not come in a packet.
+
+        Args:
+            sensor: Name of the odometry that they belong to.
+            stamp_ns: Time [ns].
+            speed: Speeds [rad/s], shape [R].
+            vehicle: Name of the vehicle; None: the first one.
+        """
+        entity = f"plots/{vehicle or self._first}/{sensor}/rotor_speed"
+        self._plot(entity, stamp_ns, speed, _rotors(len(speed)))
+
     def log_command(
         self, mode: str, stamp_ns: int, setpoint: ArrayLike, *, vehicle: str | None = None
     ) -> None:
@@ -187,7 +205,7 @@ class RerunLogger:
             vehicle: Name of the vehicle; None: the first one.
         """
         row = np.asarray(setpoint, dtype=np.float64)
-        names = _SETPOINT_NAMES.get(mode) or tuple(_ROTOR.format(k) for k in range(len(row)))
+        names = _SETPOINT_NAMES.get(mode) or _rotors(len(row))
         if mode == "attitude":
             row = np.array([row[0], *_roll_pitch_yaw(row[1:5])])
         self._plot(f"plots/{vehicle or self._first}/command/{mode}", stamp_ns, row, names)
@@ -241,7 +259,7 @@ class RerunLogger:
 
     def _send_blueprint(self, scene: SceneShapes | None) -> None:
         bounds_m = None if scene is None else scene.bounds_m
-        layout = make_blueprint(self._vehicles, bounds_m, live=self._live)
+        layout = make_blueprint(self._vehicles, bounds_m, live=self._live, links=self._links)
         self._recording.send_blueprint(layout, make_active=not self._keep_layout)
 
     def _log_description(self, vehicle: str, sensor: SensorDescription) -> None:
@@ -298,8 +316,7 @@ class RerunLogger:
         self._plot(f"{plot}/speed", packet.stamp_ns, np.linalg.norm(packet.velocity), ("speed",))
         self._plot(f"{plot}/height", packet.stamp_ns, packet.position[2], ("height",))
         if len(packet.rotor_speed):
-            rotors = tuple(f"rotor {k}" for k in range(len(packet.rotor_speed)))
-            self._plot(f"{plot}/rotor_speed", packet.stamp_ns, packet.rotor_speed, rotors)
+            self.log_rotor_speeds(packet.sensor, packet.stamp_ns, packet.rotor_speed, vehicle=vehicle)
 
     def _send_poses(
         self,
@@ -346,10 +363,19 @@ class RerunLogger:
         point = self._rr.Points3D([packet.position], colors=[_COLLISION_COLOR], radii=[0.08])
         self._recording.log(f"world/collisions/{vehicle}", point)
 
+    def _log_delivery(self, vehicle: str, packet: Delivery) -> None:
+        link = packet.sensor.removesuffix("_link")
+        delay_ms = 1e-6 * (packet.delivered_ns - packet.stamp_ns) if packet.delivered_ns >= 0 else np.nan
+        self._plot(f"plots/{vehicle}/links/{link}", packet.stamp_ns, delay_ms, (link,))
+
 
 def _body(vehicle: str) -> str:
     """Entity of a vehicle's body frame."""
     return f"world/vehicles/{vehicle}"
+
+
+def _rotors(count: int) -> tuple[str, ...]:
+    return tuple(f"rotor {k}" for k in range(count))
 
 
 def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:

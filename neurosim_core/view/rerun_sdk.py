@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -11,6 +13,8 @@ if TYPE_CHECKING:
 
 TIMELINE = "sim_time"
 """The only timeline: simulated time."""
+_QUIET = "warn,re_log_encoding::rrd::file_sink=error"
+"""What Rerun says: no warning of files without a footer, which are meant."""
 
 
 def import_rerun() -> ModuleType:
@@ -19,11 +23,17 @@ def import_rerun() -> ModuleType:
     Raises:
         ImportError: It is not installed; the message says what to install.
     """
+    quiet = "rerun" not in sys.modules and "RUST_LOG" not in os.environ
+    if quiet:
+        os.environ["RUST_LOG"] = _QUIET  # read once, at the import
     try:
         import rerun
         import rerun.blueprint
     except ImportError as error:
         raise ImportError("the viewer needs Rerun: pip install 'neurosim[view]'") from error
+    finally:
+        if quiet:
+            del os.environ["RUST_LOG"]
     return rerun
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import pytest
 import rerun as rr
 import rerun.chunk
 import trimesh
+from rerun_file import read
 from test_plan import make_scene
 
 from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSample, Odometry, Packet
@@ -87,24 +87,6 @@ def make_imu(k: int) -> ImuSample:
 
 def make_image(stamp_ns: int, sensor: str = "rgb") -> Image:
     return Image(stamp_ns=stamp_ns, sensor=sensor, data=np.full((24, 32, 3), 90, np.uint8), encoding="rgb8")
-
-
-def read(path: Path) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
-    """Rows of each entity: (time [ns] or None if static, values by name of the component)."""
-    rows: dict[str, list[tuple[int | None, dict[str, Any]]]] = defaultdict(list)
-    for chunk in rerun.chunk.RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        names = batch.schema.names
-        times = batch.column(names.index("sim_time")) if "sim_time" in names else None
-        for row in range(batch.num_rows):
-            values = {
-                name.rsplit(":", 1)[-1]: batch.column(index)[row].as_py()
-                for index, name in enumerate(names)
-                if ":" in name
-            }
-            stamp_ns = None if times is None else int(times[row].value)
-            rows[chunk.entity_path].append((stamp_ns, values))
-    return {entity: sorted(found, key=lambda item: item[0] or 0) for entity, found in rows.items()}
 
 
 def record(
