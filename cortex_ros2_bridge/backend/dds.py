@@ -33,6 +33,7 @@ from cyclonedds.util import duration
 
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, Trigger
 from cortex_ros2_bridge.backend.cyclone import Choice, Refused, Transport, choose_transport
+from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
 from cortex_ros2_bridge.backend.graph import (
     ENCLAVE,
@@ -55,12 +56,10 @@ from cortex_ros2_bridge.typestore import DEFAULT_DISTRO
 _log = logging.getLogger(__name__)
 
 _CLOSE_S = 5.0
-"""Longest wait for a callback that is under way when its subscription is closed."""
+"""Longest wait for a thread that was told to end."""
 _CLIENT_S = 0.1
 """Longest wait for a client whose request was faster than the discovery of its ear for the reply."""
 _CLIENT_BYTES = 16
-_TELL_S = 1.0
-"""Shortest time between two reports of a callback that raises."""
 
 _Part = TypeVar("_Part")
 
@@ -293,16 +292,12 @@ class DdsPublisher:
 class _Receiver:
     """Takes what comes to a reader, on its own thread: a slow callback holds up its own topic only."""
 
-    def __init__(
-        self, site: _Site, reader: Any, limit: int, deliver: Callable[[bytes], None], name: str
-    ) -> None:
-        self.error_count = 0
-        self._name = name
+    def __init__(self, site: _Site, reader: Any, limit: int, deliver: Delivery, name: str) -> None:
+        self._deliver = deliver
         self._closed = threading.Event()
-        self._told_s = -1.0
         self._guard = GuardCondition(site.participant)
         self._thread = threading.Thread(
-            target=self._run, args=(site, reader, limit, deliver), name=f"ros {name}", daemon=True
+            target=self._run, args=(site, reader, limit, name), name=f"ros {name}", daemon=True
         )
         self._thread.start()
 
@@ -310,36 +305,22 @@ class _Receiver:
         """End; waits for a call that is under way."""
         self._closed.set()
         self._guard.set(True)
+        self._deliver.close()
         if threading.current_thread() is not self._thread:
             self._thread.join(_CLOSE_S)
-            if self._thread.is_alive():
-                _log.error("the callback of %s still runs after %g s", self._name, _CLOSE_S)
 
-    def _run(self, site: _Site, reader: Any, limit: int, deliver: Callable[[bytes], None]) -> None:
-        waitset = WaitSet(site.participant)
-        waitset.attach(self._guard)
-        waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
-        while not self._closed.is_set():
-            try:
+    def _run(self, site: _Site, reader: Any, limit: int, name: str) -> None:
+        try:
+            waitset = WaitSet(site.participant)
+            waitset.attach(self._guard)
+            waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
+            while not self._closed.is_set():
                 waitset.wait(duration(infinite=True))
-                messages = site.transport.take(reader, limit)
-            except (DDSException, Refused):
-                _log.exception("%s is not received any more", self._name)
-                return
-            for message in messages:
-                if self._closed.is_set():
-                    return
-                try:
-                    deliver(message)
-                except Exception:  # whatever a callback raises must not end the subscription
-                    self._count_error()
-
-    def _count_error(self) -> None:
-        self.error_count += 1
-        now_s = time.monotonic()
-        if self._told_s < 0.0 or now_s - self._told_s >= _TELL_S:
-            self._told_s = now_s
-            _log.exception("the callback of %s failed (%d times)", self._name, self.error_count)
+                for message in site.transport.take(reader, limit):
+                    self._deliver(message)
+        except (DDSException, Refused):
+            if not self._closed.is_set():
+                _log.exception("%s is not received any more", name)
 
 
 class DdsSubscription:
@@ -353,7 +334,8 @@ class DdsSubscription:
         self._reader = site.reader(TOPIC_PREFIX + topic, kind, qos, user_data_of_type(type_name, site.distro))
         self._guid = self._reader.guid.bytes
         self._lost_count = 0
-        self._receiver = _Receiver(site, self._reader, qos.depth, callback, topic)
+        self._deliver = Delivery(callback, topic)
+        self._receiver = _Receiver(site, self._reader, qos.depth, self._deliver, topic)
 
     @property
     def publisher_count(self) -> int:
@@ -372,7 +354,7 @@ class DdsSubscription:
     @property
     def error_count(self) -> int:
         """Messages with which the callback raised."""
-        return self._receiver.error_count
+        return self._deliver.error_count
 
     def close(self) -> None:
         """Withdraw the subscription."""
@@ -407,12 +389,13 @@ class DdsService:
         self._writer = site.writer(f"{REPLY_PREFIX}{name}Reply", reply, qos, user_data)
         self._reader = site.reader(f"{REQUEST_PREFIX}{name}Request", request, qos, user_data)
         self._guids = self._writer.guid.bytes, self._reader.guid.bytes
-        self._receiver = _Receiver(site, self._reader, qos.depth, self._answer, name)
+        self._deliver = Delivery(self._answer, name)
+        self._receiver = _Receiver(site, self._reader, qos.depth, self._deliver, name)
 
     @property
     def error_count(self) -> int:
         """Requests with which the callback raised."""
-        return self._receiver.error_count
+        return self._deliver.error_count
 
     def close(self) -> None:
         """Withdraw the service."""
