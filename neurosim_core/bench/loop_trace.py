@@ -67,19 +67,18 @@ def felt_commands(trace: LoopTrace, *, hover_rad_s: float, motor_time_constant_s
     Returns:
         Index into `sent_ns`, -1 where no single command of ours held, shape [reports - 1].
     """
-    single = np.diff(trace.rotor_sequence) == 1  # else two commands may have held in between
-    span_s = np.where(single, np.diff(trace.rotor_stamp_ns), 1) * 1e-9
+    felt = np.full(max(len(trace.rotor_stamp_ns) - 1, 0), -1, dtype=np.int64)
+    pair = np.flatnonzero(np.diff(trace.rotor_sequence) == 1)  # else two commands may have held in between
+    span_s = 1e-9 * (trace.rotor_stamp_ns[pair + 1] - trace.rotor_stamp_ns[pair])
     lagging = motor_time_constant_s > 0.0
     decay = np.exp(-span_s / motor_time_constant_s) if lagging else np.zeros_like(span_s)
-    speed = trace.rotor_speed
-    asked = (speed[1:] - decay * speed[:-1]) / (1.0 - decay)
+    asked = (trace.rotor_speed[pair + 1] - decay * trace.rotor_speed[pair]) / (1.0 - decay)
     place = (asked / hover_rad_s - 1.0) / _CODE_STEP + _MIDDLE
     code = np.rint(place)
-    certain = single & (np.abs(place - code) < 0.25) & (code >= 0) & (code < CODES)
-    felt = np.full(len(code), -1, dtype=np.int64)
+    certain = (np.abs(place - code) < 0.25) & (code >= 0) & (code < CODES)
     number = 0
-    for index in np.flatnonzero(certain):
-        ahead = (int(code[index]) - number) % CODES  # commands are obeyed in the order of their numbers
+    for index, value in zip(pair[certain], code[certain], strict=True):
+        ahead = (int(value) - number) % CODES  # commands are obeyed in the order of their numbers
         if number + ahead < len(trace.sent_ns):
             number += ahead
             felt[index] = number

@@ -55,14 +55,20 @@ def test_jitter_is_measured_from_the_usual_arrival():
     """All come 0.3 ms late, which is no jitter; every fifth 2 ms later than that, and one a little early."""
     late = np.full(20_000, 0.3 * MS)
     late[::5] += 2 * MS
-    late[7] -= 0.2 * MS
+    late[7] -= 0.9 * MS
     result = streaming.summarise(heard(late))
     assert result.jitter_median_s == 0.0
     assert result.jitter_p99_s == pytest.approx(2e-3)
-    assert streaming.lateness_s(heard(late))[7] == pytest.approx(-0.2e-3)
+    assert streaming.lateness_s(heard(late))[7] == pytest.approx(-0.9e-3)
     assert result.interval_max_s == pytest.approx(3e-3)
     assert result.real_time_factor == pytest.approx(1.0, abs=2e-4)  # the first sample was 2 ms late
     assert "p99 < 1.000 ms: missed" in printed(result)
+
+
+def test_what_comes_early_is_jitter_too():
+    late = np.zeros(5000)
+    late[3000] = -0.9 * MS
+    assert streaming.summarise(heard(late)).jitter_max_s == pytest.approx(0.9e-3)
 
 
 def test_drift_is_jitter_too():
