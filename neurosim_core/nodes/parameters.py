@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import ConfigError, SimulationConfig, load_config
 
 Value = bool | int | float | str | None
 
@@ -40,4 +40,8 @@ def change(config: SimulationConfig, values: Mapping[str, Value]) -> SimulationC
             raise ValueError(f"{key} cannot be changed while it runs; what can: {', '.join(CHANGEABLE)}")
         if value is None:
             raise ValueError(f"{key}: no value is given")
-    return load_config(config.model_dump(mode="json"), overrides=dict(values))
+    try:
+        return load_config(config.model_dump(mode="json"), overrides=dict(values))
+    except ConfigError as error:
+        reasons = str(error).splitlines()[1:]
+        raise ValueError("; ".join(line.strip() for line in reasons)) from None

@@ -12,13 +12,14 @@ from processes import SOON_S, wait_for
 
 from cortex import Node, Publisher, Subscriber, reliable
 from cortex.messages import Odometry, Parameters, SimulatorReply, SimulatorStatus
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, VehicleConfig, load_config
+from neurosim_core.live import LiveConfig
 from neurosim_core.nodes.simulator import Simulator
 from neurosim_core.nodes.topics import COMMANDS, SERVICES, command_topic
 from neurosim_core.nodes.translate import command_of
 from neurosim_core.simulation import Model, make_fleet
 
-IMU = {"kind": "imu", "rate_hz": 400.0}
+IMU = {"kind": "imu", "rate_hz": 400.0, "accelerometer_noise_density": 0.01}
 RGB = {"kind": "rgb", "rate_hz": 50.0, "lens": {"width": 64, "height": 48, "horizontal_fov_rad": 1.5}}
 EVENTS = {
     "kind": "event_camera",
@@ -30,15 +31,16 @@ ODOMETRY = {"kind": "odometry", "rate_hz": 100.0}
 _models: dict[str, dict[str, Model]] = {}
 
 
-def make_config(**overrides: Any) -> SimulationConfig:
+def make_config(*, sensors: Any = None, **overrides: Any) -> SimulationConfig:
     """A vehicle that hovers in a small flat, with an IMU, odometry, a colour camera and an event camera."""
+    rig = {"imu": IMU, "odometry": ODOMETRY, "rgb": RGB, "events": EVENTS}
     base = {
         "scene": {"kind": "apartment", "rooms": 2},
         "device": "cpu",
         "renderer": "synthetic",
         "duration_s": 1.0,
         "path": {"kind": "hover"},
-        "sensors": {"imu": IMU, "odometry": ODOMETRY, "rgb": RGB, "events": EVENTS},
+        "sensors": rig if sensors is None else sensors,
         "vehicle": {"on_collision": "report"},
         "live": {"command_timeout_s": 10.0, "command_deadline_s": SOON_S},
     }
@@ -46,8 +48,9 @@ def make_config(**overrides: Any) -> SimulationConfig:
 
 
 def models_of(config: SimulationConfig) -> dict[str, Model]:
-    """The models of a configuration; scene, path and light are made once for all that share them."""
-    key = config.model_copy(update={"live": SimulationConfig().live, "links": {}}).model_dump_json()
+    """The models of a configuration; what takes time to make is made once for all that share it."""
+    common = {"live": LiveConfig(), "links": {}, "seed": 0, "duration_s": 1.0, "vehicle": VehicleConfig()}
+    key = config.model_copy(update=common).model_dump_json()
     if key not in _models:
         _models[key] = make_fleet(config)
     return {name: dataclasses.replace(model, config=config.of(name)) for name, model in _models[key].items()}
