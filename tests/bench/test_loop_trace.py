@@ -74,6 +74,7 @@ def test_what_is_not_a_command_of_ours_is_not_taken_for_one():
     speed = trace.rotor_speed.copy()
     speed[-1] += 1.0
     assert felt(dataclasses.replace(trace, rotor_speed=speed)) == [-1, -1, 0, -1]
+    assert felt(flown([None], sent_count=CODES)) == [-1]  # hover is the middle of all codes
     assert felt(flown([0, 1, 2], sent_count=2)) == [0, 1, -1]  # a number that was never sent
 
 
