@@ -182,7 +182,7 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     )
     loop.add_argument(
         "--rates",
-        type=_rates,
+        type=_numbers,
         default="100,200,500,1000,2000,5000",
         metavar="HZ,...",
         help="commands and images a second (default: %(default)s)",
@@ -219,6 +219,33 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     _add_out(streaming, "streaming")
     streaming.set_defaults(command=_bench_streaming)
 
+    delay = questions.add_parser(
+        "delay",
+        help="a slow controller in real time against the same delay in lockstep",
+        description="Fly tours with a controller that sleeps, in real time, and with the same delay simulated "
+        "in lockstep; leave delay.csv.",
+    )
+    delay.add_argument(
+        "--delays",
+        type=_numbers,
+        default="0,0.02,0.05",
+        metavar="S,...",
+        help="what the controller sleeps before each command [s] (default: %(default)s)",
+    )
+    delay.add_argument("--tours", type=int, default=3, metavar="N", help="how many paths to fly")
+    delay.add_argument(
+        "--mode",
+        default="velocity",
+        choices=["motor_speeds", "velocity", "position"],
+        help="what to command (default: velocity)",
+    )
+    delay.add_argument("--seconds", type=float, default=4.0, metavar="S", help="length of a flight [s]")
+    delay.add_argument(
+        "--factor", type=float, default=1.0, metavar="F", help="real-time factor of the slow controller"
+    )
+    _add_out(delay, "delay")
+    delay.set_defaults(command=_bench_delay)
+
 
 def _add_view(parser: argparse.ArgumentParser, *, width: int, height: int, camera: str) -> None:
     """What is looked at, by what, and where that is computed."""
@@ -238,12 +265,12 @@ def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
                      help="any further setting by its dotted key, such as scene.rooms=2")  # fmt: skip
 
 
-def _rates(text: str) -> list[float]:
-    """Read rates that are separated by commas [Hz]."""
+def _numbers(text: str) -> list[float]:
+    """Read numbers that are separated by commas."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"takes numbers, such as 100,1000, got {text!r}") from None
+        raise argparse.ArgumentTypeError(f"takes numbers with commas between them, got {text!r}") from None
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -419,6 +446,24 @@ def _bench_streaming(arguments: argparse.Namespace) -> int:
         device=arguments.device,
         scene=arguments.scene,
         sampling_rate_hz=arguments.sampling_rate,
+        settings=_settings(arguments),
+    )
+    return 0
+
+
+def _bench_delay(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.delay import bench_delay
+
+    bench_delay(
+        arguments.out,
+        Console(),
+        delays_s=arguments.delays,
+        tours=arguments.tours,
+        mode=arguments.mode,
+        seconds=arguments.seconds,
+        real_time_factor=arguments.factor,
         settings=_settings(arguments),
     )
     return 0

@@ -83,7 +83,7 @@ def test_a_simulator_that_cannot_start_says_why():
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [
-        (["closed-loop", "--rates", "fast"], 2, "takes numbers, such as 100,1000, got 'fast'"),
+        (["closed-loop", "--rates", "fast"], 2, "takes numbers with commas between them, got 'fast'"),
         (["closed-loop", "--rates", "100,0"], 1, "control.rate_hz"),
         (["closed-loop", "--seconds", "-1"], 1, "seconds must be > 0 and <= 3600, got -1.0"),
         (["closed-loop", "--set", "scene.rooms"], 1, "--set takes KEY=VALUE"),
@@ -127,6 +127,11 @@ signal.pause()
         wait_for(lambda: "deaf" in process.last_words())
         process.check()
         assert process.resident_bytes() > 1_000_000
+        with pytest.raises(
+            TimeoutError, match=r"`neurosim serve` did not end within 0.01 s; it said:\n  deaf"
+        ):
+            process.wait(0.01)
     with pytest.raises(ProcessEnded, match=r"`neurosim serve` ended with status -9; it said:\n  deaf"):
         process.check()
     assert process.resident_bytes() == -1
+    assert process.wait(1.0) == -9

@@ -84,6 +84,22 @@ class NeurosimProcess:
         lines = self._log.read_text(errors="replace").strip().splitlines()[-_TAIL_LINES:]
         return "it said:\n" + ("\n".join(f"  {line}" for line in lines) or "  (nothing)")
 
+    def wait(self, timeout_s: float) -> int:
+        """Wait until it ends by itself, and return its exit status.
+
+        Args:
+            timeout_s: Longest wait [s].
+
+        Raises:
+            TimeoutError: It goes on.
+        """
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError(
+                f"`neurosim {self._command}` did not end within {timeout_s:g} s; {self.last_words()}"
+            ) from None
+
     def resident_bytes(self) -> int:
         """Return the memory that it holds, shared pages included; -1 where the system does not say."""
         try:
