@@ -222,8 +222,8 @@ def _add_bench(parser: argparse.ArgumentParser) -> None:
     delay = questions.add_parser(
         "delay",
         help="a slow controller in real time against the same delay in lockstep",
-        description="Fly tours with a controller that sleeps, in real time, and with the same delay simulated "
-        "in lockstep; leave delay.csv.",
+        description="Fly tours with a controller that sleeps, in real time, and with the same delay in "
+        "lockstep, simulated; leave delay.csv.",
     )
     delay.add_argument(
         "--delays",
