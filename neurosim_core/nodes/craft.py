@@ -39,6 +39,7 @@ class Craft:
         lanes: How far its cameras may be behind.
         answers_ns: Stamp of the odometry whose command the next control period waits for [ns]; None: it does
             not wait, as that has come or no odometry has arrived.
+        has_newcomer: A controller has come since the last command.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Craft:
             self.outlet.announce_link("command")
         self.answers_ns: int | None = None
         self._before_reset_ns = 0
+        self.has_newcomer = False
         self._cameras = frozenset(name for cast in model.casts for name in cast.names)
         self._active: frozenset[str] = frozenset()
         self.lanes: Lanes = plan_lanes(model, drop=False)
@@ -109,7 +111,17 @@ class Craft:
         if active != self._active:
             self._active = active
             want(self.model, self.state, active & self._cameras)
+        self.has_newcomer |= self.inbox.find_newcomers()
         return (*counts, self.inbox.publisher_count)
+
+    def greet(self) -> None:
+        """Ask again for the command that is waited for, if a new controller has come since the last time.
+
+        It may have answered when nobody was connected to it yet, and would never speak again.
+        """
+        if self.has_newcomer:
+            self.has_newcomer = False
+            self.outlet.repeat_state()
 
     def answers(self, command: Command, *, lockstep: bool) -> bool:
         """Return whether the next control period may begin with a command.
@@ -134,6 +146,7 @@ class Craft:
     def obey(self, command: Command, stamp_ns: int) -> None:
         """Send a command on its way at a tick [ns]."""
         self.answers_ns = None
+        self.has_newcomer = False
         self.outlet.deliver(self.helm.send(command, stamp_ns=stamp_ns), "command")
 
     def step(self, stamp_ns: int) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.control.modes import CommandMode
+from neurosim_core.frames import heading_rad
 from neurosim_core.live import LinkConfig, LiveConfig
 from neurosim_core.nodes.channel import Channel
 from neurosim_core.packets import Delivery, Odometry
@@ -123,14 +124,4 @@ class Helm:
         if self.live.fail_safe == "cut":
             return Command(mode="motor_speeds", setpoint=self._lowest)
         state = observe()
-        return Command(mode="position", setpoint=np.array([*state.position, heading(state.orientation)]))
-
-
-def heading(orientation: NDArray[np.float64]) -> float:
-    """Return the yaw of a Z-X-Y sequence: y_B is orthogonal to (cos yaw, sin yaw, 0) [rad].
-
-    Args:
-        orientation: q_WB, xyzw, shape [4].
-    """
-    x, y, z, w = orientation
-    return float(np.arctan2(-2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z)))
+        return Command(mode="position", setpoint=np.array([*state.position, heading_rad(state.orientation)]))

@@ -62,6 +62,7 @@ class Inbox:
             )
             for mode, message in COMMANDS.items()
         }
+        self._known: dict[CommandMode, set[int]] = {mode: set() for mode in self._subscribers}
         self._refused = 0
         self._superseded = 0
         self._before = InboxCounts()
@@ -72,6 +73,16 @@ class Inbox:
     def publisher_count(self) -> int:
         """How many publishers of commands are connected, of all modes together."""
         return sum(subscriber.publisher_count for subscriber in self._subscribers.values())
+
+    def find_newcomers(self) -> bool:
+        """Return whether publishers have been connected since the last time that were not there before."""
+        newcomers = False
+        for mode, subscriber in self._subscribers.items():
+            sources = subscriber.sources()
+            if subscriber.publisher_count >= len(sources):  # else one of them is being connected
+                newcomers |= not sources <= self._known[mode]
+                self._known[mode] = sources
+        return newcomers
 
     @property
     def counts(self) -> InboxCounts:

@@ -54,6 +54,7 @@ class Stream:
         self.published_count = 0
         self.delivered_ns: int | None = None
         self._translate = translate
+        self._last: Any = None
 
     @property
     def heard(self) -> bool:
@@ -70,12 +71,20 @@ class Stream:
         self.publisher.publish(message)
         self.published_count += 1
         self.delivered_ns = message.stamp_ns
+        if self.publisher.latch:
+            self._last = message
+
+    def repeat(self) -> None:
+        """Publish the last message again, the same in every bit, where the topic is latched."""
+        if self._last is not None:
+            self.publisher.publish(self._last)
 
     def reset(self, *, seed: int) -> None:
         """Forget what is under way and begin again."""
         self.channel.reset(seed=seed)
         self.published_count = 0
         self.delivered_ns = None
+        self._last = None
 
 
 class Outlet:
@@ -179,6 +188,11 @@ class Outlet:
                 self.streams[name].publish(packet)
         if self.record is not None:
             self.record(packet)
+
+    def repeat_state(self) -> None:
+        """Publish the last state again: somebody new may have missed that it is waited for an answer."""
+        for name in ("rotor_speeds", "odometry"):
+            self.streams[name].repeat()
 
     def deliver(self, delivery: Delivery | None, link: str) -> None:
         """Tell what a link did to a message."""

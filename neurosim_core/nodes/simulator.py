@@ -194,18 +194,18 @@ class Simulator:
         The first commands of a run begin its time, once those who came with them are connected.
         """
         live, first = self.config.live, self._tick == 0
+        if live.mode == "streaming" and not first:
+            return True  # taken in at the end of the period before
         for craft in self.crafts:
-            if live.mode == "streaming" and not first:
-                command = craft.inbox.poll()
-                if command is not None:
-                    craft.obey(command, self.stamp_ns)
-            elif craft.answers_ns is not None and self._tick % live.command_every == 0:
+            if craft.answers_ns is not None and self._tick % live.command_every == 0:
                 command = self._wait_for_command(craft)
                 if command is None:
                     return False
                 craft.obey(command, self.stamp_ns)
         if first:
             self._audience.settle(self._stop)
+            for craft in self.crafts:
+                craft.has_newcomer = False
             self._pacer.start(0)
         return True
 
@@ -229,9 +229,18 @@ class Simulator:
         period_ns = end_ns - self.stamp_ns
         if streaming and not self._streaming.publish_until(end_ns, period_ns, live, self._stop.is_set):
             return
+        if streaming:  # before anything of this stamp goes out: an answer to it counts from the next tick on
+            self._take_commands(end_ns)
         for craft in self.crafts:
             craft.answers_ns = craft.outlet.publish_due(end_ns)
         self._end_period(end_ns)
+
+    def _take_commands(self, stamp_ns: int) -> None:
+        """Send what has arrived by a tick [ns] on its way."""
+        for craft in self.crafts:
+            command = craft.inbox.poll()
+            if command is not None:
+                craft.obey(command, stamp_ns)
 
     def _end_period(self, end_ns: int) -> None:
         """Move time on to a tick [ns], and see whether that was the last."""
@@ -260,6 +269,7 @@ class Simulator:
             if limited and time.monotonic() - begin_s > LATE_S:
                 self._reason = f"for the command of {craft.name} that answers {craft.answers_ns} ns"
             self._audience.look()
+            craft.greet()
             self._tell()
             return self._is_called()
 
@@ -365,7 +375,7 @@ class Simulator:
         """Stop time, or let it go on."""
         self._steps.stop("paused" if paused else "resumed")
         if self._paused and not paused:
-            self._pacer.start(self.stamp_ns)
+            self._go_on()
         self._paused = paused
 
     def _start_steps(self, request: Request) -> None:
@@ -375,8 +385,14 @@ class Simulator:
         elif not self._paused:
             request.answer("it is not paused: call /pause first")
         else:
-            self._pacer.start(self.stamp_ns)
+            self._go_on()
             self._steps.start(request)
+
+    def _go_on(self) -> None:
+        """Let a paused run go on from here, with the commands that came meanwhile."""
+        self._pacer.start(self.stamp_ns)
+        if self.config.live.mode == "streaming" and self._tick:
+            self._take_commands(self.stamp_ns)
 
     def _change(self, config: SimulationConfig | None) -> str:
         """Change settings; return why not, empty if it was done."""

@@ -121,14 +121,24 @@ class LiveRig:
         *,
         vehicle: str = "drone",
     ) -> list[Odometry]:
-        """Answer so many odometry messages, by default with hover speeds; return them and the one after."""
-        states = []
+        """Answer so many odometry messages, by default with hover speeds; return them and the one after.
+
+        One that comes again, as a new publisher was connected, is answered once.
+        """
+        states: list[Odometry] = []
+
+        def following() -> Odometry:
+            while True:
+                state: Odometry = odometry.recv(SOON_S)
+                if not states or state.stamp_ns > states[-1].stamp_ns:
+                    return state
+
         for _ in range(count):
-            state = odometry.recv(SOON_S)
+            state = following()
             states.append(state)
             mode, setpoint = ("motor_speeds", self.hover(vehicle)) if law is None else law(state)
             self.send(setpoint, mode=mode, stamp_ns=state.stamp_ns, vehicle=vehicle)
-        return [*states, odometry.recv(SOON_S)]
+        return [*states, following()]
 
     def hover(self, vehicle: str = "drone") -> np.ndarray:
         """Rotor speeds that carry the vehicle."""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core.live import LinkConfig, LiveConfig
 from neurosim_core.nodes.channel import Channel
-from neurosim_core.nodes.helm import Command, Helm, heading
+from neurosim_core.nodes.helm import Command, Helm
 from neurosim_core.packets import Odometry
 from neurosim_core.vehicle import preset
 
@@ -115,12 +115,6 @@ def test_reset_forgets():
     helm.reset(seed=3)
     assert held(helm, 30 * MS) == ("motor_speeds", None)
     assert helm.counts.taken == 0
-
-
-@pytest.mark.parametrize("yaw", [-3.0, -0.5, 0.0, 2.0])
-def test_heading_is_that_of_a_z_x_y_sequence(yaw: float):
-    rotation = Rotation.from_euler("ZXY", [yaw, 0.4, -0.6])
-    assert heading(rotation.as_quat()) == pytest.approx(yaw, abs=1e-12)
 
 
 def test_a_channel_keeps_the_order_when_its_link_changes():

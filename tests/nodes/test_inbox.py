@@ -186,6 +186,20 @@ def test_wait_hears_a_command_of_another_mode(desk: Desk):
     assert command.mode == "position"
 
 
+def test_newcomers_are_told_apart(desk: Desk):
+    """One that leaves while another comes leaves the count as it was."""
+    assert not desk.inbox.find_newcomers()
+    topic = command_topic("drone", "rates")
+    with desk.node.publisher(topic, COMMANDS["rates"]) as first:
+        assert first.wait_for_subscribers(1, SOON_S)
+        wait_for(desk.inbox.find_newcomers)
+        assert not desk.inbox.find_newcomers()
+    with desk.node.publisher(topic, COMMANDS["rates"]) as second:
+        assert second.wait_for_subscribers(1, SOON_S)
+        wait_for(desk.inbox.find_newcomers)
+    assert not desk.inbox.find_newcomers()
+
+
 def test_reset_throws_away_and_counts_anew(desk: Desk):
     desk.send("rates", row=[np.nan] * 4)
     desk.send("rates", stamp_ns=3)

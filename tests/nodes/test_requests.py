@@ -77,19 +77,16 @@ def test_a_refusal_says_why(counter: Counter):
     assert replies[0].reason == "not today"
 
 
-def test_no_answer_is_a_refusal_in_time(counter: Counter, monkeypatch: pytest.MonkeyPatch):
+def test_no_answer_is_a_refusal_in_time(shared_runtime: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(requests, "ANSWER_DEADLINE_S", 0.05)
-    replies: list[SimulatorReply] = []
-    counter.requests.close()
-    with Node("late") as node, Node("late steps") as steps:
-        late = Requests(
-            node, steps, config=make_config, state=lambda: (0, "running"), on_request=lambda: None
-        )
+    with Node("services") as node, Node("steps") as step_node, Node("caller") as caller:
+        counter = Counter(node, step_node, caller)
+        replies: list[SimulatorReply] = []
         counter.call("/resume", Trigger(), replies).join(SOON_S)
         assert not replies[0].accepted
         assert replies[0].reason == "no answer within 0.05 s"
-        assert late.take() is None  # nobody waits for it
-        late.close()
+        assert counter.requests.take() is None  # nobody waits for it
+        counter.requests.close()
 
 
 def test_steps_do_not_hold_up_the_others(counter: Counter):

@@ -20,7 +20,9 @@ from cortex.messages import (
     Events,
     Image,
     Imu,
+    MotorCommand,
     Odometry,
+    PoseCommand,
     Reset,
     RotorSpeeds,
     Simulation,
@@ -128,6 +130,24 @@ def test_lockstep_ends_with_an_error_when_no_command_comes():
     assert "mode motor_speeds that answers the odometry of 10000000 ns" in reason
     assert "1 publisher(s)" in reason
     assert "answered 77 ns" in reason
+
+
+def test_a_controller_that_spoke_too_soon_is_asked_again():
+    """Its first command reaches nobody, as the simulator is not connected to it yet; it hears again."""
+    with LiveRig(make_config(**LOCKSTEP)) as rig:
+        odometry = rig.listen("/drone/odometry", Odometry)
+        speeds = rig.listen("/drone/rotor_speeds", RotorSpeeds)
+        first = odometry.recv(SOON_S)
+        with rig.node.publisher("/drone/command/motor_speeds", MotorCommand):
+            again = odometry.recv(SOON_S)
+            assert (again.stamp_ns, again.sequence) == (0, 0)
+            assert again.position.tobytes() == first.position.tobytes()
+            assert [speeds.recv(SOON_S).sequence for _ in range(2)] == [0, 0]
+            assert drain(odometry, 0.1) == []  # once for each that comes
+            rig.send(rig.hover(), stamp_ns=0)
+            assert [m.stamp_ns for m in drain(odometry, 0.1) if m.stamp_ns] == [PERIOD_NS]
+        with rig.node.publisher("/drone/command/position", PoseCommand):  # one that is started in the middle
+            assert odometry.recv(SOON_S).stamp_ns == PERIOD_NS
 
 
 def test_lockstep_waits_only_at_every_nth_period():
@@ -286,6 +306,21 @@ def test_streaming_keeps_to_the_clock():
     assert passed[-1] >= simulated[-1] - 2 * 50 * MS
     assert end.real_time_factor == 2.0
     assert rig.simulator._pacer.lateness_ns(end.stamp_ns) >= 0
+
+
+def test_an_answer_counts_from_the_next_tick_on():
+    """What arrives by a tick is taken before anything of it is published: no answer is in time for it."""
+    with LiveRig(make_config(**{"live.real_time_factor": 0.2})) as rig:
+        odometry = rig.listen("/drone/odometry", Odometry)
+        speeds = rig.listen("/drone/rotor_speeds", RotorSpeeds)
+        rig.send(rig.hover())
+        for _ in range(20):
+            state = odometry.recv(SOON_S)
+        rig.send(1.3 * rig.hover())
+        felt = next(
+            m.stamp_ns for m in iter(lambda: speeds.recv(SOON_S), None) if m.speed[0] > rig.hover()[0] + 1
+        )
+    assert felt >= state.stamp_ns + 2 * PERIOD_NS
 
 
 def test_factor_0_does_not_wait():
