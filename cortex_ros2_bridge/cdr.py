@@ -51,7 +51,7 @@ def encode(message: Any) -> memoryview:
         UnknownTypeError: It is a message of a type that we have no definition of.
     """
     type_name = getattr(message, "__msgtype__", None)
-    convert = _as_it_is
+    convert: Callable[[Any], Any] = _as_it_is
     if type_name is None:
         type_name = type_name_of(message)
         convert = _to_record(type_name)
@@ -99,7 +99,7 @@ def type_name_of(message: Any) -> str:
         TypeError: It is neither.
     """
     if isinstance(message, Message):
-        return message._type_name
+        return message.__ros_type__
     kind = type(message)
     package, _, module = kind.__module__.partition(".")
     if not hasattr(kind, "get_fields_and_field_types") or not module.startswith("msg"):

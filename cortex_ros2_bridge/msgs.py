@@ -73,14 +73,14 @@ class Message:
     __slots__: Any = ()
     __hash__ = None  # type: ignore[assignment]  # as in rclpy: a message can change
 
-    _type_name = ""
+    __ros_type__ = ""
     _fields_and_field_types: dict[str, str] = {}  # noqa: RUF012  # rclpy's name; never changed
-    _fields: tuple[Field, ...] = ()
+    __ros_fields__: tuple[Field, ...] = ()
 
     def __init__(self, **values: Any) -> None:
         unknown = values.keys() - self._fields_and_field_types.keys()
         assert not unknown, f"Invalid arguments passed to constructor: {', '.join(sorted(unknown))}"
-        for field in self._fields:
+        for field in self.__ros_fields__:
             if field.name in values:
                 setattr(self, field.name, field.convert(values[field.name]))
             else:
@@ -101,7 +101,7 @@ class Message:
         return True
 
     def __repr__(self) -> str:
-        package, kind, name = self._type_name.split("/")
+        package, kind, name = self.__ros_type__.split("/")
         texts = []
         for slot in self.__slots__:
             value = getattr(self, slot)
@@ -168,16 +168,16 @@ def _make_class(type_name: str) -> Any:
         "__module__": __name__,
         "__qualname__": base,
         "__reduce__": _reduce,
-        "_type_name": type_name,
+        "__ros_type__": type_name,
         "_fields_and_field_types": {field.name: field.idl_type for field in fields},
-        "_fields": tuple(fields),
+        "__ros_fields__": tuple(fields),
     }
     return type(base, (Message,), attributes)
 
 
 def _reduce(self: Message) -> tuple[Any, ...]:
     """Pickle and copy by the name of the type: its class has no place in a module."""
-    return _restore, (self._type_name, [getattr(self, slot) for slot in self.__slots__])
+    return _restore, (self.__ros_type__, [getattr(self, slot) for slot in self.__slots__])
 
 
 def _restore(type_name: str, values: list[Any]) -> Any:

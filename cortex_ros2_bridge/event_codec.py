@@ -1,0 +1,454 @@
+"""Events as bytes: the encodings of event_camera_msgs/EventPacket, and the records of dvs_msgs/EventArray.
+
+evt3 is what event cameras of Prophesee send: words of 16 bits, of which the upper four say what the others
+are: the high or the low half of a time of 24 bits [us], a row, or a column with a polarity. The time wraps
+every 16.8 s, so that encoder and decoder keep state from packet to packet. mono is one word of 64 bits for
+each event, with a time of its own in nanoseconds. Nothing here loops over events in Python.
+
+Reference: Prophesee, "EVT 3.0 format"; the README of event_camera_msgs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortex_ros2_bridge.backend.base import Buffer
+
+Bytes = NDArray[np.uint8]
+Code = NDArray[np.uint8]
+Words = NDArray[np.uint16]
+Allocate = Callable[[int], Bytes]
+"""Returns so many bytes to write to, at an address that is a multiple of 4."""
+
+_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x8
+_KNOWN = {_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, 0x7, 0xA, 0xE, 0xF}
+"""All words that there are; the last four are triggers and what sensors say of themselves, not events."""
+_EPOCH_BITS = 24
+_EPOCHS_MAX = 256
+"""Time that goes further ahead than this many wraps of 16.8 s has been set anew."""
+_JITTER = 10
+"""A high half that is smaller by no more than this came late, it did not wrap; as other decoders have it."""
+_EVT3_SIZE_MAX = 2048
+_MONO_SPAN_MAX_US = (2**32 - 1) // 1000
+
+
+class EventCodecError(ValueError):
+    """Events that the encoding cannot hold, or bytes that are not of the encoding."""
+
+
+class EventColumns(NamedTuple):
+    """Events, sorted by time."""
+
+    t: NDArray[np.int64]
+    """Time [us], shape [n]; of mono [ns]."""
+    x: NDArray[np.uint16]
+    """Column [px], shape [n]."""
+    y: NDArray[np.uint16]
+    """Row [px], shape [n]."""
+    polarity: NDArray[np.uint8]
+    """1: brighter, 0: darker, shape [n]."""
+
+
+class Evt3Encoder:
+    """Encodes the packets of one camera as evt3, one after the other.
+
+    Each event takes 4 bytes (row and column), and each new time another 4. Sensors write a row only when it
+    changes, and rows of neighbours as one vector: that saves little where each microsecond has few events,
+    and costs several times the time here. Where time wraps, the last and the first value of its high half are
+    written, so that a decoder notices it even after a silence of any length up to an hour.
+    """
+
+    def __init__(self) -> None:
+        self._epoch: int | None = None
+        self._scratch = np.empty(0, np.uint32)
+
+    def encode(
+        self,
+        t_us: NDArray[np.int64],
+        x: NDArray[np.uint16],
+        y: NDArray[np.uint16],
+        polarity: NDArray[np.uint8],
+        *,
+        width: int,
+        height: int,
+        end_us: int,
+        allocate: Allocate | None = None,
+    ) -> Bytes:
+        """Return a packet, in which time is written before the first event.
+
+        Args:
+            t_us: Times, sorted [us], shape [n].
+            x: Columns [px], shape [n].
+            y: Rows [px], shape [n].
+            polarity: 1: brighter, 0: darker, shape [n].
+            width: Of the sensor [px].
+            height: Of the sensor [px].
+            end_us: Time of a packet without events [us].
+            allocate: Makes room for the packet; None: a new array.
+
+        Raises:
+            EventCodecError: The sensor has more than 2048 columns or rows, an event is outside of it or has
+                another polarity, or times decrease.
+        """
+        if width > _EVT3_SIZE_MAX or height > _EVT3_SIZE_MAX:
+            raise EventCodecError(f"evt3 holds at most 2048 x 2048 pixels, not {width} x {height}; use mono")
+        count = len(t_us)
+        _check(t_us, x, y, polarity, width, height)
+        first_of_group = np.empty(count, bool)
+        if count:
+            first_of_group[0] = True
+            np.not_equal(t_us[1:], t_us[:-1], out=first_of_group[1:])
+            before = np.flatnonzero(first_of_group)
+            times = t_us[before]
+        else:
+            before, times = np.zeros(1, np.intp), np.array([end_us], np.int64)
+        words = (
+            (times >> 12 & 0xFFF) | (times << 16 & 0xFFF0000) | (_TIME_LOW << 28 | _TIME_HIGH << 12)
+        ).astype(np.uint32)
+        before, words = self._with_wraps(before, words, times)
+
+        out = (_new_bytes if allocate is None else allocate)(4 * (count + len(words))).view("<u4")
+        is_event = np.ones(len(out), bool)
+        where = before + np.arange(len(before))
+        is_event[where] = False
+        out[where] = words
+        if count:
+            out[is_event] = self._event_words(x, y, polarity)
+        return out.view(np.uint8)
+
+    def _event_words(
+        self, x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8]
+    ) -> NDArray[np.uint32]:
+        """Return a row and a column for each event; valid until the next call."""
+        count = len(x)
+        if len(self._scratch) < count:
+            self._scratch = np.empty(count * 5 // 4, np.uint32)
+        words = self._scratch[:count]
+        halves = words.view(np.uint16).reshape(count, 2)
+        column = polarity.astype(np.uint16)
+        column <<= 11
+        column |= x
+        column |= _ADDR_X << 12
+        halves[:, 0] = y
+        halves[:, 1] = column
+        return words
+
+    def _with_wraps(
+        self, before: NDArray[np.intp], words: NDArray[np.uint32], times: NDArray[np.int64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
+        """Put words in wherever time has wrapped since the word before."""
+        begin, end = int(times[0]) >> _EPOCH_BITS, int(times[-1]) >> _EPOCH_BITS
+        last = begin if self._epoch is None or not 0 <= begin - self._epoch <= _EPOCHS_MAX else self._epoch
+        self._epoch = end
+        if last == end:
+            return before, words
+        wraps = np.diff(times >> _EPOCH_BITS, prepend=last)
+        repeats = np.where(wraps > _EPOCHS_MAX, 0, wraps) + 1
+        owner = np.repeat(np.arange(len(words)), repeats)
+        is_time = np.zeros(len(owner), bool)
+        is_time[np.cumsum(repeats) - 1] = True
+        wrap = np.uint32((_TIME_HIGH << 12) << 16 | _TIME_HIGH << 12 | 0xFFF)
+        return before[owner], np.where(is_time, words[owner], wrap)
+
+
+class Evt3Decoder:
+    """Decodes the packets of one camera, one after the other; also what sensors of Prophesee write."""
+
+    def __init__(self, *, start_us: int | None = None) -> None:
+        """Begin before the first packet.
+
+        Args:
+            start_us: Time of its first event, known to 8 s [us]: 24 bits do not say how often time has
+                wrapped before. None: it has not.
+        """
+        self._start_us = start_us
+        self._is_timed = False
+        self._high = 0
+        self._low = 0
+        self._y = 0
+        self._base_x = 0
+        self._base_polarity = 0
+
+    def decode(self, data: Buffer | Bytes, *, width: int, height: int) -> EventColumns:
+        """Return the events of a packet; of those before the first time, and outside of the sensor, nothing.
+
+        Args:
+            data: Words of 16 bits, little endian.
+            width: Of the sensor [px].
+            height: Of the sensor [px].
+
+        Raises:
+            EventCodecError: It is half a word too long, or has a word that evt3 does not know.
+        """
+        words = _words(data, "<u2", "evt3")
+        code: Code = (words >> 12).astype(np.uint8)
+        value: Words = words & np.uint16(0xFFF)
+        used = set(np.flatnonzero(np.bincount(code, minlength=16)).tolist())
+        if not used <= _KNOWN:
+            odd = ", ".join(f"0x{each:X}" for each in sorted(used - _KNOWN))
+            raise EventCodecError(f"evt3 has no words that begin with {odd}")
+
+        where, x, polarity = self._columns(code, value, used)
+        y, self._y = _hold(code == _ADDR_Y, value & 0x7FF, self._y, where)
+        t, begin = self._times(code, value, where)
+        usable = (where >= begin) & (x < width) & (y < height)
+        columns = EventColumns(t, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.uint8))
+        if usable.all():
+            return columns
+        return EventColumns(t[usable], columns.x[usable], columns.y[usable], columns.polarity[usable])
+
+    def _times(self, code: Code, value: Words, where: NDArray[np.intp]) -> tuple[NDArray[np.int64], int]:
+        """Return the time at some words [us], and the first word at which time is known."""
+        is_high, is_low = code == _TIME_HIGH, code == _TIME_LOW
+        highs = value[is_high].astype(np.int64)
+        before = np.concatenate([[self._high & 0xFFF], highs[:-1]])[: len(highs)]
+        highs += (self._high >> 12) + np.cumsum(highs < before - _JITTER) << 12
+        begin = 0
+        if not self._is_timed:
+            begin = len(code)
+            lows = np.flatnonzero(is_low)
+            if len(highs):
+                lows = lows[lows > np.flatnonzero(is_high)[0]]
+                if len(lows):
+                    begin, self._is_timed = int(lows[0]), True
+                    if self._start_us is not None:
+                        seen = int(highs[np.count_nonzero(is_high[:begin]) - 1] << 12 | value[begin])
+                        highs += (self._start_us - seen + (1 << 23) >> _EPOCH_BITS) << 12
+        high, self._high = _hold(is_high, highs, self._high, where, selected=True)
+        low, self._low = _hold(is_low, value, self._low, where)
+        return high << 12 | low, begin
+
+    def _columns(
+        self, code: Code, value: Words, used: set[int]
+    ) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
+        """Return the word, the column and the polarity of each event."""
+        where = np.flatnonzero(code == _ADDR_X)
+        x, polarity = value[where] & 0x7FF, value[where] >> 11
+        if not used & {_BASE_X, _VECT_12, _VECT_8}:
+            return where, x, polarity
+        is_base = code == _BASE_X
+        length = np.where(code == _VECT_12, 12, 0) + np.where(code == _VECT_8, 8, 0)
+        passed = np.cumsum(length) - length  # columns that vectors before this word have stepped over
+        vectors = np.flatnonzero(length)
+        base, last_base = _hold(is_base, (value & 0x7FF) - passed, self._base_x, vectors)
+        sign, self._base_polarity = _hold(is_base, value >> 11, self._base_polarity, vectors)
+        self._base_x = last_base + int(length.sum())
+        bits = np.where(length[vectors] == 8, value[vectors] & 0xFF, value[vectors])
+        row, bit = np.nonzero(bits[:, None] >> np.arange(12) & 1)
+        where = np.concatenate([where, vectors[row]])
+        order = np.argsort(where, kind="stable")
+        x = np.concatenate([x, (base + passed[vectors])[row] + bit])[order]
+        return where[order], x, np.concatenate([polarity, sign[row]])[order]
+
+
+def encode_mono(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    polarity: NDArray[np.uint8],
+    *,
+    width: int,
+    height: int,
+    base_us: int,
+    allocate: Allocate | None = None,
+) -> Bytes:
+    """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
+
+    Args:
+        t_us: Times, sorted [us], shape [n].
+        x: Columns [px], shape [n].
+        y: Rows [px], shape [n].
+        polarity: 1: brighter, 0: darker, shape [n].
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+        base_us: Time not after that of the first event [us].
+        allocate: Makes room for the events; None: a new array.
+
+    Raises:
+        EventCodecError: The sensor has too many rows, an event is outside of it or has another polarity, or
+            times decrease or reach over more than 4.29 s.
+    """
+    if width > 2**16 or height > 2**15:
+        raise EventCodecError(f"mono holds at most 65536 x 32768 pixels, not {width} x {height}")
+    count = len(t_us)
+    _check(t_us, x, y, polarity, width, height)
+    if count and not 0 <= int(t_us[0]) - base_us <= int(t_us[-1]) - base_us <= _MONO_SPAN_MAX_US:
+        raise EventCodecError(
+            f"mono holds times from its base to 4.29 s later, got {t_us[0]} to {t_us[-1]} us for {base_us} us"
+        )
+    out = (_new_bytes if allocate is None else allocate)(8 * count)
+    quarters = out.view("<u2").reshape(count, 4)
+    after_ns = t_us - base_us
+    after_ns *= 1000
+    out.view("<u4").reshape(count, 2)[:, 0] = after_ns
+    quarters[:, 2] = x
+    row = polarity.astype(np.uint16)
+    row <<= 15
+    row |= y
+    quarters[:, 3] = row
+    return out
+
+
+def decode_mono(data: Buffer | Bytes, *, base_ns: int) -> EventColumns:
+    """Return the events of a packet, with times in nanoseconds.
+
+    Args:
+        data: Words of 64 bits, little endian.
+        base_ns: The packet's `time_base` [ns].
+
+    Raises:
+        EventCodecError: It does not consist of words of 8 bytes.
+    """
+    words = _words(data, "<u8", "mono")
+    quarters = words.view("<u2").reshape(len(words), 4)
+    t = (words & 0xFFFFFFFF).astype(np.int64) + base_ns
+    row = quarters[:, 3]
+    return EventColumns(t, quarters[:, 2].copy(), row & np.uint16(0x7FFF), (row >> 15).astype(np.uint8))
+
+
+DVS_RECORD = np.dtype(
+    {
+        "names": ["x", "y", "sec", "nanosec", "polarity"],
+        "formats": ["<u2", "<u2", "<i4", "<u4", "u1"],
+        "offsets": [0, 2, 6, 10, 14],
+        "itemsize": 16,
+    }
+)
+"""A dvs_msgs/Event in an array, in CDR, from the second one on; the first has no gap before its time."""
+
+
+def dvs_size(count: int) -> int:
+    """Return how many bytes the records of so many events take in an array, in CDR."""
+    return 16 * count - 3 if count else 0
+
+
+def write_dvs(
+    out: Bytes,
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    polarity: NDArray[np.uint8],
+) -> None:
+    """Write events as the records of a dvs_msgs/EventArray.
+
+    Args:
+        out: Bytes to write to, `dvs_size` of them and 3 more, from a multiple of 4 on in the message.
+        t_us: Times [us], shape [n].
+        x: Columns [px], shape [n].
+        y: Rows [px], shape [n].
+        polarity: 1: brighter, 0: darker, shape [n].
+    """
+    out[:] = 0
+    if not len(t_us):
+        return
+    second = t_us // 1_000_000
+    nanosecond = t_us - second * 1_000_000
+    nanosecond *= 1000
+    # The first record lacks 2 bytes before its time; the others lie 16 apart.
+    records = np.frombuffer(out.data, DVS_RECORD, count=len(t_us) - 1, offset=14)
+    records["x"], records["y"] = x[1:], y[1:]
+    records["sec"], records["nanosec"] = second[1:], nanosecond[1:]
+    records["polarity"] = polarity[1:]
+    first = np.frombuffer(
+        out.data, [("x", "<u2"), ("y", "<u2"), ("sec", "<i4"), ("ns", "<u4"), ("p", "u1")], 1
+    )
+    first[0] = (x[0], y[0], second[0], nanosecond[0], polarity[0])
+
+
+class EventPicture:
+    """Draws the events of some time on white: a pixel's last one decides; brighter: blue, darker: red."""
+
+    COLORS = np.array([[255, 255, 255], [220, 30, 30], [30, 60, 220]], np.uint8)
+    """Red, green, blue of a pixel without events, that became darker, that became brighter."""
+
+    def __init__(self, *, width: int, height: int) -> None:
+        self.width = width
+        self.height = height
+        self._last = np.zeros((height, width), np.uint8)
+
+    def add(self, x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8]) -> None:
+        """Draw events, in the order of their times.
+
+        Raises:
+            EventCodecError: An event is outside of the picture, or has another polarity than 0 and 1.
+        """
+        _check_pixels(x, y, polarity, self.width, self.height)
+        pixel = y.astype(np.intp)
+        pixel *= self.width
+        pixel += x
+        self._last.reshape(-1)[pixel] = polarity + np.uint8(1)
+
+    def take(self) -> NDArray[np.uint8]:
+        """Return the picture, shape [height, width, 3], and begin a new one."""
+        picture: NDArray[np.uint8] = self.COLORS.take(self._last, axis=0)
+        self._last[:] = 0
+        return picture
+
+
+def _check(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    polarity: NDArray[np.uint8],
+    width: int,
+    height: int,
+) -> None:
+    _check_pixels(x, y, polarity, width, height)
+    if not len(t_us) == len(x):
+        raise EventCodecError(f"there are {len(t_us)} times for {len(x)} events")
+    if (t_us[1:] < t_us[:-1]).any():
+        raise EventCodecError("events are not sorted by time")
+
+
+def _check_pixels(
+    x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8], width: int, height: int
+) -> None:
+    if not len(x) == len(y) == len(polarity):
+        raise EventCodecError(f"there are {len(x)} columns, {len(y)} rows and {len(polarity)} polarities")
+    if len(x) and (x.max() >= width or y.max() >= height):
+        raise EventCodecError(
+            f"an event in column {x.max()} or row {y.max()} of a sensor with {width} x {height}"
+        )
+    if len(x) and polarity.max() > 1:
+        raise EventCodecError(f"polarity is 0 or 1, got {polarity.max()}")
+
+
+def _new_bytes(size: int) -> Bytes:
+    return np.empty(size, np.uint8)
+
+
+def _words(data: Any, dtype: str, encoding: str) -> NDArray[Any]:
+    view = memoryview(data).cast("B")
+    size = np.dtype(dtype).itemsize
+    if len(view) % size:
+        raise EventCodecError(f"{encoding} consists of words of {size} bytes, got {len(view)} bytes")
+    return np.frombuffer(view, dtype)
+
+
+def _hold(
+    mask: NDArray[np.bool_],
+    values: NDArray[Any],
+    initial: int,
+    where: NDArray[np.intp],
+    *,
+    selected: bool = False,
+) -> tuple[NDArray[np.int64], int]:
+    """Hold a value until the next one.
+
+    Args:
+        mask: Which words set it.
+        values: What they set it to; of all words, or, if `selected`, of those only.
+        initial: Value before the first one.
+        where: Words at which the value is asked for.
+        selected: See `values`.
+
+    Returns:
+        The values there, and the last one.
+    """
+    set_to = values if selected else values[mask]
+    table = np.concatenate([[initial], set_to.astype(np.int64)])
+    return table[np.cumsum(mask, dtype=np.int32)[where]], int(table[-1])
