@@ -14,7 +14,9 @@ from neurosim_core.schedule import batch_end_ns
 from neurosim_core.simulation import Batch, Model, State, free_lanes, see, skip
 
 _LAG_PERIODS = (2, 100)
-_DROP_LANES = 256
+"""Bounds of how far cameras may be behind, in control periods."""
+_SPARE_PERIODS = 32
+"""Further periods that are flown while one picture takes too long, where frames are left out."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -71,11 +73,11 @@ class Cameras:
             self._jobs.extend(jobs)
             self._changed.notify_all()
 
-    def leave_out(self, until_ns: int) -> None:
-        """Do not render what waits and ended at a simulated time [ns] or before."""
+    def leave_out(self, vehicle: str, until_ns: int) -> None:
+        """Do not render what waits of a vehicle and ended at a simulated time [ns] or before."""
         with self._changed:
             for job in self._jobs:
-                if job.batch.until_ns <= until_ns:
+                if job.vehicle == vehicle and job.batch.until_ns <= until_ns:
                     job.left_out = True
 
     def wait_for_room(self, state: State, count: int, stop: Callable[[], bool]) -> bool:
@@ -194,25 +196,34 @@ class Lanes:
     """The most batches in a control period."""
     lag_ns: int
     """How long a picture may take: as long as there is between two of the slowest camera [ns]."""
+    lag_count: int
+    """Batches in that time."""
     count: int
-    """Batches that may wait."""
+    """The most batches that may wait."""
+
+    def needed(self, *, drop: bool) -> int:
+        """Return how many must be free before a control period is flown.
+
+        Args:
+            drop: What is too late is left out; otherwise it is waited for.
+        """
+        return self.batch_count if drop else self.count - self.lag_count + self.batch_count
 
 
-def plan_lanes(model: Model, *, drop: bool) -> Lanes:
-    """Return how far the cameras of a vehicle may be behind.
-
-    Args:
-        model: What is flown.
-        drop: Leave out what comes later than that, in place of waiting for it.
-    """
+def plan_lanes(model: Model) -> Lanes:
+    """Return how far the cameras of a vehicle may be behind."""
     period_ns = model.schedule.control.stamp_ns(1)
     batch_ns = batch_end_ns(model.schedule, 0, period_ns)
-    batch_count = -(-period_ns // max(batch_ns, 1)) + 1
+    batch_count = -(-period_ns // max(batch_ns, 1)) + 1  # where rates do not divide, and for stamp 0
     least, most = _LAG_PERIODS
     slowest_ns = max((cast.rate.stamp_ns(1) for cast in model.casts), default=0)
     periods = min(max(-(-slowest_ns // period_ns), least), most)
-    count = batch_count * (_DROP_LANES if drop else periods)
-    return Lanes(batch_count=batch_count + 1, lag_ns=periods * period_ns, count=count)
+    return Lanes(
+        batch_count=batch_count,
+        lag_ns=periods * period_ns,
+        lag_count=batch_count * periods,
+        count=batch_count * (periods + _SPARE_PERIODS),
+    )
 
 
 def sees_inline(device: str) -> bool:

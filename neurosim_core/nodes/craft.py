@@ -72,7 +72,7 @@ class Craft:
         self.has_newcomer = False
         self._cameras = frozenset(name for cast in model.casts for name in cast.names)
         self._active: frozenset[str] = frozenset()
-        self.lanes: Lanes = plan_lanes(model, drop=False)
+        self.lanes: Lanes = plan_lanes(model)
         self.state: State = self.make_state(seed=config.seed)
 
     def make_state(self, *, seed: int, start: StartState | None = None) -> State:
@@ -82,7 +82,6 @@ class Craft:
             ValueError: The start is of a wrong shape or not finite.
         """
         live = self.model.config.live
-        self.lanes = plan_lanes(self.model, drop=live.overrun == "drop")
         return make_state(
             self.model,
             lane_count=1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -61,7 +62,10 @@ class Recorder:
 
         Raises:
             OSError: A folder cannot be written to.
+            ImportError: h5py is not installed.
         """
+        if importlib.util.find_spec("h5py") is None:
+            raise ImportError("h5py is not installed: pip install 'neurosim[record]'")
         self._models = models
         self._folders = folders
         for name, folder in folders.items():

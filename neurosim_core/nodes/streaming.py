@@ -64,10 +64,11 @@ class Streaming:
             DynamicsError: The integration failed.
             RuntimeError: The cameras failed.
         """
+        drop = live.overrun == "drop" and self._pacer.factor > 0.0
         for craft in self._crafts:
-            if live.overrun == "drop" and self._pacer.factor > 0.0:
-                self._cameras.leave_out(stamp_ns - craft.lanes.lag_ns)
-            if not self._cameras.wait_for_room(craft.state, craft.lanes.batch_count, stop):
+            if drop:
+                self._cameras.leave_out(craft.name, stamp_ns - craft.lanes.lag_ns)
+            if not self._cameras.wait_for_room(craft.state, craft.lanes.needed(drop=drop), stop):
                 return False
             self._cameras.look(craft.name, craft.model, craft.state, craft.fly(stamp_ns))
         return True
