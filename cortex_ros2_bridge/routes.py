@@ -30,7 +30,7 @@ CORTEX_TYPES: Mapping[str, type[Any]] = {
 
 ROOTED = frozenset({"/clock", "/tf", "/tf_static", "/diagnostics"})
 """ROS topics that every node expects under these very names: no namespace goes before them."""
-SHARED = frozenset({"/tf", "/tf_static"})
+SHARED = frozenset({"/tf", "/tf_static", "/diagnostics"})
 """ROS topics that several routes may publish on."""
 INFO = "/info"
 """The calibration of a camera T is on T/info."""
@@ -96,6 +96,10 @@ RULES: tuple[Rule, ...] = (
     Rule("cortex/RotorSpeeds", "actuator_msgs/msg/Actuators", "out", "{topic}", STREAM),
     Rule("cortex/Path", "nav_msgs/msg/Path", "out", "{topic}", QOS["latched"]),
     Rule("cortex/Text", "std_msgs/msg/String", "out", "{topic}"),
+    Rule("cortex/Collision", "neurosim/msg/Collision", "out", "{topic}"),
+    Rule("cortex/Simulation", "std_msgs/msg/String", "out", "{topic}", QOS["latched"]),
+    Rule("cortex/SimulatorStatus", "neurosim/msg/SimulatorStatus", "out", "{topic}"),
+    Rule("cortex/SimulatorStatus", "diagnostic_msgs/msg/DiagnosticArray", "out", "/diagnostics"),
     Rule("cortex/MotorCommand", "actuator_msgs/msg/Actuators", "in", "{base}/actuators", NEWEST),
     Rule(
         "cortex/RateThrustCommand", "mavros_msgs/msg/AttitudeTarget", "in", "{base}/attitude_target", NEWEST
@@ -112,6 +116,7 @@ RULES: tuple[Rule, ...] = (
         NEWEST,
     ),
     Rule("cortex/Reset", "std_msgs/msg/Empty", "call", "{topic}", NEWEST),
+    Rule("cortex/Reset", "neurosim/msg/Reset", "call", "{topic}_to", NEWEST),
     Rule("cortex/Step", "std_msgs/msg/UInt32", "call", "{topic}", NEWEST),
     Rule("cortex/Trigger", "std_msgs/msg/Empty", "call", "{topic}", NEWEST),
 )
@@ -201,6 +206,19 @@ def vehicle_of(topic: str) -> str:
         topic = topic.removesuffix(end)
     base, command, _ = topic.rpartition("/command/")
     return (base if command else topic.rpartition("/")[0]).strip("/")
+
+
+def odometry_of(vehicle: str, seen: Seen) -> str | None:
+    """Return the topic that says where a vehicle is: the one that moves it in tf, else any; or None."""
+    topics = [
+        t.topic
+        for t in seen.topics
+        if t.published
+        and t.type_name == "cortex/Odometry"
+        and _is_known(t)
+        and vehicle_of(t.topic) == vehicle
+    ]
+    return min(topics, key=lambda topic: (topic.rpartition("/")[2] not in _TF_SOURCES, topic), default=None)
 
 
 def _candidates(seen: Seen) -> list[tuple[Route, Rule]]:

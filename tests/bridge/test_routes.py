@@ -11,6 +11,7 @@ from cortex.messages import (
     CameraInfo,
     Clock,
     Collision,
+    Delivery,
     Events,
     Image,
     Imu,
@@ -21,7 +22,9 @@ from cortex.messages import (
     RateThrustCommand,
     Reset,
     RotorSpeeds,
+    Simulation,
     SimulatorReply,
+    SimulatorStatus,
     Step,
     Transform,
     Trigger,
@@ -41,6 +44,7 @@ def topic(name, kind, *, published=True, fingerprint=None):
 DRONE = Seen(
     (
         topic("/clock", Clock),
+        topic("/drone/collision", Collision),
         topic("/drone/command/attitude", AttitudeCommand, published=False),
         topic("/drone/command/motor_speeds", MotorCommand, published=False),
         topic("/drone/command/position", PoseCommand, published=False),
@@ -56,6 +60,8 @@ DRONE = Seen(
         topic("/drone/rgb/info", CameraInfo),
         topic("/drone/rgb/transform", Transform),
         topic("/drone/rotor_speeds", RotorSpeeds),
+        topic("/simulation", Simulation),
+        topic("/status", SimulatorStatus),
     ),
     (("/pause", "cortex/Trigger"), ("/reset", "cortex/Reset"), ("/step", "cortex/Step")),
 )
@@ -100,6 +106,11 @@ def test_every_standard_topic_has_its_routes():
         ),
         ("/pause <- /pause", "std_msgs/Empty"),
         ("/reset <- /reset", "std_msgs/Empty"),
+        ("/reset <- /reset_to", "neurosim/Reset"),
+        ("/simulation -> /simulation", "std_msgs/String"),
+        ("/status -> /status", "neurosim/SimulatorStatus"),
+        ("/status -> /diagnostics", "diagnostic_msgs/DiagnosticArray"),
+        ("/drone/collision -> /drone/collision", "neurosim/Collision"),
         ("/step <- /step", "std_msgs/UInt32"),
     }
     routes, problems = make_routes(DRONE, load(None))
@@ -110,7 +121,7 @@ def test_every_standard_topic_has_its_routes():
 def test_latched_topics_stay_latched():
     """tf_static, path and calibrations reach those who come later; streams do not wait for anybody."""
     latched = {r.ros_topic for r in default_routes(DRONE) if r.qos.durability == "transient_local"}
-    assert latched == {"/tf_static", "/drone/path", "/drone/events/camera_info"}
+    assert latched == {"/tf_static", "/simulation", "/drone/path", "/drone/events/camera_info"}
 
 
 def test_a_command_that_is_only_published_is_no_route():
@@ -169,6 +180,7 @@ def test_select():
     assert {
         key[0] for key in routed({"include": ["/drone/*"], "exclude": ["*/events*", "/drone/command/*"]})
     } == {
+        "/drone/collision",
         "/drone/imu",
         "/drone/imu/transform",
         "/drone/odometry",
@@ -197,7 +209,7 @@ def test_what_cannot_be_is_said_and_the_rest_goes_on():
     seen = Seen(
         (
             topic("/2/imu", Imu),
-            topic("/drone/collision", Collision),
+            topic("/drone/delivery", Delivery),
             topic("/drone/gps", Imu, fingerprint=1),
             topic("/drone/imu", Imu),
             topic("/drone/sonar", Sonar),

@@ -1,0 +1,421 @@
+"""The bridge: it looks at both sides twenty times a second, and connects what belongs together.
+
+Messages pass on the callback thread of a Cortex node (to ROS) and on threads of the backend (to Cortex); what
+is here only opens, closes and counts. Nothing waits for anybody: a queue that is full loses its oldest
+messages, which are counted, and shown on /diagnostics.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+from cortex import Node, Publisher
+from cortex_ros2_bridge import convert, diagnostics
+from cortex_ros2_bridge.backend.base import Backend, BackendError, RosPublisher
+from cortex_ros2_bridge.config import QOS, BridgeConfig, ConfigError
+from cortex_ros2_bridge.frames import FrameNames
+from cortex_ros2_bridge.incoming import Caller, Incoming, Target
+from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Whereabouts
+from cortex_ros2_bridge.routes import (
+    CORTEX_TYPES,
+    INFO,
+    Route,
+    Seen,
+    look,
+    make_routes,
+    odometry_of,
+    vehicle_of,
+)
+from cortex_ros2_bridge.tally import Tally, Totals
+
+logger = logging.getLogger(__name__)
+
+LOOK_INTERVAL_S = 0.05
+DIAGNOSTICS_INTERVAL_S = 1.0
+GONE_S = 10.0
+"""For so long a route outlives its Cortex topic, so that a simulator that is restarted finds it open [s]."""
+RETRY_S = 1.0
+"""When a route is tried again that the backend could not open [s]."""
+TF_STATIC = "/tf_static"
+
+Key = tuple[str, str, str, str]
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+V = TypeVar("V", bound=_Closable)
+
+
+class Shared(Generic[V]):
+    """Things that several routes use: opened for the first of them, and closed after the last."""
+
+    def __init__(self) -> None:
+        """Hold nothing."""
+        self._held: dict[Any, tuple[V, int]] = {}
+
+    def take(self, stack: contextlib.ExitStack, key: Any, make: Callable[[], V]) -> V:
+        """Return the thing of a key; it is given back when the stack closes."""
+        thing, users = self._held[key] if key in self._held else (make(), 0)
+        self._held[key] = thing, users + 1
+        stack.callback(self._give_back, key)
+        return thing
+
+    def values(self) -> list[V]:
+        """Return what is open now."""
+        return [thing for thing, _ in self._held.values()]
+
+    def _give_back(self, key: Any) -> None:
+        thing, users = self._held[key]
+        if users > 1:
+            self._held[key] = thing, users - 1
+        else:
+            del self._held[key]
+            thing.close()
+
+
+@dataclass(kw_only=True, eq=False)
+class _Link:
+    """A route that is open."""
+
+    route: Route
+    tally: Tally
+    listeners: Callable[[], int]
+    """How many there are on the ROS side: subscribers, or publishers of commands."""
+    resources: contextlib.ExitStack
+    gone_s: float | None = None
+    """When it is closed, because its Cortex topic has gone [s]."""
+    before: Totals = field(default_factory=Totals)
+    """As of the last diagnostics."""
+
+
+class Bridge:
+    """Connects the topics and services of Cortex with those of ROS 2. A context manager.
+
+    Attributes:
+        config: What it does.
+        problems: Why there are no routes for some topics, a sentence each.
+    """
+
+    def __init__(self, config: BridgeConfig, backend: Backend, node: Node) -> None:
+        """Prepare; nothing but /diagnostics is connected before `update` or `run`.
+
+        Args:
+            config: What to do.
+            backend: The ROS side; it stays open.
+            node: The Cortex side; it stays open.
+
+        Raises:
+            ConfigError: The names of frames are not what they must be.
+            BackendError: The backend cannot publish.
+        """
+        self.config = config
+        self.problems: list[str] = []
+        self._backend = backend
+        self._node = node
+        try:
+            self._frames = FrameNames(**config.frames)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"frames: {error}") from None
+        self._lock = threading.RLock()
+        self._closed = False
+        self._seen: Seen | None = None
+        self._retry_s: float | None = None
+        self._said: set[str] = set()
+        self._links: dict[Key, _Link] = {}
+        self._feeds: Shared[Feed] = Shared()
+        self._incoming: Shared[Incoming] = Shared()
+        self._ros_publishers: Shared[RosPublisher] = Shared()
+        self._cortex_publishers: Shared[Publisher[Any]] = Shared()
+        self._vehicles: dict[str, Whereabouts] = {}
+        self._static = StaticTransforms(convert.static_transforms, self._frames)
+        self._resources = contextlib.ExitStack()
+        self._static_publisher: RosPublisher | None = None
+        self._diagnostics = self._ros_publishers.take(
+            self._resources,
+            diagnostics.TOPIC,
+            lambda: backend.publisher(diagnostics.TOPIC, diagnostics.TYPE, QOS["default"]),
+        )
+        self._diagnosed_s = time.monotonic()
+
+    def run(self, stop: threading.Event) -> None:
+        """Work until told to stop."""
+        while not stop.is_set():
+            self.update()
+            stop.wait(LOOK_INTERVAL_S)
+
+    def update(self) -> None:
+        """Look at both sides once, and connect and disconnect accordingly."""
+        with self._lock:
+            if self._closed:
+                return
+            now_s = time.monotonic()
+            seen = look(self._node)
+            if seen != self._seen or (self._retry_s is not None and now_s >= self._retry_s):
+                self._seen, self._retry_s = seen, None
+                self._reroute(seen, now_s)
+            for key, link in list(self._links.items()):
+                if link.gone_s is not None and now_s >= link.gone_s:
+                    self._close_link(key)
+            for incoming in self._incoming.values():
+                incoming.look()
+            for feed in self._feeds.values():
+                feed.look()
+            self._publish_static()
+            if now_s - self._diagnosed_s >= DIAGNOSTICS_INTERVAL_S:
+                self._diagnose(now_s - self._diagnosed_s)
+                self._diagnosed_s = now_s
+
+    def routes(self) -> list[Route]:
+        """Return the routes that are open now."""
+        with self._lock:
+            return [link.route for link in self._links.values()]
+
+    def totals(self) -> dict[str, Totals]:
+        """Return what the open routes have done, by "/cortex/topic -> /ros/topic"."""
+        with self._lock:
+            return {str(link.route): link.tally.totals() for link in self._links.values()}
+
+    def close(self) -> None:
+        """Disconnect everything. Node and backend stay open."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                for key in list(self._links):
+                    self._close_link(key)
+                self._resources.close()
+
+    def __enter__(self) -> Bridge:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Routes
+
+    def _reroute(self, seen: Seen, now_s: float) -> None:
+        """Open the routes of what is new; those of what has gone have some time to come back."""
+        routes, problems = make_routes(seen, self.config)
+        wanted = {route.key for route in routes}
+        for key, link in self._links.items():
+            if key in wanted:
+                link.gone_s = None
+            elif link.gone_s is None:
+                link.gone_s = now_s + GONE_S
+                logger.info("%s: the Cortex side has gone", link.route)
+        for route in routes:
+            if route.key not in self._links:
+                problems += self._open(route, seen, now_s)
+        self._watch_vehicles(seen)
+        self.problems = problems
+        for problem in problems:
+            if problem not in self._said:
+                logger.warning("%s", problem)
+        self._said = set(problems)
+
+    def _open(self, route: Route, seen: Seen, now_s: float) -> list[str]:
+        """Open a route; returns why that was not possible."""
+        opens = {"out": self._open_out, "in": self._open_in, "call": self._open_call}
+        with contextlib.ExitStack() as stack:
+            try:
+                tally, listeners = opens[route.direction](route, seen, stack)
+            except ValueError as error:
+                return [f"no route {route}: {error}"]
+            except BackendError as error:
+                self._retry_s = now_s + RETRY_S
+                return [f"no route {route} yet: {error}"]
+            self._links[route.key] = _Link(
+                route=route, tally=tally, listeners=listeners, resources=stack.pop_all()
+            )
+        logger.info("%s (%s)", route, route.ros_type)
+        return []
+
+    def _close_link(self, key: Key) -> None:
+        link = self._links.pop(key)
+        link.resources.close()
+        logger.info("%s: closed", link.route)
+
+    def _open_out(
+        self, route: Route, seen: Seen, stack: contextlib.ExitStack
+    ) -> tuple[Tally, Callable[[], int]]:
+        publisher = self._ros_publishers.take(
+            stack,
+            route.ros_topic,
+            lambda: self._backend.publisher(route.ros_topic, route.ros_type, route.qos),
+        )
+        feed = self._feed(route.cortex_topic, route.cortex_type, stack)
+        if route.ros_topic == TF_STATIC:
+            tally = Tally(str(route))
+            self._tap(feed, lambda message: self._take_transform(message, tally), lambda: True, stack)
+            return tally, lambda: publisher.subscriber_count
+        kind = CORTEX_TYPES[route.cortex_type]
+        output = Outgoing(
+            route,
+            publisher,
+            convert.OUT[kind, route.ros_type],
+            self._context(route),
+            latched=any(t.topic == route.cortex_topic and t.latched for t in seen.topics),
+        )
+        if route.ros_type == "sensor_msgs/msg/CameraInfo" and route.cortex_type != "cortex/CameraInfo":
+            info = self._feed(route.cortex_topic + INFO, "cortex/CameraInfo", stack)
+            self._tap(info, output.take_camera_info, lambda: True, stack)
+        feed.add(output)
+        stack.callback(feed.remove, output)
+        return output.tally, lambda: output.subscriber_count
+
+    def _open_in(
+        self, route: Route, seen: Seen, stack: contextlib.ExitStack
+    ) -> tuple[Tally, Callable[[], int]]:
+        kind = CORTEX_TYPES[route.cortex_type]
+        publisher = self._cortex_publishers.take(
+            stack,
+            (route.cortex_topic, route.cortex_type),
+            lambda: self._node.publisher(route.cortex_topic, kind),
+        )
+        target = Target(route, publisher, convert.IN[route.ros_type, kind], self._context(route))
+        whereabouts = self._vehicles.setdefault(vehicle_of(route.cortex_topic), Whereabouts())
+
+        def subscribe() -> Incoming:
+            incoming = Incoming(whereabouts)
+            incoming.subscription = self._backend.subscription(
+                route.ros_topic, route.ros_type, route.qos, incoming.take
+            )
+            return incoming
+
+        incoming = self._incoming.take(stack, route.ros_topic, subscribe)
+        incoming.add(target)
+        stack.callback(incoming.remove, target)
+        return target.tally, lambda: incoming.publisher_count
+
+    def _open_call(
+        self, route: Route, seen: Seen, stack: contextlib.ExitStack
+    ) -> tuple[Tally, Callable[[], int]]:
+        function = convert.IN[route.ros_type, CORTEX_TYPES[route.cortex_type]]
+        caller = Caller(route, self._node, function, self._context(route))
+        stack.callback(caller.close)
+        subscription = self._backend.subscription(route.ros_topic, route.ros_type, route.qos, caller.take)
+        stack.callback(subscription.close)
+        if route.ros_type.startswith("std_msgs/"):  # a Trigger has no more to say than these
+            service = self._backend.service(route.ros_topic, caller.serve)
+            if service is not None:
+                stack.callback(service.close)
+        return caller.tally, lambda: subscription.publisher_count
+
+    def _context(self, route: Route) -> convert.Context:
+        return convert.Context(
+            frames=self._frames,
+            vehicle=vehicle_of(route.cortex_topic),
+            frame_id=route.cortex_topic.strip("/"),
+            options=route.options,
+        )
+
+    def _feed(self, topic: str, type_name: str, stack: contextlib.ExitStack) -> Feed:
+        return self._feeds.take(
+            stack, (topic, type_name), lambda: Feed(self._node, topic, CORTEX_TYPES[type_name])
+        )
+
+    def _tap(
+        self,
+        feed: Feed,
+        tap: Callable[[Any], None],
+        wants: Callable[[], bool],
+        stack: contextlib.ExitStack,
+    ) -> None:
+        feed.taps[tap] = wants
+        stack.callback(feed.taps.pop, tap)
+
+    # Vehicles
+
+    def _watch_vehicles(self, seen: Seen) -> None:
+        """Follow what time it is for the vehicles that are commanded, and how their frames hang together."""
+        for vehicle, whereabouts in self._vehicles.items():
+            topic = odometry_of(vehicle, seen)
+            clock = next(
+                (t.topic for t in seen.topics if t.type_name == "cortex/Clock" and t.published), None
+            )
+            if whereabouts.sources == (topic, clock):
+                continue
+            whereabouts.forget((topic, clock))
+            stack = whereabouts.resources
+            wants = self._commands_come_for(vehicle)
+            if topic is not None:
+                self._tap(
+                    self._feed(topic, "cortex/Odometry", stack), whereabouts.take_odometry, wants, stack
+                )
+            if clock is not None:
+                self._tap(self._feed(clock, "cortex/Clock", stack), whereabouts.take_clock, wants, stack)
+        tf_static = {vehicle_of(r.cortex_topic) for r in self.routes() if r.ros_topic == TF_STATIC}
+        moving = {vehicle_of(r.cortex_topic) for r in self.routes() if r.ros_topic == "/tf"}
+        self._static.keep(tf_static, moving)
+
+    def _commands_come_for(self, vehicle: str) -> Callable[[], bool]:
+        whereabouts = self._vehicles[vehicle]
+        return lambda: any(i.heard for i in self._incoming.values() if i.whereabouts is whereabouts)
+
+    def _take_transform(self, transform: Any, tally: Tally) -> None:
+        tally.receive()
+        self._static.add(transform)
+        tally.send()
+
+    def _publish_static(self) -> None:
+        """Publish all transforms that do not change, if there is a new one."""
+        if not self._static.changed:
+            return
+        if self._static_publisher is None:
+            self._static_publisher = self._ros_publishers.take(
+                self._resources,
+                TF_STATIC,
+                lambda: self._backend.publisher(TF_STATIC, "tf2_msgs/msg/TFMessage", QOS["latched"]),
+            )
+        try:
+            self._static_publisher.publish(self._static.message())
+        except BackendError as error:
+            logger.warning("%s: %s", TF_STATIC, error)
+
+    # Diagnostics
+
+    def _diagnose(self, elapsed_s: float) -> None:
+        """Publish how everything is doing."""
+        statuses = [
+            diagnostics.Status(
+                name="bridge",
+                level=diagnostics.WARN if self.problems else diagnostics.OK,
+                message="; ".join(self.problems) or f"{len(self._links)} routes",
+                values=(
+                    ("backend", self._backend.name),
+                    ("distro", self._backend.distro),
+                    ("routes", str(len(self._links))),
+                    ("cortex_subscriptions", str(sum(feed.active for feed in self._feeds.values()))),
+                ),
+            )
+        ]
+        for link in self._links.values():
+            now = link.tally.totals()
+            statuses.append(
+                diagnostics.route_status(
+                    str(link.route),
+                    now,
+                    link.before,
+                    listeners=link.listeners(),
+                    elapsed_s=elapsed_s,
+                    reason=link.tally.reason,
+                    types=f"{link.route.cortex_type} and {link.route.ros_type}",
+                )
+            )
+            link.before = now
+        if self._diagnostics.subscriber_count:
+            stamps = [w.now_ns for w in self._vehicles.values() if w.now_ns is not None]
+            array = diagnostics.diagnostic_array(
+                statuses, stamp_ns=max(stamps, default=0), node=self.config.node
+            )
+            try:
+                self._diagnostics.publish(array)
+            except BackendError as error:
+                logger.warning("%s: %s", diagnostics.TOPIC, error)

@@ -1,0 +1,207 @@
+"""The command `cortex-ros2-bridge`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from cortex_ros2_bridge.config import BridgeConfig, ConfigError, check_namespace, load
+from cortex_ros2_bridge.routes import ROOTED, Route, look, make_routes
+
+INTERRUPTED = 130
+LIST_S = 1.5
+"""How long `--list` and `--print-config` look for nodes [s]."""
+EXIT_S = 0.9
+"""Longest time to leave in; then the process ends as it is [s]."""
+
+_EXAMPLES = """examples:
+  cortex-ros2-bridge                                   all standard topics, both ways
+  cortex-ros2-bridge --namespace /neurosim             with /neurosim in front of them
+  cortex-ros2-bridge --list                            what would go where
+  cortex-ros2-bridge --print-config > bridge.yaml      settings to edit, for --config bridge.yaml
+  cortex-ros2-bridge --backend run.mcap                into a bag, until Ctrl-C
+  cortex-ros2-bridge bench                             how fast it is on this machine
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments[:1] == ["bench"]:
+        from cortex_ros2_bridge import bench
+
+        return bench.main(arguments[1:])
+    options = _parser().parse_args(arguments)
+    _log_to_console(verbose=options.verbose)
+    try:
+        config = _config(options)
+        if options.list or options.print_config:
+            return _show(config, as_yaml=options.print_config)
+        return _bridge(config)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        print(f"cortex-ros2-bridge: {error}", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="cortex-ros2-bridge",
+        description="Connect Cortex topics with ROS 2, both ways, with or without a ROS installation.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", metavar="FILE", help="settings in YAML; see --print-config")
+    parser.add_argument(
+        "--backend",
+        metavar="auto|rclpy|dds|BAG.mcap",
+        help="how to reach ROS 2: rclpy, DDS without ROS, or a bag to write; default: rclpy if it is there",
+    )
+    parser.add_argument(
+        "--distro", help="ROS distribution, such as humble or jazzy; default: ROS_DISTRO, or what is seen"
+    )
+    parser.add_argument(
+        "--namespace", help="goes before all ROS topics but /clock, /tf, /tf_static, /diagnostics"
+    )
+    parser.add_argument("--domain", type=int, help="Cortex domain; that of ROS is ROS_DOMAIN_ID")
+    parser.add_argument("--list", action="store_true", help="print which topic would go where, and exit")
+    parser.add_argument("--print-config", action="store_true", help="print all settings as YAML, and exit")
+    parser.add_argument("--verbose", "-v", action="store_true", help="say when topics are subscribed to, too")
+    # `ros2 launch` appends these to every node.
+    parser.add_argument("--ros-args", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    return parser
+
+
+def _config(options: argparse.Namespace) -> BridgeConfig:
+    config = load(options.config)
+    changes: dict[str, Any] = {
+        name: value
+        for name in ("backend", "distro", "domain")
+        if (value := getattr(options, name)) is not None
+    }
+    if options.namespace is not None:
+        changes["namespace"] = check_namespace(options.namespace) if options.namespace.strip("/") else ""
+    if changes.get("domain", 0) < 0:
+        raise ConfigError(f"domain must be >= 0, got {changes['domain']}")
+    return dataclasses.replace(config, **changes)
+
+
+def _bridge(config: BridgeConfig) -> int:
+    """Bridge until interrupted."""
+    stop = _stop_at_signals(forced=not config.backend.endswith(".mcap"))
+    from cortex import Node
+    from cortex_ros2_bridge.backend.choose import open_backend
+    from cortex_ros2_bridge.bridge import Bridge
+
+    backend = open_backend(
+        config.backend, node_name=config.node, namespace=config.namespace, distro=config.distro
+    )
+    try:
+        with Node(config.node, domain=config.domain) as node, Bridge(config, backend, node) as bridge:
+            _say(f"/{config.node}: {backend.name}, {backend.distro}; waiting for Cortex topics, Ctrl-C ends")
+            bridge.run(stop)
+    finally:
+        backend.close()
+    return 0
+
+
+def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
+    """Print what would go where."""
+    from cortex import Node
+
+    with Node(f"{config.node} list", domain=config.domain) as node:
+        node.wait_for_registry(LIST_S)
+        seen, until_s = look(node), time.monotonic() + LIST_S
+        while not seen.topics and time.monotonic() < until_s:
+            time.sleep(0.05)
+            seen = look(node)
+    routes, problems = make_routes(seen, config)
+    if as_yaml:
+        sys.stdout.write(to_yaml(config, routes))
+    elif not routes:
+        print("no Cortex topics that go anywhere; is a simulator running? (cortex topics)")
+    else:
+        widths = [max(len(row[n]) for row in map(_row, routes)) for n in range(3)]
+        for row in map(_row, routes):
+            print(
+                "  ".join(text.ljust(width) for text, width in zip(row, [*widths, 0], strict=True)).rstrip()
+            )
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    return 0
+
+
+def _row(route: Route) -> tuple[str, str, str, str]:
+    arrow = "->" if route.direction == "out" else "<-"
+    qos = route.qos
+    return (
+        route.cortex_topic,
+        f"{arrow} {route.ros_topic}",
+        route.ros_type,
+        (f"{qos.reliability}, {qos.durability}, depth {qos.depth}"),
+    )
+
+
+def to_yaml(config: BridgeConfig, routes: Sequence[Route]) -> str:
+    """Return settings as YAML that `load` reads back, with the routes that there are now as entries."""
+    settings: dict[str, Any] = {
+        name.name: getattr(config, name.name) for name in dataclasses.fields(BridgeConfig)
+    }
+    settings |= {"include": list(config.include), "exclude": list(config.exclude)}
+    settings |= {"rename": dict(config.rename), "frames": dict(config.frames)}
+    settings["routes"] = [
+        {
+            "cortex": route.cortex_topic,
+            "type": route.ros_type,
+            "ros": route.ros_topic.removeprefix("" if route.ros_topic in ROOTED else config.namespace),
+            "qos": dataclasses.asdict(route.qos),
+            "options": dict(route.options),
+        }
+        for route in routes
+    ]
+    return (
+        "# Settings of cortex-ros2-bridge, all optional; see README.md. The routes are those of now.\n"
+        + yaml.safe_dump(settings, sort_keys=False)
+    )
+
+
+def _log_to_console(*, verbose: bool) -> None:
+    """Print what the bridge logs, a line each."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+    for name in ("cortex", "cortex_ros2_bridge"):
+        logger = logging.getLogger(name)
+        logger.handlers[:] = [handler]
+        logger.propagate = False
+    logging.getLogger("cortex_ros2_bridge").setLevel(logging.DEBUG if verbose else logging.INFO)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _stop_at_signals(*, forced: bool) -> threading.Event:
+    """Return an event that SIGINT and SIGTERM set; if forced, the process ends soon after, whatever waits."""
+    stop = threading.Event()
+
+    def end(number: int, frame: object) -> None:
+        if not stop.is_set() and forced:
+            timer = threading.Timer(EXIT_S, os._exit, [0])
+            timer.daemon = True
+            timer.start()
+        stop.set()
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    return stop

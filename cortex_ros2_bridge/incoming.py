@@ -1,0 +1,293 @@
+"""ROS to Cortex: commands, checked before they fly anything, and requests to services."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from cortex import (
+    Closed,
+    Node,
+    Publisher,
+    ServiceFailed,
+    ServiceTimeout,
+    ServiceUnavailable,
+    TypeMismatch,
+)
+from cortex.messages import SimulatorReply
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.backend.base import RosSubscription
+from cortex_ros2_bridge.backend.base import Trigger as TriggerReply
+from cortex_ros2_bridge.convert import Context, ConvertError
+from cortex_ros2_bridge.outgoing import Whereabouts
+from cortex_ros2_bridge.routes import CORTEX_TYPES, Route
+from cortex_ros2_bridge.tally import Tally
+
+logger = logging.getLogger(__name__)
+
+Convert = Callable[[bytes, Context], Any]
+
+STALE_S = 0.5
+"""How far the stamp of a command may be from the newest state; the option `stale_s` changes it [s]."""
+PENDING_S = 1.0
+"""How long a command waits for a simulator that is about to subscribe to it [s]."""
+CALL_TIMEOUT_S = 30.0
+"""How long a service may take to answer; `step` answers when the steps are over [s]."""
+
+
+class Target:
+    """One route from ROS to Cortex: the topic that a command may become one of."""
+
+    def __init__(self, route: Route, publisher: Publisher[Any], convert: Convert, context: Context) -> None:
+        """Connect the two ends.
+
+        Args:
+            route: The route; its options `stale_s` and `stamp` are ours.
+            publisher: Of the Cortex topic.
+            convert: Makes the command of CDR; None: the message is for another target.
+            context: What it needs to know besides.
+
+        Raises:
+            ValueError: An option is not what it must be.
+        """
+        self.route = route
+        self.tally = Tally(str(route))
+        self.context = context
+        self.publisher = publisher
+        self.convert = convert
+        self.stale_ns, self.restamp = _check_options(route)
+
+
+class Incoming:
+    """One ROS topic of commands; its messages go to the one target that they are meant for.
+
+    Attributes:
+        whereabouts: Of the vehicle that is commanded.
+        subscription: To be set to what calls `take`.
+        publisher_count: How many there are in ROS; as of the last look.
+    """
+
+    def __init__(self, whereabouts: Whereabouts) -> None:
+        """Prepare, without a target.
+
+        Args:
+            whereabouts: Of the vehicle that is commanded.
+        """
+        self.whereabouts = whereabouts
+        self.subscription: RosSubscription | None = None
+        self.publisher_count = 0
+        self._targets: tuple[Target, ...] = ()
+        self._lock = threading.Lock()
+        self._pending: tuple[Target, Any, float] | None = None
+        self._told = 0
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody in ROS publishes; as of the last look."""
+        return self.publisher_count > 0
+
+    def add(self, target: Target) -> None:
+        """Add a target; there is more than one where the message says which (AttitudeTarget)."""
+        with self._lock:
+            self._targets = (*self._targets, target)
+
+    def remove(self, target: Target) -> None:
+        """Remove a target."""
+        with self._lock:
+            self._targets = tuple(other for other in self._targets if other is not target)
+            if self._pending is not None and self._pending[0] is target:
+                self._drop_pending("its route is closed")
+
+    def look(self) -> None:
+        """See whether anybody in ROS publishes, and what was lost; send what waits."""
+        subscription = self.subscription
+        if subscription is None:
+            return
+        self.publisher_count = subscription.publisher_count
+        lost = subscription.lost_count - self._told
+        self._told += lost
+        with self._lock:
+            if lost and self._targets:
+                self._targets[0].tally.receive(lost)
+                self._targets[0].tally.lose("on the way through ROS", lost)
+            self._send_pending()
+
+    def take(self, data: bytes) -> None:
+        """Take in a message of ROS, from any thread."""
+        with self._lock:
+            if not self._targets:
+                return
+            try:
+                for target in self._targets:
+                    if self._offer(target, data):
+                        return
+            except (ConvertError, cdr.CdrError) as error:
+                self._first_refuses(str(error))
+            except Exception as error:  # whatever is wrong with a message, the next one may be right
+                self._first_refuses(f"{type(error).__name__}: {error}")
+                logger.debug("%s: a message could not be converted", self._targets[0].route, exc_info=True)
+            else:
+                self._first_refuses("it commands nothing that Cortex has a topic for")
+
+    def close(self) -> None:
+        """Withdraw the subscription."""
+        if self.subscription is not None:
+            self.subscription.close()
+
+    def _first_refuses(self, reason: str) -> None:
+        self._targets[0].tally.receive()
+        self._targets[0].tally.refuse(reason)
+
+    def _offer(self, target: Target, data: bytes) -> bool:
+        """Offer a message to a target; returns whether that was where it belongs."""
+        context, now_ns = target.context, self.whereabouts.now_ns
+        context.now_ns = now_ns or 0
+        context.odometry = self.whereabouts.odometry
+        command = target.convert(data, context)
+        if command is None:
+            return False
+        target.tally.receive()
+        if target.restamp:
+            command = dataclasses.replace(command, stamp_ns=context.now_ns)
+        reason = _staleness(command.stamp_ns, now_ns, target.stale_ns)
+        if reason:
+            target.tally.refuse(reason)
+            return True
+        context.sequence += 1
+        if target.publisher.subscriber_count:
+            self._drop_pending("a newer one came")
+            self._publish(target, command)
+        else:
+            self._drop_pending("a newer one came before anybody had subscribed to it")
+            self._pending = target, command, time.monotonic() + PENDING_S
+        return True
+
+    def _publish(self, target: Target, command: Any) -> None:
+        with contextlib.suppress(Closed):  # the bridge is about to end
+            if target.publisher.publish(command):
+                target.tally.send()
+            else:
+                target.tally.lose("a reliable subscriber in Cortex did not take it in in time")
+
+    def _send_pending(self) -> None:
+        """Send the command that waits for a subscriber; the lock is held."""
+        if self._pending is None:
+            return
+        target, command, until_s = self._pending
+        if target.publisher.subscriber_count:
+            self._pending = None
+            self._publish(target, command)
+        elif time.monotonic() > until_s:
+            self._drop_pending("nobody in Cortex subscribes to it")
+
+    def _drop_pending(self, reason: str) -> None:
+        if self._pending is not None:
+            target, self._pending = self._pending[0], None
+            target.tally.lose(reason)
+
+
+class Caller:
+    """Turns messages of ROS into requests to one Cortex service, one by one, on a thread of its own."""
+
+    def __init__(self, route: Route, node: Node, convert: Convert, context: Context) -> None:
+        """Start the thread.
+
+        Args:
+            route: The route; its Cortex topic is the name of the service.
+            node: Who calls.
+            convert: Makes the request of CDR.
+            context: What it needs to know besides.
+        """
+        self.route = route
+        self.tally = Tally(str(route))
+        self._convert = convert
+        self._context = context
+        kind = CORTEX_TYPES[route.cortex_type]
+        self._client = node.client(route.cortex_topic, kind, SimulatorReply)
+        self._default = kind()
+        self._requests: queue.Queue[Any] = queue.Queue(maxsize=4)
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=f"call {route.cortex_topic}", daemon=True)
+        self._thread.start()
+
+    def take(self, data: bytes) -> None:
+        """Take in a message of ROS; its request waits for those before it."""
+        self.tally.receive()
+        try:
+            self._requests.put_nowait(self._convert(data, self._context))
+        except queue.Full:
+            self.tally.refuse("there are requests that have not been answered yet")
+        except (ConvertError, cdr.CdrError) as error:
+            self.tally.refuse(str(error))
+
+    def serve(self) -> TriggerReply:
+        """Call the service for a request of ROS (std_srvs/Trigger); waits for the answer."""
+        self.tally.receive()
+        reason = self._call(self._default)
+        return TriggerReply(not reason, reason)
+
+    def close(self) -> None:
+        """End the thread; a call that is under way is given up."""
+        self._closed = True
+        self._client.close()
+        with contextlib.suppress(queue.Full):
+            self._requests.put_nowait(None)
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while (request := self._requests.get()) is not None and not self._closed:
+            self._call(request)
+
+    def _call(self, request: Any) -> str:
+        """Call the service; returns why it did not do what was asked, empty if it did."""
+        try:
+            reply = self._client.call(request, timeout_s=CALL_TIMEOUT_S)
+        except Closed:
+            return "the bridge ends"
+        except (ServiceFailed, ServiceTimeout, ServiceUnavailable, TypeMismatch) as error:
+            self.tally.lose(str(error))
+            return str(error)
+        if not reply.accepted:
+            self.tally.refuse(reply.reason)
+            return str(reply.reason)
+        self.tally.send()
+        return ""
+
+
+def _check_options(route: Route) -> tuple[int | None, bool]:
+    """Return how far stamps may be off [ns], None: any; and whether commands get a stamp of ours.
+
+    Raises:
+        ValueError: An option is not what it must be.
+    """
+    stale_s = route.options.get("stale_s", STALE_S)
+    if stale_s is not None and (
+        isinstance(stale_s, bool) or not isinstance(stale_s, int | float) or not 0.0 < stale_s < math.inf
+    ):
+        raise ValueError(f"{route}: option stale_s must be > 0 or null, got {stale_s!r}")
+    stamp = route.options.get("stamp", "header")
+    if stamp not in ("header", "now"):
+        raise ValueError(f"{route}: option stamp must be header or now, got {stamp!r}")
+    return None if stale_s is None else round(stale_s * 1e9), stamp == "now"
+
+
+def _staleness(stamp_ns: int, now_ns: int | None, stale_ns: int | None) -> str:
+    """Say why a stamp is not that of a command for now; empty if it is, or if the time is not known."""
+    if now_ns is None or stale_ns is None:
+        return ""
+    age_ns = now_ns - stamp_ns
+    if age_ns > stale_ns:
+        return f"stale: it is stamped {age_ns / 1e9:.3f} s before the newest state"
+    if age_ns < -stale_ns:
+        return (
+            f"it is stamped {-age_ns / 1e9:.3f} s after the newest state: stamps are simulated time "
+            "(use_sim_time, or the stamp of the odometry that it answers, or 0 for now)"
+        )
+    return ""

@@ -1,0 +1,284 @@
+"""Cortex to ROS: one subscription for each Cortex topic, while somebody listens."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from cortex import Node, Subscriber, keep_last
+from cortex.messages import CameraInfo, Clock, Events, Image, Odometry, PointCloud, Transform
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
+from cortex_ros2_bridge.convert import Context
+from cortex_ros2_bridge.routes import Route
+from cortex_ros2_bridge.tally import Tally
+
+logger = logging.getLogger(__name__)
+
+Convert = Callable[[Any, Context], "Buffer | None"]
+
+QUEUES: dict[type[Any], int] = {Image: 8, PointCloud: 8, Events: 64}
+"""Messages that wait for their conversion; the option `queue` changes it."""
+QUEUE = 256
+REMIND_S = (0.1, 0.5)
+"""When the last message of a latched topic is sent again after a ROS subscriber has come [s].
+
+DDS calls a subscriber matched when it knows it, not when the subscriber knows us."""
+
+
+class Outgoing:
+    """One route from Cortex to ROS.
+
+    Attributes:
+        route: The route.
+        tally: What it has done.
+        wanted: Whether anybody in ROS listens, or may later; as of the last look.
+        subscriber_count: How many listen; as of the last look.
+    """
+
+    def __init__(
+        self, route: Route, publisher: RosPublisher, convert: Convert, context: Context, *, latched: bool
+    ) -> None:
+        """Connect the two ends.
+
+        Args:
+            route: The route.
+            publisher: Of the ROS topic.
+            convert: Makes CDR of a message; None: there is nothing to send.
+            context: What it needs to know besides.
+            latched: Whether the Cortex topic gives its last message to whoever comes later.
+        """
+        self.route = route
+        self.tally = Tally(str(route))
+        self.wanted = False
+        self.subscriber_count = 0
+        self._publisher = publisher
+        self._convert = convert
+        self._context = context
+        self._lasting = route.qos.durability == "transient_local"
+        self._latched = latched and not self._lasting
+        self._lock = threading.Lock()
+        self._last: bytes | None = None
+        self._last_s = 0.0
+        self._remind_s: list[float] = []
+
+    def take_camera_info(self, info: CameraInfo) -> None:
+        """Take in the calibration that goes with each image."""
+        self._context.camera_info = info
+
+    def look(self) -> bool:
+        """See who listens; returns whether anybody does, or may later."""
+        count = self._publisher.subscriber_count
+        if self._latched:
+            self._remind(count)
+        self.subscriber_count = count
+        self.wanted = self._lasting or count > 0
+        return self.wanted
+
+    def send(self, message: Any) -> None:
+        """Convert a message and publish it."""
+        tally = self.tally
+        tally.receive()
+        try:
+            data = self._convert(message, self._context)
+        except Exception as error:  # whatever is wrong with a message, the next one may be right
+            tally.refuse(f"{type(error).__name__}: {error}")
+            logger.debug("%s: a message could not be converted", self.route, exc_info=True)
+            return
+        if data is None:
+            return
+        self._context.sequence += 1
+        with self._lock:
+            try:
+                self._publisher.publish(data)
+            except BackendError as error:
+                self.tally.lose(str(error))
+                return
+            self.tally.send()
+            if self._latched:
+                self._last, self._last_s = bytes(data), time.monotonic()
+
+    def _remind(self, count: int) -> None:
+        """Send the last message of a latched topic again, if it may have been too early for a newcomer."""
+        now_s = time.monotonic()
+        if count > self.subscriber_count:
+            self._remind_s = [now_s + delay_s for delay_s in REMIND_S]
+        while self._remind_s and now_s >= self._remind_s[0]:
+            came_s = self._remind_s.pop(0)
+            with self._lock:
+                if self._last is not None and self._last_s < came_s:
+                    try:
+                        self._publisher.publish(self._last)
+                    except BackendError as error:
+                        self.tally.lose(str(error))
+
+
+class StaticTransforms:
+    """All transforms that do not change, in one message: /tf_static keeps one for whoever comes later."""
+
+    def __init__(
+        self, join: Callable[[Iterable[Transform], Iterable[str], Any], Buffer], frames: Any
+    ) -> None:
+        """Begin without any.
+
+        Args:
+            join: Makes the message of transforms and the names of vehicles.
+            frames: Names of frames.
+        """
+        self._join = join
+        self._frames = frames
+        self._transforms: dict[str, Transform] = {}
+        self._vehicles: tuple[str, ...] = ()
+        self._lock = threading.Lock()
+        self.changed = False
+
+    def add(self, transform: Transform) -> None:
+        """Take in a transform, or a newer one of the same child."""
+        with self._lock:
+            self._transforms[transform.child] = transform
+            self.changed = True
+
+    def keep(self, parents: Iterable[str], vehicles: Iterable[str]) -> None:
+        """Say which vehicles there are; transforms of others are forgotten.
+
+        Args:
+            parents: Vehicles that have transforms.
+            vehicles: Vehicles that move.
+        """
+        there = set(parents)
+        with self._lock:
+            kept = {child: t for child, t in self._transforms.items() if child.rpartition("/")[0] in there}
+            names = tuple(sorted(set(vehicles)))
+            if len(kept) < len(self._transforms) or names != self._vehicles:
+                self._transforms, self._vehicles, self.changed = kept, names, True
+
+    def message(self) -> Buffer:
+        """Return the message with all of them."""
+        with self._lock:
+            self.changed = False
+            return self._join(list(self._transforms.values()), self._vehicles, self._frames)
+
+
+class Feed:
+    """One Cortex topic: it is subscribed to only while a route or the bridge itself wants its messages.
+
+    Attributes:
+        topic: The topic.
+        taps: Functions of the bridge that get each message before the routes do; with each, what says whether
+            it wants any now.
+    """
+
+    def __init__(self, node: Node, topic: str, kind: type[Any]) -> None:
+        """Prepare; nothing is subscribed to yet.
+
+        Args:
+            node: Who subscribes.
+            topic: The topic.
+            kind: Class of its messages.
+        """
+        self.topic = topic
+        self.taps: dict[Callable[[Any], None], Callable[[], bool]] = {}
+        self._outputs: tuple[Outgoing, ...] = ()
+        self._node = node
+        self._kind = kind
+        self._queue = QUEUES.get(kind, QUEUE)
+        self._subscriber: Subscriber[Any] | None = None
+        self._told = (0, 0)
+
+    def add(self, output: Outgoing) -> None:
+        """Let a route have the messages."""
+        self._queue = output.route.options.get("queue", self._queue)
+        self._outputs = (*self._outputs, output)
+
+    def remove(self, output: Outgoing) -> None:
+        """Let a route have no more of them."""
+        self._outputs = tuple(other for other in self._outputs if other is not output)
+
+    @property
+    def active(self) -> bool:
+        """Whether it is subscribed to."""
+        return self._subscriber is not None
+
+    def look(self) -> None:
+        """See who wants its messages, and subscribe or unsubscribe accordingly; count what was lost."""
+        wanted = [output.look() for output in self._outputs]
+        if any(wanted) or any(wants() for wants in list(self.taps.values())):
+            if self._subscriber is None:
+                self._told = (0, 0)
+                self._subscriber = self._node.subscriber(
+                    self.topic, self._kind, self._take, policy=keep_last(self._queue)
+                )
+                logger.debug("%s: subscribed", self.topic)
+        elif self._subscriber is not None:
+            self.close()
+            logger.debug("%s: not needed any more", self.topic)
+        self._count()
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._count()
+        subscriber, self._subscriber = self._subscriber, None
+        if subscriber is not None:
+            subscriber.close()
+
+    def _take(self, message: Any) -> None:
+        for tap in tuple(self.taps):
+            tap(message)
+        for output in self._outputs:
+            if output.wanted:
+                output.send(message)
+
+    def _count(self) -> None:
+        """Pass on what Cortex lost and rejected since the last look."""
+        if self._subscriber is None:
+            return
+        counters = self._subscriber.counters
+        now = counters.lost + counters.overtaken, counters.rejected
+        lost, rejected = now[0] - self._told[0], now[1] - self._told[1]
+        self._told = now
+        for output in self._outputs:
+            if lost and output.wanted:
+                output.tally.receive(lost)
+                output.tally.lose("the bridge, or the machine, is too slow", lost)
+            for _ in range(rejected):
+                output.tally.refuse("a malformed message, or one of another type")
+
+
+class Whereabouts:
+    """What the bridge knows of a vehicle: its newest state, and what time that is.
+
+    Attributes:
+        odometry: The newest state; None if none has come.
+        sources: Topics of state and time; None where there is none.
+        resources: What is to be closed when the sources change.
+    """
+
+    def __init__(self) -> None:
+        """Know nothing."""
+        self.odometry: Odometry | None = None
+        self.sources: tuple[str | None, str | None] = None, None
+        self.resources = contextlib.ExitStack()
+        self._clock_ns: int | None = None
+
+    def forget(self, sources: tuple[str | None, str | None]) -> None:
+        """Forget all that came from other sources."""
+        self.resources.close()
+        self.sources = sources
+        self.odometry = self._clock_ns = None
+
+    def take_odometry(self, message: Odometry) -> None:
+        """Take in a state."""
+        self.odometry = message
+
+    def take_clock(self, message: Clock) -> None:
+        """Take in the time of the run."""
+        self._clock_ns = message.stamp_ns
+
+    @property
+    def now_ns(self) -> int | None:
+        """Time of the newest state, else that of the run [ns]; None if neither has come."""
+        odometry = self.odometry
+        return self._clock_ns if odometry is None else odometry.stamp_ns

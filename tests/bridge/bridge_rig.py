@@ -1,0 +1,130 @@
+"""A simulator's side, a bridge with a recording backend, and what tests wait for."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from processes import wait_for
+from recording_backend import RecordingBackend
+
+from cortex import Node
+from cortex import messages as msg
+from cortex_ros2_bridge.bridge import Bridge
+from cortex_ros2_bridge.config import load
+
+
+class Rig:
+    """Everything in one process; `update_until` is the bridge's clockwork."""
+
+    def __init__(self, settings: Any = None) -> None:
+        self.backend = RecordingBackend()
+        self.simulator = Node("simulator")
+        self._node = Node("bridge")
+        try:
+            self.bridge = Bridge(load(settings), self.backend, self._node)
+        except BaseException:
+            self._node.close()
+            self.simulator.close()
+            raise
+
+    def update_until(self, condition: Callable[[], object], timeout_s: float = 10.0) -> Any:
+        def look() -> object:
+            self.bridge.update()
+            return condition()
+
+        return wait_for(look, timeout_s)
+
+    def updates_during(self, count: int = 20) -> None:
+        """Let the bridge look some times."""
+        for _ in range(count):
+            self.bridge.update()
+
+    def opens(self, *topics: str) -> list[Any]:
+        """Wait until the bridge publishes ROS topics."""
+        self.update_until(lambda: all(topic in self.backend.publishers for topic in topics))
+        return [self.backend.publishers[topic] for topic in topics]
+
+    def subscribes(self, *topics: str) -> list[Any]:
+        """Wait until the bridge subscribes to ROS topics."""
+        self.update_until(lambda: all(topic in self.backend.subscriptions for topic in topics))
+        return [self.backend.subscriptions[topic] for topic in topics]
+
+    @contextlib.contextmanager
+    def listening(self, publisher: Any, *topics: str) -> Iterator[list[Any]]:
+        """Somebody in ROS listens to topics, and the Cortex publisher has got its subscriber."""
+        with self.backend.listening(*topics) as found:
+            self.update_until(lambda: publisher.subscriber_count == 1)
+            yield found
+
+    def tally(self, name: str) -> Any:
+        return self.bridge.totals()[name]
+
+    def close(self) -> None:
+        self.bridge.close()
+        self._node.close()
+        self.simulator.close()
+
+
+@contextlib.contextmanager
+def rig_of(settings: Any = None) -> Iterator[Rig]:
+    rig = Rig(settings)
+    try:
+        yield rig
+    finally:
+        rig.close()
+
+
+def odometry(stamp_ns: int, *, sequence: int = 0) -> msg.Odometry:
+    """At (1, 2, 3), turned by 90 degrees about z, flying to the north: forward."""
+    half = np.sqrt(0.5)
+    return msg.Odometry(
+        stamp_ns=stamp_ns,
+        position=np.array([1.0, 2.0, 3.0]),
+        orientation=np.array([0.0, 0.0, half, half]),
+        velocity=np.array([0.0, 2.0, 0.0]),
+        body_rate=np.array([0.1, 0.2, 0.3]),
+        sequence=sequence,
+    )
+
+
+def imu(stamp_ns: int, *, sequence: int = 0) -> msg.Imu:
+    return msg.Imu(
+        stamp_ns=stamp_ns,
+        specific_force=np.array([0.1, 0.2, 9.81]),
+        angular_rate=np.array([1.0, 2.0, 3.0]),
+        sequence=sequence,
+    )
+
+
+def image(stamp_ns: int, *, width: int = 4, height: int = 3) -> msg.Image:
+    data = np.arange(height * width * 3, dtype=np.uint8).reshape(height, width, 3)
+    return msg.Image(stamp_ns=stamp_ns, data=data, encoding="rgb8", frame_id="drone/rgb_optical_frame")
+
+
+def camera_info(sensor: str, *, width: int = 4, height: int = 3) -> msg.CameraInfo:
+    return msg.CameraInfo(
+        stamp_ns=0,
+        width=width,
+        height=height,
+        matrix=np.array([[2.0, 0.0, 2.0], [0.0, 2.0, 1.5], [0.0, 0.0, 1.0]]),
+        distortion_model="",
+        distortion=np.zeros(0),
+        frame_id=f"drone/{sensor}_optical_frame",
+    )
+
+
+def transform(sensor: str, *, x: float = 0.1) -> msg.Transform:
+    return msg.Transform(
+        stamp_ns=0,
+        parent="drone/base_link",
+        child=f"drone/{sensor}",
+        translation=np.array([x, 0.0, 0.0]),
+        rotation=np.array([0.0, 0.0, 0.0, 1.0]),
+    )
+
+
+def stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

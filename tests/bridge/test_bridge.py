@@ -1,0 +1,602 @@
+"""The bridge between Cortex and a backend that records: what flows, when, and what is counted."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import numpy as np
+import pytest
+from bridge_rig import camera_info, image, imu, odometry, rig_of, stamp_ns, transform
+from processes import wait_for
+from runtime_directory import own_directory
+
+from cortex import Node, message
+from cortex import messages as msg
+from cortex_ros2_bridge import bridge as bridge_module
+from cortex_ros2_bridge import incoming as incoming_module
+from cortex_ros2_bridge.backend.base import BackendError
+from cortex_ros2_bridge.config import ConfigError
+from cortex_ros2_bridge.msgs import message_class
+
+IMU = "/drone/imu -> /drone/imu"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_registry():
+    """All tests of this module share a runtime directory."""
+    with pytest.MonkeyPatch.context() as monkeypatch, own_directory(monkeypatch):
+        yield
+
+
+# Cortex to ROS
+
+
+def test_nothing_is_subscribed_to_until_ros_listens():
+    """The sensor is not even computed: its publisher has no subscriber before and after."""
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/imu", msg.Imu)
+        (ros,) = rig.opens("/drone/imu")
+        rig.updates_during()
+        sent.publish(imu(1))
+        assert sent.subscriber_count == 0
+        with rig.listening(sent, "/drone/imu"):
+            sent.publish(imu(5_000_000_007))
+            got = wait_for(lambda: ros.messages())
+        rig.update_until(lambda: sent.subscriber_count == 0)
+        sent.publish(imu(9))
+        rig.updates_during()
+        assert len(ros.sent) == 1
+        assert rig.tally(IMU).sent == rig.tally(IMU).received == 1
+    assert stamp_ns(got[0].header) == 5_000_000_007
+    assert got[0].angular_velocity.z == 3.0
+    assert got[0].header.frame_id == "drone/imu"
+
+
+def test_an_image_and_its_calibration_have_one_stamp():
+    with rig_of() as rig:
+        info = rig.simulator.publisher("/drone/rgb/info", msg.CameraInfo, latch=True)
+        info.publish(camera_info("rgb"))
+        sent = rig.simulator.publisher("/drone/rgb", msg.Image)
+        names = "/drone/rgb/image_raw", "/drone/rgb/camera_info"
+        pictures, infos = rig.opens(*names)
+        rig.update_until(lambda: info.subscriber_count == 1)
+        with rig.listening(sent, *names):
+            for stamp in (33_333_333, 66_666_666):
+                sent.publish(image(stamp))
+            wait_for(lambda: len(infos.sent) == 2)
+        assert [stamp_ns(m.header) for m in infos.messages()] == [33_333_333, 66_666_666]
+        assert [stamp_ns(m.header) for m in pictures.messages()] == [33_333_333, 66_666_666]
+        picture, calibration = pictures.messages()[0], infos.messages()[0]
+    assert (picture.width, picture.height, picture.encoding, picture.step) == (4, 3, "rgb8", 12)
+    assert bytes(picture.data) == bytes(range(36))
+    assert (calibration.width, calibration.height) == (4, 3)
+    assert picture.header.frame_id == calibration.header.frame_id == "drone/rgb_optical_frame"
+
+
+def test_only_what_is_listened_to_is_converted():
+    """With a listener for the calibration only, no picture is converted."""
+    with rig_of() as rig:
+        info = rig.simulator.publisher("/drone/rgb/info", msg.CameraInfo, latch=True)
+        info.publish(camera_info("rgb"))
+        sent = rig.simulator.publisher("/drone/rgb", msg.Image)
+        pictures, infos = rig.opens("/drone/rgb/image_raw", "/drone/rgb/camera_info")
+        rig.update_until(lambda: info.subscriber_count == 1)
+        with rig.listening(sent, "/drone/rgb/camera_info"):
+            sent.publish(image(1))
+            wait_for(lambda: infos.sent)
+        assert pictures.sent == []
+        assert rig.tally("/drone/rgb -> /drone/rgb/image_raw").received == 0
+
+
+def test_frames_hang_together():
+    """/tf_static has, in one message, map to odom and every sensor; /tf moves the vehicle in odom."""
+    with rig_of() as rig:
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        for sensor in ("imu", "rgb"):
+            mount = rig.simulator.publisher(f"/drone/{sensor}/transform", msg.Transform, latch=True)
+            mount.publish(transform(sensor))
+        moving, static = rig.opens("/tf", "/tf_static")
+        rig.update_until(lambda: static.sent and len(static.messages()[-1].transforms) == 3)
+        links = {(t.header.frame_id, t.child_frame_id) for t in static.messages()[-1].transforms}
+        with rig.listening(state, "/tf"):
+            state.publish(odometry(2_000_000_000))
+            wait_for(lambda: moving.sent)
+        (moved,) = moving.messages()[-1].transforms
+    assert links == {
+        ("map", "drone/odom"),
+        ("drone/base_link", "drone/imu"),
+        ("drone/base_link", "drone/rgb"),
+    }
+    assert (moved.header.frame_id, moved.child_frame_id) == ("drone/odom", "drone/base_link")
+    assert (moved.transform.translation.x, moved.transform.translation.z) == (1.0, 3.0)
+    assert static.qos.durability == "transient_local"
+    assert static.qos.depth == 1
+
+
+def test_the_transform_of_a_sensor_that_moved_replaces_the_old_one():
+    with rig_of() as rig:
+        mount = rig.simulator.publisher("/drone/imu/transform", msg.Transform, latch=True)
+        mount.publish(transform("imu"))
+        (static,) = rig.opens("/tf_static")
+        rig.update_until(lambda: static.sent)
+        mount.publish(transform("imu", x=0.5))
+        rig.update_until(lambda: static.messages()[-1].transforms[0].transform.translation.x == 0.5)
+        assert len(static.messages()[-1].transforms) == 1
+
+
+def test_new_topics_appear_and_old_ones_are_closed(monkeypatch):
+    """A topic that comes back in time finds its ROS publisher, and so do the subscribers in ROS."""
+    with rig_of() as rig:
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.opens("/drone/imu")
+        second = rig.simulator.publisher("/drone/gyro", msg.Imu)
+        (before,) = rig.opens("/drone/gyro")
+        second.close()
+        rig.update_until(lambda: len(bridge_module.look(rig._node).topics) == 1)
+        rig.updates_during()
+        assert not before.closed
+        second = rig.simulator.publisher("/drone/gyro", msg.Imu)
+        with rig.listening(second, "/drone/gyro"):
+            second.publish(imu(3))
+            wait_for(lambda: before.sent)
+        monkeypatch.setattr(bridge_module, "GONE_S", 0.05)
+        second.close()
+        rig.update_until(lambda: before.closed)
+        assert set(rig.backend.publishers) == {"/drone/imu", "/diagnostics"}
+        assert list(rig.bridge.totals()) == [IMU]
+
+
+def test_a_latched_state_is_sent_again_to_a_subscriber_that_may_have_been_too_early():
+    """DDS counts a subscriber before that one hears us, and nobody else repeats the state of stamp 0."""
+    with rig_of() as rig:
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        state.publish(odometry(0))
+        ros, moving = rig.opens("/drone/odometry", "/tf")
+        with rig.backend.listening("/drone/odometry"):
+            rig.update_until(lambda: len(ros.sent) >= 3)
+            assert len(set(ros.sent)) == 1
+            assert moving.sent == []
+            rig.updates_during()
+            assert len(ros.sent) == 3
+            state.publish(odometry(5))
+            wait_for(lambda: len(ros.sent) == 4)
+            rig.updates_during()
+            assert len(ros.sent) == 4
+
+
+def test_what_cannot_be_converted_is_counted_and_the_next_one_goes_through(caplog):
+    with rig_of() as rig, caplog.at_level(logging.WARNING, "cortex_ros2_bridge"):
+        sent = rig.simulator.publisher("/drone/rgb", msg.Image)
+        (ros,) = rig.opens("/drone/rgb/image_raw")
+        with rig.listening(sent, "/drone/rgb/image_raw"):
+            bad = image(1)
+            sent.publish(msg.Image(stamp_ns=1, data=bad.data, encoding="klingon"))
+            sent.publish(image(2))
+            wait_for(lambda: ros.sent)
+        counts = rig.tally("/drone/rgb -> /drone/rgb/image_raw")
+    assert (counts.received, counts.sent, counts.refused) == (2, 1, 1)
+    assert any("refused 1" in r.getMessage() and "klingon" in r.getMessage() for r in caplog.records)
+
+
+def test_a_backend_that_does_not_take_a_message_loses_it_counted():
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/imu", msg.Imu)
+        (ros,) = rig.opens("/drone/imu")
+        with rig.listening(sent, "/drone/imu"):
+            ros.error = "the network is on fire"
+            sent.publish(imu(1))
+            wait_for(lambda: rig.tally(IMU).lost == 1)
+            ros.error = None
+            sent.publish(imu(2))
+            wait_for(lambda: ros.sent)
+        assert (rig.tally(IMU).received, rig.tally(IMU).sent) == (2, 1)
+
+
+def test_a_bridge_that_is_too_slow_loses_messages_counted_and_holds_nobody_up():
+    """What was sent is what was sent on and what was lost; publishing is not delayed by a blocked backend."""
+    with rig_of({"routes": [{"cortex": "/drone/imu", "options": {"queue": 4}}]}) as rig:
+        sent = rig.simulator.publisher("/drone/imu", msg.Imu)
+        (ros,) = rig.opens("/drone/imu")
+        go_on, publish = threading.Event(), ros.publish
+
+        def blocked(data):
+            assert go_on.wait(10.0)
+            publish(data)
+
+        ros.publish = blocked
+        with rig.listening(sent, "/drone/imu"):
+            for n in range(3000):
+                sent.publish(imu(n, sequence=n))
+            go_on.set()
+            rig.update_until(lambda: (c := rig.tally(IMU)).received == 3000 == c.sent + c.lost)
+            assert rig.tally(IMU).lost > 1000
+
+
+def test_a_route_that_ros_refuses_is_said_and_the_others_work(caplog):
+    with rig_of() as rig, caplog.at_level(logging.WARNING, "cortex_ros2_bridge"):
+        rig.backend.refuse["/drone/imu"] = ValueError("such a topic must not be")
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.simulator.publisher("/drone/gyro", msg.Imu)
+        rig.opens("/drone/gyro")
+        rig.updates_during()
+        assert rig.bridge.problems == [f"no route {IMU}: such a topic must not be"]
+    said = [r for r in caplog.records if "must not be" in r.getMessage()]
+    assert len(said) == 1
+
+
+def test_a_route_that_fails_for_now_is_tried_again(monkeypatch):
+    monkeypatch.setattr(bridge_module, "RETRY_S", 0.02)
+    with rig_of() as rig:
+        rig.backend.refuse["/drone/imu"] = BackendError("the network is down")
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.update_until(lambda: rig.bridge.problems)
+        assert "the network is down" in rig.bridge.problems[0]
+        del rig.backend.refuse["/drone/imu"]
+        rig.opens("/drone/imu")
+        assert rig.bridge.problems == []
+
+
+def test_foreign_types_are_said_once(caplog):
+    @message(name="lab/Sonar")
+    class Sonar:
+        range_m: float
+
+    with rig_of() as rig, caplog.at_level(logging.WARNING, "cortex_ros2_bridge"):
+        rig.simulator.publisher("/drone/sonar", Sonar)
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.opens("/drone/imu")
+        rig.update_until(lambda: rig.bridge.problems)
+        rig.simulator.publisher("/drone/gyro", msg.Imu)
+        rig.opens("/drone/gyro")
+    said = [r.getMessage() for r in caplog.records if "lab/Sonar" in r.getMessage()]
+    assert said == ["no route for /drone/sonar: nothing converts its type lab/Sonar"]
+
+
+def test_wrong_names_of_frames_are_refused():
+    with pytest.raises(ConfigError, match="frames"), rig_of({"frames": {"wrold": "map"}}):
+        pass
+
+
+# ROS to Cortex
+
+
+def actuators(*speeds, stamp=0, frame=""):
+    command = message_class("actuator_msgs/msg/Actuators")()
+    stamped(command.header, stamp, frame)
+    command.velocity = list(speeds)
+    return command
+
+
+def stamped(header, stamp, frame=""):
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+    header.frame_id = frame
+
+
+def attitude_target(*, mask, stamp=0, thrust=0.5):
+    command = message_class("mavros_msgs/msg/AttitudeTarget")()
+    stamped(command.header, stamp)
+    command.type_mask, command.thrust = mask, thrust
+    command.orientation.w = 1.0
+    command.body_rate.z = 0.25
+    return command
+
+
+class Craft:
+    """The inbox of a simulator."""
+
+    def __init__(self, rig, **kinds):
+        self.subscribers = {
+            mode: rig.simulator.subscriber(f"/drone/command/{mode}", kind) for mode, kind in kinds.items()
+        }
+
+    def connected(self):
+        return all(subscriber.publisher_count == 1 for subscriber in self.subscribers.values())
+
+    def recv(self, mode):
+        return self.subscribers[mode].recv(5.0)
+
+
+def test_every_command_reaches_its_topic():
+    """One message of each ROS type; AttitudeTarget goes where its mask says."""
+    with rig_of({"routes": [{"cortex": "*", "type": "mavros_msgs/AttitudeTarget",
+                             "options": {"max_thrust_n": 20.0}}]}) as rig:  # fmt: skip
+        craft = Craft(
+            rig,
+            motor_speeds=msg.MotorCommand,
+            rates=msg.RateThrustCommand,
+            attitude=msg.AttitudeCommand,
+            velocity=msg.VelocityCommand,
+            position=msg.PoseCommand,
+        )
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        state.publish(odometry(1_000_000_000))
+        topics = ("actuators", "attitude_target", "cmd_vel", "command_velocity", "command_pose")
+        rotors, target, twist, twist_stamped, pose = rig.subscribes(*(f"/drone/{t}" for t in topics))
+        twist.publisher_count = 1
+        rig.update_until(lambda: craft.connected() and state.subscriber_count == 1)
+        rig.update_until(lambda: rig.bridge._vehicles["drone"].now_ns == 1_000_000_000)
+
+        rotors.put(actuators(1.0, 2.0, 3.0, 4.0, stamp=1_000_000_000))
+        command = craft.recv("motor_speeds")
+        np.testing.assert_array_equal(command.speed, [1.0, 2.0, 3.0, 4.0])
+        assert command.stamp_ns == 1_000_000_000
+
+        target.put(attitude_target(mask=128, stamp=1_000_000_000))
+        command = craft.recv("rates")
+        np.testing.assert_array_equal(command.body_rate, [0.0, 0.0, 0.25])
+        assert command.thrust_n == 10.0
+        target.put(attitude_target(mask=7, stamp=1_000_000_000))
+        np.testing.assert_array_equal(craft.recv("attitude").orientation, [0.0, 0.0, 0.0, 1.0])
+
+        velocity = message_class("geometry_msgs/msg/Twist")()
+        velocity.linear.x, velocity.angular.z = 1.5, 0.2
+        twist.put(velocity)
+        command = craft.recv("velocity")
+        # Forward is north: the vehicle is turned by 90 degrees. No stamp: that of the newest state.
+        np.testing.assert_allclose(command.velocity, [0.0, 1.5, 0.0], atol=1e-12)
+        assert (command.yaw_rate_rad_s, command.stamp_ns) == (0.2, 1_000_000_000)
+        command = message_class("geometry_msgs/msg/TwistStamped")()
+        stamped(command.header, 1_000_000_000, "map")
+        command.twist.linear.x = 1.5
+        twist_stamped.put(command)
+        np.testing.assert_allclose(craft.recv("velocity").velocity, [1.5, 0.0, 0.0], atol=1e-12)
+
+        command = message_class("geometry_msgs/msg/PoseStamped")()
+        stamped(command.header, 1_000_000_000, "map")
+        command.pose.position.z = 2.0
+        pose.put(command)
+        assert craft.recv("position").position[2] == 2.0
+        totals = rig.bridge.totals()
+    assert {name: (t.received, t.sent, t.refused) for name, t in totals.items() if "<-" in name} == {
+        "/drone/command/motor_speeds <- /drone/actuators": (1, 1, 0),
+        "/drone/command/rates <- /drone/attitude_target": (1, 1, 0),
+        "/drone/command/attitude <- /drone/attitude_target": (1, 1, 0),
+        "/drone/command/velocity <- /drone/cmd_vel": (1, 1, 0),
+        "/drone/command/velocity <- /drone/command_velocity": (1, 1, 0),
+        "/drone/command/position <- /drone/command_pose": (1, 1, 0),
+        "/drone/command/position <- /drone/command_trajectory": (0, 0, 0),
+    }
+
+
+ROTORS = "/drone/command/motor_speeds <- /drone/actuators"
+
+
+def test_commands_that_must_not_fly_are_refused_counted_and_reported(caplog):
+    """Stale, from another clock, not finite, truncated and garbage; good ones pass."""
+    with rig_of() as rig, caplog.at_level(logging.WARNING, "cortex_ros2_bridge"):
+        craft = Craft(rig, motor_speeds=msg.MotorCommand)
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        state.publish(odometry(10_000_000_000))
+        (rotors,) = rig.subscribes("/drone/actuators")
+        rotors.publisher_count = 1
+        rig.update_until(lambda: craft.connected() and state.subscriber_count == 1)
+        rig.update_until(lambda: rig.bridge._vehicles["drone"].now_ns == 10_000_000_000)
+        reasons = []
+        for command in (
+            actuators(1.0, stamp=9_400_000_000),
+            actuators(1.0, stamp=1_763_764_000_000_000_000),
+            actuators(float("nan"), stamp=10_000_000_000),
+            b"\x00\x01\x00\x00\x01\x00\x00\x00",
+            b"",
+            b"\x00\x07garbage that is no CDR at all",
+            b"\x00\x01\x00\x00" + b"\xff" * 64,
+        ):
+            rotors.put(command)
+            (target,) = rig.bridge._incoming.values()[0]._targets
+            reasons.append(target.tally.reason)
+        assert rig.tally(ROTORS).refused == rig.tally(ROTORS).received == 7
+        rotors.put(actuators(5.0, stamp=9_600_000_000))
+        assert craft.recv("motor_speeds").speed[0] == 5.0
+        rotors.put(actuators(6.0))
+        assert craft.recv("motor_speeds").stamp_ns == 10_000_000_000
+        assert rig.tally(ROTORS).sent == 2
+    assert "0.600 s before the newest state" in reasons[0]
+    assert "after the newest state" in reasons[1]
+    assert "use_sim_time" in reasons[1]
+    assert "finite" in reasons[2]
+    assert all(reason.startswith("refused: ") for reason in reasons)
+    said = [r.getMessage() for r in caplog.records if "refused" in r.getMessage()]
+    assert len(said) == 1  # the other six came within the same second
+    assert said[0].startswith(ROTORS)
+
+
+def test_after_a_reset_the_clock_of_the_new_run_counts():
+    """Odometry of stamp 0 makes a command of stamp 0 a fresh one, and those of the old run stale."""
+    with rig_of() as rig:
+        craft = Craft(rig, motor_speeds=msg.MotorCommand)
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        clock = rig.simulator.publisher("/clock", msg.Clock)
+        state.publish(odometry(100_000_000_000))
+        (rotors,) = rig.subscribes("/drone/actuators")
+        rotors.publisher_count = 1
+        rig.update_until(lambda: craft.connected() and clock.subscriber_count == 1)
+        clock.publish(msg.Clock(100_000_000_000, 0))
+        vehicle = rig.bridge._vehicles["drone"]
+        rig.update_until(lambda: vehicle.now_ns == 100_000_000_000)
+        rotors.put(actuators(1.0, stamp=100_000_000_000))
+        state.publish(odometry(0))
+        wait_for(lambda: vehicle.now_ns == 0)
+        rotors.put(actuators(2.0, stamp=100_000_000_000))
+        rotors.put(actuators(3.0, stamp=0))
+        assert [craft.recv("motor_speeds").speed[0] for _ in range(2)] == [1.0, 3.0]
+        assert rig.tally(ROTORS).refused == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "stamp", "passes"),
+    [
+        ({"stale_s": 2.0}, 9_000_000_000, True),
+        ({"stale_s": 0.1}, 9_800_000_000, False),
+        ({"stale_s": None}, 5, True),
+        ({"stamp": "now"}, 1_763_764_000_000_000_000, True),
+    ],
+)
+def test_options_of_staleness(options, stamp, passes):
+    with rig_of({"routes": [{"cortex": "/drone/command/*", "options": options}]}) as rig:
+        craft = Craft(rig, motor_speeds=msg.MotorCommand)
+        clock = rig.simulator.publisher("/clock", msg.Clock)
+        (rotors,) = rig.subscribes("/drone/actuators")
+        rotors.publisher_count = 1
+        rig.update_until(lambda: craft.connected() and clock.subscriber_count == 1)
+        clock.publish(msg.Clock(10_000_000_000, 0))
+        wait_for(lambda: rig.bridge._vehicles["drone"].now_ns)
+        rotors.put(actuators(1.0, stamp=stamp))
+        assert rig.tally(ROTORS).sent == passes
+        if options == {"stamp": "now"}:
+            assert craft.recv("motor_speeds").stamp_ns == 10_000_000_000
+
+
+def test_wrong_options_are_a_problem_of_their_route_only():
+    with rig_of({"routes": [{"cortex": "/drone/command/rates", "options": {"stale_s": -1}}]}) as rig:
+        Craft(rig, motor_speeds=msg.MotorCommand, rates=msg.RateThrustCommand)
+        rig.subscribes("/drone/actuators")
+        rig.update_until(lambda: rig.bridge.problems)
+        assert "option stale_s must be > 0 or null, got -1" in rig.bridge.problems[0]
+
+
+def test_state_and_time_are_followed_only_while_somebody_commands():
+    with rig_of() as rig:
+        Craft(rig, motor_speeds=msg.MotorCommand)
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        (rotors,) = rig.subscribes("/drone/actuators")
+        rig.opens("/drone/odometry")
+        rig.updates_during()
+        assert state.subscriber_count == 0
+        rotors.publisher_count = 1
+        rig.update_until(lambda: state.subscriber_count == 1)
+        rotors.publisher_count = 0
+        rig.update_until(lambda: state.subscriber_count == 0)
+
+
+def test_a_command_waits_for_a_simulator_that_is_about_to_listen(monkeypatch):
+    """The newest of those that came too early; one that nobody ever takes is lost, and counted."""
+    with rig_of() as rig, Node("other") as other:
+        early = other.subscriber("/drone/command/motor_speeds", msg.MotorCommand)
+        (rotors,) = rig.subscribes("/drone/actuators")
+        rig.update_until(lambda: early.publisher_count == 1)
+        early.close()
+        publisher = rig.bridge._cortex_publishers.values()[0]
+        wait_for(lambda: publisher.subscriber_count == 0)
+        rotors.put(actuators(1.0))
+        rotors.put(actuators(2.0))
+        craft = Craft(rig, motor_speeds=msg.MotorCommand)
+        rig.update_until(lambda: rig.tally(ROTORS).sent == 1)
+        assert craft.recv("motor_speeds").speed[0] == 2.0
+        assert rig.tally(ROTORS).lost == 1
+        craft.subscribers["motor_speeds"].close()
+        wait_for(lambda: publisher.subscriber_count == 0)
+        monkeypatch.setattr(incoming_module, "PENDING_S", 0.0)
+        rotors.put(actuators(3.0))
+        rig.update_until(lambda: rig.tally(ROTORS).lost == 2)
+
+
+def test_requests_as_topics_and_as_services():
+    """Empty and UInt32 become requests; a refusal is an answer, a service that is gone an error in time."""
+    asked = []
+
+    def answer(request):
+        asked.append(request)
+        refused = isinstance(request, msg.Step) and request.count > 5
+        return msg.SimulatorReply(not refused, "not so many" if refused else "", 0, "paused")
+
+    with rig_of() as rig, Node("services") as server:
+        for name, kind in (("/reset", msg.Reset), ("/step", msg.Step), ("/pause", msg.Trigger)):
+            server.service(name, kind, msg.SimulatorReply, answer)
+        reset, step, pause = rig.subscribes("/reset", "/step", "/pause")
+        reset.put(message_class("std_msgs/msg/Empty")())
+        wait_for(lambda: asked)
+        step.put(message_class("std_msgs/msg/UInt32")(data=3))
+        wait_for(lambda: len(asked) == 2)
+        pause.put(message_class("std_msgs/msg/Empty")())
+        wait_for(lambda: len(asked) == 3)
+        assert asked == [msg.Reset(), msg.Step(3), msg.Trigger()]
+        assert rig.backend.services["/reset"].call() == (True, "")
+        step.put(message_class("std_msgs/msg/UInt32")(data=6))
+        wait_for(lambda: rig.tally("/step <- /step").refused == 1)
+        step.put(b"\x00\x01\x00\x00\x01")
+        assert rig.tally("/step <- /step").refused == 2
+        assert rig.tally("/reset <- /reset").sent == 2
+
+
+def test_closing_gives_up_a_call_that_is_under_way():
+    release = threading.Event()
+
+    def answer(request):
+        release.wait(10.0)
+        return msg.SimulatorReply(True, "", 0, "running")
+
+    with rig_of() as rig, Node("services") as server:
+        server.service("/step", msg.Step, msg.SimulatorReply, answer)
+        (step,) = rig.subscribes("/step")
+        for _ in range(10):
+            step.put(message_class("std_msgs/msg/UInt32")(data=1))
+        assert rig.tally("/step <- /step").refused >= 4
+        threads = {t.name for t in threading.enumerate()}
+        rig.bridge.close()
+        assert "call /step" in threads
+        assert "call /step" not in {t.name for t in threading.enumerate()}
+        release.set()
+
+
+# Both
+
+
+def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.05)
+    with rig_of() as rig:
+        Craft(rig, motor_speeds=msg.MotorCommand)
+        sent = rig.simulator.publisher("/drone/imu", msg.Imu)
+        (rotors,) = rig.subscribes("/drone/actuators")
+        (ros,) = rig.opens("/drone/imu")
+        diagnostics = rig.backend.publishers["/diagnostics"]
+        rig.updates_during(100)
+        assert diagnostics.sent == []
+        with rig.listening(sent, "/drone/imu"), rig.backend.listening("/diagnostics"):
+            sent.publish(imu(1))
+            wait_for(lambda: ros.sent)
+            rotors.put(actuators(float("inf")))
+            rig.update_until(lambda: statuses(diagnostics).get(ROTORS, {}).get("refused") == "1")
+            found = statuses(diagnostics)
+            level = {s.name: s.level for s in diagnostics.messages()[-1].status}
+            rig.update_until(lambda: statuses(diagnostics)[ROTORS]["message"] == "idle")
+    assert found[IMU] | {"rate_hz": "", "message": ""} == {
+        "message": "",
+        "received": "1",
+        "sent": "1",
+        "lost": "0",
+        "refused": "0",
+        "rate_hz": "",
+        "listeners": "1",
+        "types": "cortex/Imu and sensor_msgs/msg/Imu",
+    }
+    assert found["bridge"]["backend"] == "recording"
+    assert level[f"cortex_bridge: {ROTORS}"] == b"\x01"
+    assert "1 refused" in found[ROTORS]["message"]
+    assert "finite" in found[ROTORS]["message"]
+
+
+def statuses(publisher):
+    """Values of the newest diagnostics, by the name of what they are about."""
+    if not publisher.sent:
+        return {}
+    return {
+        status.name.partition(": ")[2]: {"message": status.message} | {v.key: v.value for v in status.values}
+        for status in publisher.messages()[-1].status
+    }
+
+
+def test_closing_leaves_nothing_open():
+    with rig_of() as rig:
+        Craft(rig, motor_speeds=msg.MotorCommand, rates=msg.RateThrustCommand, attitude=msg.AttitudeCommand)
+        for name, kind in (("imu", msg.Imu), ("odometry", msg.Odometry), ("rgb", msg.Image)):
+            rig.simulator.publisher(f"/drone/{name}", kind)
+        rig.opens("/drone/imu", "/tf_static", "/drone/rgb/image_raw")
+        rig.subscribes("/drone/actuators", "/drone/attitude_target")
+        rig.bridge.close()
+        assert rig.backend.publishers == {}
+        assert rig.backend.subscriptions == {}
+        assert rig.bridge.routes() == []
+        assert rig._node.topics() == [] or all("bridge" not in t.publishers for t in rig._node.topics())
+        rig.bridge.update()
+        rig.bridge.close()
