@@ -84,9 +84,11 @@ def answer_images(
 
         def idle() -> None:
             """Answer what the rotors say where an image was lost: in lockstep nothing would go on."""
+            nonlocal answered_ns
             reports.extend(_reports(rotors))
             if reports[-1][0] > answered_ns:
-                command(reports[-1][0])
+                answered_ns = reports[-1][0]
+                command(answered_ns)
             check()
 
         while not end_ns or time.monotonic_ns() < end_ns or len(images) - begin < _IMAGES_MIN:
