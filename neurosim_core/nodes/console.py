@@ -93,7 +93,7 @@ class StatusLine:
 
     def __enter__(self) -> StatusLine:
         if self._console.is_terminal:
-            self._line = self._console.status("")
+            self._line = self._console.status("", refresh_per_second=5)
             self._line.start()
         return self
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -204,8 +205,9 @@ def _fault(mode: CommandMode, setpoint: np.ndarray, width: int) -> str:
     """Say what is wrong with a setpoint; empty if nothing is."""
     if setpoint.shape != (width,):
         return f"{mode} takes {width} numbers, got {setpoint.size}"
-    if not np.isfinite(setpoint).all():
-        return f"{mode} takes finite numbers, got {setpoint.tolist()}"
+    numbers = setpoint.tolist()
+    if not all(map(math.isfinite, numbers)):
+        return f"{mode} takes finite numbers, got {numbers}"
     if mode == "attitude" and not np.linalg.norm(setpoint[1:]) > 1e-6:
         return f"attitude takes a unit quaternion, got {setpoint[1:].tolist()}"
     return ""

@@ -179,7 +179,16 @@ class Outlet:
         if state.stamp_ns <= self._odometry_ns:
             return
         self._odometry_ns = state.stamp_ns
-        packet = dataclasses.replace(state, sensor="odometry", sequence=self._odometry_count)
+        packet = Odometry(  # `dataclasses.replace` takes five times as long, in every control period
+            sensor="odometry",
+            stamp_ns=state.stamp_ns,
+            sequence=self._odometry_count,
+            position=state.position,
+            orientation=state.orientation,
+            velocity=state.velocity,
+            body_rate=state.body_rate,
+            rotor_speed=state.rotor_speed,
+        )
         self._odometry_count += 1
         for name in ("rotor_speeds", "odometry"):
             if packet.stamp_ns:
