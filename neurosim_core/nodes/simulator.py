@@ -21,10 +21,10 @@ from cortex.messages import Reset, SimulatorStatus
 from neurosim_core.clock import to_ns
 from neurosim_core.config import SimulationConfig
 from neurosim_core.nodes.audience import Audience
+from neurosim_core.nodes.beginning import Beginning, make_beginning
 from neurosim_core.nodes.cameras import Cameras, sees_inline
 from neurosim_core.nodes.console import StatusLine, print_end, print_plan, stop_at_signals
 from neurosim_core.nodes.craft import Craft
-from neurosim_core.nodes.episode import Episode, make_episode
 from neurosim_core.nodes.helm import Command
 from neurosim_core.nodes.meetings import Meetings
 from neurosim_core.nodes.recorder import Recorder, open_folders
@@ -113,7 +113,7 @@ class Simulator:
             self.board = Board(node)
             self._audience = Audience(self.crafts)
             self._streaming = Streaming(self.crafts, self._cameras, self._pacer, self._meter, bell=self._bell)
-            self._begin(make_episode(self.crafts, config, Reset()))
+            self._begin(make_beginning(self.crafts, config, Reset()))
             self.board.announce(config)
             self._requests = Requests(
                 services,
@@ -306,17 +306,17 @@ class Simulator:
 
     # Beginning and end
 
-    def _begin(self, episode: Episode) -> None:
+    def _begin(self, beginning: Beginning) -> None:
         """Begin a run at stamp 0, and publish where everybody is."""
         self._cameras.clear()
         if self._recorder is not None:
-            self._recorder.begin(episode.seeds, replace=self._tick == 0)
+            self._recorder.begin(beginning.seeds, replace=self._tick == 0)
         self._tick = self.stamp_ns = 0
         self._ended, self._reason = False, ""
         self._meter.reset()
         self._meetings.reset()
         for craft in self.crafts:
-            craft.begin(episode.states[craft.name], seed=episode.seeds[craft.name])
+            craft.begin(beginning.states[craft.name], seed=beginning.seeds[craft.name])
 
     def _end(self, reason: str) -> None:
         """End the run, but not the simulator, unless that was all there was to do."""
@@ -364,11 +364,11 @@ class Simulator:
     def _reset(self, request: Reset) -> str:
         """Begin again; return why not, empty if it was done."""
         try:
-            episode = make_episode(self.crafts, self.config, request)
+            beginning = make_beginning(self.crafts, self.config, request)
         except ValueError as error:
             return str(error)
         self._steps.stop("the run was reset")
-        self._begin(episode)
+        self._begin(beginning)
         return ""
 
     def _pause(self, *, paused: bool) -> None:

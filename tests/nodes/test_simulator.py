@@ -32,6 +32,7 @@ from cortex.messages import (
 )
 from cortex.messages import Delivery as DeliveryMessage
 from neurosim_core.config import load_config
+from neurosim_core.nodes import cameras
 from neurosim_core.nodes import simulator as simulator_module
 from neurosim_core.packets import Delivery
 from neurosim_core.record import Flight
@@ -367,8 +368,6 @@ def test_the_fail_safe_ends_with_the_next_command():
 
 
 def _with_slow_cameras(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    from neurosim_core.nodes import cameras
-
     see = cameras.see
 
     def slow(*arguments: Any) -> Any:
@@ -407,6 +406,19 @@ def test_slow_cameras_lose_frames_where_time_matters_more(monkeypatch: pytest.Mo
     assert sequence[-1] > 4
     assert dropped.sensors[2].name == "rgb"
     assert all(second.start_ns == first.stamp_ns for first, second in itertools.pairwise(windows))
+
+
+def test_cameras_that_fail_end_it(monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: Any) -> Any:
+        raise ValueError("no picture")
+
+    monkeypatch.setattr(cameras, "see", fail)
+    with LiveRig(make_config()) as rig:
+        rig.send(rig.hover())
+        assert rig.join() is None
+        error, rig.error = rig.error, None
+    assert isinstance(error, RuntimeError)
+    assert str(error) == "the cameras failed: no picture"
 
 
 def test_links_delay_in_streaming():
@@ -669,8 +681,8 @@ def test_serve_says_what_it_does(
     begin = simulator_module.Simulator._begin
     command = simulator_module.Command(mode="motor_speeds", setpoint=np.full(4, 500.0))
 
-    def begin_and_command(self: Any, episode: Any) -> None:
-        begin(self, episode)
+    def begin_and_command(self: Any, beginning: Any) -> None:
+        begin(self, beginning)
         for craft in self.crafts:
             monkeypatch.setattr(craft.inbox, "wait", lambda fits, **options: command)
 

@@ -11,14 +11,14 @@ from neurosim_core.nodes.craft import Craft
 from neurosim_core.simulation import StartState, State
 
 
-class Episode(NamedTuple):
+class Beginning(NamedTuple):
     """The beginning of a run, by vehicle."""
 
     states: dict[str, State]
     seeds: dict[str, int]
 
 
-def make_episode(crafts: Sequence[Craft], config: SimulationConfig, request: Reset) -> Episode:
+def make_beginning(crafts: Sequence[Craft], config: SimulationConfig, request: Reset) -> Beginning:
     """Return the beginning of the run that is asked for.
 
     Args:
@@ -51,4 +51,4 @@ def make_episode(crafts: Sequence[Craft], config: SimulationConfig, request: Res
         states[craft.name] = craft.make_state(
             seed=seeds[craft.name], start=start if starts and moved else None
         )
-    return Episode(states, seeds)
+    return Beginning(states, seeds)
