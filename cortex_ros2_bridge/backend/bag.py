@@ -192,8 +192,8 @@ class _BagTime:
 def stamp_reader(type_name: str, store: Typestore) -> Callable[[Buffer], int | None]:
     """Return a function that reads the stamp [ns] of messages of a type; it returns None where there is none.
 
-    The stamp is the time with which the message begins, as a header does, or, of a message that is a list, that
-    with which its first element begins.
+    The stamp is the time with which the message begins, as a header does, or, of a message that is a list,
+    that with which its first element begins.
     """
     field: Any = (Nodetype.NAME, type_name)
     is_list = False

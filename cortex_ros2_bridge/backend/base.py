@@ -69,7 +69,10 @@ class RosSubscription(Protocol):
 
     @property
     def lost_count(self) -> int:
-        """Messages known to be lost on the way; what a newer one has overtaken is not counted."""
+        """Messages that the middleware says were lost; it does not notice all that were.
+
+        What a newer one has overtaken is not counted.
+        """
 
     @property
     def error_count(self) -> int:

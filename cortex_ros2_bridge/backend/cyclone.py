@@ -71,10 +71,9 @@ class Fast:
 
     def write(self, writer: Any, message: Buffer) -> None:
         """Write a message."""
+        _check_length(message)
         if len(message) % 4:  # Cyclone DDS wants whole words
             message = bytes(message) + bytes(-len(message) % 4)
-        if len(message) <= 4:
-            raise Refused("it is shorter than its header")
         view = np.frombuffer(message, dtype=np.uint8)
         address = view.__array_interface__["data"][0]
         code = self._write(writer._ref, ctypes.byref(self._sample(address, len(message))))
@@ -96,6 +95,7 @@ class Public:
 
     def write(self, writer: Any, message: Buffer) -> None:
         """Write a message."""
+        _check_length(message)
         try:
             sample = writer.topic.data_type.deserialize(bytes(message))
         except Exception as error:  # whatever its decoder stumbles over
@@ -115,6 +115,11 @@ class Public:
                 message = sample.serialize(use_version_2=False)
                 messages.append(bytes(message) + bytes(-len(message) % 4))
         return messages
+
+
+def _check_length(message: Buffer) -> None:
+    if len(message) <= 4:
+        raise Refused("it is not longer than its header")
 
 
 def choose_transport(participant: DomainParticipant, choice: Choice = "auto") -> Transport:

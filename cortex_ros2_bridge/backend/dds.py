@@ -345,7 +345,7 @@ class DdsSubscription:
 
     @property
     def lost_count(self) -> int:
-        """Messages that DDS knows to have been lost on the way."""
+        """Messages that Cyclone DDS says were lost; it seldom does."""
         reader = self._reader
         if reader is not None:
             self._lost_count = int(reader.get_sample_lost_status().total_count)
@@ -378,7 +378,7 @@ class DdsService:
         identity = ".".join(f"{byte:x}" for byte in os.urandom(16))
         user_data = f"serviceid={identity};".encode()
         qos = Qos(depth=10)
-        header = {"client": types.uint64, "sequence": types.int64}
+        header = {"guid": types.uint64, "seq": types.int64}
         request = make_struct(
             "std_srvs::srv::dds_::Trigger_Request_",
             {**header, "structure_needs_at_least_one_member": types.uint8},

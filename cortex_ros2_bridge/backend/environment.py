@@ -82,7 +82,8 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
     if peers:
         discovery += f"<Peers>{''.join(f'<Peer address={quoteattr(peer)}/>' for peer in peers)}</Peers>"
     ours = (
-        f"<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery>{_TUNING}"
+        f"<CycloneDDS><Domain>{general and f'<General>{general}</General>'}"
+        f"<Discovery>{discovery}</Discovery>{_TUNING}"
         "</Domain></CycloneDDS>"
     )
     theirs = environment.get("CYCLONEDDS_URI", "")

@@ -1,20 +1,22 @@
-"""Fixtures for tests of the bridge: a runtime directory of Cortex and a DDS domain, both of the test alone."""
+"""Fixtures for tests of the bridge: a runtime directory of Cortex and a DDS domain, for the test alone."""
 
 from __future__ import annotations
 
+import os
 import random
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
+from foreigners import Foreigner
 from processes import processes_with, wait_for
 from runtime_directory import runtime
 
-__all__ = ["dds_domain", "runtime"]
+__all__ = ["dds_domain", "foreigner", "runtime", "short_lease"]
 
-# `lo` has no multicast, so processes find each other by the ports of 127.0.0.1. The tag keeps apart what has the
-# same number of domain by accident. Killed processes are missed after the lease.
+# `lo` has no multicast, so processes find each other by the ports of 127.0.0.1. The tag keeps apart what has
+# the same number of domain by accident.
 _CONFIG = """<CycloneDDS><Domain>
   <General>
     <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
@@ -25,7 +27,6 @@ _CONFIG = """<CycloneDDS><Domain>
     <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
     <Peers><Peer address="127.0.0.1"/></Peers>
     <Tag>{tag}</Tag>
-    <LeaseDuration>1 s</LeaseDuration>
   </Discovery>
 </Domain></CycloneDDS>"""
 
@@ -45,3 +46,25 @@ def dds_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     yield number
     wait_for(lambda: not processes_with(tag))
     wait_for(lambda: not set(threading.enumerate()) - threads)
+
+
+@pytest.fixture
+def short_lease(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that are killed are missed after a second instead of ten, by those that start after this."""
+    lease = "<Discovery><LeaseDuration>1 s</LeaseDuration></Discovery>"
+    config = os.environ["CYCLONEDDS_URI"]
+    monkeypatch.setenv("CYCLONEDDS_URI", f"{config},<CycloneDDS><Domain>{lease}</Domain></CycloneDDS>")
+
+
+@pytest.fixture
+def foreigner(dds_domain: int) -> Iterator[Callable[..., Foreigner]]:
+    """A function that starts processes which speak DDS without our code, in the domain of the test."""
+    started: list[Foreigner] = []
+
+    def start(**environment: str) -> Foreigner:
+        started.append(Foreigner(dds_domain, **environment))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.end()
