@@ -240,7 +240,8 @@ class Bridge:
     def _close_link(self, key: Key) -> None:
         link = self._links.pop(key)
         link.resources.close()
-        logger.info("%s: closed", link.route)
+        if not self._closed:
+            logger.info("%s: closed", link.route)
 
     def _open_out(
         self, route: Route, seen: Seen, stack: contextlib.ExitStack
