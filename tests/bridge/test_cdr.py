@@ -1,0 +1,176 @@
+"""CDR against a second writer; and data that are no messages: cut off, too long, wrong lengths, noise."""
+
+from __future__ import annotations
+
+import array
+import importlib.util
+import struct
+
+import numpy as np
+import pytest
+from cdr_oracle import random_message, write
+
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.cdr import CdrError
+from cortex_ros2_bridge.convert import IN, OUT
+from cortex_ros2_bridge.msgs import (
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    Image,
+    Imu,
+    KeyValue,
+    String,
+    message_class,
+)
+from cortex_ros2_bridge.typestore import UnknownTypeError, typestore
+
+ROUTED = sorted({name for _, name in OUT} | {name for name, _ in IN})
+
+
+def test_a_header_is_these_bytes():
+    """By hand: header of CDR; seconds; nanoseconds; length of "map" with its 0; the text."""
+    header = Header(frame_id="map")
+    header.stamp.sec, header.stamp.nanosec = -2, 500
+    expected = bytes.fromhex("00010000 feffffff f4010000 04000000 6d617000")
+    assert bytes(cdr.encode(header)) == expected
+    assert cdr.decode(expected, "std_msgs/msg/Header") == header
+
+
+def test_a_message_is_padded_to_a_multiple_of_four():
+    assert bytes(cdr.encode(String(data="ab"))) == bytes.fromhex("00010000 03000000 61620000")
+    assert bytes(cdr.encode(String(data="abcd"))) == bytes.fromhex("00010000 05000000 61626364 00000000")
+
+
+def test_encoding_and_decoding_agree_with_a_second_writer():
+    rng = np.random.default_rng(0)
+    for type_name in sorted(typestore().fielddefs):
+        for _ in range(3):
+            message = random_message(type_name, rng)
+            expected = write(message, type_name)
+            assert bytes(cdr.encode(message)) == expected, type_name
+            decoded = cdr.decode(expected, type_name)
+            assert decoded == message, type_name
+            assert bytes(cdr.encode(decoded)) == expected, type_name
+            assert cdr.decode(write(message, type_name, ">"), type_name) == message, type_name
+
+
+@pytest.mark.parametrize("type_name", ROUTED)
+def test_records_are_the_same_bytes_as_messages(type_name):
+    message = random_message(type_name, np.random.default_rng(1))
+    data = cdr.encode(message)
+    record = cdr.decode_record(data, type_name)
+    assert bytes(cdr.encode(record)) == bytes(data)
+    theirs = bytes(typestore().serialize_cdr(record, type_name))
+    assert bytes(data) == theirs + bytes(-len(theirs) % 4)
+
+
+def test_what_is_decoded_has_the_types_of_rclpy():
+    status = DiagnosticStatus(level=DiagnosticStatus.WARN, values=[KeyValue(key="a", value="b")])
+    decoded = cdr.decode(cdr.encode(DiagnosticArray(status=[status])), "diagnostic_msgs/msg/DiagnosticArray")
+    assert decoded.status[0].level == b"\x01"
+    assert decoded.status[0].values[0].value == "b"
+    image = cdr.decode(cdr.encode(Image(data=[1, 2, 3])), "sensor_msgs/msg/Image")
+    assert image.data == array.array("B", [1, 2, 3])
+    imu = cdr.decode(bytes(cdr.encode(Imu())), "sensor_msgs/msg/Imu")
+    imu.orientation_covariance[0] = -1.0  # writable: it is a copy
+    assert imu.orientation_covariance.dtype == np.float64
+
+
+@pytest.mark.parametrize("type_name", ROUTED)
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_message_that_is_cut_off_anywhere_is_refused(type_name, order):
+    message = random_message(type_name, np.random.default_rng(5))
+    data = write(message, type_name, order)
+    unpadded = len(typestore().serialize_cdr(cdr.decode_record(data, type_name), type_name))
+    for length in range(unpadded):
+        with pytest.raises(CdrError, match=type_name):
+            cdr.decode(data[:length], type_name)
+    for length in range(unpadded, len(data) + 1):
+        assert cdr.decode(data[:length], type_name) == message
+
+
+@pytest.mark.parametrize("type_name", ROUTED)
+def test_a_message_that_is_too_long_is_refused(type_name):
+    data = cdr.encode(random_message(type_name, np.random.default_rng(6)))
+    with pytest.raises(CdrError, match=rf"{type_name}|mismatch"):
+        cdr.decode(bytes(data) + bytes(4), type_name)
+
+
+@pytest.mark.parametrize("kind", [b"\0\2", b"\0\3", b"\0\7", b"\0\6", b"\1\0", b"\xff\xff"])
+def test_other_representations_than_plain_cdr_are_refused(kind):
+    data = bytearray(cdr.encode(String(data="a")))
+    data[:2] = kind
+    with pytest.raises(CdrError, match=f"0x{kind.hex()}"):
+        cdr.decode(data, "std_msgs/msg/String")
+
+
+@pytest.mark.parametrize("count", [5, 1000, 2**31, 2**32 - 1])
+def test_lengths_beyond_the_data_are_refused_without_making_room_for_them(count):
+    image = bytearray(cdr.encode(Image(data=[7])))
+    assert image[-8:-4] == struct.pack("<I", 1)
+    image[-8:-4] = struct.pack("<I", count)
+    with pytest.raises(CdrError, match="Image"):
+        cdr.decode(image, "sensor_msgs/msg/Image")
+    text = bytearray(cdr.encode(String(data="a")))
+    text[4:8] = struct.pack("<I", count)
+    with pytest.raises(CdrError, match="String"):
+        cdr.decode(text, "std_msgs/msg/String")
+    transforms = bytearray(cdr.encode(message_class("tf2_msgs/msg/TFMessage")()))
+    transforms[4:8] = struct.pack("<I", count)
+    with pytest.raises(CdrError, match="TFMessage"):
+        cdr.decode(transforms, "tf2_msgs/msg/TFMessage")
+
+
+def test_text_that_is_no_utf8_is_refused():
+    with pytest.raises(CdrError, match="String"):
+        cdr.decode(bytes.fromhex("00010000 03000000 fffe0000"), "std_msgs/msg/String")
+
+
+def test_noise_is_decoded_or_refused_but_nothing_else():
+    """Messages with random bytes in random places: whatever comes out, it is a message or a CdrError."""
+    rng = np.random.default_rng(11)
+    refused = 0
+    for type_name in ROUTED:
+        good = np.frombuffer(cdr.encode(random_message(type_name, rng)), np.uint8)
+        for _ in range(60):
+            data = good.copy()
+            where = rng.integers(2, len(data), rng.integers(1, 6))
+            data[where] = rng.integers(0, 256, len(where))
+            try:
+                cdr.decode(data.tobytes(), type_name)
+            except CdrError:
+                refused += 1
+    assert refused > 100
+
+
+def test_a_message_that_does_not_fit_its_type_is_refused():
+    record = cdr.record_class("std_msgs/msg/UInt8")
+    with pytest.raises(CdrError, match="UInt8"):
+        cdr.encode(record(300))
+    image = cdr.decode_record(cdr.encode(Imu()), "sensor_msgs/msg/Imu")
+    image.orientation_covariance = np.zeros(8)
+    with pytest.raises(CdrError, match="Imu"):
+        cdr.encode(image)
+
+
+def test_unknown_types_are_refused():
+    with pytest.raises(UnknownTypeError, match="no_msgs/msg/Such"):
+        cdr.decode(b"\0\1\0\0", "no_msgs/msg/Such")
+    with pytest.raises(TypeError, match="not a ROS message"):
+        cdr.encode(3)
+
+
+def test_bytes_are_those_of_rclpy():
+    """Where ROS is sourced: the messages of the packages that are installed."""
+    serialization = pytest.importorskip("rclpy.serialization")
+    compared = 0
+    for type_name in ROUTED:
+        if importlib.util.find_spec(type_name.split("/")[0]) is None:
+            continue
+        message = random_message(type_name, np.random.default_rng(3))
+        theirs = serialization.serialize_message(message)
+        assert bytes(cdr.encode(message))[: len(theirs)] == theirs
+        assert cdr.decode(theirs, type_name) == serialization.deserialize_message(theirs, type(message))
+        compared += 1
+    assert compared > 5
