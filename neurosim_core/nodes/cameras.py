@@ -11,6 +11,7 @@ import warp as wp
 
 from neurosim_core.packets import Packet
 from neurosim_core.schedule import batch_end_ns
+from neurosim_core.sensors.cast import is_due
 from neurosim_core.simulation import Batch, Model, State, free_lanes, see, skip
 
 _LAG_PERIODS = (2, 100)
@@ -55,7 +56,7 @@ class Cameras:
         self._seen: deque[tuple[str, list[Packet]]] = deque()
         self._busy = False
         self._closed = False
-        self._failure: BaseException | None = None
+        self._failure: Exception | None = None
         self._changed = threading.Condition()
         self._thread = None
         if not inline:
@@ -63,15 +64,22 @@ class Cameras:
             self._thread.start()
 
     def look(self, vehicle: str, model: Model, state: State, batches: Sequence[Batch]) -> None:
-        """Have batches looked at, after those before."""
-        jobs = [Job(vehicle=vehicle, model=model, state=state, batch=batch) for batch in batches]
-        if self._thread is None:
-            for job in jobs:
-                self._do(job)
-            return
-        with self._changed:
-            self._jobs.extend(jobs)
-            self._changed.notify_all()
+        """Have batches looked at, after those before; where there is nothing to see, without the thread.
+
+        Raises:
+            RuntimeError: The rendering failed.
+        """
+        for batch in batches:
+            job = Job(vehicle=vehicle, model=model, state=state, batch=batch)
+            with self._changed:
+                idle = not (self._jobs or self._busy)
+                here = self._thread is None or (idle and not _shows_anything(job))
+                if not here:
+                    self._jobs.append(job)
+                    self._changed.notify_all()
+            if here:
+                self._try(job)
+                self.check()
 
     def leave_out(self, vehicle: str, until_ns: int) -> None:
         """Do not render what waits of a vehicle and ended at a simulated time [ns] or before."""
@@ -151,19 +159,19 @@ class Cameras:
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                while not self._jobs:
-                    if self._closed:
-                        return
+                while not self._jobs and not self._closed:
                     self._changed.wait()
+                if self._closed or self._failure is not None:
+                    return
                 job = self._jobs.popleft()
                 self._busy = True
-            try:
-                self._do(job)
-            except Exception as error:  # told to the thread that flies
-                with self._changed:
-                    self._failure, self._busy = error, False
-                    self._changed.notify_all()
-                return
+            self._try(job)
+
+    def _try(self, job: Job) -> None:
+        try:
+            self._do(job)
+        except Exception as error:  # told to the thread that flies
+            self._failure = error
 
     def _do(self, job: Job) -> None:
         if job.left_out:
@@ -186,6 +194,15 @@ class Cameras:
                 rate = cast_state.images[name].rate
                 due = sum(rate.has_tick(boundary.stamp_ns) for boundary in job.batch.boundaries)
                 self.dropped[job.vehicle, name] += due
+
+
+def _shows_anything(job: Job) -> bool:
+    """Return whether a camera has to look at a batch."""
+    return any(
+        index in boundary.casts and is_due(cast, boundary.stamp_ns, job.batch.wanted)
+        for index, cast in enumerate(job.state.casts)
+        for boundary in job.batch.boundaries
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
