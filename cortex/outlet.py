@@ -17,7 +17,9 @@ from cortex.wire import AttachKey, parse_attach_key, parse_resume_key
 
 logger = logging.getLogger(__name__)
 
-DONTWAIT, SNDMORE = int(zmq.DONTWAIT), int(zmq.SNDMORE)  # joined as enums they cost a microsecond
+# As enums they cost a microsecond or two where they are joined or masked.
+DONTWAIT, SNDMORE = int(zmq.DONTWAIT), int(zmq.SNDMORE)
+EVENTS, POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
 
 ATTACHED_MAX = 16_384
 
@@ -130,7 +132,7 @@ class Outlets:
     def refresh(self) -> None:
         """Read who has come and gone; the caller holds the lock."""
         for outlet in self._outlets:
-            while int(outlet.socket.get(zmq.EVENTS)) & zmq.POLLIN:
+            while int(outlet.socket.get(EVENTS)) & POLLIN:
                 try:
                     event = outlet.socket.recv(DONTWAIT)
                 except zmq.Again:

@@ -83,4 +83,6 @@ def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.floa
         raise ValueError(f"{name} must have shape [{count}, {width}] or [{width}], got {list(rows.shape)}")
     if not np.isfinite(rows).all():
         raise ValueError(f"{name} must be finite, got {rows.tolist()}")
+    if rows.size == count * width:
+        return np.ascontiguousarray(rows.reshape(count, width))
     return np.ascontiguousarray(np.broadcast_to(rows, (count, width)))

@@ -18,11 +18,11 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode, Controller, make_controller
+from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, ImuSample, Odometry, Packet
 from neurosim_core.render.renderer import SceneOnDevice, upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
@@ -41,19 +42,20 @@ from neurosim_core.schedule import Boundary, Schedule, batch_end_ns, boundaries,
 from neurosim_core.sensors.cast import (
     CastState,
     Instants,
+    Look,
     close_eyes,
     flush_events,
     is_due,
     leave_out,
     make_cast_state,
+    plan_look,
     read_events,
     read_images,
-    render_instants,
     scan_events,
 )
 from neurosim_core.sensors.imu import Imu
 from neurosim_core.sensors.rig import Cast, ImuSensorConfig, OdometrySensorConfig, plan_casts
-from neurosim_core.streams import Graphs, HostCopy, Milestone, make_stream, on
+from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_stream, on
 from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace, TraceRows
 from neurosim_core.trajectory import Path, make_path
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig
@@ -129,6 +131,13 @@ class Batch:
     seen: Sequence[tuple[CastState, Instants]] = ()
 
 
+class Pilot(NamedTuple):
+    """Turns the setpoints of one mode into rotor speeds."""
+
+    controller: Controller
+    setpoint: HostInput
+
+
 @dataclass(kw_only=True, eq=False)
 class State:
     """What changes during a run."""
@@ -153,6 +162,8 @@ class State:
     render_stream: wp.Stream | None
     event_stream: wp.Stream | None
     """Where events are found, while the next batch is rendered."""
+    overlaps: bool
+    """Parts of a batch are launched on their own; on a CUDA device with one lane, all as one graph."""
     flown: Sequence[Milestone]
     """For each batch that may be flown and not looked at, its end on `flight_stream`."""
     rendered: Milestone
@@ -168,8 +179,12 @@ class State:
     """Batches that cameras have looked at, or left out; written by the thread that does."""
     last: Odometry | None = None
     """The state at the end of what was flown and read."""
-    pilots: dict[str, Controller] = field(default_factory=dict)
-    """Controllers of the command modes that were used."""
+    rotor_speeds: HostInput
+    """Where rotor speeds are commanded from outside."""
+    pilots: dict[str, Pilot] = field(default_factory=dict)
+    """Who flies in the command modes that were used."""
+    order: CommandMode | None = None
+    """Mode of the setpoint that the next batch begins with."""
     under_way: deque[Batch] = field(default_factory=deque)
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
@@ -352,6 +367,8 @@ def make_state(
     }
     return State(
         vehicle=vehicle,
+        rotor_speeds=HostInput(vehicle.arrays.rotor_speed_command),
+        overlaps=lane_count > 1 or wp.get_device(device).is_cpu,
         controller=make_controller(
             "path", model.airframe, config.control.gains, device=device, paths=model.path
         ),
@@ -471,8 +488,10 @@ def fly_period(
     def fly(stretch: Sequence[Boundary]) -> None:
         if free_lanes(state) < 1:
             raise RuntimeError(f"{state.flight_lane_count} batches wait for see() or skip(): no lane is free")
-        batch = _fly_batch(model, state, stretch, closed_loop=False)
+        batch, key, flight = _plan_flight(model, state, stretch, closed_loop=False)
+        _launch_flight(state, batch, key, flight)
         batches.append(batch)
+        state.flown[batch.number % state.flight_lane_count].wait()
         packets.extend(_in_order(model, _read_flight(model, state, batch), state.stamp_ns))
         if state.failure is not None:
             raise state.failure
@@ -601,6 +620,9 @@ def read(model: Model, state: State) -> list[Packet]:
             the integration failed (`failure`).
     """
     batch = state.under_way.popleft()
+    with timed(state.wall_s, "read-back"):
+        flown = state.flown if state.overlaps else state.lanes  # one graph has one end
+        flown[batch.number % len(flown)].wait()
     packets = _read_flight(model, state, batch)  # may end the run before the end of the batch
     packets += _read_cameras(state, batch)
     state.looked_count += 1
@@ -631,47 +653,64 @@ def _parts_of_period(model: Model, state: State) -> Iterator[int]:
 
 
 def _command(model: Model, state: State, command: ArrayLike | None, mode: CommandMode) -> None:
-    """Turn a setpoint into rotor speeds at the present state of the vehicle."""
+    """Have the next batch begin with a setpoint, which becomes rotor speeds at the state of the vehicle then.
+
+    The batch before has been read: what it took from the host is free.
+    """
     if command is None:
         return
-    with on(state.flight_stream):
-        if mode == "motor_speeds":
-            state.vehicle.command(command)
-            return
+    if mode == "motor_speeds":
+        rotor_count = model.airframe.rotor_count
+        rows = as_rows(command, name="rotor_speed_command", count=1, width=rotor_count)
+        state.rotor_speeds.rows[:] = rows
+    else:
         if mode not in state.pilots:
             gains = model.config.control.gains
-            state.pilots[mode] = make_controller(mode, model.airframe, gains, device=model.device)
+            controller = make_controller(mode, model.airframe, gains, device=model.device)
+            state.pilots[mode] = Pilot(controller, HostInput(controller.setpoint))
         pilot = state.pilots[mode]
-        pilot.set(command)
-        pilot.update(state.vehicle.arrays)
+        pilot.setpoint.rows[:] = pilot.controller.checked(command)
+    state.order = mode
 
 
 def _launch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool) -> None:
     """Fly a stretch, let the cameras see it, and launch the copies to the host."""
-    batch = _fly_batch(model, state, stretch, closed_loop=closed_loop)
-    _look(model, state, batch)
+    batch, key, flight = _plan_flight(model, state, stretch, closed_loop=closed_loop)
+    if state.overlaps:
+        _launch_flight(state, batch, key, flight)
+        _look(model, state, batch)
+    else:  # all of it as one graph
+        looks = _plan_looks(state, batch)
+        with timed(state.wall_s, "flight and render"):
+            state.graphs.run(
+                (key, *(look.key for look in looks)), lambda: (flight(), *(look.render() for look in looks))
+            )
+        _scan(state, batch, looks)
     state.under_way.append(batch)
 
 
-def _fly_batch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool) -> Batch:
-    """Move the vehicle through a stretch."""
+def _plan_flight(
+    model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool
+) -> tuple[Batch, Hashable, Callable[[], None]]:
+    """Take the vehicle through a stretch: return the batch, and what launches it, with its key."""
     number = state.launched_count
     slot = number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count)
     stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in stretch)]
     elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
-    with timed(state.wall_s, "dynamics and control"), on(state.flight_stream):
-        pattern = tuple(
-            (span, boundary.control, boundary.samplers)
-            for span, boundary in zip(elapsed_ns, stretch, strict=True)
-        )
-        state.graphs.run(
-            (slot, closed_loop, pattern),
-            lambda: _fly(model, state, stretch, elapsed_ns, slot=slot, closed_loop=closed_loop),
-        )
-        state.flown[number % state.flight_lane_count].set()
+    order, state.order = state.order, None
+    pattern = tuple(
+        (span, boundary.control, boundary.samplers)
+        for span, boundary in zip(elapsed_ns, stretch, strict=True)
+    )
+
+    def flight() -> None:
+        if order is not None:
+            _obey(state, order)
+        _fly(model, state, stretch, elapsed_ns, slot=slot, closed_loop=closed_loop)
+
     state.launched_count += 1
     state.launched_ns = stretch[-1].stamp_ns
-    return Batch(
+    batch = Batch(
         boundaries=stretch,
         step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
         command_count=sum(closed_loop and boundary.control for boundary in stretch),
@@ -680,6 +719,23 @@ def _fly_batch(model: Model, state: State, stretch: Sequence[Boundary], *, close
         wanted=state.wanted,
         until_ns=state.launched_ns,
     )
+    return batch, (order, slot, closed_loop, pattern), flight
+
+
+def _launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], None]) -> None:
+    with timed(state.wall_s, "dynamics and control"), on(state.flight_stream):
+        state.graphs.run(key, flight)
+        state.flown[batch.number % state.flight_lane_count].set()
+
+
+def _obey(state: State, order: CommandMode) -> None:
+    """Turn the setpoint that the host has written into rotor speeds, on the device only."""
+    if order == "motor_speeds":
+        state.rotor_speeds.upload()
+    else:
+        pilot = state.pilots[order]
+        pilot.setpoint.upload()
+        pilot.controller.update(state.vehicle.arrays)
 
 
 def _fly(
@@ -711,43 +767,53 @@ def _fly(
 
 def _look(model: Model, state: State, batch: Batch) -> None:
     """Let the cameras that are wanted see a batch, and launch the copies to the host."""
-    lane = batch.number % len(state.lanes)
-    seen = []
     with timed(state.wall_s, "render"), on(state.render_stream):
         state.flown[batch.number % state.flight_lane_count].hold()
-        for index, cast in enumerate(state.casts):
-            close_eyes(cast, batch.wanted)
-            due = [
-                place
-                for place, boundary in enumerate(batch.boundaries)
-                if index in boundary.casts and is_due(cast, boundary.stamp_ns, batch.wanted)
-            ]
-            if due:
-                stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
-                slots = [batch.slot + place for place in due]
-                instants = render_instants(
+        looks = _plan_looks(state, batch)
+        for look in looks:
+            state.graphs.run(look.key, look.render)
+        state.rendered.set()
+    with on(state.event_stream):
+        state.rendered.hold()
+        _scan(state, batch, looks)
+
+
+def _plan_looks(state: State, batch: Batch) -> list[Look]:
+    """Return what the casts with cameras that are wanted have to render of a batch."""
+    looks = []
+    for index, cast in enumerate(state.casts):
+        close_eyes(cast, batch.wanted)
+        due = [
+            place
+            for place, boundary in enumerate(batch.boundaries)
+            if index in boundary.casts and is_due(cast, boundary.stamp_ns, batch.wanted)
+        ]
+        if due:
+            looks.append(
+                plan_look(
                     cast,
                     state.trace,
-                    slots,
-                    stamps_ns,
-                    lane=lane,
+                    slots=[batch.slot + place for place in due],
+                    stamps_ns=[batch.boundaries[place].stamp_ns for place in due],
+                    lane=batch.number % len(state.lanes),
                     wanted=batch.wanted,
-                    graphs=state.graphs,
                 )
-                seen.append((cast, instants))
-        state.rendered.set()
-    with timed(state.wall_s, "events"), on(state.event_stream):
-        state.rendered.hold()
-        for cast, instants in seen:
-            scan_events(cast, instants)
-        state.lanes[lane].set()
-    batch.seen = seen
+            )
+    return looks
+
+
+def _scan(state: State, batch: Batch, looks: Sequence[Look]) -> None:
+    """Let event cameras see what was rendered; that is the end of a batch on the device."""
+    with timed(state.wall_s, "events"):
+        for look in looks:
+            scan_events(look.cast, look.instants)
+        state.lanes[batch.number % len(state.lanes)].set()
+    batch.seen = [(look.cast, look.instants) for look in looks]
 
 
 def _read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
-    """Wait until a batch is flown; return what was sampled on the way, and collisions."""
+    """Return what was sampled in a batch that is flown, and collisions."""
     with timed(state.wall_s, "read-back"):
-        state.flown[batch.number % state.flight_lane_count].wait()
         rows = state.trace.numpy(batch.slot, len(batch.boundaries))
     state.stamp_ns = batch.boundaries[-1].stamp_ns
     state.counts["steps"] += batch.step_count

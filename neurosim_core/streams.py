@@ -92,6 +92,29 @@ class Graphs:
         self._graphs[key] = (graph, kept)  # at the end: the one that was not used for longest goes first
 
 
+class HostInput:
+    """A device array that the host writes, through pinned memory on CUDA, so that a graph can hold the copy.
+
+    Args:
+        array: Contiguous.
+
+    Attributes:
+        rows: What is uploaded, as NumPy; on a CPU the array itself. To be left alone until the device has
+            come past the `upload`.
+    """
+
+    def __init__(self, array: Any) -> None:
+        self._array = array
+        self._copied = array.device.is_cuda
+        self._host = wp.empty_like(array, device="cpu", pinned=True) if self._copied else array
+        self.rows: NDArray[Any] = self._host.numpy()
+
+    def upload(self) -> None:
+        """Launch the copy to the device."""
+        if self._copied:
+            wp.copy(self._array, self._host)
+
+
 class HostCopy:
     """The copy of a device array in pinned memory of the host; on a CPU the array itself.
 

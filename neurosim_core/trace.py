@@ -140,8 +140,8 @@ class Trace:
             count: Number of slots, at least one.
             radius_m: Of the vehicle [m].
         """
-        known_field, launch = self._room_checks.get((first, count, radius_m), (None, None))
-        if known_field is not field:
+        key = (first, count, radius_m)
+        if key not in self._room_checks or self._room_checks[key][0] is not field:
             stride = self.states.strides[0]
             positions: Any = wp.array(
                 ptr=self.states.ptr + first * stride,
@@ -154,8 +154,8 @@ class Trace:
             launch = collision_check(field, positions, room, radius_m=radius_m)
             if len(self._room_checks) >= _LAUNCHES_MAX:
                 self._room_checks.clear()
-            self._room_checks[first, count, radius_m] = (field, launch)
-        launch.launch()
+            self._room_checks[key] = (field, launch)
+        self._room_checks[key][1].launch()
 
     def camera_poses(
         self,
@@ -180,8 +180,8 @@ class Trace:
             vehicle: Which vehicle carries the camera.
         """
         key = (slots.ptr, count, p_WC.ptr, vehicle)
-        held, launch = self._pose_launches.get(key, (None, None))
-        if held is not slots:  # another list of slots may have its memory by now
+        # another list of slots may have the memory of one that is gone
+        if key not in self._pose_launches or self._pose_launches[key][0] is not slots:
             launch = wp.launch(
                 _camera_poses,
                 dim=count,
@@ -193,7 +193,7 @@ class Trace:
             if len(self._pose_launches) >= _LAUNCHES_MAX:
                 self._pose_launches.clear()
             self._pose_launches[key] = (slots, launch)
-        launch.launch()
+        self._pose_launches[key][1].launch()
 
     def fetch(self, first: int, count: int) -> None:
         """Launch the copy of some slots to the host."""

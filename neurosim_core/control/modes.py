@@ -366,6 +366,10 @@ class Controller:
         Raises:
             ValueError: If the shape does not fit or an element is not finite.
         """
+        self.setpoint.assign(self.checked(setpoint))
+
+    def checked(self, setpoint: ArrayLike) -> NDArray[np.float64]:
+        """Return setpoints as rows, shape [N, len(layout)]; arguments and errors as for `set`."""
         try:
             rows = as_rows(setpoint, name="setpoint", count=self.count, width=len(self.layout))
         except ValueError as error:
@@ -374,7 +378,7 @@ class Controller:
             ) from None
         if self.mode == "attitude" and not (np.linalg.norm(rows[:, 1:], axis=1) > 1e-6).all():
             raise ValueError(f"mode 'attitude' takes unit quaternions, got {rows[:, 1:].tolist()}")
-        self.setpoint.assign(rows)
+        return rows
 
     def _record(self, arrays: Any) -> Any:
         """Prepare the launch on some arrays."""

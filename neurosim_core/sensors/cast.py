@@ -6,9 +6,9 @@ has been read.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -19,7 +19,7 @@ from neurosim_core.packets import Events, Image, ImageEncoding, Packet
 from neurosim_core.render.renderer import Renderer, SceneOnDevice, make_renderer
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig, SensorConfig
-from neurosim_core.streams import Graphs, HostCopy
+from neurosim_core.streams import HostCopy
 from neurosim_core.trace import Trace
 
 _ENCODING: dict[str, ImageEncoding] = {"rgb": "rgb8", "depth": "32FC1"}
@@ -172,7 +172,18 @@ def _pictures_due(cast: CastState, stamp_ns: int, wanted: Collection[str]) -> li
     return [name for name, image in cast.images.items() if name in wanted and image.rate.has_tick(stamp_ns)]
 
 
-def render_instants(
+class Look(NamedTuple):
+    """A batch that a cast is going to render."""
+
+    cast: CastState
+    instants: Instants
+    key: Hashable
+    """Same key, same launches."""
+    render: Callable[[], Any]
+    """Launches the rendering and the copy of the pictures; returns what must be kept for a graph of it."""
+
+
+def plan_look(
     cast: CastState,
     trace: Trace,
     slots: Sequence[int],
@@ -180,18 +191,16 @@ def render_instants(
     *,
     lane: int,
     wanted: Collection[str],
-    graphs: Graphs,
-) -> Instants:
-    """Launch the rendering of the instants of a batch, and the copy of its pictures.
+) -> Look:
+    """Return how a cast renders the instants of a batch.
 
     Args:
-        cast: The lane's buffers are overwritten.
+        cast: The lane's buffers are overwritten by the rendering.
         trace: Where the states of the batch are.
         slots: Slots of the instants in the trace, at least one.
         stamps_ns: Their stamps.
         lane: Of the batch; the one that had it before has been read.
         wanted: Names of the cameras that look.
-        graphs: Of the run.
     """
     pictures = []
     image_slots = []
@@ -212,13 +221,13 @@ def render_instants(
             copy.fetch(0, used)
         return from_slots, to_slots
 
-    graphs.run((id(cast), lane, tuple(slots), tuple(image_slots)), render)
-    return Instants(
+    instants = Instants(
         lane=lane,
         stamps_ns=tuple(stamps_ns),
         pictures=tuple(pictures),
         events=tuple(name for name in cast.events if name in wanted),
     )
+    return Look(cast, instants, (id(cast), lane, tuple(slots), tuple(image_slots)), render)
 
 
 def close_eyes(cast: CastState, wanted: Collection[str]) -> None:

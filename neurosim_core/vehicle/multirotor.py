@@ -283,7 +283,6 @@ class Multirotor:
             wp.array(quadratic, dtype=wp.vec4d, device=self.device),
             wp.array(linear_weights(position, drag), dtype=vec10d, device=self.device),
         ]
-        self._command_on_host = self.arrays.rotor_speed_command.numpy() if self.device.is_cpu else None
         self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
         self.reset()
@@ -362,10 +361,7 @@ class Multirotor:
             ValueError: The shape is wrong or a command is not finite.
         """
         rows = self._rows(rotor_speed_command, "rotor_speed_command", self.config.rotor_count)
-        if self.device.is_cpu:
-            self._command_on_host[:] = rows
-        else:
-            self.arrays.rotor_speed_command.assign(rows)
+        self.arrays.rotor_speed_command.assign(rows)
 
     def advance(self, duration_ns: int) -> None:
         """Move all vehicles with the command in `arrays`; device form of `step`, without checks.
