@@ -112,6 +112,7 @@ class Outlets:
         self._publishers: dict[int, Attachable] = {}
         self._attached: dict[bytes, Outlet] = {}
         self._notes: deque[str] = deque(maxlen=100)
+        self._refreshed_ns = 0
         self.closed = False
 
     def add(self, outlet: Outlet) -> None:
@@ -131,6 +132,7 @@ class Outlets:
 
     def refresh(self) -> None:
         """Read who has come and gone; the caller holds the lock."""
+        self._refreshed_ns = time.monotonic_ns()
         for outlet in self._outlets:
             while int(outlet.socket.get(EVENTS)) & POLLIN:
                 try:
@@ -138,6 +140,11 @@ class Outlets:
                 except zmq.Again:
                     break
                 self._handle(outlet, event)
+
+    def refresh_if_older(self, stamp_ns: int) -> None:
+        """Do `refresh`, unless it was done after a time of the monotonic clock [ns], for whichever publisher."""
+        if self._refreshed_ns < stamp_ns:
+            self.refresh()
 
     def note(self, text: str) -> None:
         """Say that something goes wrong; the caller holds the lock, so no handler of a log may run."""

@@ -405,7 +405,7 @@ class Publisher(Generic[T]):
                 self._lock.acquire()
         self._check_open()
         self._refresh_ns = now_ns + REFRESH_NS
-        self._outlets.refresh()
+        self._outlets.refresh_if_older(now_ns - REFRESH_NS)
 
     def _check_open(self) -> None:
         if self._closed:
