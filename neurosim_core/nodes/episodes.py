@@ -35,7 +35,8 @@ class Episodes:
             stamp_ns: Stamp of the message [ns].
             sequence: Number of the message in its stream.
         """
-        run, last_ns, last_sequence = self._last.get(stream, (self._run, stamp_ns, sequence))
+        unheard = (max(self._run - 1, 0), stamp_ns, sequence)
+        run, last_ns, last_sequence = self._last.get(stream, unheard)
         found: Run = "present"
         if stamp_ns < last_ns or sequence < last_sequence:
             if run == self._run:

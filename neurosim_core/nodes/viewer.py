@@ -63,7 +63,13 @@ _WITHOUT_WINDOW = "`neurosim view --web` serves a page, `neurosim view --save FI
 
 
 class Outlet(Protocol):
-    """Where recordings are opened."""
+    """Where recordings are opened.
+
+    Attributes:
+        compress: Whether pictures should be small, rather than there at once.
+    """
+
+    compress: bool
 
     def open(self, name: str) -> rr.RecordingStream:
         """Open a recording of this name."""
@@ -77,6 +83,8 @@ class Outlet(Protocol):
 
 class ViewerOutlet:
     """Recordings go to a viewer."""
+
+    compress = False
 
     def __init__(self, viewer: RerunViewer) -> None:
         self._viewer = viewer
@@ -99,6 +107,8 @@ class ViewerOutlet:
 
 class FileOutlet:
     """Each recording is a file: NAME.rrd, and after a reset the first free of NAME-2.rrd, NAME-3.rrd, ..."""
+
+    compress = True
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         """Refuse at once what cannot be written.
@@ -173,7 +183,7 @@ class Show:
             number: Numbers of recordings.
             only: Sensors to show; None: all.
             event_window_ns: Time in one picture of events [ns].
-            image_rate_hz: Most pictures of a sensor a second [Hz].
+            image_rate_hz: Most images of a sensor a second [Hz].
             say: Told what a user should know.
             scene: Loads the scene.
 
@@ -246,6 +256,7 @@ class Show:
             event_window_ns=self._window_ns,
             image_rate_max_hz=self._image_rate_hz,
             links=bool(self._links),
+            compress=self._outlet.compress,
             live=True,
             keep_layout=number > 1,
         )
@@ -499,7 +510,7 @@ def view(
         save: File to write, with "save"; after a reset NAME-2.rrd, ...
         only: Sensors to show; None: all.
         event_window_s: Time in one picture of events [s].
-        image_rate_hz: Most pictures of a sensor a second, by the wall clock [Hz].
+        image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
         port: Port of the page; 0: any.
         open_browser: Open the page.
 
@@ -579,7 +590,7 @@ def watch(
         say: Told what a user should know.
         only: Sensors to show; None: all.
         event_window_s: Time in one picture of events [s].
-        image_rate_hz: Most pictures of a sensor a second, by the wall clock [Hz].
+        image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
         to_the_end: Return when a simulator has left after the end of its flight.
 
     Returns:

@@ -1,7 +1,7 @@
 """Packets as Rerun sees them: the same code fills a file and feeds a live viewer.
 
-Rerun gets what eyes need: pictures as JPEG, depth as 16-bit PNG in millimetres, events as one picture per
-window. Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. Entities:
+Rerun gets what eyes need: pictures as JPEG, depth in whole millimetres, events as one picture per window.
+Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. Entities:
 
     world/scene/{room,ceiling}/<n>          the scene, one mesh per material; the ceiling is hidden
     world/vehicles/<vehicle>                its pose; below it one entity per camera, with frustum and picture
@@ -31,13 +31,15 @@ from neurosim_core.record.header import SensorDescription
 from neurosim_core.view.event_picture import EventWindow
 from neurosim_core.view.rerun_layout import make_blueprint
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
-from neurosim_core.view.rerun_shapes import SceneShapes, encode_events, encode_image
+from neurosim_core.view.rerun_shapes import SceneShapes, encode_events, encode_image, event_colors
 
 if TYPE_CHECKING:
     import rerun as rr
 
 _BATCH_NS = 50_000_000
 _BATCH_ROWS = 1024
+_EVENT_PERIOD_NS = 20_000_000
+_EVENT_BURST_NS = 500_000_000
 _XYZ_COLORS = ((224, 49, 49), (47, 158, 68), (28, 126, 214))
 _SERIES_COLORS = (
     *_XYZ_COLORS,
@@ -77,6 +79,7 @@ class RerunLogger:
         event_window_ns: int = 20_000_000,
         image_rate_max_hz: float | None = None,
         links: bool = False,
+        compress: bool = True,
         live: bool = False,
         keep_layout: bool = False,
         clock_ns: Callable[[], int] = time.monotonic_ns,
@@ -89,9 +92,10 @@ class RerunLogger:
                 frustum.
             scene: The scene to show.
             event_window_ns: How much time one picture of events shows [ns].
-            image_rate_max_hz: Log no more pictures per sensor and second than this: of simulated time, or,
-                live, by the wall clock, and then those of events, too.
+            image_rate_max_hz: Log no more images per sensor and second than this: of simulated time, or live,
+                by the wall clock. Live, pictures of events are as many as in real time, at most 50 a second.
             links: Deliveries of links will come.
+            compress: Make pictures small; what is not, a viewer shows without delay.
             live: This is a stream that may go on for hours.
             keep_layout: Leave the layout as the viewer has it now, if it has one.
             clock_ns: The wall clock [ns].
@@ -111,7 +115,9 @@ class RerunLogger:
         }
         self._event_window_ns = event_window_ns
         self._image_limit = _RateLimit(0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz))
+        self._event_limit = _RateLimit(max(event_window_ns, _EVENT_PERIOD_NS), burst_ns=_EVENT_BURST_NS)
         self._links = links
+        self._compress = compress
         self._live = live
         self._keep_layout = keep_layout
         self._clock_ns = clock_ns
@@ -339,23 +345,27 @@ class RerunLogger:
     def _color(self, vehicle: str) -> tuple[int, int, int]:
         return self._colors.get(vehicle, _VEHICLE_COLORS[0])
 
-    def _shows_picture(self, entity: str, stamp_ns: int) -> bool:
-        return self._image_limit.passes(entity, self._clock_ns() if self._live else stamp_ns)
-
     def _log_image(self, vehicle: str, packet: Image) -> None:
         entity = f"{_body(vehicle)}/{packet.sensor}/image"
-        if self._shows_picture(entity, packet.stamp_ns):
+        now_ns = self._clock_ns() if self._live else packet.stamp_ns
+        if self._image_limit.passes(entity, now_ns):
             self._set_time(packet.stamp_ns)
-            self._recording.log(entity, encode_image(packet))
+            self._recording.log(entity, encode_image(packet, compress=self._compress))
 
     def _log_events(self, vehicle: str, packet: Events) -> None:
         entity = f"{_body(vehicle)}/{packet.sensor}/image"
-        window = self._windows.setdefault(entity, EventWindow(length_ns=self._event_window_ns))
+        if entity not in self._windows:
+            self._windows[entity] = EventWindow(length_ns=self._event_window_ns)
+            if not self._compress:
+                self._recording.log(entity, event_colors(), static=True)
+        window = self._windows[entity]
         arrays = packet.numpy()
         for end_ns, events in window.add(arrays, start_ns=packet.start_ns, stamp_ns=packet.stamp_ns):
-            if not self._live or self._shows_picture(entity, end_ns):
+            if not self._live or self._event_limit.passes(entity, self._clock_ns()):
                 self._set_time(end_ns)
-                picture = encode_events(events, width=packet.width, height=packet.height)
+                picture = encode_events(
+                    events, width=packet.width, height=packet.height, compress=self._compress
+                )
                 self._recording.log(entity, picture)
 
     def _log_collision(self, vehicle: str, packet: Collision) -> None:
@@ -391,16 +401,26 @@ def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, floa
 class _RateLimit:
     """Lets so many pass that their mean rate is as wanted, whatever rate they come at."""
 
-    def __init__(self, period_ns: int) -> None:
+    def __init__(self, period_ns: int, *, burst_ns: int = 0) -> None:
+        """Let the first one pass.
+
+        Args:
+            period_ns: Mean time between those that pass, at least [ns].
+            burst_ns: How far ahead of the mean rate they may be, when they come at once [ns].
+        """
         self._period_ns = period_ns
+        self._burst_ns = burst_ns
         self._due_ns: dict[str, int] = {}
 
     def passes(self, key: str, now_ns: int) -> bool:
-        due_ns = self._due_ns.get(key, now_ns)
-        if due_ns - self._period_ns <= now_ns < due_ns:  # before that, time has begun again
+        """Return whether one of a kind may pass now."""
+        earliest_ns = now_ns - self._burst_ns
+        due_ns = self._due_ns.get(key, earliest_ns)
+        if now_ns < due_ns - self._period_ns:  # time has begun again
+            due_ns = now_ns
+        if now_ns < due_ns:
             return False
-        first = now_ns < due_ns
-        self._due_ns[key] = now_ns + self._period_ns if first else max(due_ns + self._period_ns, now_ns)
+        self._due_ns[key] = max(due_ns + self._period_ns, earliest_ns)
         return True
 
 

@@ -19,33 +19,57 @@ from neurosim_core.view.rerun_sdk import import_rerun
 _TEXTURE_MAX_PX = 256
 
 
-def encode_image(image: Image) -> Any:
+def encode_image(image: Image, *, compress: bool = True) -> Any:
     """Return a picture as Rerun shows it.
 
     rgb8 and mono8 become JPEG; 32FC1 becomes a depth image in millimetres up to 65 m, 0 where nothing is hit.
+
+    Args:
+        image: The picture.
+        compress: Make it small. What is not, a viewer shows without delay.
 
     Raises:
         ValueError: If another encoding is given.
     """
     rr = import_rerun()
     if image.encoding in ("rgb8", "mono8"):
-        return rr.Image(image.data).compress(jpeg_quality=90)
+        picture = rr.Image(image.data)
+        return picture.compress(jpeg_quality=90) if compress else picture
     if image.encoding == "32FC1":
-        depth_mm = np.where(np.isfinite(image.data), np.minimum(image.data * 1000.0 + 0.5, 65535.0), 0.0)
-        return rr.EncodedDepthImage(
-            _png(PIL.Image.fromarray(depth_mm.astype(np.uint16))),
-            media_type="image/png",
-            meter=1000.0,
-            colormap=rr.components.Colormap.Turbo,
-        )
+        high_mm = np.where(np.isfinite(image.data), np.minimum(image.data * 1000.0 + 0.5, 65535.0), 0.0)
+        depth_mm = high_mm.astype(np.uint16)
+        colormap = rr.components.Colormap.Turbo
+        if not compress:
+            return rr.DepthImage(depth_mm, meter=1000.0, colormap=colormap)
+        png = _png(PIL.Image.fromarray(depth_mm))
+        return rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0, colormap=colormap)
     raise ValueError(f"cannot show a picture of encoding {image.encoding!r}, known: rgb8, mono8, 32FC1")
 
 
-def encode_events(events: EventArrays, *, width: int, height: int) -> Any:
-    """Return events as the picture of `event_picture`, losslessly compressed."""
-    picture = PIL.Image.fromarray(event_classes(events, width=width, height=height), mode="L")
+def encode_events(events: EventArrays, *, width: int, height: int, compress: bool = True) -> Any:
+    """Return events as the picture of `event_picture`, without loss.
+
+    What is not compressed needs `event_colors` at its entity.
+    """
+    classes = event_classes(events, width=width, height=height)
+    if not compress:
+        return import_rerun().SegmentationImage(classes, opacity=1.0)
+    picture = PIL.Image.fromarray(classes, mode="L")
     picture.putpalette(PALETTE.tobytes())
     return import_rerun().EncodedImage(contents=_png(picture), media_type="image/png")
+
+
+def event_colors() -> Any:
+    """Return names and colours of the classes of events."""
+    names = ["no event"]
+    for polarity in ("darker", "brighter"):
+        names += [f"{polarity}, {count} events" for count in ("1", "2", "3", "4 or more")]
+    return import_rerun().AnnotationContext(
+        [
+            (k, name, (*map(int, color), 255))
+            for k, (name, color) in enumerate(zip(names, PALETTE, strict=True))
+        ]
+    )
 
 
 def _png(picture: PIL.Image.Image) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ Rows = dict[str, list[tuple[int | None, dict[str, Any]]]]
 def read(path: Path) -> Rows:
     """Rows of each entity: (time [ns] or None if static, values by name of the component)."""
     rows: Rows = defaultdict(list)
-    for chunk in rerun.chunk.RrdReader(path).stream():
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RRD file has no footer")  # a live file has none
+        reader = rerun.chunk.RrdReader(path)
+    for chunk in reader.stream():
         batch = chunk.to_record_batch()
         names = batch.schema.names
         times = batch.column(names.index("sim_time")) if "sim_time" in names else None
@@ -30,5 +34,5 @@ def read(path: Path) -> Rows:
 
 
 def scalars(rows: Rows, entity: str) -> list[tuple[int, list[float]]]:
-    """The points of a plot: (time [ns], values)."""
-    return [(t, values["scalars"]) for t, values in rows[entity] if t is not None]
+    """The points of a plot: (time [ns], values); none if there is no such plot."""
+    return [(t, values["scalars"]) for t, values in rows.get(entity, []) if t is not None]

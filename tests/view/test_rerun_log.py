@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import sys
 from pathlib import Path
@@ -13,16 +14,17 @@ import pytest
 import rerun as rr
 import rerun.chunk
 import trimesh
-from rerun_file import read
+from rerun_file import read, scalars
+from scipy.spatial.transform import Rotation
 from test_plan import make_scene
 
-from neurosim_core.packets import Collision, EventArrays, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.packets import Collision, Delivery, EventArrays, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record import Intrinsics, SensorDescription
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.view.event_picture import event_picture
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import open_recording
-from neurosim_core.view.rerun_shapes import encode_events, encode_image, scene_shapes
+from neurosim_core.view.rerun_shapes import encode_events, encode_image, event_colors, scene_shapes
 
 MS = 1_000_000
 LENS = Intrinsics(width=32, height=24, fx=30.0, fy=31.0, cx=16.0, cy=12.0)
@@ -192,6 +194,121 @@ def test_depth_is_in_millimetres_and_zero_is_nothing():
     blob = encoded.blob.as_arrow_array()[0].as_py()
     with PIL.Image.open(io.BytesIO(bytes(blob))) as found:
         assert np.asarray(found).tolist() == [[500, 1235], [0, 65535]]
+
+
+def test_pictures_for_a_viewer_are_not_compressed():
+    """Raw pixels, depth in millimetres, events as classes that have their colours."""
+    data = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    raw = encode_image(Image(data=data, encoding="rgb8"), compress=False)
+    assert raw.buffer.as_arrow_array().to_pylist() == [data.ravel().tolist()]
+    depth = np.array([[0.5, np.inf], [1.0, 70.0]], dtype=np.float32)
+    encoded = encode_image(Image(data=depth, encoding="32FC1"), compress=False)
+    assert encoded.meter.as_arrow_array().to_pylist() == [1000.0]
+    found = bytes(encoded.buffer.as_arrow_array()[0].as_py())
+    assert np.frombuffer(found, np.uint16).tolist() == [500, 0, 1000, 65535]
+
+    events = make_events(0).numpy()
+    classes = encode_events(events, width=32, height=24, compress=False).buffer.as_arrow_array()[0].as_py()
+    infos = [item["class_description"]["info"] for item in event_colors().context.as_arrow_array()[0].as_py()]
+    palette = {info["id"]: tuple(info["color"].to_bytes(4, "big")[:3]) for info in infos}
+    picture = np.array([palette[k] for k in classes], dtype=np.uint8).reshape(24, 32, 3)
+    assert (picture == event_picture(events, width=32, height=24)).all()
+    assert [info["label"] for info in infos][8] == "brighter, 4 or more events"
+
+
+def test_several_vehicles_are_kept_apart(tmp_path):
+    """Each has its pose, plots and path; a packet without a vehicle is of the first."""
+    vehicles = {"alpha": SENSORS, "beta": SENSORS}
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=vehicles) as logger:
+        logger.log(make_odometry(1))
+        logger.log(make_odometry(2), vehicle="beta")
+        logger.log(make_events(0), vehicle="beta")
+        logger.log(make_events(1), vehicle="beta")
+        logger.log_path(np.eye(3), vehicle="beta")
+    rows = read(tmp_path / "f.rrd")
+    for name, k in (("alpha", 1), ("beta", 2)):
+        poses = [v["translation"][0][0] for t, v in rows[f"/world/vehicles/{name}"] if t is not None]
+        assert poses == pytest.approx([0.1 * k], rel=1e-6)
+        assert len(rows[f"/world/trails/{name}"]) == 1
+        assert len(scalars(rows, f"/plots/{name}/truth/speed")) == 1
+    assert len(rows["/world/vehicles/beta/dvs/image"]) == 1
+    assert "/world/vehicles/alpha/dvs/image" not in rows
+    assert "/world/paths/alpha" not in rows
+    assert "/world/paths/beta" in rows
+    with pytest.raises(ValueError, match="at least one vehicle"):
+        RerunLogger(open_recording(), vehicles={})
+
+
+def test_the_pose_comes_from_one_sensor(tmp_path):
+    """A second odometry, which a link may hold up, does not make the vehicle jump."""
+    sensors = (*SENSORS, describe("late", "odometry"))
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles={"drone": sensors}) as logger:
+        for k in range(5):
+            logger.log(make_odometry(k))
+            logger.log(dataclasses.replace(make_odometry(k), sensor="late"))
+    rows = read(tmp_path / "f.rrd")
+    assert len([t for t, _ in rows["/world/vehicles/drone"] if t is not None]) == 5
+    assert len(scalars(rows, "/plots/drone/late/speed")) == 5
+
+
+def test_commands_are_plotted(tmp_path):
+    """An attitude as angles: roll, then pitch, then yaw, as SciPy has them."""
+    angles = np.array([0.3, -0.4, 2.0])
+    attitude = Rotation.from_euler("ZYX", angles[::-1]).as_quat()
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+        logger.log_command("attitude", 1, [5.0, *(3.0 * attitude)])
+        logger.log_command("attitude", 2, [5.0, 0.0, 0.0, 0.0, 0.0])
+        logger.log_command("motor_speeds", 3, np.arange(6))
+        logger.log_command("position", 4, [1.0, 2.0, 3.0, 0.5])
+    rows = read(tmp_path / "f.rrd")
+    (_, first), (_, second) = scalars(rows, "/plots/drone/command/attitude")
+    assert first == pytest.approx([5.0, *angles], rel=1e-12)
+    assert second[0] == 5.0
+    assert np.isnan(second[1:]).all()
+    assert scalars(rows, "/plots/drone/command/motor_speeds") == [(3, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])]
+    names = next(v["names"] for t, v in rows["/plots/drone/command/position"] if t is None)
+    assert names == ["x [m]", "y [m]", "z [m]", "yaw [rad]"]
+
+
+def test_deliveries_are_plotted_as_delays(tmp_path):
+    """In milliseconds, by link; what was lost is a gap."""
+    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING, links=True) as logger:
+        for stamp_ns, delivered_ns in ((10 * MS, 18 * MS), (20 * MS, -1)):
+            logger.log(
+                Delivery(stamp_ns=stamp_ns, sensor="imu_link", delivered_ns=delivered_ns, size_bytes=40)
+            )
+    (first, lost) = scalars(read(tmp_path / "f.rrd"), "/plots/drone/links/imu")
+    assert first == (10 * MS, [8.0])
+    assert np.isnan(lost[1][0])
+
+
+def test_live_is_sent_when_told_and_limited_by_the_wall_clock(tmp_path):
+    """Rows wait for `send`, or for 1024 of their kind; pictures pass by wall-clock time, not by stamps."""
+    now_ns = 0
+    logger = RerunLogger(
+        open_recording(tmp_path / "f.rrd", footer=False),
+        vehicles={"drone": SENSORS},
+        image_rate_max_hz=10.0,
+        live=True,
+        clock_ns=lambda: now_ns,
+    )
+    with logger:
+        for k in range(1500):
+            logger.log(make_imu(k))
+            assert len(logger._tables["plots/drone/imu/angular_rate"]._stamp_ns) == (k + 1) % 1024
+        logger.send()
+        assert not logger._tables["plots/drone/imu/angular_rate"]._stamp_ns
+        for k in range(201):  # a picture every 30 ms of wall-clock time
+            now_ns = k * 30 * MS
+            logger.log(make_image(k))
+        for k in range(2, 2000):  # events of 20 s, at once
+            logger.log(make_events(k, count=3))
+    rows = read(tmp_path / "f.rrd")
+    assert len(scalars(rows, "/plots/drone/imu/angular_rate")) == 1500
+    shown = np.array([t for t, _ in rows["/world/vehicles/drone/rgb/image"]]) * 30
+    assert len(shown) == 61  # 10 a second during 6 s, though none comes at 100 ms
+    assert np.diff(shown).min() >= 90
+    assert len(rows["/world/vehicles/drone/dvs/image"]) == 26  # those of the first half second
 
 
 def test_scene_is_split_by_material_and_ceiling():

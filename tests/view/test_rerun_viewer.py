@@ -1,0 +1,106 @@
+"""The viewer's process: who can reach it, and when it ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+import rerun as rr
+from processes import SOON_S, wait_for
+
+from neurosim_core.view import RerunViewer, ViewerEnded
+
+
+def listening(pid: int) -> set[tuple[str, int]]:
+    """Addresses and ports on which a process listens."""
+    sockets = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        sockets.update(re.findall(r"socket:\[(\d+)\]", os.readlink(entry)))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and fields[9] in sockets:
+                address, port = fields[1].split(":")
+                raw = bytes.fromhex(address)
+                found.add((socket.inet_ntoa(raw[::-1]) if len(raw) == 4 else address, int(port, 16)))
+    return found
+
+
+def test_it_listens_on_this_machine_only():
+    with RerunViewer(web=True) as viewer:
+        recording = viewer.open("flight 1")
+        recording.log("text", rr.TextDocument("hello"))
+        recording.flush(timeout_sec=SOON_S)
+        ports = {int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)", viewer.page_url)}
+        assert len(ports) == 2
+        assert listening(viewer._process.pid) == {("127.0.0.1", port) for port in ports}
+        assert viewer.page_url.endswith(f"/?url=rerun%2B{viewer.data_url.removeprefix('rerun+')}")
+        with urllib.request.urlopen(viewer.page_url, timeout=SOON_S) as page:
+            assert b"wasm" in page.read()
+        recording.disconnect()
+        assert not viewer.ended
+    assert viewer.ended
+
+
+def test_a_port_is_kept_to():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=f"port {port} cannot be used"):
+            RerunViewer(web=True, port=port)
+    with RerunViewer(web=True, port=port) as viewer:
+        assert viewer.page_url.startswith(f"http://127.0.0.1:{port}/")
+
+
+def test_it_ends_with_a_parent_that_is_killed():
+    code = (
+        "from neurosim_core.view import RerunViewer\n"
+        "viewer = RerunViewer(web=True)\n"
+        "print(viewer._process.pid, flush=True)\n"
+        "input()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        assert listening(pid)
+        parent.kill()
+    wait_for(lambda: not Path(f"/proc/{pid}").exists() or " Z " in Path(f"/proc/{pid}/stat").read_text())
+
+
+def test_a_viewer_that_fails_says_why(monkeypatch, tmp_path):
+    """Stand-ins: one ends at once, one later; the second as a window that somebody closes, and as a crash."""
+    viewer = tmp_path / "rerun"
+    monkeypatch.setenv("RERUN_CLI_PATH", str(viewer))
+    viewer.write_text("#!/bin/sh\necho no such display >&2\nexit 3\n")
+    viewer.chmod(0o755)
+    with pytest.raises(ViewerEnded, match=r"(?s)ended at once, with status 3:.*no such display"):
+        RerunViewer(web=False)
+    viewer.write_text(
+        f"#!{sys.executable}\n"
+        "import signal, socket, sys\n"
+        "port = int(sys.argv[sys.argv.index('--port') + 1])\n"
+        "signal.signal(signal.SIGUSR1, lambda *_: sys.exit(0))\n"
+        "signal.signal(signal.SIGUSR2, lambda *_: sys.exit('graphics are broken'))\n"
+        "server = socket.create_server(('127.0.0.1', port))\n"
+        "while True: server.accept()\n"
+    )
+    with RerunViewer(web=False) as window:
+        window._process.send_signal(signal.SIGUSR1)
+        wait_for(lambda: window.ended)
+        window.check()
+    with RerunViewer(web=False) as window:
+        window._process.send_signal(signal.SIGUSR2)
+        wait_for(lambda: window.ended)
+        with pytest.raises(ViewerEnded, match=r"(?s)status 1:.*graphics are broken"):
+            window.check()
