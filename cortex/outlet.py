@@ -142,7 +142,7 @@ class Outlets:
                 self._handle(outlet, event)
 
     def refresh_if_older(self, stamp_ns: int) -> None:
-        """Do `refresh`, unless it was done after a time of the monotonic clock [ns], for whichever publisher."""
+        """Do `refresh`, unless that was after a time of the monotonic clock [ns], for whichever publisher."""
         if self._refreshed_ns < stamp_ns:
             self.refresh()
 
