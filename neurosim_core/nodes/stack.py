@@ -45,7 +45,7 @@ def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite:
                 name="controller",
                 command=_neurosim("fly", str(settings)),
                 at_its_end="go on" if streaming else "end if it failed",
-                advice="the fail-safe flies until another one comes (neurosim fly)" if streaming else "",
+                advice_if_failed="the fail-safe flies until another one comes (neurosim fly)",
             ),
         ]
         if viewer_arguments is not None:

@@ -42,6 +42,8 @@ class Part:
     """What the others do when it ends by itself."""
     advice: str = ""
     """What to tell a user when it has ended and the others go on."""
+    advice_if_failed: str = ""
+    """What to tell besides, if it failed."""
     prefixed: bool = True
     """Whether its lines are printed behind its name."""
 
@@ -170,7 +172,8 @@ def _attend(
                 if status:
                     _say(console, f"{part.name} {_how(status)}; ending the others")
                 return status if status > 0 else int(status != 0)
-            _say(console, f"{part.name} {_how(status)}" + (f"; {part.advice}" if part.advice else ""))
+            advice = [part.advice, part.advice_if_failed if status else ""]
+            _say(console, "; ".join([f"{part.name} {_how(status)}", *filter(None, advice)]))
     return INTERRUPTED if caught else 0
 
 

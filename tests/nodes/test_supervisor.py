@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from line_process import LineProcess
 from processes import ROOT, SOON_S, processes_with, wait_for
 
 from neurosim_core.nodes import guard
@@ -66,70 +66,23 @@ def marker(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
                 os.kill(process, signal.SIGKILL)
 
 
-class Supervisor:
-    """A process that runs parts."""
-
-    def __init__(self, *parts: dict[str, Any], folder: Path, grace_s: float = 10.0) -> None:
-        given = json.dumps({"parts": parts, "folder": str(folder), "grace_s": grace_s})
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SUPERVISOR, given], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
-        assert self.process.stdout is not None
-        self.output = self.process.stdout
-        self._begun = b""
-
-    def read_until(self, words: list[str]) -> list[str]:
-        """Lines up to that in which the last of these words has come."""
-        lines, missing = [], list(words)
-        while missing:
-            line = self._line()
-            assert line is not None, f"it has ended, without {missing}: {lines}"
-            lines.append(line)
-            missing = [word for word in missing if word not in line]
-        return lines
-
-    def rest(self) -> list[str]:
-        """What it prints until its end."""
-        lines = []
-        while (line := self._line()) is not None:
-            lines.append(line)
-        self.process.wait(SOON_S)
-        return lines
-
-    def _line(self) -> str | None:
-        """The next line; None at the end."""
-        deadline = time.monotonic() + SOON_S
-        while b"\n" not in self._begun:
-            ready = select.select([self.output], [], [], max(deadline - time.monotonic(), 0.0))[0]
-            assert ready, f"the supervisor is silent, after {self._begun!r}"
-            chunk = os.read(self.output.fileno(), 1 << 16)
-            if not chunk:
-                return None
-            self._begun += chunk
-        line, self._begun = self._begun.split(b"\n", 1)
-        return line.decode()
-
-
 @pytest.fixture
-def start(marker: str, tmp_path: Path) -> Iterator[Callable[..., Supervisor]]:
+def start(marker: str, tmp_path: Path) -> Iterator[Callable[..., LineProcess]]:
     """Starts supervisors; they are gone at the end, with what they started."""
     with contextlib.ExitStack() as stack:
 
-        def start(*parts: dict[str, Any], grace_s: float = 10.0) -> Supervisor:
+        def start(*parts: dict[str, Any], grace_s: float = 10.0) -> LineProcess:
             folder = tmp_path / "to remove"
             folder.mkdir()
             (folder / "config.yaml").write_text("{}")
-            supervisor = Supervisor(*parts, folder=folder, grace_s=grace_s)
-            stack.callback(supervisor.output.close)
-            stack.callback(supervisor.process.wait)
-            stack.callback(supervisor.process.kill)
-            return supervisor
+            given = json.dumps({"parts": parts, "folder": str(folder), "grace_s": grace_s})
+            return stack.enter_context(LineProcess([sys.executable, "-c", SUPERVISOR, given]))
 
         yield start
 
 
 @pytest.fixture
-def run(start: Callable[..., Supervisor]) -> Callable[..., tuple[int, list[str]]]:
+def run(start: Callable[..., LineProcess]) -> Callable[..., tuple[int, list[str]]]:
     """Runs parts until they end; returns the exit status and the lines that were printed."""
 
     def run(*parts: dict[str, Any]) -> tuple[int, list[str]]:
@@ -192,18 +145,26 @@ def test_its_failure_is_reported_and_is_that_of_all(run, code, status, said):
 def test_the_others_go_on_without_one_that_they_do_not_need(start):
     supervisor = start(
         part("simulator"),
-        part("viewer", "import sys; sys.exit(1)", at_its_end="go on", advice="the flight goes on"),
+        part(
+            "viewer",
+            "import sys; sys.exit(1)",
+            at_its_end="go on",
+            advice="the others go on",
+            advice_if_failed="open another",
+        ),
     )
-    supervisor.read_until(["viewer failed with status 1; the flight goes on", *ready("simulator")])
-    supervisor.process.send_signal(signal.SIGINT)
+    supervisor.read_until("viewer failed with status 1; the others go on; open another", *ready("simulator"))
+    supervisor.interrupt()
     assert supervisor.rest() == ["simulator: closed"]
 
 
 def test_one_may_end_when_its_job_is_done_but_not_fail(start):
     """As the controller in lockstep."""
-    supervisor = start(part("simulator"), part("controller", "pass", at_its_end="end if it failed"))
-    supervisor.read_until(["controller has ended", *ready("simulator")])
-    supervisor.process.send_signal(signal.SIGINT)
+    supervisor = start(
+        part("simulator"), part("controller", "pass", at_its_end="end if it failed", advice_if_failed="x")
+    )
+    assert "controller has ended" in supervisor.read_until("controller has ended", *ready("simulator"))
+    supervisor.interrupt()
     assert supervisor.rest() == ["simulator: closed"]
 
 
@@ -221,7 +182,7 @@ def test_its_failure_ends_the_others_if_they_need_it(run):
 def test_a_signal_interrupts_each_once_and_ends_all(start, number):
     names = ("simulator", "controller", "viewer")
     supervisor = start(*(part(name) for name in names))
-    supervisor.read_until(ready(*names))
+    supervisor.read_until(*ready(*names))
     supervisor.process.send_signal(number)
     assert sorted(supervisor.rest()) == sorted(f"{name}: closed" for name in names)
     assert supervisor.process.returncode == 130
@@ -230,18 +191,18 @@ def test_a_signal_interrupts_each_once_and_ends_all(start, number):
 def test_the_terminal_cannot_interrupt_them_a_second_time(start):
     """They have sessions of their own, so that Ctrl-C goes to the supervisor alone."""
     supervisor = start(part("simulator"), part("viewer"))
-    lines = supervisor.read_until(ready("simulator", "viewer"))
+    lines = supervisor.read_until(*ready("simulator", "viewer"))
     processes = [int(line.split()[-1]) for line in lines]
     assert [os.getsid(process) for process in processes] == processes
-    supervisor.process.send_signal(signal.SIGINT)
+    supervisor.interrupt()
     supervisor.rest()
 
 
 def test_who_does_not_end_in_time_is_killed(start):
     supervisor = start(part("simulator"), part("controller", STUBBORN), grace_s=0.3)
-    supervisor.read_until(ready("simulator", "controller"))
+    supervisor.read_until(*ready("simulator", "controller"))
     begin_s = time.monotonic()
-    supervisor.process.send_signal(signal.SIGINT)
+    supervisor.interrupt()
     lines = supervisor.rest()
     assert time.monotonic() - begin_s >= 0.3
     assert "simulator: closed" in lines
@@ -252,10 +213,10 @@ def test_who_does_not_end_in_time_is_killed(start):
 def test_a_second_signal_kills_at_once(start):
     """The grace is that of the fixture, which is longer than the test waits."""
     supervisor = start(part("simulator"), part("controller", STUBBORN), grace_s=1000.0)
-    supervisor.read_until(ready("simulator", "controller"))
-    supervisor.process.send_signal(signal.SIGINT)
-    supervisor.read_until(["simulator: closed"])
-    supervisor.process.send_signal(signal.SIGINT)
+    supervisor.read_until(*ready("simulator", "controller"))
+    supervisor.interrupt()
+    supervisor.read_until("simulator: closed")
+    supervisor.interrupt()
     assert any(line.startswith("controller had not ended after") for line in supervisor.rest())
     assert supervisor.process.returncode == 130
 
@@ -265,10 +226,10 @@ def test_what_a_part_has_started_ends_with_it(start, marker):
     supervisor = start(
         part("simulator", PARENT + WAIT), part("viewer", PARENT, at_its_end="go on", advice="flying on")
     )
-    supervisor.read_until(["simulator: ready", "viewer has ended; flying on"])
+    supervisor.read_until("simulator: ready", "viewer has ended; flying on")
     left = 4  # supervisor, guard, simulator and its child
     wait_for(lambda: len(processes_with(marker)) == left)
-    supervisor.process.send_signal(signal.SIGINT)
+    supervisor.interrupt()
     supervisor.rest()
 
 
@@ -277,8 +238,8 @@ def test_none_is_left_when_the_supervisor_is_killed(start, tmp_path):
     closed = tmp_path / "closed"
     tidy = WAIT.replace('print("closed")', f"open({str(closed)!r}, 'w').close()")
     supervisor = start(part("simulator", tidy), part("viewer", PARENT + STUBBORN), grace_s=0.3)
-    supervisor.read_until(ready("simulator", "viewer"))
-    supervisor.process.kill()
+    supervisor.read_until(*ready("simulator", "viewer"))
+    supervisor.kill()
     wait_for(closed.exists)
     wait_for(lambda: not (tmp_path / "to remove").exists())
     # the fixture waits until no process is left
@@ -289,7 +250,7 @@ def test_none_is_left_when_it_is_killed_while_they_start(start, marker, count):
     """Killed when so many processes exist: the guard, or the guard and a part that is about to begin, ..."""
     supervisor = start(*(part(name) for name in ("simulator", "controller", "viewer")))
     wait_for(lambda: len(processes_with(marker)) > count, every_s=2e-4)
-    supervisor.process.kill()
+    supervisor.kill()
 
 
 def test_all_end_as_they_should_when_the_console_is_gone(start, tmp_path):
@@ -304,7 +265,7 @@ except KeyboardInterrupt:
     open({str(closed)!r}, "w").close()
 """
     supervisor = start(part("simulator", talking), part("viewer"))
-    supervisor.read_until(["simulator: step 3", *ready("viewer")])
+    supervisor.read_until("simulator: step 3", *ready("viewer"))
     supervisor.output.close()
     assert supervisor.process.wait(SOON_S) == 1
     assert closed.exists()
