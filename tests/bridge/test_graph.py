@@ -19,7 +19,7 @@ from cortex_ros2_bridge.backend.names import check_name, check_node_name, ros_to
 IMU = "sensor_msgs/msg/Imu"
 STRING = "std_msgs/msg/String"
 IMU_HASH = "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b"  # of the real Jazzy
-# Of rmw_dds_common/msg/ParticipantEntitiesInfo with an id of uint8[16], which is what rosidl makes of char[16].
+# Of rmw_dds_common/msg/ParticipantEntitiesInfo with an id of uint8[16], as rosidl reads char[16].
 DISCOVERY_HASH = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"
 GID_BYTES = {"humble": 24, "jazzy": 16}
 Start = Callable[..., Foreigner]
@@ -207,6 +207,7 @@ def settings(distro: str | None = None, **environment: str) -> dict[str, Any]:
 
     walk(ElementTree.fromstring(ours[0] + ours[1]), "")
     assert found.pop("Internal/Watermarks/WhcHigh") == "1GB"
+    assert found.pop("Internal/WriterLingerDuration") == "50 ms"
     return found
 
 

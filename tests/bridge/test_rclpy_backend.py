@@ -1,0 +1,237 @@
+"""The backend of rclpy, on a fake one in memory; and on the real one, where there is a ROS installation."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import fake_rclpy
+import pytest
+from processes import wait_for
+
+from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.choose import open_backend
+from cortex_ros2_bridge.backend.rclpy_ import RclpyBackend
+from cortex_ros2_bridge.typestore import typestore
+
+STRING = "std_msgs/msg/String"
+HAS_RCLPY = importlib.util.find_spec("rclpy") is not None
+
+
+def text(words: str) -> bytes:
+    store = typestore()
+    return bytes(store.serialize_cdr(store.types[STRING](data=words), STRING))
+
+
+@pytest.fixture(params=["fake", "real"])
+def make(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Any]]:
+    """A function that makes nodes on the fake rclpy, or on the real one where it is installed."""
+    if request.param == "fake":
+        fake_rclpy.install(monkeypatch)
+        monkeypatch.delenv("ROS_DISTRO", raising=False)
+    elif not HAS_RCLPY:
+        pytest.skip("rclpy is not installed")
+    threads = set(threading.enumerate())
+    nodes: list[RclpyBackend] = []
+
+    def start(**options: Any) -> RclpyBackend:
+        nodes.append(RclpyBackend(domain=91, **options))
+        return nodes[-1]
+
+    yield start
+    for node in nodes:
+        node.close()
+    wait_for(lambda: not set(threading.enumerate()) - threads)
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    fake_rclpy.install(monkeypatch)
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+
+
+def test_messages_go_both_ways(make: Any) -> None:
+    node, other = make(), make(node_name="other", namespace="sim")
+    got: list[bytes] = []
+    subscription = other.subscription("/words", STRING, Qos(), got.append)
+    publisher = node.publisher("/words", STRING, Qos())
+    wait_for(lambda: (publisher.subscriber_count, subscription.publisher_count) == (1, 1))
+    for form in (bytes, bytearray, memoryview):
+        publisher.publish(form(text("hello")))
+    wait_for(lambda: len(got) == 3)
+    assert {type(message) for message in got} == {bytes}
+    assert all(message.startswith(text("hello")) for message in got)
+    assert (subscription.lost_count, subscription.error_count) == (0, 0)
+    subscription.close()
+    subscription.close()
+    wait_for(lambda: publisher.subscriber_count == 0)
+    assert subscription.publisher_count == 0
+    publisher.close()
+    publisher.close()
+    assert publisher.subscriber_count == 0
+    with pytest.raises(BackendError, match="publisher of /words is closed"):
+        publisher.publish(text("late"))
+
+
+def test_who_comes_late_gets_what_is_latched(make: Any) -> None:
+    node, other = make(), make(node_name="other")
+    latched = Qos(durability="transient_local", depth=1)
+    publisher = node.publisher("/words", STRING, latched)
+    for word in "ab":
+        publisher.publish(text(word))
+    got: list[bytes] = []
+    other.subscription("/words", STRING, latched, got.append)
+    wait_for(lambda: got)
+    assert [message[8:9] for message in got] == [b"b"]
+
+
+def test_a_callback_that_raises_does_not_end_the_node(make: Any, caplog: pytest.LogCaptureFixture) -> None:
+    node, other = make(), make(node_name="other")
+    got: list[bytes] = []
+
+    def callback(message: bytes) -> None:
+        got.append(message)
+        raise ZeroDivisionError("on purpose")
+
+    subscription = other.subscription("/words", STRING, Qos(), callback)
+    publisher = node.publisher("/words", STRING, Qos())
+    wait_for(lambda: publisher.subscriber_count == 1)
+    for word in "ab":
+        publisher.publish(text(word))
+    wait_for(lambda: subscription.error_count == 2)
+    assert "the callback of /words failed" in caplog.text
+    assert "on purpose" in caplog.text
+
+
+def test_topics_of_others(make: Any) -> None:
+    node, other = make(), make(node_name="other")
+    node.publisher("/mine", STRING, Qos())
+    node.subscription("/both", STRING, Qos(), print)
+    other.publisher("/both", STRING, Qos())
+    other.subscription("/mine", STRING, Qos(), print)
+
+    def topics() -> list[TopicInfo]:
+        return [topic for topic in node.topics() if topic.type_name == STRING]
+
+    wait_for(lambda: topics() == [TopicInfo("/both", STRING, 1, 0), TopicInfo("/mine", STRING, 0, 1)])
+    other.close()
+    wait_for(lambda: topics() == [])
+    node.close()
+    node.close()
+    assert node.topics() == []
+    with pytest.raises(BackendError, match="closed"):
+        node.publisher("/mine", STRING, Qos())
+
+
+def test_errors(make: Any) -> None:
+    node = make()
+    with pytest.raises(ValueError, match="invalid ROS name 'words'"):
+        node.publisher("words", STRING, Qos())
+    with pytest.raises(ValueError, match=r"unknown ROS type 'no_msgs/msg/Thing'.*ros-\$ROS_DISTRO-no-msgs"):
+        node.subscription("/words", "no_msgs/msg/Thing", Qos(), print)
+    with pytest.raises(ValueError, match="unknown ROS type 'std_msgs/msg/Nothing'"):
+        node.publisher("/words", "std_msgs/msg/Nothing", Qos())
+    publisher = node.publisher("/words", STRING, Qos())
+    for bad in (b"", b"\0\1\0\0", b"\0\0\0\0abcd"):
+        with pytest.raises(BackendError, match="not little-endian CDR"):
+            publisher.publish(bad)
+    with pytest.raises(ValueError, match="invalid ROS name '/a b'"):
+        make(node_name="a b")
+
+
+def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None:
+    node, other = RclpyBackend(), RclpyBackend(node_name="other")
+    answers = iter([Trigger(True, "reset"), Trigger(False, "not now")])
+    service = node.service("/drone/reset", lambda: next(answers))
+    replies = [other.node.call("/drone/reset") for _ in range(3)]
+    assert [(reply.success, reply.message) for reply in replies] == [
+        (True, "reset"),
+        (False, "not now"),
+        (False, "StopIteration: "),
+    ]
+    assert service.error_count == 1
+    assert "the service /drone/reset failed" in caplog.text
+    service.close()
+    service.close()
+    assert node.node.services == []
+    node.close()
+    other.close()
+
+
+def test_quality_of_service_reaches_rclpy(fake: None) -> None:
+    node = RclpyBackend()
+    node.publisher("/a", STRING, Qos(reliability="best_effort", depth=3))
+    node.subscription("/b", STRING, Qos(durability="transient_local", depth=7), print)
+    first, second = node.node.pubs[0].qos_profile, node.node.subs[0].qos_profile
+    assert (first.depth, first.reliability.name, first.durability.name) == (3, "BEST_EFFORT", "VOLATILE")
+    assert (second.depth, second.reliability.name, second.durability.name) == (
+        7,
+        "RELIABLE",
+        "TRANSIENT_LOCAL",
+    )
+    assert {first.history.name, second.history.name} == {"KEEP_LAST"}
+    assert node.node.context.args == []  # not those of the command line
+    node.close()
+
+
+def test_the_end_of_the_context_is_told(fake: None, caplog: pytest.LogCaptureFixture) -> None:
+    node = RclpyBackend()
+    wait_for(lambda: fake_rclpy.ACTIVE)
+    node.node.context.shutdown()
+    wait_for(lambda: "the context of rclpy was shut down from outside" in caplog.text)
+    node.close()
+
+
+def test_choice(fake: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rclpy where it imports, else DDS; a bag by its name."""
+    monkeypatch.setenv("ROS_DISTRO", "humble")
+    for kind in ("auto", "rclpy"):
+        node = open_backend(kind, node_name="sim", namespace="/a")
+        assert (node.name, node.distro) == ("rclpy", "humble")
+        assert isinstance(node, RclpyBackend)
+        assert (node.node.name, node.node.namespace) == ("sim", "/a")
+        node.close()
+    for path in ("x.mcap", tmp_path / "y"):
+        bag = open_backend(tmp_path / path)
+        assert bag.name == "bag"
+        bag.close()
+    for bad in ("ros", "flight.bag", ""):
+        with pytest.raises(ValueError, match="backend must be 'auto', 'rclpy', 'dds' or a path"):
+            open_backend(bad)
+
+
+def test_choice_without_ros(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    if HAS_RCLPY:
+        monkeypatch.setitem(__import__("sys").modules, "rclpy", None)
+    node = open_backend("auto", distro="jazzy")
+    assert node.name == "dds"
+    node.close()
+    with pytest.raises(BackendError, match="rclpy cannot be imported: source the setup file"):
+        open_backend("rclpy")
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "cyclonedds" else real(name, *rest)
+    )
+    with pytest.raises(BackendError, match=r"pip install 'neurosim\[ros2\]'"):
+        open_backend("auto")
+
+
+@pytest.mark.skipif(not HAS_RCLPY, reason="rclpy is not installed")
+def test_the_fake_has_the_parameters_of_the_real_one() -> None:
+    import rclpy
+    import rclpy.node
+
+    pairs: list[tuple[Any, Any]] = [
+        (fake_rclpy.init, rclpy.init),
+        (fake_rclpy.create_node, rclpy.create_node),
+    ]
+    for name in ("create_publisher", "create_subscription", "create_service", "count_publishers"):
+        pairs.append((getattr(fake_rclpy.Node, name), getattr(rclpy.node.Node, name)))
+    for ours, theirs in pairs:
+        known = inspect.signature(theirs).parameters
+        for parameter in inspect.signature(ours).parameters.values():
+            assert known[parameter.name].kind == parameter.kind, (ours, parameter)
