@@ -1,0 +1,191 @@
+"""The command: options, what it prints, and that it ends when told to."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import pytest
+import yaml
+from bridge_process import BridgeProcess
+from bridge_rig import imu
+from processes import ROOT, SOON_S, wait_for
+from runtime_directory import own_directory
+from test_routes import DRONE
+
+from cortex import Node
+from cortex import messages as msg
+from cortex_ros2_bridge import cli
+from cortex_ros2_bridge.config import load
+from cortex_ros2_bridge.routes import make_routes
+
+SETTINGS = {
+    "namespace": "/sim",
+    "rename": {"/drone/rgb": "/front"},
+    "exclude": ["*/path"],
+    "routes": [
+        {"cortex": "/drone/events", "type": "event_camera_msgs/EventPacket", "options": {"encoding": "mono"}},
+        {"cortex": "*", "type": "dvs_msgs/EventArray"},
+        {"cortex": "/drone/imu", "qos": "sensor_data"},
+    ],
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_registry():
+    """All tests of this module share a runtime directory."""
+    with pytest.MonkeyPatch.context() as monkeypatch, own_directory(monkeypatch):
+        yield
+
+
+@pytest.fixture
+def simulator() -> Iterator[Node]:
+    with Node("simulator") as node:
+        node.publisher("/drone/imu", msg.Imu)
+        node.subscriber("/drone/command/rates", msg.RateThrustCommand)
+        yield node
+
+
+def test_printed_settings_make_the_same_routes():
+    """Namespace, names, options, qualities and what is on request come back; so do routes of new topics."""
+    config = load(SETTINGS)
+    routes, problems = make_routes(DRONE, config)
+    text = cli.to_yaml(config, routes)
+    again, problems_again = make_routes(DRONE, load(yaml.safe_load(text)))
+    assert again == routes
+    assert problems == problems_again == []
+    assert "!!" not in text
+
+
+def test_list(simulator, capsys):
+    """A line for each route: from where, to where, as what."""
+    assert cli.main(["--list", "--namespace", "sim"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:4] for line in lines] == [
+        ["/drone/command/rates", "<-", "/sim/drone/attitude_target", "mavros_msgs/msg/AttitudeTarget"],
+        ["/drone/imu", "->", "/sim/drone/imu", "sensor_msgs/msg/Imu"],
+    ]
+    assert lines[1].endswith("reliable, volatile, depth 100")
+
+
+def test_print_config(simulator, capsys, tmp_path):
+    path = tmp_path / "bridge.yaml"
+    path.write_text(yaml.safe_dump(SETTINGS))
+    assert cli.main(["--print-config", "--config", str(path), "--distro", "humble"]) == 0
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert printed["distro"] == "humble"
+    assert printed["routes"][1] == {
+        "cortex": "/drone/imu",
+        "type": "sensor_msgs/msg/Imu",
+        "ros": "/drone/imu",
+        "qos": {"reliability": "best_effort", "durability": "volatile", "depth": 5},
+        "options": {},
+    }
+
+
+def test_list_without_anything(capsys, monkeypatch):
+    monkeypatch.setattr(cli, "LIST_S", 0.1)
+    assert cli.main(["--list"]) == 0
+    assert "no Cortex topics" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--config", "nothing.yaml"], "cannot read nothing.yaml: No such file or directory"),
+        (["--namespace", "a b"], "namespace must be a ROS name"),
+        (["--domain", "-1"], "domain must be >= 0, got -1"),
+        (["--backend", "carrier-pigeon"], "carrier-pigeon"),
+        (["--distro", "hydro", "--backend", "dds"], "hydro"),
+    ],
+)
+def test_wrong_use_is_one_line(arguments, text, capsys):
+    assert cli.main(arguments) == 1
+    error = capsys.readouterr().err
+    assert text in error
+    assert error.startswith("cortex-ros2-bridge: ")
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_within_a_second(number, dds_domain, simulator):
+    """With streams open; it says what it does in lines for people."""
+    with BridgeProcess("--backend", "dds", "--distro", "jazzy", "-v") as command:
+        command.wait_for("/drone/imu -> /drone/imu (sensor_msgs/msg/Imu)")
+        assert "/cortex_bridge: dds, jazzy" in command.said
+        assert command.end(number) < 1.0 + BUSY_S
+        assert "Traceback" not in command.said
+
+
+BUSY_S = 1.0
+"""What a busy machine may add."""
+
+
+def test_a_service_that_does_not_answer_does_not_hold_it_up(dds_domain, simulator):
+    """The bridge ends while a request is under way."""
+    from cortex_ros2_bridge.backend.base import Qos
+    from cortex_ros2_bridge.backend.dds import DdsBackend
+    from cortex_ros2_bridge.cdr import encode
+    from cortex_ros2_bridge.msgs import message_class
+
+    begun, go_on = [], []
+
+    def answer(_: msg.Reset) -> msg.SimulatorReply:
+        begun.append(True)
+        while not go_on:
+            time.sleep(0.01)
+        return msg.SimulatorReply(True, "", 0, "running")
+
+    simulator.service("/reset", msg.Reset, msg.SimulatorReply, answer)
+    ros = DdsBackend(distro="jazzy", node_name="asker")
+    try:
+        with BridgeProcess("--backend", "dds", "--distro", "jazzy") as command:
+            command.wait_for("/reset <- /reset ")
+            publisher = ros.publisher("/reset", "std_msgs/msg/Empty", Qos())
+            wait_for(lambda: publisher.subscriber_count)
+            publisher.publish(encode(message_class("std_msgs/msg/Empty")()))
+            wait_for(lambda: begun)
+            assert command.end(signal.SIGINT) < 1.0 + BUSY_S
+    finally:
+        go_on.append(True)
+        ros.close()
+
+
+def test_a_bag_of_what_flew(simulator, tmp_path):
+    """--backend run.mcap records without ROS, and is complete after Ctrl-C."""
+    from rosbags.highlevel import AnyReader
+
+    sent = simulator.publisher("/drone/gyro", msg.Imu)
+    path = tmp_path / "run.mcap"
+    with BridgeProcess("--backend", str(path)) as command:
+        command.wait_for("/drone/gyro -> /drone/gyro")
+        wait_for(lambda: sent.subscriber_count)
+        for stamp_ns in range(1, 4):
+            sent.publish(imu(stamp_ns))
+        wait_for(lambda: taken_by_bridge(simulator, "/drone/gyro") == 3)
+        command.end(signal.SIGINT)
+    with AnyReader([tmp_path / "run"]) as reader:
+        found = [c for c, _, _ in reader.messages() if c.topic == "/drone/gyro"]
+    assert [c.msgtype for c in found] == ["sensor_msgs/msg/Imu"] * 3
+
+
+def taken_by_bridge(node: Node, topic: str) -> int:
+    """Messages that the bridge has taken from a Cortex topic."""
+    (bridge,) = [record.node for record in node.nodes() if record.name == "cortex_bridge"]
+    return sum(s.received for s in node.ask_stats(bridge, SOON_S).subscribers if s.topic == topic)
+
+
+def test_the_module_and_the_command_are_one():
+    process = subprocess.run(
+        [sys.executable, "-m", "cortex_ros2_bridge", "--help"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=SOON_S,
+        check=True,
+    )
+    assert "cortex-ros2-bridge --list" in process.stdout
