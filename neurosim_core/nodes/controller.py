@@ -101,7 +101,7 @@ class PathPilot:
         """Wait for odometry, and send the command that answers it.
 
         Args:
-            timeout_s: Longest wait for a simulator, and for the odometry [s]; None waits for ever.
+            timeout_s: Longest wait for a simulator, and for its odometry [s]; None waits for ever.
 
         Returns:
             Whether any came.
@@ -110,9 +110,10 @@ class PathPilot:
             Closed: The pilot or its node was closed.
             ValueError: The vehicle has another number of rotors than the follower's.
         """
-        wait_s = math.inf if timeout_s is None else timeout_s
-        if not self._commands.subscriber_count and not self._commands.wait_for_subscribers(timeout_s=wait_s):
-            return False  # what is said before somebody listens is lost, and not asked for again
+        if not self.command_count:  # one that is sent before somebody listens is lost
+            wait_s = math.inf if timeout_s is None else timeout_s
+            if not self._commands.wait_for_subscribers(timeout_s=wait_s):
+                return False
         try:
             odometry = self._odometry.recv(timeout_s)
         except TimeoutError:
