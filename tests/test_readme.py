@@ -11,14 +11,22 @@ from pathlib import Path
 
 import pytest
 
+from neurosim_core import cli
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BIN = Path(sys.executable).parent
 
 
-def named(kind: str, language: str) -> dict[str, str]:
+def named(kind: str, language: str, text: str = README) -> dict[str, str]:
     pattern = rf"<!-- {kind}: (\w+) -->\s*```{language}\n(.*?)```"
-    return dict(re.findall(pattern, README, flags=re.DOTALL))
+    return dict(re.findall(pattern, text, flags=re.DOTALL))
+
+
+def commands(block: str) -> list[str]:
+    """Lines of a list of commands, without the remarks."""
+    (body,) = re.findall(rf"<!-- commands: {block} -->\s*```\n(.*?)```", README, flags=re.DOTALL)
+    return re.findall(r"^(neurosim [^#\n]*?)\s*#", body, flags=re.MULTILINE)
 
 
 def shell(command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -73,10 +81,15 @@ def test_the_run_command(tmp_path):
     assert (rates, packets) == (1601, 81 + 801)
 
 
-@pytest.mark.parametrize("name", sorted(named("example", "python")))
+EXAMPLES = named("example", "python") | named(
+    "example", "python", (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
+)
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_examples(name, tmp_path):
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", named("example", "python")[name]],
+        [sys.executable, "-W", "error", "-c", EXAMPLES[name]],
         cwd=tmp_path, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -86,7 +99,7 @@ def test_examples(name, tmp_path):
 
 def test_the_other_commands(house, tmp_path):
     """The list under "What else there is", shortened where a flight would take long."""
-    listed = re.findall(r"^(neurosim [^#\n]*?)\s*#", README, flags=re.MULTILINE)
+    listed = commands("alone")
     assert len(listed) == 6
     small = (
         " --duration 0.05 --set sensors.events.kind=event_camera"
@@ -103,3 +116,11 @@ def test_the_other_commands(house, tmp_path):
             command += " --width 64 --height 48 --steps 32"
         done = shell(command, tmp_path)
         assert done.returncode == 0, f"{command}: {done.stderr}"
+
+
+def test_the_commands_of_the_live_stack():
+    """They go on until they are stopped, and are flown in tests/nodes; here, that they are commands."""
+    listed = commands("live")
+    assert {line.split()[1] for line in listed} == {"up", "serve", "fly", "view", "call", "bench"}
+    for line in listed:
+        assert cli._parser().parse_args(line.split()[1:]).command is not None
