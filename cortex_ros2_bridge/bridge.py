@@ -11,7 +11,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -113,7 +113,7 @@ class Bridge:
             node: The Cortex side; it stays open.
 
         Raises:
-            ConfigError: The names of frames are not what they must be.
+            ConfigError: The names of frames are not what they must be, or there is no such option.
             BackendError: The backend cannot publish.
         """
         self.config = config
@@ -124,6 +124,7 @@ class Bridge:
             self._frames = FrameNames(**config.frames)
         except (TypeError, ValueError) as error:
             raise ConfigError(f"frames: {error}") from None
+        _check_options(config)
         self._lock = threading.RLock()
         self._closed = False
         self._seen: Seen | None = None
@@ -210,15 +211,26 @@ class Bridge:
             elif link.gone_s is None:
                 link.gone_s = now_s + GONE_S
                 logger.info("%s: the Cortex side has gone", link.route)
-        for route in routes:
-            if route.key not in self._links:
-                problems += self._open(route, seen, now_s)
+        new = [route for route in routes if route.key not in self._links]
+        self._make_way(new)
+        for route in new:
+            problems += self._open(route, seen, now_s)
         self._watch_vehicles(seen)
         self.problems = problems
         for problem in problems:
             if problem not in self._said:
                 logger.warning("%s", problem)
         self._said = set(problems)
+
+    def _make_way(self, routes: Iterable[Route]) -> None:
+        """Close routes whose Cortex side has gone, if others need their ROS topics in another way."""
+        for route in routes:
+            for key, link in list(self._links.items()):
+                old = link.route
+                if link.gone_s is None or old.ros_topic != route.ros_topic:
+                    continue
+                if (old.ros_type, old.qos, old.direction) != (route.ros_type, route.qos, route.direction):
+                    self._close_link(key)
 
     def _open(self, route: Route, seen: Seen, now_s: float) -> list[str]:
         """Open a route; returns why that was not possible."""
@@ -318,8 +330,12 @@ class Bridge:
         )
 
     def _feed(self, topic: str, type_name: str, stack: contextlib.ExitStack) -> Feed:
+        topics = () if self._seen is None else self._seen.topics
+        latched = any(t.topic == topic and t.latched for t in topics)
         return self._feeds.take(
-            stack, (topic, type_name), lambda: Feed(self._node, topic, CORTEX_TYPES[type_name])
+            stack,
+            (topic, type_name),
+            lambda: Feed(self._node, topic, CORTEX_TYPES[type_name], latched=latched),
         )
 
     def _tap(
@@ -329,8 +345,8 @@ class Bridge:
         wants: Callable[[], bool],
         stack: contextlib.ExitStack,
     ) -> None:
-        feed.taps[tap] = wants
-        stack.callback(feed.taps.pop, tap)
+        feed.tap(tap, wants)
+        stack.callback(feed.untap, tap)
 
     # Vehicles
 
@@ -420,3 +436,18 @@ class Bridge:
                 self._diagnostics.publish(array)
             except BackendError as error:
                 logger.warning("%s: %s", diagnostics.TOPIC, error)
+
+
+def _check_options(config: BridgeConfig) -> None:
+    """Refuse options that nothing knows; where some routes of a pattern do not know one, it is not for them.
+
+    Raises:
+        ConfigError: There is no such option.
+    """
+    known = frozenset({"queue", "stale_s", "stamp"}).union(*convert.OPTIONS.values())
+    for number, change in enumerate(config.routes):
+        for name in change.options:
+            if name not in known:
+                raise ConfigError(
+                    f"routes[{number}].options: unknown option {name!r}, known: {', '.join(sorted(known))}"
+                )

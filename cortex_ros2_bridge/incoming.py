@@ -122,44 +122,41 @@ class Incoming:
     def take(self, data: bytes) -> None:
         """Take in a message of ROS, from any thread."""
         with self._lock:
-            if not self._targets:
-                return
-            try:
-                for target in self._targets:
-                    if self._offer(target, data):
-                        return
-            except (ConvertError, cdr.CdrError) as error:
-                self._first_refuses(str(error))
-            except Exception as error:  # whatever is wrong with a message, the next one may be right
-                self._first_refuses(f"{type(error).__name__}: {error}")
-                logger.debug("%s: a message could not be converted", self._targets[0].route, exc_info=True)
-            else:
-                self._first_refuses("it commands nothing that Cortex has a topic for")
+            for target in self._targets:
+                try:
+                    command = self._convert(target, data)
+                except (ConvertError, cdr.CdrError) as error:
+                    target.tally.receive()
+                    target.tally.refuse(str(error))
+                    return
+                if command is not None:
+                    self._deliver(target, command)
+                    return
+            for target in self._targets[:1]:
+                target.tally.receive()
+                target.tally.refuse("it commands nothing that Cortex has a topic for")
 
     def close(self) -> None:
         """Withdraw the subscription."""
         if self.subscription is not None:
             self.subscription.close()
 
-    def _first_refuses(self, reason: str) -> None:
-        self._targets[0].tally.receive()
-        self._targets[0].tally.refuse(reason)
-
-    def _offer(self, target: Target, data: bytes) -> bool:
-        """Offer a message to a target; returns whether that was where it belongs."""
-        context, now_ns = target.context, self.whereabouts.now_ns
-        context.now_ns = now_ns or 0
+    def _convert(self, target: Target, data: bytes) -> Any:
+        context = target.context
+        context.now_ns = self.whereabouts.now_ns or 0
         context.odometry = self.whereabouts.odometry
-        command = target.convert(data, context)
-        if command is None:
-            return False
+        return target.convert(data, context)
+
+    def _deliver(self, target: Target, command: Any) -> None:
+        """Send a command to where it belongs, or refuse it."""
+        context = target.context
         target.tally.receive()
         if target.restamp:
             command = dataclasses.replace(command, stamp_ns=context.now_ns)
-        reason = _staleness(command.stamp_ns, now_ns, target.stale_ns)
+        reason = _staleness(command.stamp_ns, self.whereabouts.now_ns, target.stale_ns)
         if reason:
             target.tally.refuse(reason)
-            return True
+            return
         context.sequence += 1
         if target.publisher.subscriber_count:
             self._drop_pending("a newer one came")
@@ -167,7 +164,6 @@ class Incoming:
         else:
             self._drop_pending("a newer one came before anybody had subscribed to it")
             self._pending = target, command, time.monotonic() + PENDING_S
-        return True
 
     def _publish(self, target: Target, command: Any) -> None:
         with contextlib.suppress(Closed):  # the bridge is about to end

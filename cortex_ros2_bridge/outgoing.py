@@ -165,32 +165,60 @@ class StaticTransforms:
 class Feed:
     """One Cortex topic: it is subscribed to only while a route or the bridge itself wants its messages.
 
+    Of a latched topic it keeps the last message, for those who come to want it while it is subscribed to.
+
     Attributes:
         topic: The topic.
-        taps: Functions of the bridge that get each message before the routes do; with each, what says whether
-            it wants any now.
     """
 
-    def __init__(self, node: Node, topic: str, kind: type[Any]) -> None:
+    def __init__(self, node: Node, topic: str, kind: type[Any], *, latched: bool) -> None:
         """Prepare; nothing is subscribed to yet.
 
         Args:
             node: Who subscribes.
             topic: The topic.
             kind: Class of its messages.
+            latched: Whether the topic gives its last message to whoever comes later.
         """
         self.topic = topic
-        self.taps: dict[Callable[[Any], None], Callable[[], bool]] = {}
+        self._taps: dict[Callable[[Any], None], Callable[[], bool]] = {}
         self._outputs: tuple[Outgoing, ...] = ()
         self._node = node
         self._kind = kind
+        self._latched = latched
+        self._last: Any = None
+        self._lock = threading.Lock()
         self._queue = QUEUES.get(kind, QUEUE)
         self._subscriber: Subscriber[Any] | None = None
         self._told = (0, 0)
 
+    def tap(self, function: Callable[[Any], None], wants: Callable[[], bool]) -> None:
+        """Give each message to a function of the bridge, before the routes get it.
+
+        Args:
+            function: Gets the messages, on the callback thread.
+            wants: Says whether it wants any now.
+        """
+        with self._lock:
+            self._taps[function] = wants
+            if self._last is not None:
+                function(self._last)
+
+    def untap(self, function: Callable[[Any], None]) -> None:
+        """Give it no more of them."""
+        with self._lock:
+            del self._taps[function]
+
     def add(self, output: Outgoing) -> None:
-        """Let a route have the messages."""
-        self._queue = output.route.options.get("queue", self._queue)
+        """Let a route have the messages.
+
+        Raises:
+            ValueError: Its option `queue` is not what it must be.
+        """
+        queue = output.route.options.get("queue", self._queue)
+        if isinstance(queue, bool) or not isinstance(queue, int) or not 1 <= queue <= 65_536:
+            raise ValueError(f"option queue must be an integer from 1 to 65536, got {queue!r}")
+        self._queue = queue
         self._outputs = (*self._outputs, output)
 
     def remove(self, output: Outgoing) -> None:
@@ -204,8 +232,15 @@ class Feed:
 
     def look(self) -> None:
         """See who wants its messages, and subscribe or unsubscribe accordingly; count what was lost."""
-        wanted = [output.look() for output in self._outputs]
-        if any(wanted) or any(wants() for wants in list(self.taps.values())):
+        wanted = [wants() for wants in self._taps.values()]
+        for output in self._outputs:
+            before = output.wanted
+            wanted.append(output.look())
+            if output.wanted and not before:
+                with self._lock:
+                    if self._last is not None:
+                        output.send(self._last)
+        if any(wanted):
             if self._subscriber is None:
                 self._told = (0, 0)
                 self._subscriber = self._node.subscriber(
@@ -223,13 +258,17 @@ class Feed:
         subscriber, self._subscriber = self._subscriber, None
         if subscriber is not None:
             subscriber.close()
+        self._last = None
 
     def _take(self, message: Any) -> None:
-        for tap in tuple(self.taps):
-            tap(message)
-        for output in self._outputs:
-            if output.wanted:
-                output.send(message)
+        with self._lock:
+            if self._latched:
+                self._last = message
+            for tap in self._taps:
+                tap(message)
+            for output in self._outputs:
+                if output.wanted:
+                    output.send(message)
 
     def _count(self) -> None:
         """Pass on what Cortex lost and rejected since the last look."""

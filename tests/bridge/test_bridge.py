@@ -80,6 +80,43 @@ def test_an_image_and_its_calibration_have_one_stamp():
     assert picture.header.frame_id == calibration.header.frame_id == "drone/rgb_optical_frame"
 
 
+def test_a_calibration_that_is_seen_before_its_image():
+    """First it is a latched topic of its own; then it goes with the image, as the image does."""
+    with rig_of() as rig:
+        info = rig.simulator.publisher("/drone/rgb/info", msg.CameraInfo, latch=True)
+        info.publish(camera_info("rgb"))
+        (alone,) = rig.opens("/drone/rgb/camera_info")
+        rig.update_until(lambda: alone.sent)
+        assert alone.qos.durability == "transient_local"
+        sent = rig.simulator.publisher("/drone/rgb", msg.Image)
+        rig.opens("/drone/rgb/image_raw")
+        (together,) = rig.opens("/drone/rgb/camera_info")
+        assert alone.closed
+        assert together.qos.durability == "volatile"
+        with rig.listening(sent, "/drone/rgb/camera_info"):
+            rig.update_until(lambda: info.subscriber_count == 1)
+            wait_for(lambda: sent.publish(image(7)) and together.sent, every_s=0.02)
+        assert stamp_ns(together.messages()[0].header) == 7
+
+
+def test_who_comes_later_to_a_latched_state_gets_it():
+    """While odometry is subscribed to for one listener, another one on /tf hears of the state that holds."""
+    with rig_of() as rig:
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        state.publish(odometry(3_000_000_000))
+        craft = Craft(rig, velocity=msg.VelocityCommand)
+        ros, moving = rig.opens("/drone/odometry", "/tf")
+        (twist,) = rig.subscribes("/drone/cmd_vel")
+        with rig.listening(state, "/drone/odometry"):
+            wait_for(lambda: ros.sent)
+            with rig.backend.listening("/tf"):
+                rig.update_until(lambda: moving.sent)
+                assert stamp_ns(moving.messages()[0].transforms[0].header) == 3_000_000_000
+            rig.update_until(craft.connected)
+            twist.put(message_class("geometry_msgs/msg/Twist")())
+            assert craft.recv("velocity").stamp_ns == 3_000_000_000
+
+
 def test_only_what_is_listened_to_is_converted():
     """With a listener for the calibration only, no picture is converted."""
     with rig_of() as rig:
@@ -459,6 +496,35 @@ def test_wrong_options_are_a_problem_of_their_route_only():
         rig.subscribes("/drone/actuators")
         rig.update_until(lambda: rig.bridge.problems)
         assert "option stale_s must be > 0 or null, got -1" in rig.bridge.problems[0]
+
+
+def test_an_option_that_nothing_knows_is_refused():
+    with (
+        pytest.raises(ConfigError, match=r"routes\[0\].options: unknown option 'encodng', known: .*encoding"),
+        rig_of({"routes": [{"cortex": "*", "options": {"encodng": "mono"}}]}),
+    ):
+        pass
+
+
+def test_a_queue_that_is_none():
+    with rig_of({"routes": [{"cortex": "/drone/imu", "options": {"queue": 0}}]}) as rig:
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.update_until(lambda: rig.bridge.problems)
+        assert "option queue must be an integer from 1 to 65536, got 0" in rig.bridge.problems[0]
+        assert "/drone/imu" not in rig.backend.publishers
+
+
+def test_a_refusal_counts_for_the_route_that_the_message_was_meant_for():
+    """Of two targets, the mask says which; a mask that neither has is refused, too."""
+    with rig_of() as rig:
+        craft = Craft(rig, attitude=msg.AttitudeCommand, rates=msg.RateThrustCommand)
+        (target,) = rig.subscribes("/drone/attitude_target")
+        rig.update_until(craft.connected)
+        target.put(attitude_target(mask=7, thrust=2.0))
+        target.put(attitude_target(mask=128, thrust=-1.0))
+        target.put(attitude_target(mask=128, thrust=-1.0))
+        for mode, count in (("attitude", 1), ("rates", 2)):
+            assert rig.tally(f"/drone/command/{mode} <- /drone/attitude_target").refused == count
 
 
 def test_state_and_time_are_followed_only_while_somebody_commands():

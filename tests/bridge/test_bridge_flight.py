@@ -16,7 +16,9 @@ import pytest
 import yaml
 from flight_laws import Errors, make_law
 from processes import ROOT
+from runtime_directory import own_directory
 
+from cortex import Node
 from neurosim_core.simulation import Model, make_fleet, make_state, observe, step
 
 MODES = ("attitude", "motor_speeds")
@@ -58,7 +60,15 @@ class Process:
 
 
 @pytest.fixture
-def flights(runtime: Path, dds_domain: int, tmp_path: Path) -> Iterator[tuple[Process, list[Process]]]:
+def registry() -> Iterator[None]:
+    """A runtime directory, with a registry that is not in the test's DDS domain."""
+    with pytest.MonkeyPatch.context() as monkeypatch, own_directory(monkeypatch), Node("first") as node:
+        assert node.wait_for_registry()
+        yield
+
+
+@pytest.fixture
+def flights(registry: None, dds_domain: int, tmp_path: Path) -> Iterator[tuple[Process, list[Process]]]:
     """The controller, and the other processes."""
     scene, bridge = tmp_path / "scene.yaml", tmp_path / "bridge.yaml"
     scene.write_text(yaml.safe_dump(flight_laws.SETTINGS))
