@@ -23,6 +23,8 @@ from rich.table import Table
 
 from neurosim_core.bench.loop_trace import (
     LoopTrace,
+    answered_commands,
+    felt_at_once,
     felt_commands,
     loop_latency_ns,
     received_hz,
@@ -141,6 +143,7 @@ def measure_loop(
                     rotor_count=airframe.rotor_count,
                     seconds=seconds,
                     warm_up_s=min(0.5 * seconds, 1.0) if warm_up_s is None else warm_up_s,
+                    watch_rotors=not _obeys_at_once(config),
                     check=simulator.check,
                 )
             except ProbeError as error:
@@ -151,7 +154,13 @@ def measure_loop(
         requested_hz=config.control.rate_hz,
         hover_rad_s=hover_rad_s,
         motor_time_constant_s=airframe.motor_time_constant_s,
+        at_once=_obeys_at_once(config),
     )
+
+
+def _obeys_at_once(config: SimulationConfig) -> bool:
+    """Whether every command holds from the state on that it answers."""
+    return config.live.mode == "lockstep" and config.live.command_every == 1 and not config.links
 
 
 def _check_seconds(seconds: float) -> None:
@@ -166,10 +175,28 @@ def summarise(
     requested_hz: float,
     hover_rad_s: float,
     motor_time_constant_s: float,
+    at_once: bool,
 ) -> LoopResult:
-    """Return the figures of a trace; arguments as in `felt_commands`."""
+    """Return the figures of a trace.
+
+    Args:
+        trace: What was seen.
+        mode: Of the simulator.
+        requested_hz: Commands and images a second of simulated time [Hz].
+        hover_rad_s: As in `felt_commands`.
+        motor_time_constant_s: As in `felt_commands`.
+        at_once: Whether commands hold from the state on that they answer; the warm-up has to show it.
+
+    Raises:
+        RuntimeError: It does not.
+    """
     felt = felt_commands(trace, hover_rad_s=hover_rad_s, motor_time_constant_s=motor_time_constant_s)
-    latency_s = 1e-9 * loop_latency_ns(trace, felt)
+    stamp_ns = trace.rotor_stamp_ns[1:]
+    if at_once:
+        if not felt_at_once(trace, felt):
+            raise RuntimeError("the simulator does not obey commands in lockstep: nothing was measured")
+        felt, stamp_ns = answered_commands(trace), trace.image_stamp_ns[1:]
+    latency_s = 1e-9 * loop_latency_ns(trace, felt, stamp_ns)
     transport_s = 1e-9 * transport_ns(trace)
     return LoopResult(
         mode=mode,

@@ -2,7 +2,9 @@
 
 Which image has felt which command is read from the physics: the number of a command is in the rotor speed
 that it asks for, as a change of 2e-7 at most, and two reports of the rotors give the speed that was asked for
-in between. So it makes no difference how a simulator handles commands, or what it says of it.
+in between. So it makes no difference how a simulator handles commands, or what it says of it. In lockstep the
+reports of the warm-up are enough: where they show that every command is obeyed at once, no further ones are
+asked for, which would slow down what is measured.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ class LoopTrace:
 
     sent_ns: Times
     """When each command was handed to Cortex [ns], shape [commands]."""
+    answered_ns: Times
+    """Stamp of the state that each command answers [ns], shape [commands]."""
     image_stamp_ns: Times
     """Stamp of each image that was received [ns], shape [images]."""
     published_ns: Times
@@ -85,22 +89,46 @@ def felt_commands(trace: LoopTrace, *, hover_rad_s: float, motor_time_constant_s
     return felt
 
 
-def loop_latency_ns(trace: LoopTrace, felt: Times) -> Times:
+def loop_latency_ns(trace: LoopTrace, felt: Times, stamp_ns: Times) -> Times:
     """Return the time from sending each command to having the first image that felt it [ns].
 
     Args:
         trace: What was seen.
-        felt: What `felt_commands` found.
+        felt: Commands that were felt, in the order of time, -1: none; shape [n].
+        stamp_ns: When, shape [n].
 
     Returns:
         One time for each command that was felt, and whose image came after the warm-up, in their order.
     """
     known = np.flatnonzero(felt >= 0)
     numbers, first = np.unique(felt[known], return_index=True)
-    stamps = trace.rotor_stamp_ns[known[first] + 1]
-    image = np.searchsorted(trace.image_stamp_ns, stamps)
+    image = np.searchsorted(trace.image_stamp_ns, stamp_ns[known[first]])
     seen = (image >= trace.begin) & (image < len(trace.image_stamp_ns))
     return trace.received_ns[image[seen]] - trace.sent_ns[numbers[seen]]
+
+
+def felt_at_once(trace: LoopTrace, felt: Times) -> bool:
+    """Return whether, as far as reports go, rotors obey the answer to the state that a period begins with.
+
+    Args:
+        trace: What was seen.
+        felt: What `felt_commands` found.
+    """
+    followed = np.diff(trace.rotor_sequence) == 1
+    return bool(
+        followed.any()
+        and (felt[followed] >= 0).all()
+        and (trace.answered_ns[felt[followed]] == trace.rotor_stamp_ns[:-1][followed]).all()
+    )
+
+
+def answered_commands(trace: LoopTrace) -> Times:
+    """Return which command each image but the first felt, where commands are obeyed at once.
+
+    Returns:
+        Index into `sent_ns`, shape [images - 1]: the last command that answers an earlier stamp.
+    """
+    return np.asarray(np.searchsorted(trace.answered_ns, trace.image_stamp_ns[1:]) - 1)
 
 
 def transport_ns(trace: LoopTrace) -> Times:

@@ -41,6 +41,7 @@ def answer_images(
     rotor_count: int,
     seconds: float,
     warm_up_s: float,
+    watch_rotors: bool,
     check: Check,
 ) -> LoopTrace:
     """Be a controller that answers each image with a numbered command, and note when that happens.
@@ -52,25 +53,26 @@ def answer_images(
         rotor_count: How many it has.
         seconds: How long to measure [wall-clock s].
         warm_up_s: How long to fly before that [wall-clock s].
+        watch_rotors: Listen to the rotors all the time, not only before the measurement.
         check: Called about five times a second while nothing comes.
 
     Raises:
         ProbeError: Nothing came for a long time.
     """
     sent: list[int] = []
+    answered: list[int] = []
     images: list[tuple[int, int, int]] = []
     reports: list[tuple[int, int, float]] = []
     with Node("loop probe") as node:
         pictures = node.subscriber(stream_topic(vehicle, camera), Image, policy=latest())
-        rotors = node.subscriber(
-            stream_topic(vehicle, "rotor_speeds"), RotorSpeeds, policy=keep_last(_SMALL_DEPTH)
-        )
+        rotors = _listen_to_rotors(node, vehicle)
         commands = node.publisher(command_topic(vehicle, "motor_speeds"), MotorCommand)
 
         def command(stamp_ns: int) -> None:
             number = len(sent)
             speed = np.full(rotor_count, command_speed(number, hover_rad_s))
             message = MotorCommand(stamp_ns=stamp_ns, speed=speed, sequence=number)
+            answered.append(stamp_ns)
             sent.append(time.monotonic_ns())
             commands.publish(message)
 
@@ -80,36 +82,42 @@ def answer_images(
         command(first.stamp_ns)
         begin, image_bytes, end_ns, warm_ns = 0, 0, 0, 0
         before = (0, 0)
-        answered_ns = first.stamp_ns
+        watching = True
 
         def idle() -> None:
             """Answer what the rotors say where an image was lost: in lockstep nothing would go on."""
-            nonlocal answered_ns
+            nonlocal rotors, watching
+            if not watching:
+                rotors, watching = _listen_to_rotors(node, vehicle), True
             reports.extend(_reports(rotors))
-            if reports[-1][0] > answered_ns:
-                answered_ns = reports[-1][0]
-                command(answered_ns)
+            if reports[-1][0] > answered[-1]:
+                command(reports[-1][0])
             check()
 
         while not end_ns or time.monotonic_ns() < end_ns or len(images) - begin < _IMAGES_MIN:
             image, info = _receive(pictures, idle, _SILENCE_S if images else _START_S)
-            if image.stamp_ns > answered_ns:
-                answered_ns = image.stamp_ns
-                command(answered_ns)
+            if image.stamp_ns > answered[-1]:
+                command(image.stamp_ns)
             images.append((image.stamp_ns, info.publish_ns, info.publish_ns + info.latency_ns))
-            reports += _reports(rotors)  # while the simulator is busy with the next image
+            if watching:
+                reports += _reports(rotors)  # while the simulator is busy with the next image
             if not warm_ns:
                 warm_ns = images[0][2] + round(warm_up_s * 1e9)
             if not end_ns and images[-1][2] >= warm_ns:
                 begin, image_bytes = len(images), image.data.nbytes
+                if not watch_rotors:
+                    rotors.close()
+                    watching = False
                 before = (pictures.counters.lost, pictures.counters.overtaken)
                 end_ns = time.monotonic_ns() + round(seconds * 1e9)
-        reports += _reports(rotors)
+        if watching:
+            reports += _reports(rotors)
         counters = pictures.counters
     stamps, published, received = np.array(images, dtype=np.int64).T
     rotor_stamps, sequences, speeds = zip(*reports, strict=True)
     return LoopTrace(
         sent_ns=np.array(sent, dtype=np.int64),
+        answered_ns=np.array(answered, dtype=np.int64),
         image_stamp_ns=stamps,
         published_ns=published,
         received_ns=received,
@@ -121,6 +129,11 @@ def answer_images(
         lost_count=counters.lost - before[0],
         overtaken_count=counters.overtaken - before[1],
     )
+
+
+def _listen_to_rotors(node: Node, vehicle: str) -> Subscriber[RotorSpeeds]:
+    topic = stream_topic(vehicle, "rotor_speeds")
+    return node.subscriber(topic, RotorSpeeds, policy=keep_last(_SMALL_DEPTH))
 
 
 def _meet(publisher: Publisher[Any], check: Check) -> None:

@@ -11,7 +11,9 @@ import pytest
 from neurosim_core.bench.loop_trace import (
     CODES,
     LoopTrace,
+    answered_commands,
     command_speed,
+    felt_at_once,
     felt_commands,
     loop_latency_ns,
     received_hz,
@@ -37,6 +39,7 @@ def flown(held, *, period_ns=MS, time_constant_s=0.02, begin=0, sent_count=None)
     count = sent_count or 1 + max(n for n in held if n is not None)
     return LoopTrace(
         sent_ns=np.arange(count) * MS + MS // 10,
+        answered_ns=np.arange(count) * period_ns,
         image_stamp_ns=ticks * period_ns,
         published_ns=ticks * MS + MS // 2,
         received_ns=ticks * MS + MS // 2 + MS // 5,
@@ -52,6 +55,11 @@ def flown(held, *, period_ns=MS, time_constant_s=0.02, begin=0, sent_count=None)
 
 def felt(trace, time_constant_s=0.02):
     return felt_commands(trace, hover_rad_s=HOVER_RAD_S, motor_time_constant_s=time_constant_s).tolist()
+
+
+def latency_ms(trace):
+    commands = np.array(felt(trace))
+    return (loop_latency_ns(trace, commands, trace.rotor_stamp_ns[1:]) / MS).tolist()
 
 
 @pytest.mark.parametrize("period_ns", [100_000, 200_000, 10 * MS])
@@ -93,8 +101,7 @@ def test_a_report_that_is_missing_or_comes_twice_tells_nothing():
 def test_the_loop_ends_at_the_first_image_that_felt_the_command():
     """Command 1, sent at 1.1 ms, holds from tick 2 on: the first image is that of tick 3, at 3.7 ms."""
     trace = flown([0, 0, 1, 1, 2])
-    latency = loop_latency_ns(trace, np.array(felt(trace)))
-    assert latency.tolist() == [1.6 * MS, 2.6 * MS, 3.6 * MS]
+    assert latency_ms(trace) == [1.6, 2.6, 3.6]
 
 
 def test_where_that_image_was_lost_it_is_the_next_one():
@@ -102,15 +109,43 @@ def test_where_that_image_was_lost_it_is_the_next_one():
     kept = [0, 1, 2, 4, 5]
     images = {name: getattr(trace, name)[kept] for name in ("image_stamp_ns", "published_ns", "received_ns")}
     trace = dataclasses.replace(trace, **images)
-    assert loop_latency_ns(trace, np.array(felt(trace))).tolist() == [1.6 * MS, 3.6 * MS, 3.6 * MS]
+    assert latency_ms(trace) == [1.6, 3.6, 3.6]
 
 
 def test_the_warm_up_does_not_count():
     trace = flown([0, 0, 1, 1, 2], begin=3)
-    assert loop_latency_ns(trace, np.array(felt(trace))).tolist() == [2.6 * MS, 3.6 * MS]
+    assert latency_ms(trace) == [2.6, 3.6]
     assert transport_ns(trace).tolist() == [0.2 * MS] * 3
     assert received_hz(trace) == pytest.approx(1000.0)
     assert math.isnan(received_hz(dataclasses.replace(trace, begin=5)))
+
+
+def test_in_lockstep_the_stamps_tell_the_same():
+    """Command n answers tick n, and is felt by image n + 1, 1.6 ms after it was sent."""
+    trace = flown([0, 1, 2, 3, 4])
+    assert felt_at_once(trace, np.array(felt(trace)))
+    by_stamp = answered_commands(trace)
+    assert by_stamp.tolist() == felt(trace)
+    latency = loop_latency_ns(trace, by_stamp, trace.image_stamp_ns[1:]) / MS
+    assert latency.tolist() == latency_ms(trace) == [1.6] * 5
+    kept = [0, 1, 3, 4, 5]  # image 2 was lost: image 3 shows commands 1 and 2
+    images = {name: getattr(trace, name)[kept] for name in ("image_stamp_ns", "published_ns", "received_ns")}
+    assert answered_commands(dataclasses.replace(trace, **images)).tolist() == [0, 2, 3, 4]
+
+
+@pytest.mark.parametrize("held", [[0, 0, 1, 2], [0, 1, 1, 2], [None, 0, 1], [None]])
+def test_a_command_that_comes_late_is_noticed(held):
+    for sent_count in (1, 5):
+        trace = flown(held, sent_count=sent_count)
+        assert not felt_at_once(trace, np.array(felt(trace)))
+
+
+def test_without_reports_nothing_is_known():
+    trace = flown([0, 1])
+    none = {name: getattr(trace, name)[:1] for name in ("rotor_stamp_ns", "rotor_sequence", "rotor_speed")}
+    trace = dataclasses.replace(trace, **none)
+    assert felt(trace) == []
+    assert not felt_at_once(trace, np.array(felt(trace)))
 
 
 def test_commands_average_to_hover():

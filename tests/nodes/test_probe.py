@@ -10,19 +10,29 @@ import pytest
 
 from cortex import Node, reliable
 from cortex.messages import Events, Image, Imu, MotorCommand, RotorSpeeds, SimulatorStatus
-from neurosim_core.bench.loop_trace import command_speed, felt_commands, loop_latency_ns
+from neurosim_core.bench.loop_trace import (
+    answered_commands,
+    command_speed,
+    felt_at_once,
+    felt_commands,
+    loop_latency_ns,
+)
 from neurosim_core.nodes import probe
 from neurosim_core.nodes.probe import ProbeError, StreamProbe, answer_images
 
 HOVER_RAD_S = 500.0
 PERIOD_NS = 5_000_000
-LOST_TICK = 40
 
 
 class Lockstep:
-    """A simulator in lockstep whose rotors obey at once; the image of one tick is lost."""
+    """A simulator in lockstep whose rotors obey at once; the image of one tick is lost.
 
-    def __init__(self) -> None:
+    It is that of tick 40 or, if so wished, the first from there on at which nobody listens to the rotors.
+    """
+
+    def __init__(self, *, lose_unheard: bool) -> None:
+        self.lose_unheard = lose_unheard
+        self.lost_tick = 0
         self.node = Node("played simulator")
         self.rotors = self.node.publisher("/drone/rotor_speeds", RotorSpeeds, latch=True)
         self.images = self.node.publisher("/drone/camera", Image)
@@ -44,8 +54,10 @@ class Lockstep:
             if tick == 0:
                 self.show(0)
             tick += 1
-            if tick != LOST_TICK:
+            if tick < 40 or self.lost_tick or (self.lose_unheard and self.rotors.subscriber_count):
                 self.show(tick)
+            else:
+                self.lost_tick = tick
             self.report(tick, command.speed[0])
 
     def report(self, tick: int, speed: float) -> None:
@@ -65,8 +77,9 @@ class Lockstep:
         self.node.close()
 
 
-def test_a_controller_answers_every_image_and_notes_it(runtime):
-    with Lockstep() as simulator:
+@pytest.mark.parametrize("watch_rotors", [True, False])
+def test_a_controller_answers_every_image_and_notes_it(runtime, watch_rotors):
+    with Lockstep(lose_unheard=not watch_rotors) as simulator:
         trace = answer_images(
             vehicle="drone",
             camera="camera",
@@ -74,23 +87,30 @@ def test_a_controller_answers_every_image_and_notes_it(runtime):
             rotor_count=4,
             seconds=0.4,
             warm_up_s=0.1,
+            watch_rotors=watch_rotors,
             check=lambda: None,
         )
     sent = simulator.obeyed
     assert [c.sequence for c in sent] == list(range(len(sent)))
     assert [c.speed[2] for c in sent] == [command_speed(n, HOVER_RAD_S) for n in range(len(sent))]
     stamps = trace.image_stamp_ns // PERIOD_NS
-    assert set(range(stamps[-1])) - set(stamps.tolist()) <= {0, LOST_TICK}  # that of 0 may be overtaken
+    not_seen = set(range(stamps[-1])) - set(stamps.tolist())
+    assert not_seen - {0} == {simulator.lost_tick}  # that of 0 may be overtaken
     assert trace.image_bytes == 64 * 48 * 3
     assert trace.lost_count == 0  # it was never published
     assert 0 < trace.begin < len(stamps)
     assert trace.received_ns[trace.begin] - trace.received_ns[0] >= 0.1e9
-    assert trace.received_ns[-1] - trace.received_ns[trace.begin] >= 0.35e9
+    assert trace.received_ns[-1] - trace.received_ns[trace.begin - 1] >= 0.35e9
     assert (trace.published_ns < trace.received_ns).all()
     assert (np.diff(trace.sent_ns) > 0).all()
     felt = felt_commands(trace, hover_rad_s=HOVER_RAD_S, motor_time_constant_s=0.0)
-    assert felt.tolist() == list(range(len(felt)))
-    latency_ns = loop_latency_ns(trace, felt)
+    assert (felt < 0).sum() <= (0 if watch_rotors else 1)  # where it did not listen
+    assert (felt[felt >= 0] == trace.rotor_sequence[:-1][felt >= 0]).all()
+    assert felt_at_once(trace, felt)
+    assert simulator.lost_tick >= 40
+    assert trace.rotor_sequence[-1] > stamps[trace.begin]  # at the latest after the loss it listens again
+    latency_ns = loop_latency_ns(trace, answered_commands(trace), trace.image_stamp_ns[1:])
+    assert len(latency_ns) >= len(stamps) - trace.begin - 1
     assert 0 < np.median(latency_ns) < 1e9
 
 
@@ -101,7 +121,7 @@ def test_silence_is_an_error_that_names_the_topic(runtime, monkeypatch):
     with pytest.raises(
         ProbeError, match=r"nobody took commands from /drone/command/motor_speeds within 0\.3 s"
     ):
-        answer_images(**flight, warm_up_s=0.0, check=lambda: checked.append(1))
+        answer_images(**flight, warm_up_s=0.0, watch_rotors=True, check=lambda: checked.append(1))
     assert checked
     with Node("deaf") as node, StreamProbe(vehicle="drone", imu="imu", camera="events") as listener:
         node.publisher("/drone/imu", Imu)
