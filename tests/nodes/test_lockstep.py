@@ -26,7 +26,16 @@ from neurosim_core.nodes.simulator import Simulator
 from neurosim_core.nodes.topics import COMMANDS, command_topic, stream_topic
 from neurosim_core.nodes.translate import command_of, to_packet
 from neurosim_core.packets import Packet
-from neurosim_core.simulation import Model, finish, make_model, make_state, observe, run_model, step
+from neurosim_core.simulation import (
+    Model,
+    finish,
+    make_fleet,
+    make_model,
+    make_state,
+    observe,
+    run_model,
+    step,
+)
 
 STARTED_S = 60.0
 """Deadline for a process that loads a scene, on a machine that does a lot besides."""
@@ -53,6 +62,11 @@ SETTINGS: dict[str, Any] = {
     },
     "live": {"mode": "lockstep", "run_on": False, "command_deadline_s": 20.0},
 }
+BLUE = {
+    "path": {"kind": "lissajous", "ramp_s": 0.3, "speed_max_m_s": 3.0},
+    "control": {"rate_hz": 200, "gains": {"position_gain_per_s2": 8.0}},
+}
+"""What differs in the second one of a fleet."""
 STREAMS = {"events": Events, "imu": Imu, "odometry": Odometry}
 Law = Callable[[Any], np.ndarray]
 """A controller: from odometry (a packet or a message) to a setpoint."""
@@ -82,15 +96,15 @@ def content(packets: Sequence[Packet]) -> list[tuple[Any, ...]]:
 class Listener:
     """Hears every message of a vehicle."""
 
-    def __init__(self, node: Node, vehicle: str = "drone") -> None:
+    def __init__(self, node: Node, vehicle: str = "drone", streams: Sequence[str] = tuple(STREAMS)) -> None:
         self._again: dict[str, list[Packet]] = {}
         self._before: dict[str, int] = {}
         self._speeds = node.subscriber(
             stream_topic(vehicle, "rotor_speeds"), RotorSpeeds, policy=reliable(4096)
         )
         self._streams = {
-            name: node.subscriber(stream_topic(vehicle, name), message, policy=reliable(4096))
-            for name, message in STREAMS.items()
+            name: node.subscriber(stream_topic(vehicle, name), STREAMS[name], policy=reliable(4096))
+            for name in streams
         }
         for subscriber in (self._speeds, *self._streams.values()):
             assert subscriber.wait_for_publisher(STARTED_S)
@@ -98,7 +112,9 @@ class Listener:
     def packets(self, expected: Sequence[Packet]) -> list[Packet]:
         """As many packets of each sensor as are expected; fails if there are more."""
         counts = Counter(packet.sensor for packet in expected)
-        heard = [packet for name in STREAMS for packet in itertools.islice(self._heard(name), counts[name])]
+        heard = [
+            packet for name in self._streams for packet in itertools.islice(self._heard(name), counts[name])
+        ]
         for subscriber in self._streams.values():
             with pytest.raises(TimeoutError):
                 subscriber.recv(0.05)
@@ -106,7 +122,7 @@ class Listener:
 
     def packets_after_reset(self, expected: Sequence[Packet]) -> list[Packet]:
         """As `packets`, from the second beginning of each stream."""
-        for name in STREAMS:
+        for name in self._streams:
             first = next(p for p in expected if p.sensor == name)
             begins = (p for p in self._heard(name) if p.sequence == 0)
             assert next(begins).stamp_ns == first.stamp_ns
@@ -125,10 +141,13 @@ class Listener:
 
 
 @contextlib.contextmanager
-def serving(model: Model) -> Iterator[Callable[[], int]]:
+def serving(*models: Model) -> Iterator[Callable[[], int]]:
     """A simulator in a thread; gives a function that waits for the end of its run, and returns its result."""
     stop, results = threading.Event(), []
-    with Simulator(model.config, models={"drone": model}) as simulator:
+    fleet = {next(iter(model.config.vehicles)): model for model in models}
+    members = {name: {} for name in fleet}
+    config = load_config(models[0].config.model_dump(mode="json"), overrides={"vehicles": members})
+    with Simulator(config, models=fleet) as simulator:
         thread = threading.Thread(target=lambda: results.append(simulator.run(stop)))
         thread.start()
 
@@ -218,12 +237,14 @@ def test_two_processes_fly_as_one(model, shared_runtime, tmp_path):
 
 
 @contextlib.contextmanager
-def piloting(node: Node, model: Model, *, nap: Callable[[], float] = lambda: 0.0) -> Iterator[PathPilot]:
+def piloting(
+    node: Node, model: Model, vehicle: str = "drone", *, nap: Callable[[], float] = lambda: 0.0
+) -> Iterator[PathPilot]:
     """A pilot in a thread, which sleeps before it looks."""
     follower = PathFollower(model.path, model.airframe, model.config.control.gains)
     hover = np.full(4, model.airframe.hover_rotor_speed_rad_s)
     done = threading.Event()
-    with PathPilot(node, "drone", follower, lockstep=True, rotor_speed=hover) as pilot:
+    with PathPilot(node, vehicle, follower, lockstep=True, rotor_speed=hover) as pilot:
 
         def run() -> None:
             while not done.wait(nap()):
@@ -264,6 +285,21 @@ def test_after_a_reset_it_is_the_first_flight(model, shared_runtime):
         with piloting(node, model):
             assert result() == 0
         assert content(listener.packets_after_reset(expected)) == content(expected)
+
+
+def test_each_of_a_fleet_flies_as_alone(model, shared_runtime):
+    """Two on paths of their own, with two controllers of which one is slow."""
+    blind = {"sensors": {name: s for name, s in SETTINGS["sensors"].items() if name != "events"}}
+    config = load_config(SETTINGS | blind, overrides={"vehicles": {"red": {}, "blue": BLUE}})
+    fleet = make_fleet(config)
+    expected = {name: list(run_model(member, make_state(member))) for name, member in fleet.items()}
+    assert content(expected["red"]) != content(expected["blue"])
+    with serving(*fleet.values()) as result, Node("controller") as node:
+        listeners = {name: Listener(node, name, ["imu", "odometry"]) for name in fleet}
+        with piloting(node, fleet["red"], "red"), piloting(node, fleet["blue"], "blue", nap=lambda: 0.003):
+            assert result() == 0
+        for name, listener in listeners.items():
+            assert content(listener.packets(expected[name])) == content(expected[name])
 
 
 def law_of(mode: str, model: Model) -> Law:
