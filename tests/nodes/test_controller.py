@@ -138,6 +138,17 @@ def test_who_comes_late_answers_what_was_said_last(stage, start_pilot):
     assert stage.hear() == expected(7)
 
 
+def test_who_is_asked_twice_answers_twice_the_same(stage, start_pilot):
+    """As a simulator asks again while it waits for a command, and somebody new has come."""
+    pilot = start_pilot()
+    stage.odometry.wait_for_subscribers()
+    stage.rotor_speeds.wait_for_subscribers()
+    for tick in (0, 0, 1):
+        stage.send(tick)
+    assert [stage.hear() for _ in range(3)] == [expected(tick) for tick in (0, 0, 1)]
+    assert pilot.missing_count == 0
+
+
 def test_a_reset_is_answered_like_the_rest(stage, start_pilot):
     """Stamps and sequence begin again, also with rotor speeds of before still on their way."""
     start_pilot()
