@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,8 +17,11 @@ LIVE_PLOT_S = 10.0
 LIVE_TRAIL_S = 30.0
 """How much of its way a vehicle draws behind it, in a stream [s]."""
 _PICTURES = ("rgb", "event_camera", "depth")
-_PLOTS_PER_ROW = (3, 4)
-"""For up to six plots, and for more."""
+_LOOK = np.array([0.2, 0.62, -0.76]) / np.linalg.norm([0.2, 0.62, -0.76])
+"""From where the scene is seen at first: direction of the view in W."""
+_FIELD_OF_VIEW_RAD = 0.9
+"""Rerun's, from top to bottom, and a little room [rad]."""
+_ASPECT = 1.6
 
 
 def make_blueprint(
@@ -54,8 +58,7 @@ def make_blueprint(
             pictures = views
         views = _plots(name, sensors, live=live, links=links)
         if views:
-            columns = _PLOTS_PER_ROW[len(views) > 6]
-            plots.append(rrb.Grid(*views, grid_columns=columns, name=name))
+            plots.append(rrb.Grid(*views, grid_columns=_columns(len(views)), name=name))
     if live:
         plots.append(rrb.Horizontal(*_simulator_plots(), name="simulator"))
     right = [rrb.Tabs(*pictures)] if many and pictures else pictures
@@ -77,6 +80,11 @@ def make_blueprint(
     )
 
 
+def _columns(count: int) -> int:
+    """Columns of a grid of plots that leaves few places empty."""
+    return 2 if count == 4 else 3 if count <= 6 else 4
+
+
 def _cameras(sensors: tuple[SensorDescription, ...]) -> list[SensorDescription]:
     cameras = [sensor for sensor in sensors if sensor.intrinsics is not None]
     return sorted(cameras, key=lambda sensor: _PICTURES.index(sensor.kind))
@@ -91,10 +99,9 @@ def _space(
     rrb = import_rerun().blueprint
     eye = None
     if bounds_m is not None:
-        low, high = bounds_m
-        center, size = 0.5 * (low + high), high - low
-        away = np.array([-0.2 * size[0], -0.6 * max(size), 0.75 * max(size)])
-        eye = rrb.EyeControls3D(position=center + away, look_target=center, eye_up=(0.0, 0.0, 1.0))
+        center = bounds_m.mean(axis=0)
+        position = center - _distance_m(bounds_m) * _LOOK
+        eye = rrb.EyeControls3D(position=position, look_target=center, eye_up=(0.0, 0.0, 1.0))
     until_now = _last_seconds(LIVE_TRAIL_S if live else None)
     # One frustum is enough where cameras share a place; the others' pictures are at the right.
     hidden = [
@@ -114,6 +121,15 @@ def _space(
         eye_controls=eye,
         line_grid=False,
     )
+
+
+def _distance_m(bounds_m: NDArray[np.float64]) -> float:
+    """How far from its middle a box has to be looked at to be seen as a whole [m]."""
+    corners = np.array(list(itertools.product(*bounds_m.T))) - bounds_m.mean(axis=0)
+    right = np.cross(_LOOK, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    across = np.maximum(np.abs(corners @ np.cross(right, _LOOK)), np.abs(corners @ right) / _ASPECT)
+    return float((across / np.tan(0.5 * _FIELD_OF_VIEW_RAD) - corners @ _LOOK).max())
 
 
 def _last_seconds(seconds: float | None) -> Any:

@@ -1,0 +1,80 @@
+"""The layout of the viewer: where the eye is at first, and what has a place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+from hypothesis import given
+from hypothesis import strategies as st
+from test_rerun_log import SENSORS
+
+from neurosim_core.view.rerun_layout import make_blueprint
+
+SIZES = st.floats(0.5, 200.0)
+
+
+def views(part: object) -> list[rrb.View]:
+    """All views below a container."""
+    return [part] if isinstance(part, rrb.View) else [v for p in part.contents for v in views(p)]  # type: ignore[attr-defined]
+
+
+def origins(blueprint: rrb.Blueprint) -> list[str]:
+    return [str(view.origin) for view in views(blueprint.root_container)]
+
+
+@given(size=st.tuples(SIZES, SIZES, SIZES), middle=st.tuples(*[st.floats(-50.0, 50.0)] * 3))
+def test_the_whole_scene_is_seen_at_first(size, middle):
+    """Every corner is in a picture of 55 degrees, half as wide again as high; and the scene fills it."""
+    bounds_m = np.array(middle) + np.array([[-0.5], [0.5]]) * np.array(size)
+    space = views(make_blueprint({"drone": ()}, bounds_m).root_container)[0]
+    eye = space.properties["EyeControls3D"]
+    position, target = (
+        np.array(part.as_arrow_array().to_pylist()[0]) for part in (eye.position, eye.look_target)
+    )
+    assert target == pytest.approx(np.array(middle), abs=1e-3)  # float32, and 50 m away
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    corners = bounds_m[np.indices((2, 2, 2)).reshape(3, -1).T, range(3)] - position
+    depth = corners @ forward
+    assert (depth > 0.0).all()
+    half = np.tan(np.radians(55.0) / 2)
+    high = np.abs(corners @ up / depth / half).max()
+    wide = np.abs(corners @ right / depth / half / 1.6).max()
+    assert 0.85 < max(high, wide) < 1.0
+
+
+def test_nothing_has_an_empty_place():
+    """A file has what sensors measure; a stream has commands, timing and status, too; links if there are any."""
+    file = origins(make_blueprint({"drone": SENSORS}))
+    pictures = [f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "z")]
+    plots = [
+        "plots/drone/imu/specific_force",
+        "plots/drone/imu/angular_rate",
+        "plots/drone/truth",
+        "plots/drone/truth/rotor_speed",
+    ]
+    assert file == ["world", *plots, *pictures]
+    live = origins(make_blueprint({"drone": SENSORS}, live=True))
+    simulator = ["simulator/timing", "simulator/real_time_factor", "simulator/losses"]
+    commands = ["plots/drone/command", "simulator/timing"]
+    assert live == ["world", *plots, *commands, *simulator, *pictures, "status"]
+    assert "plots/drone/links" in origins(make_blueprint({"drone": SENSORS}, live=True, links=True))
+    assert origins(make_blueprint({"drone": ()})) == ["world"]
+    assert origins(make_blueprint({"drone": ()}, live=True))[-1] == "status"
+
+
+def test_several_vehicles_have_tabs():
+    blueprint = make_blueprint({"alpha": SENSORS, "beta": SENSORS}, live=True)
+    found = origins(blueprint)
+    assert len([o for o in found if o.startswith("world/vehicles/beta/")]) == 3
+    assert len([o for o in found if o.startswith("plots/alpha/")]) == 5
+    left, right = blueprint.root_container.contents
+    for tabs, names in (
+        (left.contents[1], ["alpha", "beta", "simulator"]),
+        (right.contents[0], ["alpha", "beta"]),
+    ):
+        assert isinstance(tabs, rrb.Tabs)
+        assert [tab.name for tab in tabs.contents] == names
