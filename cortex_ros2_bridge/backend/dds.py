@@ -242,7 +242,7 @@ def _dds_qos(qos: Qos, user_data: bytes) -> DdsQos:
     history = Policy.History.KeepLast(qos.depth)
     return DdsQos(
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        # Without a wait: what is not acknowledged is pushed out by what is newer (see environment.py).
+        # Writes do not wait: newer messages push out what a subscriber has not acknowledged.
         Policy.Reliability.Reliable(0) if qos.reliability == "reliable" else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal
         if qos.durability == "transient_local"

@@ -13,12 +13,8 @@ _log = logging.getLogger(__name__)
 
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 
-# A write never waits for subscribers: what is not acknowledged is bounded by the depth of the history. Nor
-# does the end of a writer, of which there are many, wait a second each for a subscriber that was killed.
-_TUNING = (
-    "<Internal><Watermarks><WhcHigh>1GB</WhcHigh></Watermarks>"
-    "<WriterLingerDuration>50 ms</WriterLingerDuration></Internal>"
-)
+# The end of a writer, of which there are many, waits a second each for a subscriber that was killed.
+_TUNING = "<Internal><WriterLingerDuration>50 ms</WriterLingerDuration></Internal>"
 # As ROS does it: unicast discovery on a host works only between processes with numbers.
 _INDEX = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
 

@@ -153,6 +153,10 @@ class Peer:
             }
         writer.write(writer.data_type(**fields))
 
+    def retract(self, topic: str) -> None:
+        """End a publisher; what it published is disposed of."""
+        del self.writers[topic]
+
     def look(self) -> dict[str, Any]:
         """Return what discovery shows: participants, and endpoints by their ids."""
         if not self.builtin:

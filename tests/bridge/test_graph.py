@@ -206,7 +206,6 @@ def settings(distro: str | None = None, **environment: str) -> dict[str, Any]:
                 found[name] = child.text
 
     walk(ElementTree.fromstring(ours[0] + ours[1]), "")
-    assert found.pop("Internal/Watermarks/WhcHigh") == "1GB"
     assert found.pop("Internal/WriterLingerDuration") == "50 ms"
     return found
 
