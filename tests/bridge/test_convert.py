@@ -611,6 +611,8 @@ def test_event_images_come_at_their_rate():
         assert len(sent) == 30
         assert sent[:4] == [34, 67, 100, 134]
     assert window(1001, width=5) is None
+    assert window(2001, width=5) is not None  # late, and but once
+    assert window(2002, width=5) is None
 
 
 # Frames
@@ -650,6 +652,9 @@ def test_rotations():
     assert frames.rotate((0.0, 0.0, 1.0, 0.0), (1.0, 2.0, 3.0)).tolist() == [-1.0, -2.0, 3.0]
     assert frames.yaw_rad(TURN) == math.pi / 2
     assert frames.yaw_rad((0.0, 0.0, 0.0, 1.0)) == 0.0
+    tilted = np.array([0.1, -0.3, 0.5, 0.806225774829855])  # where it turns the x axis, seen from above
+    east, north, _ = frames.rotate(tilted, (1.0, 0.0, 0.0))
+    assert frames.yaw_rad(tilted) == pytest.approx(math.atan2(north, east), abs=1e-14)
     assert frames.yaw_rad((0.0, 0.0, math.sin(-0.6), math.cos(-0.6))) == pytest.approx(-1.2, abs=1e-15)
 
 
@@ -787,11 +792,12 @@ def many_events(count: int, begin_us: int = 0) -> messages.Events:
 
 @pytest.mark.parametrize("encoding", ["evt3", "mono"])
 def test_event_packets_are_decoded_again(encoding):
-    """Packets of a flight of 20 s, empty ones among them, decoded from CDR with nothing but the message."""
+    """Packets of a flight, some empty, one after nearly a whole wrap: the message says all that is needed."""
     given = context(options={"encoding": encoding})
     decoder = Evt3Decoder()
-    for index, count in enumerate((100, 0, 1, 33, 0, 2000)):
-        events = many_events(count, begin_us=index * 4_000_000)
+    gap_us = (1 << 24) - 5 * 4096
+    for begin_us, count in ((0, 100), (4, 0), (8, 1), (8 + gap_us, 33), (2 * gap_us, 0), (3 * gap_us, 2000)):
+        events = many_events(count, begin_us)
         data = convert.event_packet(events, given)
         assert len(data) % 4 == 0
         sent = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")

@@ -179,6 +179,9 @@ def test_evt3_after_time_was_set_back_or_far_ahead_begins_anew():
     encode(encoder, packet(10 * WRAP_US, 10 * WRAP_US + 5, 5))
     assert len(encode(encoder, packet(0, 1, 1))) == 8
     assert len(encode(encoder, packet(10**12, 10**12 + 1, 1))) == 8
+    ones = np.ones(2, np.uint16)
+    both = Packet(np.array([0, 10**15]), ones, ones, ones.astype(np.uint8))
+    assert len(encode(Evt3Encoder(), both)) == 16  # no word for each wrap of 32 years
 
 
 def test_evt3_decoder_finds_the_wraps_that_it_did_not_see():
@@ -216,6 +219,15 @@ def test_evt3_of_a_sensor_with_vectors_and_other_words():
         assert events == reference.decode(data[begin:end])
         seen += len(events)
     assert seen > 2000
+
+
+def test_evt3_vectors_go_on_in_the_next_packet():
+    """By hand: columns from 100 on, 12 of which the packet before had, then 8, then 12."""
+    decoder = Evt3Decoder()
+    begin = word(8, 0) + word(6, 9) + word(0, 3) + word(3, 0x800 | 100) + word(4, 1)
+    assert rows(decoder.decode(begin, **SIZE)) == [(9, 100, 3, 1)]
+    assert rows(decoder.decode(word(5, 0xF81), **SIZE)) == [(9, 112, 3, 1), (9, 119, 3, 1)]
+    assert rows(decoder.decode(word(4, 0x801), **SIZE)) == [(9, 120, 3, 1), (9, 131, 3, 1)]
 
 
 def test_evt3_without_a_time_is_ignored():
