@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 from importlib.resources import files
+from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -87,4 +89,24 @@ def type_hash(type_name: str, distro: str = DEFAULT_DISTRO) -> str:
         UnknownTypeError: There is no such type.
     """
     check_type(type_name, distro)
-    return typestore(distro).hash_rihs01(type_name)
+    return _rosidl_store(distro).hash_rihs01(type_name)
+
+
+@functools.cache
+def _rosidl_store(distro: str) -> Typestore:
+    """Return the types as rosidl describes them: it makes `char` of a .msg file a uint8."""
+
+    def described(desc: Any) -> Any:
+        kind, what = desc
+        if kind == Nodetype.NAME:
+            return desc
+        if kind == Nodetype.BASE:
+            return (kind, ("uint8", what[1])) if what[0] == "char" else desc
+        return kind, (described(what[0]), what[1])
+
+    store = Typestore()
+    store.fielddefs = {
+        name: (constants, [(field, described(desc)) for field, desc in fields])
+        for name, (constants, fields) in typestore(distro).fielddefs.items()
+    }
+    return store
