@@ -7,8 +7,9 @@ import time
 from collections.abc import Sequence
 
 from neurosim_core.nodes.craft import Craft
+from neurosim_core.nodes.status import Board
 
-LOOK_INTERVAL_S = 0.005
+LOOK_INTERVAL_S = 0.02
 """How often it is looked, at most [s]."""
 SETTLE_S = 0.1
 """For so long nobody must have come or gone before time begins [s]."""
@@ -18,13 +19,15 @@ SETTLE_MAX_S = 2.0
 class Audience:
     """Keeps the vehicles' sensors on and off as others come and go."""
 
-    def __init__(self, crafts: Sequence[Craft]) -> None:
-        """Look for the first time.
+    def __init__(self, crafts: Sequence[Craft], board: Board) -> None:
+        """Begin with nobody.
 
         Args:
             crafts: The vehicles.
+            board: What is said besides.
         """
         self._crafts = crafts
+        self._board = board
         self._counts: tuple[int, ...] = ()
         self._changed_s = self._looked_s = 0.0
 
@@ -45,10 +48,10 @@ class Audience:
             left_s = self._changed_s + SETTLE_S - time.monotonic()
             if left_s <= 0.0:
                 return
-            stop.wait(min(left_s, LOOK_INTERVAL_S))
+            stop.wait(min(left_s, SETTLE_S / 10))
 
     def _look(self) -> None:
         self._looked_s = time.monotonic()
-        counts = tuple(count for craft in self._crafts for count in craft.look())
+        counts = (self._board.look(), *(count for craft in self._crafts for count in craft.look()))
         if counts != self._counts:
             self._counts, self._changed_s = counts, self._looked_s

@@ -62,7 +62,12 @@ class Craft:
         link = config.links.get("command", NO_LINK)
         self.name = name
         self.model = model
-        self.inbox = Inbox(node, name, rotor_count=model.airframe.rotor_count)
+        self.inbox = Inbox(
+            node,
+            name,
+            rotor_count=model.airframe.rotor_count,
+            lockstep=config.live.mode == "lockstep",
+        )
         self.helm = Helm(config.live, link, airframe=model.airframe, seed=config.seed)
         self.outlet = Outlet(node, name, model, record=record)
         if not link.delivers_at_once:

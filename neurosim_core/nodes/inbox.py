@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cortex import Node, Subscriber, TypeMismatch, keep_last
+from cortex import Node, Subscriber, TypeMismatch, keep_last, reliable
 from neurosim_core.control.modes import MODES, CommandMode
 from neurosim_core.nodes.helm import Command
 from neurosim_core.nodes.topics import COMMANDS, command_topic
@@ -46,21 +46,21 @@ class Inbox:
         missed: The last command that did not fit what was waited for; None if there was none.
     """
 
-    def __init__(self, node: Node, vehicle: str, *, rotor_count: int) -> None:
+    def __init__(self, node: Node, vehicle: str, *, rotor_count: int, lockstep: bool = False) -> None:
         """Subscribe to the commands of a vehicle.
 
         Args:
             node: Where to.
             vehicle: Its name.
             rotor_count: Numbers in a command of rotor speeds.
+            lockstep: Every command counts. Who floods is held up; and `wait` is in the socket at once.
         """
+        policy = reliable(timeout_s=0.1) if lockstep else keep_last()
         self.vehicle = vehicle
         self.missed: Command | None = None
         self._widths = {mode: len(MODES[mode].layout) for mode in COMMANDS} | {"motor_speeds": rotor_count}
         self._subscribers: dict[CommandMode, Subscriber[Any]] = {
-            cast(CommandMode, mode): node.subscriber(
-                command_topic(vehicle, mode), message, policy=keep_last()
-            )
+            cast(CommandMode, mode): node.subscriber(command_topic(vehicle, mode), message, policy=policy)
             for mode, message in COMMANDS.items()
         }
         self._known: dict[CommandMode, set[int]] = {mode: set() for mode in self._subscribers}

@@ -27,8 +27,8 @@ class Stream:
         name: Of the sensor, or odometry, rotor_speeds, collision.
         channel: What is under way.
         subscriber_count: As of the last look.
-        published_count: Messages since the last reset, for whoever may have listened.
-        delivered_ns: Stamp, as in the message, of what was published last [ns]; None if there was nothing.
+        published_count: Messages since the last reset.
+        delivered_ns: Stamp, as in the message, of what arrived last [ns]; None if there was nothing.
     """
 
     def __init__(
@@ -55,24 +55,37 @@ class Stream:
         self.delivered_ns: int | None = None
         self._translate = translate
         self._last: Any = None
+        self._kept: Packet | None = None
 
-    @property
-    def heard(self) -> bool:
-        """Whether a message would reach anybody, now or later."""
-        return self.subscriber_count > 0 or self.publisher.latch
+    def publish(self, packet: Packet, *, at_once: bool = False) -> None:
+        """Publish a packet, if anybody listens.
 
-    def publish(self, packet: Packet) -> None:
-        """Publish a packet now, if anybody listens."""
-        if not self.heard:
-            return
+        Where the topic is latched, the newest packet is kept, and published with the next look: whoever comes
+        gets a state that is not older than that, and it costs nothing in between.
+
+        Args:
+            packet: What to publish.
+            at_once: Even if nobody listens.
+        """
         config = self.channel.config
         clocked = config.clock_offset_s or config.clock_drift_ppm
+        self.delivered_ns = config.clock_ns(packet.stamp_ns)
+        if not (self.subscriber_count or at_once):
+            self._kept = packet if self.publisher.latch else None
+            return
         message = self._translate(packet, config.clock_ns if clocked else None)
+        self._kept = None
         self.publisher.publish(message)
         self.published_count += 1
-        self.delivered_ns = message.stamp_ns
         if self.publisher.latch:
             self._last = message
+
+    def look(self) -> int:
+        """See who listens; return how many."""
+        self.subscriber_count = self.publisher.subscriber_count
+        if self._kept is not None:
+            self.publish(self._kept, at_once=True)
+        return self.subscriber_count
 
     def repeat(self) -> None:
         """Publish the last message again, the same in every bit, where the topic is latched."""
@@ -84,7 +97,7 @@ class Stream:
         self.channel.reset(seed=seed)
         self.published_count = 0
         self.delivered_ns = None
-        self._last = None
+        self._last = self._kept = None
 
 
 class Outlet:
@@ -145,9 +158,7 @@ class Outlet:
 
     def look(self) -> tuple[int, ...]:
         """See who listens, and return how many subscribers each topic has."""
-        for stream in self.streams.values():
-            stream.subscriber_count = stream.publisher.subscriber_count
-        return tuple(stream.subscriber_count for stream in self.streams.values())
+        return tuple(stream.look() for stream in self.streams.values())
 
     def active(self) -> frozenset[str]:
         """Return the sensors that are listened to or recorded, as of the last look."""
@@ -194,7 +205,7 @@ class Outlet:
             if packet.stamp_ns:
                 self._send(self.streams[name], packet)
             else:
-                self.streams[name].publish(packet)
+                self.streams[name].publish(packet, at_once=True)
         if self.record is not None:
             self.record(packet)
 

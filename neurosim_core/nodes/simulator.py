@@ -111,7 +111,7 @@ class Simulator:
             self._cameras = Cameras(inline=inline, on_packets=self._bell.set)
             stack.callback(self._cameras.close)
             self.board = Board(node)
-            self._audience = Audience(self.crafts)
+            self._audience = Audience(self.crafts, self.board)
             self._streaming = Streaming(self.crafts, self._cameras, self._pacer, self._meter, bell=self._bell)
             self._begin(make_beginning(self.crafts, config, Reset()))
             self.board.announce(config)

@@ -34,6 +34,7 @@ class Board:
         self._simulation = node.publisher(topics.SIMULATION, Simulation, latch=True)
         self._clock = node.publisher(topics.CLOCK, Clock)
         self._status = node.publisher(topics.STATUS, SimulatorStatus)
+        self._clock_listeners = 0
         self._told_s = 0.0
         self._told_phase = ""
 
@@ -49,8 +50,15 @@ class Board:
             )
         )
 
+    def look(self) -> int:
+        """See who listens to the clock; return how many."""
+        self._clock_listeners = self._clock.subscriber_count
+        return self._clock_listeners
+
     def strike(self, stamp_ns: int, live: LiveConfig, *, sequence: int) -> None:
-        """Say what time it is: at a tick [ns]."""
+        """Say what time it is, if anybody listens: at a tick [ns]."""
+        if not self._clock_listeners:
+            return
         factor = live.real_time_factor if live.mode == "streaming" else 0.0
         self._clock.publish(
             Clock(stamp_ns=stamp_ns, wall_ns=time.time_ns(), real_time_factor=factor, sequence=sequence)

@@ -31,9 +31,9 @@ ROWS = {
 class Desk:
     """An inbox, and publishers of commands."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, *, lockstep: bool) -> None:
         self.node = node
-        self.inbox = Inbox(node, "drone", rotor_count=4)
+        self.inbox = Inbox(node, "drone", rotor_count=4, lockstep=lockstep)
         self._publishers: dict[str, Publisher[Any]] = {}
 
     def publisher(self, mode: str) -> Publisher[Any]:
@@ -57,10 +57,10 @@ class Desk:
         wait_for(lambda: arrived() >= taken)
 
 
-@pytest.fixture
-def desk(shared_runtime: Path) -> Iterator[Desk]:
+@pytest.fixture(params=[False, True], ids=["streaming", "lockstep"])
+def desk(shared_runtime: Path, request: pytest.FixtureRequest) -> Iterator[Desk]:
     with Node("inbox") as node:
-        yield Desk(node)
+        yield Desk(node, lockstep=request.param)
 
 
 @pytest.mark.parametrize("mode", COMMANDS)

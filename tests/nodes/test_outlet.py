@@ -162,6 +162,23 @@ def test_the_last_state_is_there_for_who_comes_later(make_stand: Callable[..., S
     assert stand.listen("/drone/rotor_speeds", RotorSpeeds).recv(SOON_S).speed.tolist() == [1, 2, 3, 4]
 
 
+def test_a_state_that_nobody_hears_is_built_when_somebody_may_come(make_stand: Callable[..., Stand]):
+    """Once a look, not once a control period; and its stamp is known all the same."""
+    stand = make_stand()
+    stand.outlet.look()
+    stand.outlet.offer_state(odometry(0))
+    for tick in range(1, 11):
+        stand.outlet.offer_state(odometry(5 * MS * tick))
+        assert stand.outlet.publish_due(5 * MS * tick) == 5 * MS * tick
+    stream = stand.outlet.streams["odometry"]
+    assert stream.published_count == 1
+    stand.outlet.look()
+    assert stream.published_count == 2
+    assert stand.listen("/drone/odometry", Odometry).recv(SOON_S).stamp_ns == 50 * MS
+    stand.outlet.look()
+    assert stream.published_count == 2
+
+
 def test_a_link_delays_and_says_so(make_stand: Callable[..., Stand]):
     link = {"latency_s": 0.008}
     stand = make_stand(links={"imu": link, "odometry": link})
