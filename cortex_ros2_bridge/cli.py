@@ -15,12 +15,15 @@ from typing import Any
 
 import yaml
 
+from cortex import Node
 from cortex_ros2_bridge.config import BridgeConfig, ConfigError, check_namespace, load
-from cortex_ros2_bridge.routes import ROOTED, Route, look, make_routes
+from cortex_ros2_bridge.routes import ROOTED, Route, Seen, look, make_routes
 
 INTERRUPTED = 130
 LIST_S = 1.5
 """How long `--list` and `--print-config` look for nodes [s]."""
+SETTLED_S = 0.3
+"""After so long without news, all nodes have been heard [s]."""
 EXIT_S = 0.9
 """Longest time to leave in; then the process ends as it is [s]."""
 
@@ -100,7 +103,6 @@ def _config(options: argparse.Namespace) -> BridgeConfig:
 def _bridge(config: BridgeConfig) -> int:
     """Bridge until interrupted."""
     stop = _stop_at_signals(forced=not config.backend.endswith(".mcap"))
-    from cortex import Node
     from cortex_ros2_bridge.backend.choose import open_backend
     from cortex_ros2_bridge.bridge import Bridge
 
@@ -118,14 +120,9 @@ def _bridge(config: BridgeConfig) -> int:
 
 def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
     """Print what would go where."""
-    from cortex import Node
-
     with Node(f"{config.node} list", domain=config.domain) as node:
         node.wait_for_registry(LIST_S)
-        seen, until_s = look(node), time.monotonic() + LIST_S
-        while not seen.topics and time.monotonic() < until_s:
-            time.sleep(0.05)
-            seen = look(node)
+        seen = _what_there_is(node)
     routes, problems = make_routes(seen, config)
     if as_yaml:
         sys.stdout.write(to_yaml(config, routes))
@@ -140,6 +137,20 @@ def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
     for problem in problems:
         print(problem, file=sys.stderr)
     return 0
+
+
+def _what_there_is(node: Node) -> Seen:
+    """Look until there are topics and nothing new has come for a while, or for `LIST_S`."""
+    begin_s = changed_s = time.monotonic()
+    seen = look(node)
+    while (now_s := time.monotonic()) - begin_s < LIST_S:
+        if seen.topics and now_s - changed_s > SETTLED_S:
+            break
+        time.sleep(0.02)
+        before, seen = seen, look(node)
+        if seen != before:
+            changed_s = now_s
+    return seen
 
 
 def _row(route: Route) -> tuple[str, str, str, str]:

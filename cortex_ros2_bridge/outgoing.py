@@ -29,6 +29,10 @@ REMIND_S = (0.1, 0.5)
 DDS calls a subscriber matched when it knows it, not when the subscriber knows us."""
 
 
+STREAM_S = 0.05
+"""What has sent something within this time needs no reminder [s]."""
+
+
 class Outgoing:
     """One route from Cortex to ROS.
 
@@ -107,9 +111,9 @@ class Outgoing:
         if count > self.subscriber_count:
             self._remind_s = [now_s + delay_s for delay_s in REMIND_S]
         while self._remind_s and now_s >= self._remind_s[0]:
-            came_s = self._remind_s.pop(0)
+            self._remind_s.pop(0)
             with self._lock:
-                if self._last is not None and self._last_s < came_s:
+                if self._last is not None and now_s - self._last_s > STREAM_S:
                     try:
                         self._publisher.publish(self._last)
                     except BackendError as error:

@@ -59,6 +59,11 @@ class Rig:
             self.update_until(lambda: publisher.subscriber_count == 1)
             yield found
 
+    def reminded(self, topic: str) -> bool:
+        """Whether the last message of a latched topic has been repeated for all who came."""
+        feeds = self.bridge._feeds.values()
+        return not any(o._remind_s for f in feeds for o in f._outputs if o.route.ros_topic == topic)
+
     def tally(self, name: str) -> Any:
         return self.bridge.totals()[name]
 

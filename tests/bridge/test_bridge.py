@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -104,11 +105,11 @@ def test_who_comes_later_to_a_latched_state_gets_it():
     with rig_of() as rig:
         state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
         state.publish(odometry(3_000_000_000))
-        craft = Craft(rig, velocity=msg.VelocityCommand)
         ros, moving = rig.opens("/drone/odometry", "/tf")
-        (twist,) = rig.subscribes("/drone/cmd_vel")
         with rig.listening(state, "/drone/odometry"):
             wait_for(lambda: ros.sent)
+            craft = Craft(rig, velocity=msg.VelocityCommand)
+            (twist,) = rig.subscribes("/drone/cmd_vel")
             with rig.backend.listening("/tf"):
                 rig.update_until(lambda: moving.sent)
                 assert stamp_ns(moving.messages()[0].transforms[0].header) == 3_000_000_000
@@ -190,6 +191,23 @@ def test_new_topics_appear_and_old_ones_are_closed(monkeypatch):
         assert list(rig.bridge.totals()) == [IMU]
 
 
+def test_a_topic_that_came_back_stays(monkeypatch):
+    """The time that it had to come back is over, and nothing happens."""
+    with rig_of() as rig:
+        first = rig.simulator.publisher("/drone/imu", msg.Imu)
+        (ros,) = rig.opens("/drone/imu")
+        monkeypatch.setattr(bridge_module, "GONE_S", 0.3)
+        first.close()
+        rig.update_until(lambda: not bridge_module.look(rig._node).topics)
+        (link,) = rig.bridge._links.values()
+        until_s = link.gone_s
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.update_until(lambda: bridge_module.look(rig._node).topics)
+        rig.update_until(lambda: time.monotonic() > until_s)
+        rig.updates_during()
+        assert not ros.closed
+
+
 def test_a_latched_state_is_sent_again_to_a_subscriber_that_may_have_been_too_early():
     """DDS counts a subscriber before that one hears us, and nobody else repeats the state of stamp 0."""
     with rig_of() as rig:
@@ -202,10 +220,18 @@ def test_a_latched_state_is_sent_again_to_a_subscriber_that_may_have_been_too_ea
             assert moving.sent == []
             rig.updates_during()
             assert len(ros.sent) == 3
-            state.publish(odometry(5))
-            wait_for(lambda: len(ros.sent) == 4)
-            rig.updates_during()
-            assert len(ros.sent) == 4
+        rig.update_until(lambda: state.subscriber_count == 0)
+        with rig.backend.listening("/drone/odometry"):
+            rig.update_until(lambda: state.subscriber_count == 1)
+            stamps = itertools.count(5)
+
+            def stream() -> bool:
+                state.publish(odometry(next(stamps)))
+                return rig.reminded("/drone/odometry")
+
+            rig.update_until(stream)
+        new = [data for data in ros.sent if data != ros.sent[0]]
+        assert len(set(new)) == len(new) > 10  # what streams is not repeated
 
 
 def test_what_cannot_be_converted_is_counted_and_the_next_one_goes_through(caplog):
@@ -535,8 +561,14 @@ def test_state_and_time_are_followed_only_while_somebody_commands():
         rig.opens("/drone/odometry")
         rig.updates_during()
         assert state.subscriber_count == 0
+        rig.simulator.subscriber("/bravo/command/motor_speeds", msg.MotorCommand)
+        other = rig.simulator.publisher("/bravo/odometry", msg.Odometry, latch=True)
+        rig.subscribes("/bravo/actuators")
+        rig.opens("/bravo/odometry")
         rotors.publisher_count = 1
         rig.update_until(lambda: state.subscriber_count == 1)
+        rig.updates_during()
+        assert other.subscriber_count == 0
         rotors.publisher_count = 0
         rig.update_until(lambda: state.subscriber_count == 0)
 
@@ -622,7 +654,8 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
         (rotors,) = rig.subscribes("/drone/actuators")
         (ros,) = rig.opens("/drone/imu")
         diagnostics = rig.backend.publishers["/diagnostics"]
-        rig.updates_during(100)
+        before_s = rig.bridge._diagnosed_s
+        rig.update_until(lambda: rig.bridge._diagnosed_s > before_s)
         assert diagnostics.sent == []
         with rig.listening(sent, "/drone/imu"), rig.backend.listening("/diagnostics"):
             sent.publish(imu(1))
