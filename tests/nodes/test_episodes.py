@@ -34,6 +34,14 @@ def test_a_leftover_that_looks_new_does_not_begin_another_run():
     assert episodes.sort("odometry", 10 * MS, 1) == "present"
 
 
+def test_a_leftover_of_a_stream_that_is_new_here_does_not_either():
+    episodes = Episodes()
+    assert episodes.sort("odometry", 60 * MS, 6) == "present"
+    assert episodes.sort("odometry", 0, 0) == "next"
+    assert episodes.sort("rgb", 50 * MS, 1) == "present"
+    assert episodes.sort("rgb", 0, 0) == "present"
+
+
 def test_a_message_again_is_no_new_run():
     """What is latched is sent again to those who connect again."""
     episodes = Episodes()

@@ -25,6 +25,7 @@ from rerun_file import Rows, read, scalars
 
 from cortex import Node
 from cortex import messages as msg
+from neurosim_core.nodes import viewer as viewer_module
 from neurosim_core.nodes.viewer import FileOutlet, view, watch
 from neurosim_core.packets import EventArrays
 from neurosim_core.view import event_picture
@@ -249,8 +250,9 @@ def test_an_unknown_sensor_is_an_error_once_the_known_are_known(tmp_path, box, s
     assert not (tmp_path / "live.rrd").exists()
 
 
-def test_simulators_come_and_go(tmp_path, box, start):
+def test_simulators_come_and_go(tmp_path, box, start, monkeypatch):
     """Gone and back, with a scene whose file is not there: each in a file of its own."""
+    monkeypatch.setattr(viewer_module, "OVER_S", 0.0)  # would end it at once
     watcher = start(tmp_path / "live.rrd", to_the_end=True)
     for count, (name, scene) in enumerate((("live", box), ("live-2", "nowhere.glb")), start=1):
         with FakeSimulator(scene) as simulator:
@@ -270,7 +272,9 @@ def test_simulators_come_and_go(tmp_path, box, start):
         assert {t for t, _ in speeds} == {20 * MS}
 
 
-def test_a_file_is_closed_when_the_flight_is_over(tmp_path, box, start):
+def test_a_file_is_closed_when_the_flight_is_over(tmp_path, box, start, monkeypatch):
+    """With all that had come, though it was not yet sent."""
+    monkeypatch.setattr(viewer_module, "SEND_S", 1e9)
     watcher = start(tmp_path / "live.rrd", to_the_end=True)
     with FakeSimulator(box, run_on=False) as simulator:
         simulator.announce()
@@ -278,8 +282,11 @@ def test_a_file_is_closed_when_the_flight_is_over(tmp_path, box, start):
         simulator.status(20 * MS, "ended")
         grows_to(tmp_path / "live.rrd", lambda rows: "/status" in rows)
         assert not watcher.result.done()
+        simulator.state(4)
     assert watcher.result.result(SOON_S) == 0
-    assert "it is over" in read(tmp_path / "live.rrd")["/status"][0][1]["text"][0]
+    rows = read(tmp_path / "live.rrd")
+    assert "it is over" in rows["/status"][0][1]["text"][0]
+    assert [t for t, _ in scalars(rows, "/plots/drone/odometry/speed")] == [15 * MS, 20 * MS]
     assert watcher.said[-1] == f"wrote {tmp_path / 'live.rrd'}"
 
 
