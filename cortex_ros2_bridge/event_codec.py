@@ -56,10 +56,11 @@ class EventColumns(NamedTuple):
 class Evt3Encoder:
     """Encodes the packets of one camera as evt3, one after the other.
 
-    Each event takes 4 bytes (row and column), and each new time another 4. Sensors write a row only when it
-    changes, and rows of neighbours as one vector: that saves little where each microsecond has few events,
-    and costs several times the time here. Where time wraps, the last and the first value of its high half are
-    written, so that a decoder notices it even after a silence of any length up to an hour.
+    Each event takes 4 bytes (row and column), and each new time another 4; if there are many new times, each
+    event has one. Sensors write a row only when it changes, and neighbours as one vector: that saves little
+    where a microsecond has few events, and costs several times the time here. Where time wraps, the last and
+    the first value of its high half are written, so that a decoder notices it even after a silence of any
+    length up to an hour.
     """
 
     def __init__(self) -> None:
@@ -106,36 +107,30 @@ class Evt3Encoder:
             times = t_us[before]
         else:
             before, times = np.zeros(1, np.intp), np.array([end_us], np.int64)
-        words = (
-            (times >> 12 & 0xFFF) | (times << 16 & 0xFFF0000) | (_TIME_LOW << 28 | _TIME_HIGH << 12)
-        ).astype(np.uint32)
-        before, words = self._with_wraps(before, words, times)
+        allocate = _new_bytes if allocate is None else allocate
+        if 3 * len(before) > count > 0 and not self._wraps(times):
+            # A time for each event, new or not: then all words have their places beforehand.
+            out = allocate(8 * count).view("<u4").reshape(count, 2)
+            out[:, 0] = _time_words(t_us)
+            _write_events(out[:, 1:], x, y, polarity)
+            return out.view(np.uint8).reshape(-1)
 
-        out = (_new_bytes if allocate is None else allocate)(4 * (count + len(words))).view("<u4")
-        is_event = np.ones(len(out), bool)
+        before, words = self._with_wraps(before, _time_words(times), times)
+        out = allocate(4 * (count + len(words))).view("<u4")
         where = before + np.arange(len(before))
+        is_event = np.ones(len(out), bool)
         is_event[where] = False
         out[where] = words
-        if count:
-            out[is_event] = self._event_words(x, y, polarity)
-        return out.view(np.uint8)
-
-    def _event_words(
-        self, x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8]
-    ) -> NDArray[np.uint32]:
-        """Return a row and a column for each event; valid until the next call."""
-        count = len(x)
         if len(self._scratch) < count:
             self._scratch = np.empty(count * 5 // 4, np.uint32)
-        words = self._scratch[:count]
-        halves = words.view(np.uint16).reshape(count, 2)
-        column = polarity.astype(np.uint16)
-        column <<= 11
-        column |= x
-        column |= _ADDR_X << 12
-        halves[:, 0] = y
-        halves[:, 1] = column
-        return words
+        events = self._scratch[:count]
+        _write_events(events[:, None], x, y, polarity)
+        out[is_event] = events
+        return out.view(np.uint8)
+
+    def _wraps(self, times: NDArray[np.int64]) -> bool:
+        """Return whether time wraps, in a packet or since the one before."""
+        return not self._epoch == int(times[0]) >> _EPOCH_BITS == int(times[-1]) >> _EPOCH_BITS
 
     def _with_wraps(
         self, before: NDArray[np.intp], words: NDArray[np.uint32], times: NDArray[np.int64]
@@ -415,6 +410,31 @@ def _check_pixels(
         )
     if len(x) and polarity.max() > 1:
         raise EventCodecError(f"polarity is 0 or 1, got {polarity.max()}")
+
+
+def _time_words(t_us: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Return the high and the low half of each time, as they are written one after the other."""
+    time = t_us.astype(np.uint32)
+    words: NDArray[np.uint32] = time << np.uint32(16)
+    words &= 0xFFF0000
+    time >>= 12
+    time &= 0xFFF
+    words |= time
+    words |= _TIME_LOW << 28 | _TIME_HIGH << 12
+    return words
+
+
+def _write_events(
+    out: NDArray[np.uint32], x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8]
+) -> None:
+    """Write a row and a column for each event; shape of `out` [n, 1]."""
+    column = polarity.astype(np.uint16)
+    column <<= 11
+    column |= x
+    column |= _ADDR_X << 12
+    halves = out.view("<u2")
+    halves[:, 0] = y
+    halves[:, 1] = column
 
 
 def _new_bytes(size: int) -> Bytes:

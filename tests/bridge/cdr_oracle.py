@@ -112,4 +112,4 @@ def _random_base(base: str, rng: np.random.Generator) -> Any:
     if base.startswith("float"):
         return float(np.dtype(base).type(rng.normal()))
     info = np.iinfo("uint8" if base == "char" else base)
-    return int(rng.integers(info.min, info.max, dtype=info.dtype, endpoint=True))
+    return int(rng.integers(info.min, info.max, dtype=info.dtype.type, endpoint=True))

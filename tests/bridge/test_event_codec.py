@@ -112,13 +112,17 @@ def test_evt3_words_of_three_events():
 
 @pytest.mark.parametrize("span_us", [1, 50, 1000, 100_000, 40_000_000])
 def test_evt3_there_and_back(span_us):
-    events = packet(123, 123 + span_us, 5000, seed=span_us)
-    data = encode(Evt3Encoder(), events)
-    decoded = Evt3Decoder().decode(data, **SIZE)
-    for ours, theirs in zip(decoded, events, strict=True):
-        assert ours.dtype == theirs.dtype
-        assert np.array_equal(ours, theirs)
-    assert Reference().decode(data) == rows(events)
+    """With few and with many new times; the second packet begins with state."""
+    encoder, decoder, reference = Evt3Encoder(), Evt3Decoder(), Reference()
+    for begin_us in (123, 123 + span_us):
+        events = packet(begin_us, begin_us + span_us, 5000, seed=span_us)
+        data = encode(encoder, events)
+        decoded = decoder.decode(data, **SIZE)
+        for ours, theirs in zip(decoded, events, strict=True):
+            assert ours.dtype == theirs.dtype
+            assert np.array_equal(ours, theirs)
+        assert reference.decode(data) == rows(events)
+        assert len(data) <= 8 * 5000 + 16
 
 
 def test_evt3_of_many_packets_over_several_wraps():
