@@ -7,12 +7,10 @@ tried out before: if it is not what it was, the public functions do the work, sl
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 from typing import Any, Literal, NamedTuple, Protocol
 
-import numpy as np
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
@@ -53,30 +51,23 @@ class Fast:
     """Bytes as they are, through private names of cyclonedds 11.
 
     Raises:
-        AttributeError, ImportError: The names are not there.
+        ImportError: The names are not there.
     """
 
     name = "fast"
 
     def __init__(self) -> None:
-        from cyclonedds._clayer import ddspy_take
-        from cyclonedds.internal import DDS
-        from cyclonedds.topic import Sample
+        from cyclonedds._clayer import ddspy_take, ddspy_write
 
         self._take = ddspy_take
-        self._sample = Sample
-        # Through ctypes, which lets other threads run meanwhile; `_clayer.ddspy_write` does not.
-        prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int32, ctypes.POINTER(Sample))
-        self._write = prototype(("dds_write", DDS._dll_handle))
+        self._write = ddspy_write
 
     def write(self, writer: Any, message: Buffer) -> None:
         """Write a message."""
         _check_length(message)
         if len(message) % 4:  # Cyclone DDS wants whole words
             message = bytes(message) + bytes(-len(message) % 4)
-        view = np.frombuffer(message, dtype=np.uint8)
-        address = view.__array_interface__["data"][0]
-        code = self._write(writer._ref, ctypes.byref(self._sample(address, len(message))))
+        code = self._write(writer._ref, message)
         if code < 0:
             raise Refused(f"Cyclone DDS returned {code}")
 

@@ -13,8 +13,12 @@ _log = logging.getLogger(__name__)
 
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 
-# The end of a writer, of which there are many, waits a second each for a subscriber that was killed.
-_TUNING = "<Internal><WriterLingerDuration>50 ms</WriterLingerDuration></Internal>"
+# The end of a writer, of which there are many, waits a second each for a subscriber that was killed. An image
+# is larger than the usual buffer of a socket: what the kernel drops is asked for again after 100 ms.
+_TUNING = (
+    "<Internal><WriterLingerDuration>50 ms</WriterLingerDuration>"
+    '<SocketReceiveBufferSize min="default" max="4MB"/></Internal>'
+)
 # As ROS does it: unicast discovery on a host works only between processes with numbers.
 _INDEX = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
 

@@ -50,7 +50,6 @@ ENCLAVE = b"enclave=/;"
 """User data by which ROS knows a participant as one of its own."""
 DISCOVERY_TOPIC = "ros_discovery_info"
 DISCOVERY_TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
-DISCOVERY_HASH = b"typehash=RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e;"
 
 Kind = Literal["writer", "reader"]
 _CLOSE_S = 5.0
@@ -264,7 +263,7 @@ class Graph:
             Policy.WriterDataLifecycle(autodispose=False),
         )
         if distro != "humble":
-            qos = Qos(Policy.Userdata(DISCOVERY_HASH), base=qos)
+            qos = Qos(Policy.Userdata(user_data_of_type(DISCOVERY_TYPE, distro)), base=qos)
         topic = Topic(self._participant, DISCOVERY_TOPIC, idl_struct(DISCOVERY_TYPE, distro))
         self._writer = DataWriter(self._participant, topic, qos)
         self._layout = distro

@@ -21,7 +21,7 @@ _Part = TypeVar("_Part")
 
 
 class RclpyBackend:
-    """A node of `rclpy`, in a context and with an executor thread of its own."""
+    """A node of `rclpy`, in a context and with an executor of its own."""
 
     name = "rclpy"
 
@@ -40,8 +40,9 @@ class RclpyBackend:
             BackendError: rclpy does not start.
         """
         import rclpy
+        from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
         from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.executors import MultiThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
         node_name, namespace = check_node_name(node_name, namespace)
@@ -60,7 +61,9 @@ class RclpyBackend:
             self._node: Any = rclpy.create_node(
                 node_name, context=self._context, namespace=namespace, use_global_arguments=False
             )
-            self._executor: Any = SingleThreadedExecutor(context=self._context)
+            # One thread for subscriptions, one for services, which take their time.
+            self._executor: Any = MultiThreadedExecutor(2, context=self._context)
+            self._service_group: Any = MutuallyExclusiveCallbackGroup()
             self._executor.add_node(self._node)
         except Exception as error:  # rclpy has many, of modules without public names
             raise BackendError(f"rclpy does not start: {error}") from error
@@ -78,7 +81,7 @@ class RclpyBackend:
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
     ) -> RclpySubscription:
-        """Subscribe to a topic; all callbacks share the thread of the executor."""
+        """Subscribe to a topic; all subscriptions share a thread."""
         check_name(topic)
         kind = _interface(type_name)
         deliver = Delivery(callback, topic)
@@ -87,11 +90,11 @@ class RclpyBackend:
             return self._keep(RclpySubscription(self, handle, topic, deliver))
 
     def service(self, name: str, callback: Callable[[], Trigger]) -> RclpyService:
-        """Answer requests to a service."""
+        """Answer requests to a service; all services share a thread."""
         check_name(name)
         kind = _interface("std_srvs/srv/Trigger")
         with self._lock:
-            return self._keep(RclpyService(self, self._here(), kind, name, callback))
+            return self._keep(RclpyService(self, self._here(), kind, name, callback, self._service_group))
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
@@ -220,14 +223,20 @@ class RclpyService:
     """Answers the requests to one service."""
 
     def __init__(
-        self, backend: RclpyBackend, node: Any, kind: Any, name: str, callback: Callable[[], Trigger]
+        self,
+        backend: RclpyBackend,
+        node: Any,
+        kind: Any,
+        name: str,
+        callback: Callable[[], Trigger],
+        group: Any,
     ) -> None:
         self.topic = None
         self._backend = backend
         self._callback = callback
         self._name = name
         self._error_count = 0
-        self._handle = node.create_service(kind, name, self._answer)
+        self._handle = node.create_service(kind, name, self._answer, callback_group=group)
 
     @property
     def error_count(self) -> int:

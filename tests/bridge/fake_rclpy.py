@@ -208,8 +208,11 @@ class Subscription:
 
 
 class Service:
-    def __init__(self, node: Node, srv_type: type, srv_name: str, callback: Callable[..., Any]) -> None:
+    def __init__(
+        self, node: Node, srv_type: type, srv_name: str, callback: Callable[..., Any], callback_group: Any
+    ) -> None:
         self.node, self.srv_type, self.srv_name, self.callback = node, srv_type, srv_name, callback
+        self.callback_group = callback_group
         self.waiting: deque[tuple[Any, Callable[[Any], None]]] = deque()
 
 
@@ -275,7 +278,7 @@ class Node:
         qos_profile: Any = None,
         callback_group: Any = None,
     ) -> Service:
-        self.services.append(Service(self, srv_type, srv_name, callback))
+        self.services.append(Service(self, srv_type, srv_name, callback, callback_group))
         return self.services[-1]
 
     def destroy_publisher(self, publisher: Publisher) -> bool:
@@ -342,11 +345,17 @@ def create_node(
     return Node(node_name, context, namespace)
 
 
-class SingleThreadedExecutor:
-    def __init__(self, *, context: Context | None = None) -> None:
+class MutuallyExclusiveCallbackGroup:
+    """Its members run one at a time."""
+
+
+class MultiThreadedExecutor:
+    def __init__(self, num_threads: int | None = None, *, context: Context | None = None) -> None:
         assert context is not None, "the fake has no default context"
+        self._free = num_threads or 4
         self._context = context
         self._nodes: list[Node] = []
+        self._busy: set[Any] = set()
         self._is_shutdown = False
 
     def add_node(self, node: Node) -> bool:
@@ -354,35 +363,53 @@ class SingleThreadedExecutor:
         return True
 
     def spin(self) -> None:
-        """Run callbacks one by one; what one raises ends it."""
+        """Run callbacks, of each group one at a time; what one raises ends it."""
         ACTIVE.append(threading.current_thread())
-        while not self._is_shutdown:
+        while True:
             with self._context.wake:
-                while (job := self._job()) is None:
-                    if not self._context.ok():
-                        raise ExternalShutdownException()
+                while (found := self._job()) is None:
                     if self._is_shutdown:
                         return
+                    if not self._context.ok():
+                        raise ExternalShutdownException()
                     self._context.wake.wait()
-            job()
+                group, job = found
+                self._busy.add(group)
+                self._free -= 1
+            threading.Thread(target=self._run, args=(group, job)).start()
 
-    def _job(self) -> Callable[[], None] | None:
+    def _run(self, group: Any, job: Callable[[], None]) -> None:
+        try:
+            job()
+        except Exception:
+            self._context.shutdown()
+        with self._context.wake:
+            self._busy.discard(group)
+            self._free += 1
+            self._context.wake.notify_all()
+
+    def _job(self) -> tuple[Any, Callable[[], None]] | None:
+        if not self._free:
+            return None
         for node in self._nodes:
             for subscription in node.subs:
-                if subscription.waiting:
+                if subscription.waiting and node not in self._busy:
                     message = subscription.waiting.popleft()
-                    return lambda s=subscription, m=message: s.callback(m)
+                    return node, lambda s=subscription, m=message: s.callback(m)
             for service in node.services:
-                if service.waiting:
+                group = service.callback_group or node
+                if service.waiting and group not in self._busy:
                     request, answer = service.waiting.popleft()
-                    return lambda s=service, r=request, a=answer: a(s.callback(r, s.srv_type.Response()))
+                    return group, lambda s=service, r=request, a=answer: a(
+                        s.callback(r, s.srv_type.Response())
+                    )
         return None
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         with self._context.wake:
             self._is_shutdown = True
             self._context.wake.notify_all()
-        return True
+            return self._context.wake.wait_for(lambda: not self._busy, timeout_sec)
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -390,9 +417,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     WORLD.clear()
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": init, "create_node": create_node},
+        "rclpy.callback_groups": {"MutuallyExclusiveCallbackGroup": MutuallyExclusiveCallbackGroup},
         "rclpy.context": {"Context": Context},
         "rclpy.executors": {
-            "SingleThreadedExecutor": SingleThreadedExecutor,
+            "MultiThreadedExecutor": MultiThreadedExecutor,
             "ExternalShutdownException": ExternalShutdownException,
         },
         "rclpy.qos": {

@@ -200,6 +200,8 @@ def settings(distro: str | None = None, **environment: str) -> dict[str, Any]:
             name = f"{path}/{child.tag}".removeprefix("/Domain/")
             if "address" in child.attrib:
                 found.setdefault(name, []).append(child.attrib["address"])
+            elif "max" in child.attrib:
+                found[name] = child.attrib["max"]
             elif len(child):
                 walk(child, f"{path}/{child.tag}")
             else:
@@ -207,6 +209,7 @@ def settings(distro: str | None = None, **environment: str) -> dict[str, Any]:
 
     walk(ElementTree.fromstring(ours[0] + ours[1]), "")
     assert found.pop("Internal/WriterLingerDuration") == "50 ms"
+    assert found.pop("Internal/SocketReceiveBufferSize") == "4MB"
     return found
 
 

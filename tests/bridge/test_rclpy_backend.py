@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,10 @@ def make(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
         return nodes[-1]
 
     yield start
+    begin_s = time.monotonic()
     for node in nodes:
         node.close()
+    assert time.monotonic() - begin_s < 4.0  # each thread that does not end by itself takes five
     wait_for(lambda: not set(threading.enumerate()) - threads)
 
 
@@ -158,6 +161,28 @@ def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None
     service.close()
     service.close()
     assert node.node.services == []
+    node.close()
+    other.close()
+
+
+def test_a_slow_service_does_not_hold_up_messages(fake: None) -> None:
+    node, other = RclpyBackend(), RclpyBackend(node_name="other")
+    go, got, replies = threading.Event(), [], []
+
+    def serve() -> Trigger:
+        assert go.wait(10.0)
+        return Trigger(True, "")
+
+    node.service("/reset", serve)
+    node.subscription("/words", STRING, Qos(), got.append)
+    asking = threading.Thread(target=lambda: replies.append(other.node.call("/reset")))
+    asking.start()
+    other.publisher("/words", STRING, Qos()).publish(text("meanwhile"))
+    wait_for(lambda: got)
+    assert replies == []
+    go.set()
+    asking.join(10.0)
+    assert replies[0].success
     node.close()
     other.close()
 
