@@ -263,11 +263,20 @@ def event_array(message: messages.Events, context: Context) -> Buffer:
             [],
         )
     )
-    count = len(message.t)
-    if count and not _SECONDS_MIN <= message.t[0] // 1_000_000 <= message.t[-1] // 1_000_000 <= _SECONDS_MAX:
-        raise ConvertError(f"ROS has no time for events from {message.t[0]} to {message.t[-1]} us")
     room = _Room(prefix)
-    write_dvs(room.make(dvs_size(count), count=count), message.t, message.x, message.y, message.polarity)
+    count = len(message.t)
+    try:
+        write_dvs(
+            room.make(dvs_size(count), count=count),
+            message.t,
+            message.x,
+            message.y,
+            message.polarity,
+            width=message.width,
+            height=message.height,
+        )
+    except EventCodecError as error:
+        raise ConvertError(str(error)) from error
     return room.message()
 
 

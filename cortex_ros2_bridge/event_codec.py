@@ -34,6 +34,7 @@ _JITTER = 10
 """A high half that is smaller by no more than this came late, it did not wrap; as other decoders have it."""
 _EVT3_SIZE_MAX = 2048
 _MONO_SPAN_MAX_US = (2**32 - 1) // 1000
+_DVS_SPAN_US = 2**32 - 10**6
 
 
 class EventCodecError(ValueError):
@@ -277,8 +278,8 @@ def encode_mono(
         )
     out = (_new_bytes if allocate is None else allocate)(8 * count)
     quarters = out.view("<u2").reshape(count, 4)
-    after_ns = t_us - base_us
-    after_ns *= 1000
+    after_ns = _after(t_us, base_us)
+    after_ns *= np.uint32(1000)
     out.view("<u4").reshape(count, 2)[:, 0] = after_ns
     quarters[:, 2] = x
     row = polarity.astype(np.uint16)
@@ -327,31 +328,47 @@ def write_dvs(
     x: NDArray[np.uint16],
     y: NDArray[np.uint16],
     polarity: NDArray[np.uint8],
+    *,
+    width: int,
+    height: int,
 ) -> None:
     """Write events as the records of a dvs_msgs/EventArray.
 
     Args:
         out: Bytes to write to, `dvs_size` of them and 3 more, from a multiple of 4 on in the message.
-        t_us: Times [us], shape [n].
+        t_us: Times, sorted [us], shape [n].
         x: Columns [px], shape [n].
         y: Rows [px], shape [n].
         polarity: 1: brighter, 0: darker, shape [n].
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+
+    Raises:
+        EventCodecError: An event is outside of the sensor or has another polarity; times decrease, reach over
+            more than 71 minutes, or have seconds of more than 32 bits.
     """
+    _check(t_us, x, y, polarity, width, height)
     out[:] = 0
     if not len(t_us):
         return
-    second = t_us // 1_000_000
-    nanosecond = t_us - second * 1_000_000
-    nanosecond *= 1000
+    first, last = int(t_us[0]), int(t_us[-1])
+    if not -(2**31) <= first // 1_000_000 <= last // 1_000_000 < 2**31 or last - first >= _DVS_SPAN_US:
+        raise EventCodecError(f"dvs_msgs cannot hold times from {first} to {last} us")
+    begin = first // 1_000_000
+    nanosecond = _after(t_us, begin * 1_000_000)
+    second = nanosecond // np.uint32(1_000_000)
+    nanosecond -= second * np.uint32(1_000_000)
+    nanosecond *= np.uint32(1000)
+    second += np.uint32(begin & 0xFFFFFFFF)
     # The first record lacks 2 bytes before its time; the others lie 16 apart.
     records = np.frombuffer(out.data, DVS_RECORD, count=len(t_us) - 1, offset=14)
     records["x"], records["y"] = x[1:], y[1:]
-    records["sec"], records["nanosec"] = second[1:], nanosecond[1:]
+    records["sec"], records["nanosec"] = second[1:].view(np.int32), nanosecond[1:]
     records["polarity"] = polarity[1:]
-    first = np.frombuffer(
+    head = np.frombuffer(
         out.data, [("x", "<u2"), ("y", "<u2"), ("sec", "<i4"), ("ns", "<u4"), ("p", "u1")], 1
     )
-    first[0] = (x[0], y[0], second[0], nanosecond[0], polarity[0])
+    head[0] = (x[0], y[0], begin, nanosecond[0], polarity[0])
 
 
 class EventPicture:
@@ -410,6 +427,13 @@ def _check_pixels(
         )
     if len(x) and polarity.max() > 1:
         raise EventCodecError(f"polarity is 0 or 1, got {polarity.max()}")
+
+
+def _after(t_us: NDArray[np.int64], begin_us: int) -> NDArray[np.uint32]:
+    """Return times after another one, none by 71 minutes or more [us]: in half the memory of int64."""
+    after = t_us.astype(np.uint32)
+    after -= np.uint32(begin_us & 0xFFFFFFFF)
+    return after
 
 
 def _time_words(t_us: NDArray[np.int64]) -> NDArray[np.uint32]:

@@ -260,7 +260,7 @@ def test_evt3_that_is_none_is_refused():
         Evt3Decoder().decode(word(0x9, 0) + word(0x8, 0) + word(0xB, 0), **SIZE)
 
 
-@pytest.mark.parametrize("encoding", ["evt3", "mono"])
+@pytest.mark.parametrize("encoding", ["evt3", "mono", "dvs"])
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -278,6 +278,7 @@ def test_events_that_do_not_fit_are_refused(encoding, change, reason):
     encode_it = {
         "evt3": lambda: Evt3Encoder().encode(*wrong, **SIZE, end_us=0),
         "mono": lambda: encode_mono(*wrong, **SIZE, base_us=0),
+        "dvs": lambda: write_dvs(np.zeros(32, np.uint8), *wrong, **SIZE),
     }[encoding]
     with pytest.raises(EventCodecError, match=reason):
         encode_it()
@@ -339,13 +340,20 @@ def test_dvs_records_are_those_of_an_event_array(count):
     """Against the encoding of the messages, one by one."""
     events = packet(1_500_000, 3_500_000, count)
     out = np.full(16 * count, 0xEE, np.uint8)
-    write_dvs(out, *events)
+    write_dvs(out, *events, **SIZE)
     record, time = cdr.record_class("dvs_msgs/msg/Event"), cdr.record_class("builtin_interfaces/msg/Time")
     header = cdr.record_class("std_msgs/msg/Header")(time(0, 0), "")
     messages = [record(x, y, time(t // 10**6, t % 10**6 * 1000), bool(p)) for t, x, y, p in rows(events)]
     array = cdr.encode(cdr.record_class("dvs_msgs/msg/EventArray")(header, HEIGHT, WIDTH, messages))
     assert bytes(array)[-16 * count :] == bytes(out) if count else len(array) % 4 == 0
     assert dvs_size(count) == max(16 * count - 3, 0)
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 2**32), (0, 10**15), (2**31 * 10**6, 2**31 * 10**6)])
+def test_dvs_times_that_are_too_far_apart_or_too_late_are_refused(first, last):
+    ones = np.ones(2, np.uint16)
+    with pytest.raises(EventCodecError, match="dvs_msgs cannot hold"):
+        write_dvs(np.zeros(32, np.uint8), np.array([first, last]), ones, ones, ones.astype(np.uint8), **SIZE)
 
 
 def test_picture_shows_the_last_event_of_each_pixel():
