@@ -63,6 +63,8 @@ class Result:
 
     sent: int
     received: int
+    lost_in_bridge: int
+    """As /diagnostics say; others were lost in DDS."""
     latency_ms: tuple[float, float, float]
     """Median, 99th percentile and maximum [ms]."""
 
@@ -90,7 +92,8 @@ def main(arguments: Sequence[str]) -> int:
     for streams in (("imu",), ("image", "events"), ("image", "events", "imu")):
         for name, result in end_to_end(streams, seconds=options.seconds, encoding=options.encoding).items():
             title = f"{'+'.join(streams)}.{name}"
-            print(f"{title}.received {result.received} of {result.sent}")
+            print(f"{title}.received {result.received} of {result.sent} messages")
+            print(f"{title}.lost_in_bridge {result.lost_in_bridge} messages")
             for which, value in zip(("median", "p99", "max"), result.latency_ms, strict=True):
                 print(f"{title}.latency_{which} {value:.3f} ms", flush=True)
     return 0
@@ -164,12 +167,7 @@ def end_to_end(streams: Sequence[str], *, seconds: float, encoding: str = "evt3"
             sent = _hear(publisher)
             print("end", file=subscriber.stdin, flush=True)
             got = _hear(subscriber)
-    return {
-        name: Result(
-            sent=sent[name], received=got[name]["received"], latency_ms=tuple(got[name]["latency_ms"])
-        )
-        for name in streams
-    }
+    return {name: Result(sent=sent[name], **got[name]) for name in streams}
 
 
 def make_events(rng: np.random.Generator, count: int, *, stamp_ns: int) -> Events:
@@ -238,17 +236,25 @@ def _publish(streams: Sequence[str], seconds: float) -> int:
                 if tick % STREAMS[name].every == 0:
                     publisher.publish(makers[name](time.monotonic_ns(), sent[name]))
                     sent[name] += 1
-        time.sleep(0.5)  # until all has arrived
+        time.sleep(1.5)  # until all has arrived, and the bridge has said what it lost
     print(json.dumps(sent), flush=True)
     return 0
 
 
 def _subscribe(streams: Sequence[str]) -> int:
     """Receive until told to end, and print how much that was and how late."""
+    from cortex_ros2_bridge import cdr, diagnostics
     from cortex_ros2_bridge.backend.base import Qos
     from cortex_ros2_bridge.backend.choose import open_backend
 
     latencies: dict[str, list[int]] = {name: [] for name in streams}
+    lost = dict.fromkeys(streams, 0)
+
+    def take_diagnostics(data: bytes) -> None:
+        for status in cdr.decode(data, diagnostics.TYPE).status:
+            for name in streams:
+                if status.name.endswith(f"-> {STREAMS[name].ros_topic}"):
+                    lost[name] = int({pair.key: pair.value for pair in status.values}["lost"])
 
     def taker(name: str) -> Callable[[bytes], None]:
         append = latencies[name].append
@@ -263,14 +269,19 @@ def _subscribe(streams: Sequence[str]) -> int:
     try:
         for name in streams:
             stream = STREAMS[name]
-            backend.subscription(stream.ros_topic, stream.ros_type, Qos(depth=100), taker(name))
+            backend.subscription(stream.ros_topic, stream.ros_type, Qos(depth=1000), taker(name))
+        backend.subscription(diagnostics.TOPIC, diagnostics.TYPE, Qos(), take_diagnostics)
         sys.stdin.readline()
     finally:
         backend.close()
     found = {}
     for name, values in latencies.items():
         quantiles = np.quantile(values, (0.5, 0.99, 1.0)) / 1e6 if values else np.full(3, np.nan)
-        found[name] = {"received": len(values), "latency_ms": quantiles.tolist()}
+        found[name] = {
+            "received": len(values),
+            "lost_in_bridge": lost[name],
+            "latency_ms": quantiles.tolist(),
+        }
     print(json.dumps(found), flush=True)
     return 0
 

@@ -20,9 +20,9 @@ logger = logging.getLogger(__name__)
 
 Convert = Callable[[Any, Context], "Buffer | None"]
 
-QUEUES: dict[type[Any], int] = {Image: 8, PointCloud: 8, Events: 64}
+QUEUES: dict[type[Any], int] = {Image: 16, PointCloud: 16, Events: 128}
 """Messages that wait for their conversion; the option `queue` changes it."""
-QUEUE = 256
+QUEUE = 1024
 REMIND_S = (0.1, 0.5)
 """When the last message of a latched topic is sent again after a ROS subscriber has come [s].
 

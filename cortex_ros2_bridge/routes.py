@@ -74,9 +74,11 @@ class Rule(NamedTuple):
     """False: only where the settings ask for it."""
 
 
-STREAM = Qos(depth=100)
-"""Many small messages: a subscriber may sleep for a tenth of a second."""
-FRAMES = Qos(depth=5)
+STREAM = Qos(depth=1000)
+"""Many small messages: at 1 kHz a subscriber may sleep for a second."""
+PACKETS = Qos(depth=100)
+"""Many messages that may be large."""
+FRAMES = Qos(depth=10)
 """Few large messages."""
 NEWEST = Qos(depth=1)
 
@@ -88,9 +90,9 @@ RULES: tuple[Rule, ...] = (
     Rule("cortex/Transform", "tf2_msgs/msg/TFMessage", "out", "/tf_static", QOS["latched"]),
     Rule("cortex/Image", "sensor_msgs/msg/Image", "out", "{topic}/image_raw", FRAMES),
     Rule("cortex/Image", "sensor_msgs/msg/CameraInfo", "out", "{topic}/camera_info"),
-    Rule("cortex/Events", "event_camera_msgs/msg/EventPacket", "out", "{topic}", STREAM),
+    Rule("cortex/Events", "event_camera_msgs/msg/EventPacket", "out", "{topic}", PACKETS),
     Rule("cortex/Events", "sensor_msgs/msg/Image", "out", "{topic}/image", FRAMES),
-    Rule("cortex/Events", "dvs_msgs/msg/EventArray", "out", "{topic}/event_array", STREAM, default=False),
+    Rule("cortex/Events", "dvs_msgs/msg/EventArray", "out", "{topic}/event_array", PACKETS, default=False),
     Rule("cortex/CameraInfo", "sensor_msgs/msg/CameraInfo", "out", "{parent}/camera_info", QOS["latched"]),
     Rule("cortex/PointCloud", "sensor_msgs/msg/PointCloud2", "out", "{topic}", FRAMES),
     Rule("cortex/RotorSpeeds", "actuator_msgs/msg/Actuators", "out", "{topic}", STREAM),

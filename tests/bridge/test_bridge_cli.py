@@ -19,7 +19,7 @@ from test_routes import DRONE
 
 from cortex import Node
 from cortex import messages as msg
-from cortex_ros2_bridge import cli
+from cortex_ros2_bridge import bench, cli
 from cortex_ros2_bridge.config import load
 from cortex_ros2_bridge.routes import make_routes
 
@@ -69,7 +69,7 @@ def test_list(simulator, capsys):
         ["/drone/command/rates", "<-", "/sim/drone/attitude_target", "mavros_msgs/msg/AttitudeTarget"],
         ["/drone/imu", "->", "/sim/drone/imu", "sensor_msgs/msg/Imu"],
     ]
-    assert lines[1].endswith("reliable, volatile, depth 100")
+    assert lines[1].endswith("reliable, volatile, depth 1000")
 
 
 def test_print_config(simulator, capsys, tmp_path):
@@ -189,3 +189,16 @@ def test_the_module_and_the_command_are_one():
         check=True,
     )
     assert "cortex-ros2-bridge --list" in process.stdout
+
+
+def test_the_benchmark_measures_what_it_says():
+    """All messages of a short run arrive, and take longer than nothing and less than a second."""
+    result = bench.end_to_end(("imu",), seconds=0.2)["imu"]
+    assert result.sent == result.received == 200
+    assert result.lost_in_bridge == 0
+    median, p99, largest = result.latency_ms
+    assert 0.0 < median <= p99 <= largest < 1000.0
+
+
+def test_the_benchmark_knows_every_conversion():
+    assert all(0.0 < milliseconds < 1000.0 for milliseconds in bench.conversions(repeats=1).values())

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path as FilePath
+
 import pytest
+import yaml
 from processes import wait_for
 
 from cortex import Node, message
@@ -334,3 +338,40 @@ def test_discovery_shows_topics_and_services(runtime):
         ("/drone/odometry", True, True),
     ]
     assert seen.services == (("/reset", "cortex/Reset"), ("/step", "cortex/Step"))
+
+
+README = FilePath(__file__).resolve().parents[2] / "cortex_ros2_bridge" / "README.md"
+
+
+def example(name):
+    """The code block of README.md that follows its mark."""
+    text = README.read_text().partition(f"<!-- example: {name} -->")[2]
+    return text.split("```")[1].partition("\n")[2]
+
+
+def test_settings_of_the_readme():
+    """They load, every entry changes something, and names come out as the comments say."""
+    settings = yaml.safe_load(example("settings"))
+    routes = routed(settings)
+    assert routes["/drone/rgb", "Image"].ros_topic == "/neurosim/front/image_raw"
+    assert routes["/drone/imu", "Imu"].ros_topic == "/neurosim/imu/data_raw"
+    assert routes["/drone/imu", "Imu"].qos == config.QOS["sensor_data"]
+    assert routes["/drone/events", "EventPacket"].options == {"encoding": "mono"}
+    assert ("/drone/events", "EventArray") in routes
+    assert routes["/drone/command/rates", "AttitudeTarget"].options["max_thrust_n"] == 20.0
+    assert ("/drone/odometry", "TFMessage") not in routes
+
+
+def test_names_of_the_readme():
+    """Every ROS topic of the table is one that a default route has, and the other way round."""
+    table_text = README.read_text().partition("## Routes")[2].partition("## Settings")[0]
+    named = set(re.findall(r"`(/[a-z_/]+)`", table_text))
+    for route in default_routes(DRONE):
+        if route.direction == "call" or "transform" in route.cortex_topic or "/info" in route.cortex_topic:
+            continue
+        assert route.ros_topic in named
+
+
+def test_messages_of_the_readme(capsys):
+    exec(compile(example("messages"), str(README), "exec"), {})
+    assert capsys.readouterr().out == "9.81\n"
