@@ -180,6 +180,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
             open_recording(save or made),
             vehicles={next(iter(config.vehicles)): header.sensors},
             scene=scene_shapes(load_scene(config.scene)),
+            links=bool(config.links),
         )
         with logger:
             logger.log_path(header.path_position)

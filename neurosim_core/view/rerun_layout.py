@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
 
-LIVE_PLOT_S = 10.0
-"""How much time the plots of a stream show [s]."""
-LIVE_TRAIL_S = 30.0
-"""How much of its way a vehicle draws behind it, in a stream [s]."""
+ROLLING_PLOT_S = 10.0
+"""How much time rolling plots show [s]."""
+ROLLING_TRAIL_S = 30.0
+"""How much of its way a vehicle then draws behind it [s]."""
 _PICTURES = ("rgb", "event_camera", "depth")
 _LOOK = np.array([0.2, 0.62, -0.76]) / np.linalg.norm([0.2, 0.62, -0.76])
 """From where the scene is seen at first: direction of the view in W."""
@@ -30,14 +30,16 @@ def make_blueprint(
     *,
     live: bool = False,
     links: bool = False,
+    rolling: bool = False,
 ) -> Any:
     """Lay the viewer out; see `rerun_log` for the entities.
 
     Args:
         vehicles: Sensors of each vehicle.
         bounds_m: Lowest and highest corner of the scene [m], shape [2, 3]; None: there is none.
-        live: Plots show the last seconds, and those of commands and of the simulator are there.
+        live: The plots of commands and of the simulator are there, and its status.
         links: The plot of link delays is there.
+        rolling: Follow the newest data; plots show the last seconds only.
     """
     rrb = import_rerun().blueprint
     many = len(vehicles) > 1
@@ -56,16 +58,16 @@ def make_blueprint(
             pictures.append(rrb.Vertical(*views, name=name))
         elif views:
             pictures = views
-        views = _plots(name, sensors, live=live, links=links)
+        views = _plots(name, sensors, live=live, links=links, rolling=rolling)
         if views:
             plots.append(rrb.Grid(*views, grid_columns=_columns(len(views)), name=name))
     if live:
-        plots.append(rrb.Horizontal(*_simulator_plots(), name="simulator"))
+        plots.append(rrb.Horizontal(*_simulator_plots(rolling=rolling), name="simulator"))
     right = [rrb.Tabs(*pictures)] if many and pictures else pictures
     shares = [3 * camera_count] if many and pictures else [3] * len(right)
     if live:
         right, shares = [*right, rrb.TextDocumentView(origin="status", name="status")], [*shares, 4]
-    space = _space(vehicles, bounds_m, live=live)
+    space = _space(vehicles, bounds_m, rolling=rolling)
     below = rrb.Tabs(*plots) if len(plots) > 1 else plots[0] if plots else None
     left = space if below is None else rrb.Vertical(space, below, row_shares=[5, 4] if live else [5, 3])
     layout = (
@@ -73,7 +75,7 @@ def make_blueprint(
     )
     return rrb.Blueprint(
         layout,
-        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following" if live else None),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following" if rolling else None),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
@@ -94,7 +96,7 @@ def _space(
     vehicles: Mapping[str, tuple[SensorDescription, ...]],
     bounds_m: NDArray[np.float64] | None,
     *,
-    live: bool,
+    rolling: bool,
 ) -> Any:
     rrb = import_rerun().blueprint
     eye = None
@@ -102,7 +104,7 @@ def _space(
         center = bounds_m.mean(axis=0)
         position = center - _distance_m(bounds_m) * _LOOK
         eye = rrb.EyeControls3D(position=position, look_target=center, eye_up=(0.0, 0.0, 1.0))
-    until_now = _last_seconds(LIVE_TRAIL_S if live else None)
+    until_now = _last_seconds(ROLLING_TRAIL_S if rolling else None)
     # One frustum is enough where cameras share a place; the others' pictures are at the right.
     hidden = [
         f"- /world/vehicles/{name}/{camera.name}/**"
@@ -140,26 +142,28 @@ def _last_seconds(seconds: float | None) -> Any:
     return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=start, end=boundary.cursor_relative()))
 
 
-def _plot(name: str, origin: str, contents: list[str] | None = None, *, live: bool) -> Any:
+def _plot(name: str, origin: str, contents: list[str] | None = None, *, rolling: bool) -> Any:
     rrb = import_rerun().blueprint
     return rrb.TimeSeriesView(
         origin=origin,
         contents=["$origin/**"] if contents is None else contents,
         name=name,
-        time_ranges=_last_seconds(LIVE_PLOT_S) if live else None,
+        time_ranges=_last_seconds(ROLLING_PLOT_S) if rolling else None,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
     )
 
 
-def _plots(vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool, links: bool) -> list[Any]:
+def _plots(
+    vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool, links: bool, rolling: bool
+) -> list[Any]:
     root = f"plots/{vehicle}"
     plots = []
     for sensor in sensors:
         at = f"{root}/{sensor.name}"
         if sensor.kind == "imu":
             plots += [
-                _plot(f"{sensor.name}: specific force [m/s²]", f"{at}/specific_force", live=live),
-                _plot(f"{sensor.name}: angular rate [rad/s]", f"{at}/angular_rate", live=live),
+                _plot(f"{sensor.name}: specific force [m/s²]", f"{at}/specific_force", rolling=rolling),
+                _plot(f"{sensor.name}: angular rate [rad/s]", f"{at}/angular_rate", rolling=rolling),
             ]
     for sensor in sensors:
         at = f"{root}/{sensor.name}"
@@ -167,24 +171,24 @@ def _plots(vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool, 
             motion = [f"/{at}/speed", f"/{at}/height"] + ([] if live else [f"/{root}/clearance"])
             name = "speed [m/s], height" + (" [m]" if live else ", clearance [m]")
             plots += [
-                _plot(name, at, motion, live=live),
-                _plot("rotor speed [rad/s]", f"{at}/rotor_speed", live=live),
+                _plot(name, at, motion, rolling=rolling),
+                _plot("rotor speed [rad/s]", f"{at}/rotor_speed", rolling=rolling),
             ]
     if live:
-        plots.append(_plot("command", f"{root}/command", live=True))
-        plots.append(_timing_plot())
+        plots.append(_plot("command", f"{root}/command", rolling=rolling))
+        plots.append(_timing_plot(rolling=rolling))
     if links:
-        plots.append(_plot("link delay [ms]", f"{root}/links", live=live))
+        plots.append(_plot("link delay [ms]", f"{root}/links", rolling=rolling))
     return plots
 
 
-def _timing_plot() -> Any:
-    return _plot("loop timing [ms]", "simulator/timing", live=True)
+def _timing_plot(*, rolling: bool) -> Any:
+    return _plot("loop timing [ms]", "simulator/timing", rolling=rolling)
 
 
-def _simulator_plots() -> list[Any]:
+def _simulator_plots(*, rolling: bool) -> list[Any]:
     return [
-        _timing_plot(),
-        _plot("real-time factor", "simulator/real_time_factor", live=True),
-        _plot("lost messages", "simulator/losses", live=True),
+        _timing_plot(rolling=rolling),
+        _plot("real-time factor", "simulator/real_time_factor", rolling=rolling),
+        _plot("lost messages", "simulator/losses", rolling=rolling),
     ]

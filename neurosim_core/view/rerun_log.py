@@ -95,7 +95,8 @@ class RerunLogger:
             image_rate_max_hz: Log no more images per sensor and second than this: of simulated time, or live,
                 by the wall clock. Live, pictures of events are as many as in real time, at most 50 a second.
             links: Deliveries of links will come.
-            compress: Make pictures small; what is not, a viewer shows without delay.
+            compress: Make pictures small, for a file. What is not, a viewer shows without delay; it then
+                follows a stream, and shows the last seconds of it.
             live: This is a stream that may go on for hours.
             keep_layout: Leave the layout as the viewer has it now, if it has one.
             clock_ns: The wall clock [ns].
@@ -265,7 +266,13 @@ class RerunLogger:
 
     def _send_blueprint(self, scene: SceneShapes | None) -> None:
         bounds_m = None if scene is None else scene.bounds_m
-        layout = make_blueprint(self._vehicles, bounds_m, live=self._live, links=self._links)
+        layout = make_blueprint(
+            self._vehicles,
+            bounds_m,
+            live=self._live,
+            links=self._links,
+            rolling=self._live and not self._compress,
+        )
         self._recording.send_blueprint(layout, make_active=not self._keep_layout)
 
     def _log_description(self, vehicle: str, sensor: SensorDescription) -> None:

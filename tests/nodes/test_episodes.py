@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.nodes.episodes import Episodes
@@ -66,6 +66,7 @@ def test_a_stream_that_is_far_ahead_is_believed_after_a_second():
     assert episodes.sort("imu", 6000 * MS, 2) == "present"
 
 
+@settings(deadline=None)
 @given(
     runs=st.lists(st.integers(4, 200), min_size=1, max_size=6),
     lag=st.integers(0, 3),

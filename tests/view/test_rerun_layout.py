@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_rerun_log import SENSORS
 
@@ -23,6 +23,7 @@ def origins(blueprint: rrb.Blueprint) -> list[str]:
     return [str(view.origin) for view in views(blueprint.root_container)]
 
 
+@settings(deadline=None, max_examples=50)
 @given(size=st.tuples(SIZES, SIZES, SIZES), middle=st.tuples(*[st.floats(-50.0, 50.0)] * 3))
 def test_the_whole_scene_is_seen_at_first(size, middle):
     """Every corner is in a picture of 55 degrees, half as wide again as high; and the scene fills it."""
@@ -47,7 +48,7 @@ def test_the_whole_scene_is_seen_at_first(size, middle):
 
 
 def test_nothing_has_an_empty_place():
-    """A file has what sensors measure; a stream has commands, timing and status, too; links if there are any."""
+    """A file has what sensors measure, a stream commands, timing and status, too; links where there are any."""
     file = origins(make_blueprint({"drone": SENSORS}))
     pictures = [f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "z")]
     plots = [
@@ -78,3 +79,13 @@ def test_several_vehicles_have_tabs():
     ):
         assert isinstance(tabs, rrb.Tabs)
         assert [tab.name for tab in tabs.contents] == names
+
+
+def test_what_rolls_shows_the_last_seconds():
+    """A stream in a viewer; a file shows all of it."""
+    for rolling in (False, True):
+        blueprint = make_blueprint({"drone": SENSORS}, live=True, rolling=rolling)
+        plots = [view for view in views(blueprint.root_container) if isinstance(view, rrb.TimeSeriesView)]
+        assert len(plots) == 9
+        assert all(("VisibleTimeRanges" in plot.properties) == rolling for plot in plots)
+        assert (blueprint.time_panel.play_state is not None) == rolling
