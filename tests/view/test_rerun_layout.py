@@ -48,7 +48,7 @@ def test_the_whole_scene_is_seen_at_first(size, middle):
 
 
 def test_nothing_has_an_empty_place():
-    """A file has what sensors measure, a stream commands, timing and status, too; links where there are any."""
+    """A file has what sensors measure, a stream also commands, timing and status; links if there are any."""
     file = origins(make_blueprint({"drone": SENSORS}))
     pictures = [f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "z")]
     plots = [
