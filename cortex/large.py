@@ -100,6 +100,8 @@ class LargeSender:
         self._rings: list[Ring] = []
         self._ring_count = 0
         self._columns: dict[int, Reader] = {}
+        self._late: set[int] = set()
+        """Columns of reliable readers that did not make room in time: they hold up nothing until they have."""
         self._inline: list[Reader] = []
         self._pins: deque[_Pin] = deque()
         self._private_bytes = {False: 0, True: 0}
@@ -156,6 +158,7 @@ class LargeSender:
             self._inline.remove(reader)
         else:
             del self._columns[reader.column]
+            self._late.discard(reader.column)
             for ring in self._rings:
                 ring.free_column(reader.column)
         self._plan()
@@ -219,12 +222,22 @@ class LargeSender:
         full = self._inline_strict and self._pinned(ring, strict=True) >= self._pin_quota
         mask, passed_over = 0, False
         for column, bit, quota, strict in self._grants:
+            if column in self._late:
+                if not ring.has_room(column, max(1, quota // 2)):
+                    passed_over = True
+                    continue
+                self._late.discard(column)
             if ring.has_room(column, quota):
                 mask |= bit
             else:
                 passed_over = True
                 full |= strict
         return mask, full, passed_over
+
+    @property
+    def is_leaving_out(self) -> bool:
+        """Whether a reliable reader was late and gets nothing, as of the last `grant`."""
+        return bool(self._late)
 
     def await_strict(self, ring: Ring | None) -> bool:
         """Wait until every reliable reader can take one more; the lock is held, and let go while sleeping.
@@ -235,17 +248,28 @@ class LargeSender:
         backoff, began_s = Backoff(self._timeout_s), time.monotonic()
         while self.grant(ring)[1]:
             if ring is not None and not self._worth_waiting(ring, time.monotonic() - began_s):
-                return not self.grant(ring)[1]  # it may have made room since we looked
+                if not self.grant(ring)[1]:  # it has made room since we looked
+                    return not self.is_leaving_out
+                self._give_up(ring)
+                return False
             self._outlets.lock.release()
             try:
                 more = backoff.wait()
             finally:
                 self._outlets.lock.acquire()
             if not more:
+                if ring is not None:
+                    self._give_up(ring)
                 return False
             self._outlets.refresh()
             self._prune()
-        return True
+        return not self.is_leaving_out
+
+    def _give_up(self, ring: Ring) -> None:
+        """Do not wait for the reliable readers that have no room now, until they have read about half."""
+        self._late.update(
+            column for column, _, quota, strict in self._grants if strict and not ring.has_room(column, quota)
+        )
 
     def _worth_waiting(self, ring: Ring, waited_s: float) -> bool:
         """Whether a reader that has no room would have us wait for longer than this."""

@@ -376,6 +376,7 @@ class Publisher(Generic[T]):
             finally:
                 self._blocked = False
             mask, _, passed_over = self._large.grant(slot.ring)
+        on_time &= not self._large.is_leaving_out
         if self._closed:
             self._check_open()
         stamps = Stamps(self._sequence, stamp_ns, now_ns)

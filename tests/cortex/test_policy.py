@@ -200,11 +200,30 @@ def test_back_pressure_of_large_messages(node):
     delivered = []
     while all(delivered) or len(delivered) < 3:
         assert len(delivered) < 1000
+        begin = time.monotonic()
+        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    assert 0.045 < time.monotonic() - begin < 1.0
+    received = [subscriber.recv(1.0).stamp_ns for _ in range(sum(delivered))]
+    assert received == [number for number, came in enumerate(delivered) if came]
+    assert publisher.publish(Scan(-1, ranges))
+    assert subscriber.recv(1.0).stamp_ns == -1
+    assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
+
+
+def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
+    """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
+    publisher = node.publisher("/scan", Scan)
+    subscriber = node.subscriber("/scan", Scan, policy=reliable(depth=4, timeout_s=0.3))
+    assert publisher.wait_for_subscribers(1)
+    ranges = np.zeros(50_000, np.float32)
+    delivered: list[bool] = []
+    while not delivered or delivered[-1]:
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
     begin = time.monotonic()
-    delivered.append(publisher.publish(Scan(len(delivered), ranges)))
-    assert not delivered[-1]
-    assert 0.045 < time.monotonic() - begin < 1.0
+    for _ in range(20):
+        delivered.append(publisher.publish(Scan(len(delivered), ranges)))
+    assert time.monotonic() - begin < 2.0  # 20 times 0.3 s if each waited
+    assert not any(delivered[-20:])
     received = [subscriber.recv(1.0).stamp_ns for _ in range(sum(delivered))]
     assert received == [number for number, came in enumerate(delivered) if came]
     assert publisher.publish(Scan(-1, ranges))
