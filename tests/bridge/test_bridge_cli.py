@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -132,12 +132,11 @@ def test_a_service_that_does_not_answer_does_not_hold_it_up(dds_domain, simulato
     from cortex_ros2_bridge.cdr import encode
     from cortex_ros2_bridge.msgs import message_class
 
-    begun, go_on = [], []
+    begun, go_on = threading.Event(), threading.Event()
 
     def answer(_: msg.Reset) -> msg.SimulatorReply:
-        begun.append(True)
-        while not go_on:
-            time.sleep(0.01)
+        begun.set()
+        go_on.wait(SOON_S)
         return msg.SimulatorReply(True, "", 0, "running")
 
     simulator.service("/reset", msg.Reset, msg.SimulatorReply, answer)
@@ -148,10 +147,10 @@ def test_a_service_that_does_not_answer_does_not_hold_it_up(dds_domain, simulato
             publisher = ros.publisher("/reset", "std_msgs/msg/Empty", Qos())
             wait_for(lambda: publisher.subscriber_count)
             publisher.publish(encode(message_class("std_msgs/msg/Empty")()))
-            wait_for(lambda: begun)
+            assert begun.wait(SOON_S)
             assert command.end(signal.SIGINT) < 1.0 + BUSY_S
     finally:
-        go_on.append(True)
+        go_on.set()
         ros.close()
 
 
