@@ -451,19 +451,19 @@ def step(
 
     Returns:
         What the sensors yield in (stamp, next stamp], in the order of time; the first call also yields stamp
-        0.
+        0. Less where a collision ended the run (`state.ended`) or the integration failed (`state.failure`).
 
     Raises:
         ValueError: The command is of a wrong shape or not finite.
-        DynamicsError: The integration failed.
+        DynamicsError: The integration has failed before; what was measured until then has been returned.
     """
+    if state.failure is not None:
+        raise state.failure
     packets = start(model, state) if state.launched_count == 0 else []
     _command(model, state, command, mode)
     for end_ns in _parts_of_period(model, state):
         packets += advance(model, state, end_ns, closed_loop=False)
-        if state.failure is not None:
-            raise state.failure
-        if state.ended:
+        if state.ended or state.failure is not None:
             break
     return packets
 
@@ -480,8 +480,10 @@ def fly_period(
     Raises:
         RuntimeError: More batches wait for the cameras than there are lanes: see `free_lanes`.
         ValueError: The command is of a wrong shape or not finite.
-        DynamicsError: The integration failed.
+        DynamicsError: The integration has failed before; what was measured until then has been returned.
     """
+    if state.failure is not None:
+        raise state.failure
     packets: list[Packet] = []
     batches: list[Batch] = []
 
@@ -493,15 +495,13 @@ def fly_period(
         batches.append(batch)
         state.flown[batch.number % state.flight_lane_count].wait()
         packets.extend(_in_order(model, _read_flight(model, state, batch), state.stamp_ns))
-        if state.failure is not None:
-            raise state.failure
 
     if state.launched_count == 0:
         fly([_everything(model)])
     _command(model, state, command, mode)
     for end_ns in _parts_of_period(model, state):
         fly(boundaries(model.schedule, state.launched_ns, end_ns))
-        if state.ended:
+        if state.ended or state.failure is not None:
             break
     return packets, batches
 
@@ -536,6 +536,7 @@ def skip(model: Model, state: State, batch: Batch) -> int:
     """
     count = 0
     for index, cast in enumerate(state.casts):
+        close_eyes(cast, batch.wanted)
         stamps = [b.stamp_ns for b in batch.boundaries if index in b.casts]
         due = [stamp_ns for stamp_ns in stamps if is_due(cast, stamp_ns, batch.wanted)]
         leave_out(cast, due, batch.wanted)
@@ -691,8 +692,11 @@ def _launch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_l
 
 def _plan_flight(
     model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool
-) -> tuple[Batch, Hashable, Callable[[], None]]:
-    """Take the vehicle through a stretch: return the batch, and what launches it, with its key."""
+) -> tuple[Batch, Hashable, Callable[[], object]]:
+    """Take the vehicle through a stretch: return the batch, and what launches it, with its key.
+
+    A pilot may be replaced by another; a graph keeps the one that it was made with.
+    """
     number = state.launched_count
     slot = number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count)
     stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in stretch)]
@@ -703,10 +707,16 @@ def _plan_flight(
         for span, boundary in zip(elapsed_ns, stretch, strict=True)
     )
 
-    def flight() -> None:
-        if order is not None:
-            _obey(state, order)
+    pilot = None if order is None else state.pilots.get(order)
+
+    def flight() -> Pilot | None:
+        if pilot is not None:
+            pilot.setpoint.upload()
+            pilot.controller.update(state.vehicle.arrays)
+        elif order is not None:
+            state.rotor_speeds.upload()
         _fly(model, state, stretch, elapsed_ns, slot=slot, closed_loop=closed_loop)
+        return pilot
 
     state.launched_count += 1
     state.launched_ns = stretch[-1].stamp_ns
@@ -719,23 +729,13 @@ def _plan_flight(
         wanted=state.wanted,
         until_ns=state.launched_ns,
     )
-    return batch, (order, slot, closed_loop, pattern), flight
+    return batch, (order, id(pilot), slot, closed_loop, pattern), flight
 
 
-def _launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], None]) -> None:
+def _launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], object]) -> None:
     with timed(state.wall_s, "dynamics and control"), on(state.flight_stream):
         state.graphs.run(key, flight)
         state.flown[batch.number % state.flight_lane_count].set()
-
-
-def _obey(state: State, order: CommandMode) -> None:
-    """Turn the setpoint that the host has written into rotor speeds, on the device only."""
-    if order == "motor_speeds":
-        state.rotor_speeds.upload()
-    else:
-        pilot = state.pilots[order]
-        pilot.setpoint.upload()
-        pilot.controller.update(state.vehicle.arrays)
 
 
 def _fly(
@@ -836,7 +836,7 @@ def _read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
 def _read_cameras(state: State, batch: Batch) -> list[Packet]:
     """Wait until the cameras have seen a batch, and return what they yield."""
     packets: list[Packet] = []
-    with timed(state.wall_s, "read-back"):
+    with timed(state.wall_s, "camera read-back"):
         state.lanes[batch.number % len(state.lanes)].wait()
     state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
     with timed(state.wall_s, "events"):
@@ -844,7 +844,7 @@ def _read_cameras(state: State, batch: Batch) -> list[Packet]:
             events = read_events(cast, instants, until_ns=batch.until_ns)
             state.counts["events dropped"] += sum(packet.dropped_count for packet in events)
             packets += events
-    with timed(state.wall_s, "read-back"):
+    with timed(state.wall_s, "camera read-back"):
         for cast, instants in batch.seen:
             packets += read_images(cast, instants, borrow=state.borrow_pictures)
     return packets

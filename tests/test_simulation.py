@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 from typing import Any
@@ -458,3 +459,42 @@ def test_a_fleet_shares_its_scene(settings):
     )
     with pytest.raises(ValueError, match="one vehicle, got a, b"):
         simulation.make_model(config)
+
+
+def test_gains_can_change_between_two_periods(outside_model):
+    """A pilot that was replaced is not asked any more, though its launches may be kept in a graph."""
+    model = outside_model
+    changed, steady = simulation.make_state(model), simulation.make_state(model)
+    setpoint = [0.6, 0.4, 1.6, 0.3]
+    for state in (changed, steady):
+        for _ in range(4):
+            simulation.step(model, state, setpoint, mode="position")
+    gains = model.config.control.gains
+    softer = gains.model_copy(update={"position_gain_per_s2": 0.2 * gains.position_gain_per_s2})
+    control = model.config.control.model_copy(update={"gains": softer})
+    other = dataclasses.replace(model, config=model.config.model_copy(update={"control": control}))
+    changed.pilots.clear()
+    for _ in range(8):
+        simulation.step(other, changed, setpoint, mode="position")
+        simulation.step(model, steady, setpoint, mode="position")
+    fresh = simulation.make_state(model)
+    for period in range(12):
+        if period == 4:
+            fresh.pilots.clear()
+        simulation.step(model if period < 4 else other, fresh, setpoint, mode="position")
+    assert simulation.observe(changed).position.tobytes() == simulation.observe(fresh).position.tobytes()
+    assert simulation.observe(changed).position.tobytes() != simulation.observe(steady).position.tobytes()
+
+
+def test_what_was_measured_before_a_failure_is_returned(outside_model):
+    """`step` and `fly_period` return it, and raise when they are asked to go on."""
+    model = outside_model
+    for fly_on in (simulation.step, lambda *a: simulation.fly_period(*a)[0]):
+        state = simulation.make_state(model, flight_lane_count=32)
+        fly_on(model, state, None)
+        state.vehicle.arrays.body_rate.assign([[1e9, 1e9, 1e9]])
+        packets = fly_on(model, state, None)
+        assert isinstance(state.failure, DynamicsError)
+        assert all(p.stamp_ns <= state.failure.stamp_ns for p in packets)
+        with pytest.raises(DynamicsError):
+            fly_on(model, state, None)
