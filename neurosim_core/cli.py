@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
 import gc
 import logging
 import os
@@ -13,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +25,58 @@ from neurosim_core import __version__
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
-    arguments = _parser().parse_args(argv)
     atexit.register(
         gc.freeze
     )  # else the collector looks at all objects once more: 0.4 s with a scene in memory
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # `kill` ends like Ctrl-C: files are closed
-    _start_warp()
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    arguments = _parser().parse_args(argv)
+    with _leave_at_once():
+        _start_warp()
+        logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+        try:
+            return int(arguments.command(arguments))
+        except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
+            print(f"neurosim: {error}", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            print("neurosim: interrupted", file=sys.stderr)
+            return 130
+
+
+@contextlib.contextmanager
+def _leave_at_once() -> Iterator[None]:
+    """Let Ctrl-C and `kill` end the process on the spot, which a `KeyboardInterrupt` in an import may not.
+
+    Commands that have something to close install handlers of their own while they have.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread is told of signals
+        return
+
+    def leave(_signal: int, _frame: object) -> None:
+        os.write(2, b"neurosim: interrupted\n")
+        os._exit(130)
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        return int(arguments.command(arguments))
-    except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
-        print(f"neurosim: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("neurosim: interrupted", file=sys.stderr)
-        return 130
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let Ctrl-C and `kill` raise a `KeyboardInterrupt`, for what has something to close."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _start_warp() -> None:
@@ -376,7 +413,8 @@ def _fly(arguments: argparse.Namespace) -> int:
     overrides = _overrides(arguments)
     given = arguments.config is not None or overrides
     config = load_config(arguments.config, overrides=overrides) if given else None
-    return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
+    with _interruptible():
+        return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
 
 def _up(arguments: argparse.Namespace) -> int:
@@ -390,7 +428,8 @@ def _up(arguments: argparse.Namespace) -> int:
 def _call(arguments: argparse.Namespace) -> int:
     from neurosim_core.nodes.call import call
 
-    return call(arguments)
+    with _interruptible():
+        return call(arguments)
 
 
 def _scene(arguments: argparse.Namespace) -> int:
@@ -422,19 +461,20 @@ def _bench_closed_loop(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.bench.closed_loop import bench_closed_loop
 
-    bench_closed_loop(
-        arguments.out,
-        Console(),
-        rates_hz=arguments.rates,
-        seconds=arguments.seconds,
-        renderer=arguments.renderer,
-        width=arguments.width,
-        height=arguments.height,
-        device=arguments.device,
-        scene=arguments.scene,
-        settings=_settings(arguments),
-    )
-    return 0
+    with _interruptible():
+        bench_closed_loop(
+            arguments.out,
+            Console(),
+            rates_hz=arguments.rates,
+            seconds=arguments.seconds,
+            renderer=arguments.renderer,
+            width=arguments.width,
+            height=arguments.height,
+            device=arguments.device,
+            scene=arguments.scene,
+            settings=_settings(arguments),
+        )
+        return 0
 
 
 def _bench_streaming(arguments: argparse.Namespace) -> int:
@@ -442,18 +482,19 @@ def _bench_streaming(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.bench.streaming import bench_streaming
 
-    bench_streaming(
-        arguments.out,
-        Console(),
-        seconds=arguments.seconds,
-        width=arguments.width,
-        height=arguments.height,
-        device=arguments.device,
-        scene=arguments.scene,
-        sampling_rate_hz=arguments.sampling_rate,
-        settings=_settings(arguments),
-    )
-    return 0
+    with _interruptible():
+        bench_streaming(
+            arguments.out,
+            Console(),
+            seconds=arguments.seconds,
+            width=arguments.width,
+            height=arguments.height,
+            device=arguments.device,
+            scene=arguments.scene,
+            sampling_rate_hz=arguments.sampling_rate,
+            settings=_settings(arguments),
+        )
+        return 0
 
 
 def _bench_delay(arguments: argparse.Namespace) -> int:
@@ -461,17 +502,18 @@ def _bench_delay(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.bench.delay import bench_delay
 
-    bench_delay(
-        arguments.out,
-        Console(),
-        delays_s=arguments.delays,
-        tours=arguments.tours,
-        mode=arguments.mode,
-        seconds=arguments.seconds,
-        real_time_factor=arguments.factor,
-        settings=_settings(arguments),
-    )
-    return 0
+    with _interruptible():
+        bench_delay(
+            arguments.out,
+            Console(),
+            delays_s=arguments.delays,
+            tours=arguments.tours,
+            mode=arguments.mode,
+            seconds=arguments.seconds,
+            real_time_factor=arguments.factor,
+            settings=_settings(arguments),
+        )
+        return 0
 
 
 def _view(arguments: argparse.Namespace) -> int:
