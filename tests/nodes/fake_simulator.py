@@ -50,7 +50,9 @@ class FakeSimulator:
         odometry: Its publisher, and so on.
     """
 
-    def __init__(self, scene_file: str, *, run_on: bool = True, overrides: Mapping[str, Any] | None = None):
+    def __init__(
+        self, scene_file: str = "", *, run_on: bool = True, overrides: Mapping[str, Any] | None = None
+    ):
         config = load_config(
             {
                 "scene": {"kind": "mesh", "file": scene_file},

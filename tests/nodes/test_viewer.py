@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
@@ -26,9 +27,10 @@ from rerun_file import Rows, read, scalars
 from cortex import Node
 from cortex import messages as msg
 from neurosim_core.nodes import viewer as viewer_module
-from neurosim_core.nodes.viewer import FileOutlet, view, watch
+from neurosim_core.nodes.scene_loader import SceneLoader
+from neurosim_core.nodes.viewer import view, watch
 from neurosim_core.packets import EventArrays
-from neurosim_core.view import event_picture
+from neurosim_core.view import FileOutlet, event_picture
 
 BODY = "/world/vehicles/drone"
 
@@ -55,7 +57,9 @@ class Watcher:
     def _run(self, path: Path, options: dict[str, Any]) -> int:
         with Node("viewer") as node:
             outlet = FileOutlet(path, self.said.append)
-            return watch(node, outlet, stop=self._stop, say=self.said.append, **options)
+            return watch(
+                node, outlet, SceneLoader(self.said.append), stop=self._stop, say=self.said.append, **options
+            )
 
     def wait_for(self, text: str) -> None:
         """Wait until it has said something."""
@@ -93,7 +97,8 @@ def grows_to(
     def fulfilled() -> bool:
         nonlocal rows
         meanwhile()
-        rows = read(path) if path.exists() and path.stat().st_size else {}
+        with contextlib.suppress(FileNotFoundError, ValueError):  # it has no recording yet
+            rows = read(path)
         return bool(rows and check(rows))
 
     wait_for(fulfilled, every_s=0.1)
@@ -301,39 +306,57 @@ def test_a_publisher_of_another_type_is_named(tmp_path, box, start):
         watcher.end()
 
 
+@contextlib.contextmanager
+def viewer_process(file: Path) -> Iterator[subprocess.Popen[str]]:
+    """`neurosim view --save`, once it waits for a simulator."""
+    command = [sys.executable, "-m", "neurosim_core", "view", "--save", str(file)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            line = process.stdout.readline()
+            assert "waiting for a simulator" in line, process.stderr.read()
+            yield process
+        finally:
+            process.kill()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_and_close_the_file(tmp_path, box, number):
     """Within a second, as its own process; the file holds what came before."""
     file = tmp_path / "live.rrd"
-    command = [sys.executable, "-m", "neurosim_core", "view", "--save", str(file)]
-    with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
-        FakeSimulator(box) as simulator,
-    ):
-        try:
-            simulator.announce()
-            for k in range(100):
-                simulator.state(k)
-            simulator.status(500 * MS)
-            grows_to(file, lambda rows: "/status" in rows)
-            begin_s = time.monotonic()
-            process.send_signal(number)
-            assert process.wait(SOON_S) == 130
-            assert time.monotonic() - begin_s < 3.0  # half a second, on a machine that does nothing besides
-        finally:
-            process.kill()
-        assert process.stdout is not None
-        assert f"wrote {file}" in process.stdout.read()
+    with viewer_process(file) as process, FakeSimulator(box) as simulator:
+        simulator.announce()
+        for k in range(100):
+            simulator.state(k)
+        simulator.status(500 * MS)
+        grows_to(file, lambda rows: "/status" in rows)
+        begin_s = time.monotonic()
+        process.send_signal(number)
+        out, errors = process.communicate(timeout=SOON_S)
+        assert time.monotonic() - begin_s < 3.0  # half a second, on a machine that does nothing besides
+        assert (process.returncode, errors) == (130, "")
+        assert out.endswith(f"wrote {file}\n")
     assert len(scalars(read(file), "/plots/drone/odometry/speed")) == 100
 
 
-def test_waiting_is_interrupted(tmp_path):
-    command = [sys.executable, "-m", "neurosim_core", "view", "--save", str(tmp_path / "live.rrd")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+def test_loading_a_scene_is_interrupted(tmp_path):
+    """The thread that loads is not torn down in the middle of foreign code, which would abort the process."""
+    rooms = {"scene": {"kind": "apartment", "rooms": 8}}
+    with viewer_process(tmp_path / "live.rrd") as process, FakeSimulator(overrides=rooms) as simulator:
+        simulator.announce()
         assert process.stdout is not None
-        assert "waiting for a simulator" in process.stdout.readline()
+        assert "showing" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        assert process.wait(SOON_S) == 130
+        _, errors = process.communicate(timeout=SOON_S)
+        assert (process.returncode, errors) == (130, "")
+
+
+def test_waiting_is_interrupted(tmp_path):
+    with viewer_process(tmp_path / "live.rrd") as process:
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=SOON_S)
+        assert (process.returncode, errors) == (130, "")
     assert not (tmp_path / "live.rrd").exists()
 
 

@@ -88,10 +88,10 @@ def test_a_viewer_that_fails_says_why(monkeypatch, tmp_path):
         RerunViewer(web=False)
     viewer.write_text(
         f"#!{sys.executable}\n"
-        "import signal, socket, sys\n"
+        "import os, signal, socket, sys\n"
         "port = int(sys.argv[sys.argv.index('--port') + 1])\n"
-        "signal.signal(signal.SIGUSR1, lambda *_: sys.exit(0))\n"
-        "signal.signal(signal.SIGUSR2, lambda *_: sys.exit('graphics are broken'))\n"
+        "signal.signal(signal.SIGUSR1, lambda *_: os._exit(0))\n"
+        "signal.signal(signal.SIGUSR2, lambda *_: (os.write(2, b'graphics are broken'), os._exit(1)))\n"
         "server = socket.create_server(('127.0.0.1', port))\n"
         "while True: server.accept()\n"
     )

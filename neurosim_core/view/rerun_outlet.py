@@ -1,0 +1,100 @@
+"""Where the recordings of a live view go: to a viewer, or into files."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from neurosim_core.view.rerun_log import RerunLogger
+from neurosim_core.view.rerun_sdk import open_recording
+from neurosim_core.view.rerun_viewer import RerunViewer
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+CLOSE_S = 0.3
+
+
+class Outlet(Protocol):
+    """Where recordings are opened.
+
+    Attributes:
+        compress: Whether pictures should be small, rather than there at once.
+    """
+
+    compress: bool
+
+    def open(self, name: str) -> rr.RecordingStream:
+        """Open a recording of this name."""
+
+    def check(self) -> bool:
+        """Return whether there is still somebody who looks; raise if it failed."""
+
+    def close_recording(self, logger: RerunLogger) -> None:
+        """Send what is left, and close a recording."""
+
+
+class ViewerOutlet:
+    """Recordings go to a viewer."""
+
+    compress = False
+
+    def __init__(self, viewer: RerunViewer) -> None:
+        self._viewer = viewer
+
+    def open(self, name: str) -> rr.RecordingStream:
+        """Open a recording; the viewer shows it."""
+        return self._viewer.open(name)
+
+    def check(self) -> bool:
+        """Return False if the window was closed."""
+        self._viewer.check()
+        return not self._viewer.ended
+
+    def close_recording(self, logger: RerunLogger) -> None:
+        """Close a recording. A viewer that does not take it is not waited for."""
+        closing = threading.Thread(target=logger.close, name="close recording", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+
+
+class FileOutlet:
+    """Each recording is a file: NAME.rrd, and after a reset the first free of NAME-2.rrd, NAME-3.rrd, ..."""
+
+    compress = True
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        """Refuse at once what cannot be written.
+
+        Args:
+            path: The first file; replaced if it is there.
+            say: Told what has been written.
+
+        Raises:
+            OSError: There is no such folder.
+        """
+        if not path.parent.is_dir():
+            raise OSError(f"cannot write {path}: there is no folder {path.parent}")
+        if path.is_dir():
+            raise OSError(f"cannot write {path}: it is a folder")
+        self._say = say
+        numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
+        self._next = itertools.chain([path], (other for other in numbered if not other.exists()))
+        self._path = path
+
+    def open(self, name: str) -> rr.RecordingStream:
+        """Open the next file."""
+        self._path = next(self._next)
+        return open_recording(self._path, name=name, footer=False)
+
+    def check(self) -> bool:
+        """Return True: files do not go away."""
+        return True
+
+    def close_recording(self, logger: RerunLogger) -> None:
+        """Close a file, and say so."""
+        logger.close()
+        self._say(f"wrote {self._path}")
