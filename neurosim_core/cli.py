@@ -196,7 +196,11 @@ def _parser() -> argparse.ArgumentParser:
         "--event-window", type=float, default=0.02, metavar="S", help="time in one picture of events [s]"
     )
     view.add_argument(
-        "--image-rate", type=float, default=15.0, metavar="HZ", help="live: most pictures a second [Hz]"
+        "--image-rate",
+        type=float,
+        default=15.0,
+        metavar="HZ",
+        help="live: most images a second [Hz]; events have a limit of their own",
     )
     view.add_argument("--port", type=int, default=0, help="live, --web: port of the page (default: any)")
     view.add_argument("--no-browser", action="store_true", help="live, --web: print the address only")

@@ -66,8 +66,14 @@ def print_plan(console: Console, crafts: Sequence[Craft], config: SimulationConf
     console.print(f"waiting for the first command on {commands}: `neurosim fly` sends them", highlight=False)
 
 
+_SLOW_STATUSES = 5
+"""Statuses in a row, five a second, after which a run is called slow."""
+
+
 class StatusLine:
-    """One line that tells how it is going; only on a terminal. A context manager.
+    """One line that tells how it is going, on a terminal; and lines for what a user would want to know of.
+
+    A context manager.
 
     Attributes:
         last: The newest status; None if there was none.
@@ -80,16 +86,35 @@ class StatusLine:
             console: Where to.
         """
         self.last: SimulatorStatus | None = None
+        self._slow_count = 0
         self._console = console
         self._line: Status | None = None
 
     def show(self, status: SimulatorStatus) -> None:
-        """Update the line; where there is no terminal, say only why a run ended."""
+        """Update the line, and say what has changed."""
         before, self.last = self.last, status
         if self._line is not None:
             self._line.update(_summary(status))
-        if status.phase == "ended" and (before is None or before.phase != "ended"):
-            self._console.print(f"[yellow]ended:[/] {status.reason}", highlight=False, soft_wrap=True)
+        for news in (*changes(before, status), *self._slowness(before, status)):
+            self._console.print(f"[yellow]{news}[/]", highlight=False, soft_wrap=True)
+
+    def _slowness(self, before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
+        """Say once in a run that it goes slower than it was meant to, when it has for a second."""
+        wanted = status.real_time_factor_wanted
+        if before is None or status.step_count < before.step_count:
+            self._slow_count = 0
+            return []
+        slow = before.phase == status.phase == "running" and status.real_time_factor < 0.9 * wanted
+        if slow or self._slow_count > _SLOW_STATUSES:  # once said, it is not said again
+            self._slow_count += 1
+        else:
+            self._slow_count = 0
+        if self._slow_count != _SLOW_STATUSES:
+            return []
+        return [
+            f"this machine manages {status.real_time_factor:.2f} x real time, not {wanted:g}: time is held "
+            "back (live.overrun: drop leaves out pictures instead); fewer, slower or smaller cameras help"
+        ]
 
     def __enter__(self) -> StatusLine:
         if self._console.is_terminal:
@@ -103,6 +128,23 @@ class StatusLine:
         if self._line is not None:
             self._line.stop()
             self._line = None
+
+
+def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
+    """Say what a user would want to know of that has changed between two statuses, a line each."""
+    news = []
+    if status.phase == "ended" and (before is None or before.phase != "ended"):
+        news.append(f"ended: {status.reason}")
+    if before is None or before.phase == "ended" or status.step_count < before.step_count:
+        return news
+    if status.phase == "waiting" and status.reason and not before.reason and status.step_count:
+        news.append(f"waiting {status.reason}")
+    for was, now in zip(before.vehicles, status.vehicles, strict=False):
+        if now.fail_safe_count > was.fail_safe_count:
+            news.append(f"{now.name}: no command has come in time; the fail-safe flies")
+        if was.fail_safe and not now.fail_safe:
+            news.append(f"{now.name}: commands are coming again")
+    return news
 
 
 def print_end(console: Console, last: SimulatorStatus | None, record: Path | None) -> None:
@@ -127,8 +169,22 @@ def print_end(console: Console, last: SimulatorStatus | None, record: Path | Non
             highlight=False,
             soft_wrap=True,
         )
+    undelivered = _undelivered(last)
+    if undelivered:
+        console.print(
+            f"[yellow]{undelivered:,} messages were lost by reliable readers that were too slow[/]",
+            highlight=False,
+            soft_wrap=True,
+        )
     if record is not None:
         console.print(f"recorded to {record}/", highlight=False, soft_wrap=True)
+
+
+def _undelivered(status: SimulatorStatus) -> int:
+    """Messages that reliable readers lost."""
+    return sum(s.undelivered_count for s in status.sensors) + sum(
+        v.undelivered_count for v in status.vehicles
+    )
 
 
 def _summary(status: SimulatorStatus) -> str:
@@ -139,7 +195,9 @@ def _summary(status: SimulatorStatus) -> str:
         if status.mode == "streaming":
             parts.append(f"late {status.late_p99_ns / 1e6:.2f} ms (p99)")
         lost = sum(v.lost_count for v in status.vehicles) + sum(s.dropped_count for s in status.sensors)
-        parts.append(f"{lost:,} lost")
+        parts.append(f"{lost + _undelivered(status):,} lost")
+        if status.reason:
+            parts.append(f"[yellow]{status.reason}[/]")
         if any(vehicle.fail_safe for vehicle in status.vehicles):
             parts.append("[red]fail-safe[/]")
     return ", ".join(parts)
