@@ -76,7 +76,7 @@ def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
     held = [name for name in ("flight.h5", "config.yaml") if (out / name).exists()]
     if held and not overwrite:
         raise FileExistsError(
-            f"{out} already holds a flight ({', '.join(held)}): add --overwrite, or name another --out"
+            f"{out} already holds a flight ({', '.join(held)}): add --overwrite, or name another folder"
         )
     return out
 
