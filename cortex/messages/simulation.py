@@ -9,10 +9,13 @@ from cortex.message import Array, Int64, UInt32, UInt64, Unit, message
 
 @message(name="cortex/Simulation")
 class Simulation:
-    """What does not change during a run; published once, for those who come later too."""
+    """What is simulated; for those who come later, too.
+
+    Published when a simulator begins, and again by the same publisher when settings have been changed.
+    """
 
     config: str
-    """All settings as YAML."""
+    """All settings that hold now, as YAML."""
     version: str
     """Version of the simulator."""
     vehicles: list[str]
@@ -55,6 +58,8 @@ class Step:
 
     count: UInt32 = 1
     """Control periods."""
+    timeout_s: Annotated[float, Unit("s")] = 60.0
+    """For how long the answer is waited for [s]; then the run stops where it is. At most 60."""
 
 
 @message(name="cortex/SimulatorReply")
@@ -86,6 +91,12 @@ class SensorStatus:
     """Frames that were not rendered, because the machine was too slow, and messages that a link lost."""
     injected_lost_count: UInt64 = 0
     """Of these, messages that a link lost as configured."""
+    undelivered_count: UInt64 = 0
+    """Besides, messages that a reliable subscriber lost, as it held up the simulator for too long."""
+    late_p99_ns: Annotated[int, Unit("ns")] = 0
+    """How late by the wall clock messages were published, 99th percentile since the status before [ns].
+
+    After the time at which they were to arrive; 0 when time is not paced, or nothing was published."""
 
 
 @message(name="cortex/VehicleStatus")
@@ -110,6 +121,8 @@ class VehicleStatus:
     fail_safe_count: UInt64
     """How often it set in."""
     collision_count: UInt64
+    undelivered_count: UInt64 = 0
+    """As in `SensorStatus`, of its other topics: odometry, rotor speeds, collisions, deliveries."""
 
 
 @message(name="cortex/SimulatorStatus")
@@ -123,7 +136,7 @@ class SimulatorStatus:
     phase: str
     """"waiting" for a first or a late command, "running", "paused" or "ended"."""
     reason: str
-    """Why it waits or has ended; empty if there is nothing to say."""
+    """Why it waits or has ended, or whose readers hold it up; empty if there is nothing to say."""
     mode: str
     """"lockstep" or "streaming"."""
     real_time_factor_wanted: float

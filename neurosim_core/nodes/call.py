@@ -15,7 +15,11 @@ from rich.table import Table
 from cortex import Node, ServiceTimeout, ServiceUnavailable, latest
 from cortex.messages import Parameters, Reset, SimulatorReply, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
+from neurosim_core.nodes.requests import STEP_DEADLINE_S
 from neurosim_core.nodes.topics import SERVICES, STATUS
+
+GRACE_S = 1.0
+"""So much longer than steps may take do we wait to hear that they were not over [s]."""
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -39,6 +43,8 @@ def call(arguments: argparse.Namespace) -> int:
         print_status(_status(timeout_s), console)
         return 0
     service, request = _request(arguments)
+    if isinstance(request, Step):
+        timeout_s += GRACE_S
     reply = _ask(service, request, timeout_s)
     at = f"{reply.phase} at {reply.stamp_ns / NS_PER_S:g} s"
     if reply.accepted:
@@ -87,6 +93,10 @@ def print_status(status: SimulatorStatus, console: Console) -> None:
         run.add_row(
             "overruns", f"{status.overrun_count:,}; held back by {status.slipped_ns / NS_PER_S:.3f} s"
         )
+    for vehicle in status.vehicles:
+        if vehicle.undelivered_count:
+            lost = f"{vehicle.undelivered_count:,} messages on other topics than those of sensors"
+            run.add_row("by readers", f"{escape(vehicle.name)} lost {lost}")
     console.print(run)
 
     vehicles = _table("vehicle", "flown by", "commands", "age", "refused", "superseded", "lost", "fail-safe")
@@ -100,13 +110,15 @@ def print_status(status: SimulatorStatus, console: Console) -> None:
             *(f"{n:,}" for n in (vehicle.refused_count, vehicle.superseded_count, vehicle.lost_count)),
             str(fail_safe),
         )
-    sensors = _table("sensor", "state", "readers", "published", "dropped", "lost by its link")
+    sensors = _table("sensor", "state", "readers", "published", "dropped", "by link", "by reader", "late")
     for sensor in status.sensors:
         sensors.add_row(
             f"{sensor.vehicle}/{sensor.name}",
             "on" if sensor.active else "off",
             *(f"{n:,}" for n in (sensor.subscriber_count, sensor.published_count, sensor.dropped_count)),
             f"{sensor.injected_lost_count:,}",
+            f"{sensor.undelivered_count:,}",
+            _ms(sensor.late_p99_ns),
         )
     for table in (vehicles, sensors):
         if table.row_count:
@@ -123,7 +135,7 @@ def _request(arguments: argparse.Namespace) -> tuple[str, Any]:
         case "step":
             if not 1 <= arguments.count < 2**32:
                 raise ValueError(f"the number of control periods must be >= 1, got {arguments.count}")
-            return "/step", Step(arguments.count)
+            return "/step", Step(arguments.count, timeout_s=min(arguments.timeout, STEP_DEADLINE_S))
         case "set":
             return "/set_parameters", parameters_of(arguments.settings)
         case _:

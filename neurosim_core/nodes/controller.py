@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.status import Status
 
-from cortex import Closed, Node, Subscriber, keep_last, latest, reliable
+from cortex import Closed, Info, Node, Subscriber, keep_last, latest, reliable
 from cortex.messages import Odometry, RotorSpeeds, Simulation, SimulatorStatus
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import FollowMode, PathFollower
@@ -315,7 +315,7 @@ def _attend(node: Node, crew: _Crew, config: SimulationConfig | None, console: C
     """Let the crew fly for one simulator after the other, and say what happens."""
     announcements = node.subscriber(SIMULATION, Simulation, policy=latest())
     statuses = node.subscriber(STATUS, SimulatorStatus, policy=latest())
-    run_on, said = True, ""
+    run_on, said, source = True, "", 0
 
     def say(text: str) -> None:
         nonlocal said
@@ -324,8 +324,9 @@ def _attend(node: Node, crew: _Crew, config: SimulationConfig | None, console: C
         said = text
 
     while True:
-        simulation = _take(announcements, 0.0 if crew.vehicles else _LOOK_S)
-        if simulation is not None:
+        found = _take_with_info(announcements, 0.0 if crew.vehicles else _LOOK_S)
+        if found is not None and not (crew.vehicles and found[1].source == source):
+            simulation, source = found[0], found[1].source  # the same one again: its settings have changed
             _take(statuses, 0.0)  # of the simulator before
             theirs = load_config(yaml.safe_load(simulation.config))
             run_on = theirs.live.run_on
@@ -348,6 +349,14 @@ def _attend(node: Node, crew: _Crew, config: SimulationConfig | None, console: C
             say(_WAITING)
             line.update(_WAITING)
             crew.land()
+
+
+def _take_with_info(subscriber: Subscriber[T], timeout_s: float) -> tuple[T, Info] | None:
+    """Return the next message and where it comes from; None if none comes in time."""
+    try:
+        return subscriber.recv_with_info(timeout_s)
+    except TimeoutError:
+        return None
 
 
 def _take(subscriber: Subscriber[T], timeout_s: float) -> T | None:

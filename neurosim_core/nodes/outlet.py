@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,56 @@ from cortex import messages as msg
 from neurosim_core.live import LinkConfig
 from neurosim_core.nodes import topics, translate
 from neurosim_core.nodes.channel import Channel, payload_bytes
+from neurosim_core.pacing import Timings
 from neurosim_core.packets import Delivery, Image, Odometry, Packet
 from neurosim_core.record import describe_sensors
 from neurosim_core.simulation import COLLISION, Model
 
 NO_LINK = LinkConfig()
+HELD_UP_NS = 50_000_000
+"""Time that readers may take of the simulator between two statuses without being named [ns]."""
 
 
-class Stream:
+class Post:
+    """A publisher, and what its reliable readers cost.
+
+    Attributes:
+        publisher: Where messages go.
+        undelivered_count: Messages that a reliable reader lost since the last reset.
+    """
+
+    def __init__(self, publisher: Publisher[Any]) -> None:
+        """Wrap a publisher."""
+        self.publisher = publisher
+        self.undelivered_count = 0
+        self._told_count = 0
+        self._held_ns = 0
+
+    def publish(self, message: Any) -> None:
+        """Publish a message, and count it if a reader that holds us up loses it."""
+        begin_ns = time.monotonic_ns()
+        if not self.publisher.publish(message):
+            self.undelivered_count += 1
+        self._held_ns += time.monotonic_ns() - begin_ns
+
+    def take_held_up(self) -> bool:
+        """Return whether, since the last time, readers lost messages or took much of our time."""
+        held = self._held_ns > HELD_UP_NS or self.undelivered_count > self._told_count
+        self._held_ns, self._told_count = 0, self.undelivered_count
+        return held
+
+    def reset(self) -> None:
+        """Count from 0."""
+        self.undelivered_count = self._told_count = self._held_ns = 0
+
+
+class Stream(Post):
     """One topic of packets, with the link in front of it.
 
     Attributes:
         name: Of the sensor, or odometry, rotor_speeds, collision.
         channel: What is under way.
+        late_times: How late by the wall clock messages were published, since somebody last looked [ns].
         subscriber_count: As of the last look.
         published_count: Messages since the last reset.
         delivered_ns: Stamp, as in the message, of what arrived last [ns]; None if there was nothing.
@@ -47,9 +85,10 @@ class Stream:
             name: Of the sensor.
             translate: Makes the message of a packet, with the sensor's clock if that is not simulated time.
         """
+        super().__init__(publisher)
         self.name = name
         self.channel = channel
-        self.publisher = publisher
+        self.late_times = Timings()
         self.subscriber_count = 0
         self.published_count = 0
         self.delivered_ns: int | None = None
@@ -57,8 +96,8 @@ class Stream:
         self._last: Any = None
         self._kept: Packet | None = None
 
-    def publish(self, packet: Packet, *, at_once: bool = False) -> None:
-        """Publish a packet, if anybody listens.
+    def send(self, packet: Packet, *, at_once: bool = False) -> bool:
+        """Publish a packet, if anybody listens; return whether it was published.
 
         Where the topic is latched, the newest packet is kept, and published with the next look: whoever comes
         gets a state that is not older than that, and it costs nothing in between.
@@ -72,28 +111,31 @@ class Stream:
         self.delivered_ns = config.clock_ns(packet.stamp_ns)
         if not (self.subscriber_count or at_once):
             self._kept = packet if self.publisher.latch else None
-            return
+            return False
         message = self._translate(packet, config.clock_ns if clocked else None)
         self._kept = None
-        self.publisher.publish(message)
+        self.publish(message)
         self.published_count += 1
         if self.publisher.latch:
             self._last = message
+        return True
 
     def look(self) -> int:
         """See who listens; return how many."""
         self.subscriber_count = self.publisher.subscriber_count
         if self._kept is not None:
-            self.publish(self._kept, at_once=True)
+            self.send(self._kept, at_once=True)
         return self.subscriber_count
 
     def repeat(self) -> None:
         """Publish the last message again, the same in every bit, where the topic is latched."""
         if self._last is not None:
-            self.publisher.publish(self._last)
+            self.publish(self._last)
 
-    def reset(self, *, seed: int) -> None:
+    def begin(self, *, seed: int) -> None:
         """Forget what is under way and begin again."""
+        self.reset()
+        self.late_times.take()
         self.channel.reset(seed=seed)
         self.published_count = 0
         self.delivered_ns = None
@@ -107,6 +149,8 @@ class Outlet:
 
     Attributes:
         streams: The topics by name: sensors in the order of the rig, collision, rotor_speeds, odometry.
+        lateness_ns: Says for how long a simulated time [ns] has been due by the wall clock [ns]; None: time
+            is not paced.
     """
 
     def __init__(
@@ -122,9 +166,10 @@ class Outlet:
         """
         self.vehicle = vehicle
         self.record = record
+        self.lateness_ns: Callable[[int], int] | None = None
         self._node = node
         self._seed = model.config.seed
-        self._delivery_publishers: dict[str, Publisher[msg.Delivery]] = {}
+        self._delivery_posts: dict[str, Post] = {}
         self._odometry_count = 0
         self._odometry_ns = -1
         config = model.config
@@ -154,7 +199,9 @@ class Outlet:
         self._odometry_count = 0
         self._odometry_ns = -1
         for stream in self.streams.values():
-            stream.reset(seed=seed)
+            stream.begin(seed=seed)
+        for post in self._delivery_posts.values():
+            post.reset()
 
     def look(self) -> tuple[int, ...]:
         """See who listens, and return how many subscribers each topic has."""
@@ -205,7 +252,7 @@ class Outlet:
             if packet.stamp_ns:
                 self._send(self.streams[name], packet)
             else:
-                self.streams[name].publish(packet, at_once=True)
+                self.streams[name].send(packet, at_once=True)
         if self.record is not None:
             self.record(packet)
 
@@ -221,7 +268,7 @@ class Outlet:
         if self.record is not None:
             self.record(delivery)
         self.announce_link(link)
-        self._delivery_publishers[link].publish(
+        self._delivery_posts[link].publish(
             msg.Delivery(
                 stamp_ns=delivery.stamp_ns,
                 delivered_ns=delivery.delivered_ns,
@@ -232,9 +279,9 @@ class Outlet:
 
     def announce_link(self, link: str) -> None:
         """Open the topic of what a link does, if it is not open yet."""
-        if link not in self._delivery_publishers:
-            self._delivery_publishers[link] = self._node.publisher(
-                topics.delivery_topic(self.vehicle, link), msg.Delivery
+        if link not in self._delivery_posts:
+            self._delivery_posts[link] = Post(
+                self._node.publisher(topics.delivery_topic(self.vehicle, link), msg.Delivery)
             )
 
     def publish_due(self, stamp_ns: int) -> int | None:
@@ -250,17 +297,33 @@ class Outlet:
         ]
         arrived.sort(key=lambda entry: entry[:2])
         newest_ns = None
-        for _, _, stream, packet in arrived:
-            stream.publish(packet)
+        for due_ns, _, stream, packet in arrived:
+            late_ns = 0 if self.lateness_ns is None else self.lateness_ns(due_ns)
+            if stream.send(packet) and self.lateness_ns is not None:
+                stream.late_times.add(max(late_ns, 0))
             if stream.name == "odometry":
                 newest_ns = stream.delivered_ns
         return newest_ns
+
+    @property
+    def other_undelivered_count(self) -> int:
+        """Messages of topics that are not sensors' which a reliable reader lost since the last reset."""
+        sensors = {id(self.streams[name]) for name in self._sensor_names}
+        return sum(post.undelivered_count for post in self._posts() if id(post) not in sensors)
+
+    def take_held_up(self) -> list[str]:
+        """Return the topics whose reliable readers have held us up since the last time."""
+        return [post.publisher.topic for post in self._posts() if post.take_held_up()]
 
     @property
     def next_due_ns(self) -> int | None:
         """When the next packet arrives [ns]; None if none is under way."""
         dues = [due for s in self.streams.values() if (due := s.channel.next_due_ns) is not None]
         return min(dues, default=None)
+
+    def _posts(self) -> Iterator[Post]:
+        yield from self.streams.values()
+        yield from self._delivery_posts.values()
 
     def _send(self, stream: Stream, packet: Packet) -> None:
         channel = stream.channel

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cortex import Node
-from cortex.messages import Parameters, SimulatorReply
+from cortex.messages import Parameters, SimulatorReply, Step
 from neurosim_core.config import SimulationConfig
 from neurosim_core.nodes.parameters import change
 from neurosim_core.nodes.topics import SERVICES
@@ -17,7 +17,7 @@ from neurosim_core.nodes.topics import SERVICES
 ANSWER_DEADLINE_S = 30.0
 """How long a request waits for its answer."""
 STEP_DEADLINE_S = 60.0
-"""How long a request for steps does: it may have to wait for the commands of a controller."""
+"""How long a request for steps does, at most: it may have to wait for the commands of a controller."""
 
 
 @dataclass(eq=False)
@@ -30,22 +30,51 @@ class Request:
     """As it came."""
     config: SimulationConfig | None = None
     """What `/set_parameters` leads to."""
-    abandoned: bool = False
-    """Nobody waits for the answer any more."""
-    _answered: threading.Event = field(default_factory=threading.Event)
+    _state: str = "waits"
+    """"waits", "taken", "abandoned" (nobody waits for the answer any more) or "answered"."""
     _reason: str = ""
+    _changed: threading.Condition = field(default_factory=threading.Condition)
 
-    def answer(self, reason: str = "") -> None:
-        """Say that it is done, or why not."""
-        self._reason = reason
-        self._answered.set()
+    @property
+    def abandoned(self) -> bool:
+        """Nobody waits for the answer any more."""
+        return self._state == "abandoned"
+
+    def take(self) -> bool:
+        """Begin with it; False if nobody waits for it any more, so that it is not to be done."""
+        with self._changed:
+            if self._state != "waits":
+                return False
+            self._state = "taken"
+            return True
+
+    def answer(self, reason: str = "") -> bool:
+        """Say that it is done, or why not; False if nobody waits for that any more."""
+        with self._changed:
+            if self.abandoned:
+                return False
+            self._state, self._reason = "answered", reason
+            self._changed.notify_all()
+            return True
 
     def wait(self, timeout_s: float) -> str:
-        """Wait for the answer; return why it was not done, empty if it was."""
-        if not self._answered.wait(timeout_s):
-            self.abandoned = True
-            return f"no answer within {timeout_s:g} s"
-        return self._reason
+        """Wait for the answer; return why it was not done, empty if it was.
+
+        One that was taken just now is being done: its answer is waited for as long again. Steps that have
+        not come to their end are given up.
+        """
+        with self._changed:
+            done = self._changed.wait_for(lambda: self._state == "answered", timeout_s)
+            if not done and self._state == "taken" and self.service != "/step":
+                done = self._changed.wait_for(lambda: self._state == "answered", timeout_s)
+            if done:
+                return self._reason
+            begun, self._state = self._state == "taken", "abandoned"
+        if not begun:
+            return f"no answer within {timeout_s:g} s; it will not be done"
+        if self.service == "/step":
+            return f"not over within {timeout_s:g} s: it stops where it is"
+        return f"no answer within {2 * timeout_s:g} s; it may still be done"
 
 
 class Steps:
@@ -63,6 +92,11 @@ class Steps:
         self._request, self._left = request, request.message.count
         if not self._left:
             self.stop()
+
+    @property
+    def end_next(self) -> bool:
+        """Whether the next control period is the last."""
+        return self._left == 1
 
     def count(self) -> None:
         """Note that a control period is over."""
@@ -127,10 +161,10 @@ class Requests:
         return bool(self._waiting)
 
     def take(self) -> Request | None:
-        """Return the next request; None if there is none."""
+        """Return the next request, which is then waited for until it is done; None if there is none."""
         while self._waiting:
             request = self._waiting.popleft()
-            if not request.abandoned:
+            if request.take():
                 return request
         return None
 
@@ -145,9 +179,12 @@ class Requests:
             request.answer("the simulator has ended")
 
     def _handler(self, service: str) -> Callable[[Any], SimulatorReply]:
-        deadline_s = STEP_DEADLINE_S if service == "/step" else ANSWER_DEADLINE_S
+        answer_deadline_s = ANSWER_DEADLINE_S
 
         def handle(message: Any) -> SimulatorReply:
+            deadline_s = answer_deadline_s
+            if isinstance(message, Step):  # for as long as its client waits: that tells whether there is one
+                deadline_s = min(max(0.0, message.timeout_s), STEP_DEADLINE_S)
             reason = self._ask(Request(service, message), deadline_s)
             stamp_ns, phase = self._state()
             return SimulatorReply(accepted=not reason, reason=reason, stamp_ns=stamp_ns, phase=phase)

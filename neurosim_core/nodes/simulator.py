@@ -155,6 +155,8 @@ class Simulator:
             RuntimeError: The cameras failed.
         """
         self._stop = stop
+        if self._recorder is not None:
+            self._recorder.stop = stop
         while not stop.is_set() and self._exit is None:
             self._answer_requests()
             self._audience.look()
@@ -402,6 +404,9 @@ class Simulator:
         self.config = config
         for craft in self.crafts:
             craft.configure(config.of(craft.name))
+        if self._recorder is not None:
+            self._recorder.change(config, stamp_ns=self.stamp_ns)
+        self.board.announce(config)
         return ""
 
 

@@ -39,7 +39,7 @@ class Board:
         self._told_phase = ""
 
     def announce(self, config: SimulationConfig) -> None:
-        """Say what is flown."""
+        """Say what is flown, and with which settings: at the beginning, and when they have changed."""
         self._simulation.publish(
             Simulation(
                 config=to_yaml(config),
@@ -129,7 +129,7 @@ class Meter:
             config: Settings that hold.
             stamp_ns: Simulated time [ns].
             phase: As in the message.
-            reason: As in the message.
+            reason: As in the message; where it is empty, topics are named whose readers hold up the run.
         """
         now_ns = time.monotonic_ns()
         elapsed_ns = max(now_ns - self._wall_ns, 1)
@@ -138,6 +138,9 @@ class Meter:
         steps, late = self.step_times.take(), self.late_times.take()
         self._sequence += 1
         streaming = config.live.mode == "streaming"
+        held_up = [topic for craft in crafts for topic in craft.outlet.take_held_up()]
+        if held_up and not reason:
+            reason = f"held up by reliable readers of {', '.join(held_up)}"
         return SimulatorStatus(
             stamp_ns=stamp_ns,
             wall_ns=time.time_ns(),
@@ -174,6 +177,8 @@ def _sensors(craft: Craft, dropped: Mapping[tuple[str, str], int]) -> list[Senso
                 published_count=stream.published_count,
                 dropped_count=dropped.get((craft.name, name), 0) + lost,
                 injected_lost_count=lost,
+                undelivered_count=stream.undelivered_count,
+                late_p99_ns=stream.late_times.take().p99_ns,
             )
         )
     return entries
@@ -192,4 +197,5 @@ def _vehicle(craft: Craft, stamp_ns: int) -> VehicleStatus:
         fail_safe=helm.fail_safe,
         fail_safe_count=helm.counts.fail_safe,
         collision_count=craft.state.counts["collisions"],
+        undelivered_count=craft.outlet.other_undelivered_count,
     )

@@ -44,6 +44,9 @@ class Streaming:
             bell: Rung when the cameras have seen something.
         """
         self._crafts = crafts
+        for craft in crafts:
+            if craft.model.config.live.mode == "streaming":
+                craft.outlet.lateness_ns = pacer.lateness_ns
         self._cameras = cameras
         self._pacer = pacer
         self._meter = meter

@@ -166,8 +166,11 @@ class FlightWriter:
         self._pending_bytes = 0
         self._flushed_s = time.monotonic()
 
-    def close(self) -> None:
-        """Write what is left and mark the file as complete. Closing twice is allowed.
+    def close(self, *, complete: bool = True) -> None:
+        """Write what is left, and mark the file as complete unless it is not. Closing twice is allowed.
+
+        Args:
+            complete: All that was to be recorded was written.
 
         Raises:
             OSError: The disk is full or gone.
@@ -179,7 +182,7 @@ class FlightWriter:
                 for stream in self._streams.values():
                     stream.finish()
                 self.flush()
-                self._file.attrs["clean"] = True
+                self._file.attrs["clean"] = complete
                 self._file.flush()
                 self._disk.seal()
         finally:
@@ -397,7 +400,7 @@ class Flight:
         }
         self.notes: tuple[str, ...] = ()
         if not self.clean:
-            self.notes = (f"{self._path} was not closed: packets after its last flush are missing",)
+            self.notes = (f"{self._path} was not closed properly: packets at its end are missing",)
             log.warning(self.notes[0])
 
     def close(self) -> None:

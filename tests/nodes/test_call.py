@@ -39,10 +39,10 @@ STATUS_NOW = SimulatorStatus(
     overrun_count=17,
     slipped_ns=345_000_000,
     sensors=[
-        SensorStatus("red", "events", True, 2, 1357, 3, 1),
+        SensorStatus("red", "events", True, 2, 1357, 3, 1, 12, 98_500_000),
         SensorStatus("red", "rgb", False, 0, 0, 0, 0),
     ],
-    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1)],
+    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13)],
 )
 
 
@@ -77,7 +77,8 @@ def test_requests_arrive_as_they_are_meant(asked, capsys):
     assert ask("set", "live.real_time_factor=2", "live.fail_safe=cut", "links.imu.latency_s=0.008") == 0
     first, *others = requests
     assert (first.seed, first.vehicle, first.position.tolist()) == (7, "red", [1.0, -2.0, 0.5])
-    assert others[:5] == [Reset(), Step(12), Step(1), Trigger(), Trigger()]
+    steps = [Step(12, timeout_s=20.0), Step(1, timeout_s=20.0)]  # no longer than we wait
+    assert others[:5] == [Reset(), *steps, Trigger(), Trigger()]
     assert isinstance(others[5], Parameters)
     assert others[5].to_dict() == {
         "live.real_time_factor": 2,
@@ -140,11 +141,12 @@ def test_status(shared_runtime, capsys):
         "a period 1.25 ms (99 %: 3.75 ms)",
         "late by 0.06 ms (99 %: 0.21 ms)",
         "overruns 17; held back by 0.345 s",
+        "by readers red lost 13 messages on other topics than those of sensors",
         "vehicle flown by commands age refused superseded lost fail-safe",
         "red velocity 4,321 8.00 ms 5 6 7 9, flies now",
-        "sensor state readers published dropped lost by its link",
-        "red/events on 2 1,357 3 1",
-        "red/rgb off 0 0 0 0",
+        "sensor state readers published dropped by link by reader late",
+        "red/events on 2 1,357 3 1 12 98.50 ms",
+        "red/rgb off 0 0 0 0 0 0.00 ms",
     ]
 
 

@@ -241,12 +241,16 @@ class Simulator:
         self.simulation = node.publisher(SIMULATION, Simulation, latch=True)
         self.status = node.publisher(STATUS, SimulatorStatus)
         self.stages = {name: Stage(node, name) for name in self.config.vehicles}
+        self.mode = mode
+        self.announce()
+
+    def announce(self) -> None:
         self.simulation.publish(
             Simulation(
                 config=to_yaml(self.config),
                 version="0",
                 vehicles=list(self.config.vehicles),
-                mode=mode,
+                mode=self.mode,
                 control_rate_hz=200.0,
             )
         )
@@ -330,9 +334,12 @@ def test_fly_serves_one_simulator_after_the_other(start_fly, paths):
                 command = follower.command(stamp_ns=tick * TICK_NS, **a_state(tick))
                 assert simulator.stages["drone"].hear(60.0) == (tick * TICK_NS, command.tobytes())
             process.wait_until_said("flying drone: motor_speeds, lockstep, 200 Hz", count)
+            if run_on:
+                simulator.announce()  # settings were changed; pilots fly on
             simulator.say("ended", "it has hit a wall")
             if run_on:
                 process.wait_until_said("it has hit a wall")
+                assert process.said.count("flying drone") == count
                 assert process.process.poll() is None
         if run_on:
             process.wait_until_said("waiting for a simulator", 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from cortex import Node, Subscriber, reliable
 from cortex.messages import CameraInfo, Collision, Image, Imu, Odometry, RotorSpeeds, Transform
 from cortex.messages import Delivery as DeliveryMessage
 from cortex.messages import Path as PathMessage
+from neurosim_core.nodes import outlet as outlet_module
 from neurosim_core.nodes.outlet import Outlet
 from neurosim_core.packets import Collision as CollisionPacket
 from neurosim_core.packets import Delivery, ImuSample, Packet
@@ -110,6 +112,80 @@ def test_packets_come_out_when_they_are_due(make_stand: Callable[..., Stand]):
     stand.outlet.publish_due(10 * MS)
     assert take(samples, 1)[0].stamp_ns == 10 * MS
     assert stand.outlet.next_due_ns is None
+
+
+def test_what_a_reader_that_is_too_slow_loses_is_counted(make_stand: Callable[..., Stand]):
+    """A reliable reader that never reads: what it loses is counted for its topic, which is named once."""
+    stand = make_stand()
+    policy = reliable(1, timeout_s=0.001)
+    stream = stand.outlet.streams["imu"]
+    with stand.node.subscriber("/drone/imu", Imu, policy=policy):
+        assert stream.publisher.wait_for_subscribers(1, SOON_S)
+        stand.outlet.look()
+        stand.outlet.take_held_up()
+        for tick in range(100_000):
+            stand.outlet.offer([imu(tick)])
+            stand.outlet.publish_due(5 * MS * tick)
+            if stream.undelivered_count == 3:
+                break
+    assert stream.undelivered_count == 3
+    assert stand.outlet.take_held_up() == ["/drone/imu"]
+    assert stand.outlet.take_held_up() == []
+    assert stand.outlet.other_undelivered_count == 0
+    stand.outlet.reset(seed=1)
+    assert stream.undelivered_count == 0
+
+
+class Sluggish:
+    """A publisher whose reader loses every message, or none."""
+
+    def __init__(self, topic: str, *, loses: bool) -> None:
+        self.topic = topic
+        self.loses = loses
+
+    def publish(self, message: Any) -> bool:
+        return not self.loses
+
+
+def test_losses_on_topics_that_are_no_sensors_are_counted_too(make_stand: Callable[..., Stand]):
+    stand = make_stand(links={"rgb": {"latency_s": 0.001}})
+    posts = {post.publisher.topic: post for post in stand.outlet._posts()}
+    for topic in ("/drone/rgb/delivery", "/drone/collision"):
+        posts[topic].publisher = Sluggish(topic, loses=True)  # type: ignore[assignment]
+        posts[topic].publish(None)
+    assert stand.outlet.other_undelivered_count == 2
+    assert sorted(stand.outlet.take_held_up()) == ["/drone/collision", "/drone/rgb/delivery"]
+
+
+def test_readers_that_take_time_are_named_even_if_they_lose_nothing(
+    make_stand: Callable[..., Stand], monkeypatch: pytest.MonkeyPatch
+):
+    now = itertools.count(0, outlet_module.HELD_UP_NS // 2 + 1)
+    stand = make_stand()
+    stream = stand.outlet.streams["imu"]
+    stream.publisher = Sluggish("/drone/imu", loses=False)  # type: ignore[assignment]
+    monkeypatch.setattr(outlet_module.time, "monotonic_ns", lambda: next(now))
+    stream.publish(None)
+    assert stand.outlet.take_held_up() == []  # half of what is allowed
+    stream.publish(None)
+    stream.publish(None)
+    monkeypatch.undo()
+    assert stand.outlet.take_held_up() == ["/drone/imu"]
+
+
+def test_how_late_messages_are_published(make_stand: Callable[..., Stand]):
+    """After the time at which they were to arrive, behind the link; what nobody hears is not counted."""
+    stand = make_stand(links={"imu": {"latency_s": 0.002}})
+    stand.listen("/drone/imu", Imu)
+    stand.outlet.lateness_ns = lambda stamp_ns: 20 * MS - stamp_ns  # the wall clock is at 20 ms
+    stand.outlet.offer([imu(1), odometry(5 * MS)])
+    stand.outlet.publish_due(20 * MS)
+    late = stand.outlet.streams["imu"].late_times.take()
+    assert (late.count, late.max_ns) == (1, 13 * MS)
+    assert stand.outlet.streams["odometry"].late_times.take().count == 0
+    stand.outlet.offer([imu(5)])
+    stand.outlet.publish_due(30 * MS)
+    assert stand.outlet.streams["imu"].late_times.take().max_ns == 0  # not early
 
 
 def test_nobody_listens_nothing_is_built(make_stand: Callable[..., Stand]):

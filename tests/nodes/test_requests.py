@@ -84,7 +84,7 @@ def test_no_answer_is_a_refusal_in_time(shared_runtime: Path, monkeypatch: pytes
         replies: list[SimulatorReply] = []
         counter.call("/resume", Trigger(), replies).join(SOON_S)
         assert not replies[0].accepted
-        assert replies[0].reason == "no answer within 0.05 s"
+        assert replies[0].reason == "no answer within 0.05 s; it will not be done"
         assert counter.requests.take() is None  # nobody waits for it
         counter.requests.close()
 
@@ -152,12 +152,47 @@ def test_steps_stop_for_a_reason_or_when_nobody_waits():
     assert not steps
     assert request.wait(0.0) == "reset"
     left = Request("/step", Step(count=2))
+    assert left.take()
     steps.start(left)
     steps.check()
     assert steps
-    left.abandoned = True
+    assert left.wait(0.0) == "not over within 0 s: it stops where it is"
     steps.check()
     assert not steps
+
+
+def test_steps_end_with_the_patience_of_who_asked_for_them(counter: Counter):
+    """A client that waits for 50 ms is gone after that: the loop sees it, whatever the longest wait is."""
+    replies: list[SimulatorReply] = []
+    thread = counter.call("/step", Step(count=1000, timeout_s=0.05), replies)
+    steps = Steps()
+    steps.start(counter.take())
+    thread.join(SOON_S)
+    assert replies[0].reason == "not over within 0.05 s: it stops where it is"
+    steps.check()
+    assert not steps
+
+
+def test_what_is_being_done_when_the_time_is_over_is_waited_for():
+    """Else a client would be told that a reset that happens has not happened."""
+    request = Request("/reset", Reset())
+    reasons: list[str] = []
+    assert request.take()
+    late = threading.Timer(0.3, request.answer)
+    late.start()
+    reasons.append(request.wait(0.2))
+    late.join(SOON_S)
+    assert reasons == [""]
+
+
+def test_what_nobody_waits_for_is_not_begun():
+    request = Request("/reset", Reset())
+    assert request.wait(0.0) == "no answer within 0 s; it will not be done"
+    assert not request.take()
+    assert not request.answer()
+    hopeless = Request("/reset", Reset())
+    assert hopeless.take()
+    assert hopeless.wait(0.0) == "no answer within 0 s; it may still be done"
 
 
 @pytest.mark.parametrize(
