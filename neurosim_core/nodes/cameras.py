@@ -18,6 +18,8 @@ _LAG_PERIODS = (2, 100)
 """Bounds of how far cameras may be behind, in control periods."""
 _SPARE_PERIODS = 32
 """Further periods that are flown while one picture takes too long, where frames are left out."""
+GIVE_UP_S = 0.5
+"""How long the batch in work may take when nobody waits for more [s]."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -30,16 +32,18 @@ class Job:
     batch: Batch
     left_out: bool = False
     """The machine is too slow for it."""
+    forgotten: bool = False
+    """Nobody wants what it shows any more."""
 
 
 class Cameras:
     """Looks at what was flown, in order, and collects the packets until somebody takes them.
 
-    On a CUDA device the thread that flies does it: launches take no time there, and the packets are read back
-    with the next ones.
+    On a CUDA device the thread that flies does it, and waits for the device: it flies on when the packets are
+    there.
 
     Attributes:
-        dropped: Frames that were left out, by vehicle and sensor, since the last `clear`. Pictures count one
+        dropped: Frames that were left out, by vehicle and sensor, since the last `reset`. Pictures count one
             each, an event camera counts instants that it did not see.
     """
 
@@ -54,7 +58,8 @@ class Cameras:
         self._on_packets = on_packets
         self._jobs: deque[Job] = deque()
         self._seen: deque[tuple[str, list[Packet]]] = deque()
-        self._busy = False
+        self._work: Job | None = None
+        """What the thread looks at."""
         self._closed = False
         self._failure: Exception | None = None
         self._changed = threading.Condition()
@@ -63,8 +68,17 @@ class Cameras:
             self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
             self._thread.start()
 
-    def look(self, vehicle: str, model: Model, state: State, batches: Sequence[Batch]) -> None:
+    def look(
+        self, vehicle: str, model: Model, state: State, batches: Sequence[Batch], *, late: bool = False
+    ) -> None:
         """Have batches looked at, after those before; where there is nothing to see, without the thread.
+
+        Args:
+            vehicle: Name.
+            model: What does not change.
+            state: What does.
+            batches: What was flown.
+            late: They come too late, and are left out where there is no thread that could catch up.
 
         Raises:
             RuntimeError: The rendering failed.
@@ -72,9 +86,12 @@ class Cameras:
         for batch in batches:
             job = Job(vehicle=vehicle, model=model, state=state, batch=batch)
             with self._changed:
-                idle = not (self._jobs or self._busy)
-                here = self._thread is None or (idle and not _shows_anything(job))
-                if not here:
+                idle = not self._jobs and self._work is None
+                shows = _shows_anything(job)
+                here = self._thread is None or (idle and not shows)
+                if here:
+                    job.left_out = late and shows
+                else:
                     self._jobs.append(job)
                     self._changed.notify_all()
             if here:
@@ -123,18 +140,41 @@ class Cameras:
     def finish(self, stop: Callable[[], bool]) -> None:
         """Wait until everything has been looked at, or `stop` says so."""
         with self._changed:
-            while (self._jobs or self._busy) and self._failure is None and not stop():
+            while (self._jobs or self._work is not None) and self._failure is None and not stop():
                 self._changed.wait(0.02)
         self.check()
 
-    def clear(self) -> None:
-        """Forget what waits, and what was seen; waits for the batch in work, so its state is not in use."""
+    def give_up(self, timeout_s: float = GIVE_UP_S) -> bool:
+        """Let the batch in work end, and leave out and count what waits. What was seen can be taken.
+
+        Args:
+            timeout_s: How long the batch in work may take; then it is left out, too.
+
+        Returns:
+            Whether it has ended: else the states are in use by the thread.
+        """
+        with self._changed:
+            left_out = list(self._jobs)
+            self._jobs.clear()
+            ended = self._wait_for_work(timeout_s)
+            if self._work is not None:
+                self._work.forgotten = True
+                left_out.insert(0, self._work)
+            for job in left_out:
+                self._count(job)
+                if ended:
+                    skip(job.model, job.state, job.batch)
+        return ended
+
+    def reset(self) -> None:
+        """Forget what waits and what was seen, and count from 0."""
         with self._changed:
             self._jobs.clear()
-            while self._busy:
-                self._changed.wait(0.02)
-        self._seen.clear()
-        self.dropped.clear()
+            if self._work is not None:
+                self._work.forgotten = True
+            self._wait_for_work(GIVE_UP_S)
+            self._seen.clear()
+            self.dropped.clear()
 
     def check(self) -> None:
         """Raise what went wrong in the thread.
@@ -152,19 +192,22 @@ class Cameras:
             self._jobs.clear()
             self._changed.notify_all()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(GIVE_UP_S)
+
+    def _wait_for_work(self, timeout_s: float) -> bool:
+        """Wait until the thread does nothing, with the lock held; return whether that is so."""
+        return self._changed.wait_for(lambda: self._work is None, timeout_s)
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._busy = False
+                self._work = None
                 self._changed.notify_all()
                 while not self._jobs and not self._closed:
                     self._changed.wait()
                 if self._closed or self._failure is not None:
                     return
-                job = self._jobs.popleft()
-                self._busy = True
+                job = self._work = self._jobs.popleft()
             self._try(job)
 
     def _try(self, job: Job) -> None:
@@ -175,13 +218,17 @@ class Cameras:
 
     def _do(self, job: Job) -> None:
         if job.left_out:
-            self._count(job)
             skip(job.model, job.state, job.batch)
+            with self._changed:
+                if not job.forgotten:
+                    self._count(job)
             return
         packets = see(job.model, job.state, job.batch)
-        if packets:
+        with self._changed:
+            if not packets or job.forgotten:
+                return
             self._seen.append((job.vehicle, packets))
-            self._on_packets()
+        self._on_packets()
 
     def _count(self, job: Job) -> None:
         """Count what a batch that is left out would have shown."""
@@ -244,5 +291,5 @@ def plan_lanes(model: Model) -> Lanes:
 
 
 def sees_inline(device: str) -> bool:
-    """Return whether the thread that flies looks itself: where launches return at once."""
+    """Return whether the thread that flies looks itself: where a picture takes it little time."""
     return bool(wp.get_device(device).is_cuda)

@@ -53,7 +53,6 @@ class Helm:
 
     Attributes:
         holds: The command that took over last; None before the first.
-        fail_safe: Whether that is stale, and the fail-safe flies.
         counts: What happened so far.
     """
 
@@ -70,17 +69,22 @@ class Helm:
         self.channel = Channel("command", link, seed=seed)
         self._lowest = np.full(airframe.rotor_count, airframe.rotor_speed_min_rad_s)
         self.holds: Command | None = None
-        self.fail_safe = False
         self.counts = HelmCounts()
         self._since_ns = 0
+        self._instead: Command | None = None
 
     def reset(self, *, seed: int) -> None:
         """Forget all commands and begin again."""
         self.channel.reset(seed=seed)
         self.holds = None
-        self.fail_safe = False
         self.counts = HelmCounts()
         self._since_ns = 0
+        self._instead = None
+
+    @property
+    def fail_safe(self) -> bool:
+        """Whether the command that holds is stale, and the fail-safe flies."""
+        return self._instead is not None
 
     def send(self, command: Command, *, stamp_ns: int) -> Delivery | None:
         """Send a command on its way at a tick [ns]; what its link does to it, if there is one."""
@@ -104,14 +108,13 @@ class Helm:
             self._since_ns = stamp_ns
             self.counts.taken += 1
             self.counts.superseded += len(arrived) - 1
-            self.fail_safe = False
+            self._instead = None
         if self.holds is None:
             return "motor_speeds", None
         if not self.fail_safe and self.age_ns(stamp_ns) > round(self.live.command_timeout_s * 1e9):
-            self.fail_safe = True
             self.counts.fail_safe += 1
             self._instead = self._give_up(self.holds, observe)
-        flown = self._instead if self.fail_safe else self.holds
+        flown = self._instead or self.holds
         return flown.mode, flown.setpoint
 
     def age_ns(self, stamp_ns: int) -> int:

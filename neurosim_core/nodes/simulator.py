@@ -162,12 +162,13 @@ class Simulator:
             self._audience.look()
             self._tell()
             if self._ended or (self._paused and not self._steps):
+                if self._tick and not self._ended:
+                    self._streaming.publish_seen(self.stamp_ns)
                 self._bell.wait(0.02)
                 self._bell.clear()
             elif self._receive():
                 self._fly()
         if not self._ended:
-            self._cameras.clear()
             self._flush()
         self._tell(at_once=True)
         return self._exit or 0
@@ -251,6 +252,8 @@ class Simulator:
         self._meter.step_count += 1
         live = self.config.live
         self.board.strike(end_ns, live, sequence=self._tick - 1)
+        if self._steps.end_next:
+            self._streaming.catch_up(end_ns, self._stop.is_set)
         self._steps.count()
         ended = next((craft for craft in self.crafts if craft.state.ended), None)
         if ended is not None:
@@ -310,7 +313,7 @@ class Simulator:
 
     def _begin(self, beginning: Beginning) -> None:
         """Begin a run at stamp 0, and publish where everybody is."""
-        self._cameras.clear()
+        self._cameras.reset()
         if self._recorder is not None:
             self._recorder.begin(beginning.seeds, replace=self._tick == 0)
         self._tick = self.stamp_ns = 0
@@ -335,10 +338,15 @@ class Simulator:
         self._exit = 1
 
     def _flush(self) -> None:
-        """Publish what is known up to now, events of a window that has only begun included."""
+        """Publish what is known up to now, events of a window that has only begun included.
+
+        What the cameras have not looked at yet is left out and counted.
+        """
+        at_rest = self._cameras.give_up()
         self._streaming.offer_seen()
         for craft in self.crafts:
-            craft.finish()
+            if at_rest:
+                craft.finish()
             craft.outlet.publish_due(max(self.stamp_ns, craft.state.stamp_ns))
 
     def _culprit(self, error: DynamicsError) -> str:
@@ -375,6 +383,8 @@ class Simulator:
 
     def _pause(self, *, paused: bool) -> None:
         """Stop time, or let it go on."""
+        if paused and not self._ended and self._tick:
+            self._streaming.catch_up(self.stamp_ns, self._stop.is_set)
         self._steps.stop("paused" if paused else "resumed")
         if self._paused and not paused:
             self._go_on()

@@ -73,8 +73,30 @@ class Streaming:
                 self._cameras.leave_out(craft.name, stamp_ns - craft.lanes.lag_ns)
             if not self._cameras.wait_for_room(craft.state, craft.lanes.needed(drop=drop), stop):
                 return False
-            self._cameras.look(craft.name, craft.model, craft.state, craft.fly(stamp_ns))
+            late = drop and self._pacer.lateness_ns(stamp_ns) > min(
+                craft.lanes.lag_ns / self._pacer.factor, BEHIND_MAX_NS / 2
+            )
+            self._cameras.look(craft.name, craft.model, craft.state, craft.fly(stamp_ns), late=late)
         return True
+
+    def catch_up(self, stamp_ns: int, stop: Callable[[], bool]) -> None:
+        """Wait for the cameras, and publish what arrives by a tick at which time stops [ns].
+
+        Args:
+            stamp_ns: The tick.
+            stop: Ends the wait.
+
+        Raises:
+            RuntimeError: The cameras failed.
+        """
+        self._cameras.finish(stop)
+        self.publish_seen(stamp_ns)
+
+    def publish_seen(self, stamp_ns: int) -> None:
+        """Publish what the cameras have seen and what arrives by a tick at which time stands [ns]."""
+        self.offer_seen()
+        for craft in self._crafts:
+            craft.outlet.publish_due(stamp_ns)
 
     def publish_until(self, end_ns: int, period_ns: int, live: LiveConfig, stop: Callable[[], bool]) -> bool:
         """Publish what arrives before the end of a control period, each when it is due, and wait for the end.
@@ -90,11 +112,11 @@ class Streaming:
         """
 
         def interrupted() -> bool:
+            self._bell.clear()  # before the look at why it was rung; requests wait for the end
             return stop() or self._cameras.has_packets
 
         self._make_way(end_ns, period_ns, live)
         while not stop():
-            self._bell.clear()
             self.offer_seen()
             due_ns = min([end_ns, *(d for c in self._crafts if (d := c.outlet.next_due_ns) is not None)])
             late_ns = self._pacer.wait_until(due_ns, interrupted)

@@ -132,3 +132,14 @@ def test_a_channel_keeps_the_order_when_its_link_changes():
     assert channel.send("d", stamp_ns=30 * MS, size_bytes=1) is None
     channel.reset(seed=0)
     assert channel.next_due_ns is None
+
+
+def test_nothing_of_the_fail_safe_is_left_after_a_reset():
+    helm = make_helm(command_timeout_s=0.1, fail_safe="cut")
+    helm.send(command(1.0), stamp_ns=0)
+    assert held(helm, 0)[1][0] == 1.0
+    held(helm, 200 * MS)
+    assert helm.fail_safe
+    helm.reset(seed=3)
+    assert not helm.fail_safe
+    assert held(helm, 0) == ("motor_speeds", None)

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from live_rig import IMU, LiveRig, drain, make_config, models_of
 from processes import SOON_S, wait_for
+from rich.console import Console
 
 from cortex.messages import (
     Clock,
@@ -34,6 +35,7 @@ from cortex.messages import Delivery as DeliveryMessage
 from neurosim_core.config import load_config
 from neurosim_core.nodes import cameras
 from neurosim_core.nodes import simulator as simulator_module
+from neurosim_core.nodes.console import print_end
 from neurosim_core.packets import Delivery
 from neurosim_core.record import Flight
 from neurosim_core.simulation import make_state, observe, step
@@ -408,6 +410,67 @@ def test_slow_cameras_lose_frames_where_time_matters_more(monkeypatch: pytest.Mo
     assert all(second.start_ns == first.stamp_ns for first, second in itertools.pairwise(windows))
 
 
+def test_slow_cameras_of_the_thread_that_flies_lose_frames_too(monkeypatch: pytest.MonkeyPatch):
+    """As on CUDA: time goes on, and what would come too late is left out."""
+    monkeypatch.setattr(simulator_module, "sees_inline", lambda device: True)
+    _with_slow_cameras(monkeypatch, 0.08)
+    with LiveRig(make_config(**{"live.overrun": "drop"})) as rig:
+        pictures = rig.listen("/drone/rgb", Image)
+        rig.send(rig.hover())
+        found = [pictures.recv(SOON_S) for _ in range(3)]
+        dropped = rig.wait_for_status(lambda s: s.sensors[2].dropped_count > 2)
+    assert [p.sequence for p in found] == [p.stamp_ns // (20 * MS) for p in found]
+    assert found[-1].sequence > 2
+    assert dropped.sensors[2].name == "rgb"
+    assert dropped.slipped_ns == 0
+
+
+def test_what_is_left_out_at_the_end_is_counted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Every picture of the flight is in the recording, or the last status says that it is missing."""
+    _with_slow_cameras(monkeypatch, 0.05)
+    told: list[SimulatorStatus] = []
+    with LiveRig(make_config(**{"live.overrun": "drop"}), record=tmp_path) as rig:
+        rig.simulator.board.on_status = told.append
+        rig.send(rig.hover())
+        running = rig.wait_for_status(lambda s: s.sensors[2].dropped_count)
+        rig.stop.set()
+        assert rig.join() == 0
+        flown_ns = rig.simulator.crafts[0].state.stamp_ns
+    with Flight(tmp_path / "flight.h5") as flight:
+        packets = list(flight.packets())
+    pictures = [p.stamp_ns for p in packets if p.sensor == "rgb"]
+    dropped = told[-1].sensors[2].dropped_count
+    assert dropped >= running.sensors[2].dropped_count
+    assert len(pictures) + dropped == flown_ns // (20 * MS) + 1
+    assert [p.stamp_ns for p in packets if p.sensor == "odometry"][-1] == flown_ns
+    print_end(Console(), told[-1], None)
+    assert f"{sum(s.dropped_count for s in told[-1].sensors)} frames were left out" in capsys.readouterr().out
+
+
+def test_the_picture_in_work_at_the_end_is_published(monkeypatch: pytest.MonkeyPatch):
+    see, reached, told = cameras.see, threading.Event(), []
+
+    def held(model: Any, state: Any, batch: Any) -> Any:
+        if batch.until_ns == 20 * MS:
+            reached.set()
+            assert rig.stop.wait(SOON_S)
+        return see(model, state, batch)
+
+    monkeypatch.setattr(cameras, "see", held)
+    with LiveRig(make_config()) as rig:
+        rig.simulator.board.on_status = told.append
+        pictures = rig.listen("/drone/rgb", Image)
+        rig.send(rig.hover())
+        assert reached.wait(SOON_S)
+        rig.stop.set()
+        assert rig.join() == 0
+        flown_ns = rig.simulator.crafts[0].state.stamp_ns
+        assert [m.stamp_ns for m in drain(pictures)] == [0, 20 * MS]
+    assert told[-1].sensors[2].dropped_count == flown_ns // (20 * MS) - 1
+
+
 def test_cameras_that_fail_end_it(monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any) -> Any:
         raise ValueError("no picture")
@@ -453,6 +516,23 @@ def test_pause_step_resume():
         assert len(drain(clock, 0.05)) == 3
         assert rig.call("/resume", Trigger()).accepted
         assert clock.recv(SOON_S).stamp_ns == stepped.stamp_ns + PERIOD_NS
+
+
+def test_a_paused_run_shows_all_its_pictures(monkeypatch: pytest.MonkeyPatch):
+    """Those that were not ready are published before /pause and /step are answered, and no later."""
+    _with_slow_cameras(monkeypatch, 0.03)
+    with LiveRig(make_config(**{"live.real_time_factor": 0.0})) as rig:
+        pictures = rig.listen("/drone/rgb", Image)
+        rig.send(rig.hover())
+        stream = rig.simulator.crafts[0].outlet.streams["rgb"]
+        assert pictures.recv(SOON_S).stamp_ns == 0
+        end_ns = rig.call("/pause", Trigger()).stamp_ns
+        assert stream.published_count == end_ns // (20 * MS) + 1
+        for _ in range(3):
+            begin_ns, end_ns = end_ns, rig.call("/step", Step(count=6)).stamp_ns
+            assert stream.published_count == end_ns // (20 * MS) + 1
+            assert end_ns == begin_ns + 6 * PERIOD_NS
+        assert [m.stamp_ns for m in drain(pictures)] == list(range(20 * MS, end_ns + 1, 20 * MS))
 
 
 def test_pause_ends_steps_that_wait_for_a_command():
