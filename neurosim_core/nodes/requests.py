@@ -98,11 +98,6 @@ class Steps:
         """Whether the next control period is the last."""
         return self._left == 1
 
-    @property
-    def end_next(self) -> bool:
-        """Whether the next control period is the last."""
-        return self._left == 1
-
     def count(self) -> None:
         """Note that a control period is over."""
         if self._left:
