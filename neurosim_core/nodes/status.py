@@ -140,7 +140,7 @@ class Meter:
         streaming = config.live.mode == "streaming"
         held_up = [topic for craft in crafts for topic in craft.outlet.take_held_up()]
         if held_up and not reason:
-            reason = f"held up by reliable readers of {', '.join(held_up)}"
+            reason = f"reliable readers do not keep up with {', '.join(held_up)}"
         return SimulatorStatus(
             stamp_ns=stamp_ns,
             wall_ns=time.time_ns(),

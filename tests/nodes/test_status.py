@@ -41,7 +41,7 @@ def test_a_reader_that_is_too_slow_is_named_and_its_losses_are_counted():
             rig.send(rig.hover())
             status = rig.wait_for_status(lambda s: s.sensors[0].undelivered_count and s.reason)
     assert status.phase == "running"
-    assert status.reason == "held up by reliable readers of /drone/imu"
+    assert status.reason == "reliable readers do not keep up with /drone/imu"
     count = status.sensors[0].undelivered_count
     assert f"{count:,} messages were lost by reliable readers that were too slow" in said(status)
 
@@ -51,7 +51,7 @@ def test_the_line_names_who_holds_it_up():
         rig.send(rig.hover())
         status = rig.wait_for_status(lambda s: s.phase == "running")
     vehicle = dataclasses.replace(status.vehicles[0], undelivered_count=7)
-    reason = "held up by reliable readers of /drone/imu"
+    reason = "reliable readers do not keep up with /drone/imu"
     status = dataclasses.replace(status, reason=reason, vehicles=[vehicle])
     text = io.StringIO()
     with StatusLine(Console(file=text, force_terminal=True, width=200)) as line:
@@ -59,7 +59,7 @@ def test_the_line_names_who_holds_it_up():
         assert line._line is not None
         shown = str(line._line.status)
     assert "7 lost" in shown
-    assert "held up by reliable readers of /drone/imu" in shown
+    assert "reliable readers do not keep up with /drone/imu" in shown
 
 
 def test_pictures_that_come_late_are_said_to(monkeypatch: pytest.MonkeyPatch):
