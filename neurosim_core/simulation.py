@@ -468,6 +468,11 @@ def step(
     return packets
 
 
+def warm_up(model: Model) -> None:
+    """Compile and load the kernels of all sensors: fly one control period of an episode that nobody sees."""
+    step(model, make_state(model), None)
+
+
 def fly_period(
     model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
 ) -> tuple[list[Packet], list[Batch]]:

@@ -27,13 +27,14 @@ from neurosim_core.nodes.console import StatusLine, print_end, print_plan, stop_
 from neurosim_core.nodes.craft import Craft
 from neurosim_core.nodes.helm import Command
 from neurosim_core.nodes.meetings import Meetings
+from neurosim_core.nodes.presence import refuse_second
 from neurosim_core.nodes.recorder import Recorder, open_folders
 from neurosim_core.nodes.requests import Request, Requests, Steps
 from neurosim_core.nodes.status import Board, Meter
 from neurosim_core.nodes.streaming import Streaming
 from neurosim_core.pacing import Pacer
 from neurosim_core.packets import Packet
-from neurosim_core.simulation import Model, make_fleet
+from neurosim_core.simulation import Model, make_fleet, warm_up
 from neurosim_core.vehicle import DynamicsError
 
 LATE_S = 0.1
@@ -80,9 +81,12 @@ class Simulator:
         if record is not None:
             folders = open_folders(record, list(config.vehicles), overwrite=overwrite)
         self.config = config
-        models = make_fleet(config, on_phase=on_phase) if models is None else models
-        if on_phase is not None:
-            on_phase("kernels (compiled on the first run, then cached)")
+        if models is None:
+            models = make_fleet(config, on_phase=on_phase)
+            if on_phase is not None:
+                on_phase("kernels (compiled on the first run, then cached)")
+            for model in models.values():  # else the first pictures would hold up time
+                warm_up(model)
         self.stamp_ns = 0
         self._control = next(iter(models.values())).schedule.control
         self._stop = threading.Event()
@@ -434,20 +438,24 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
     Raises:
         ValueError: The scene cannot be loaded, no path exists, or the device is not there.
         OSError: There is a recording already, or it cannot be written.
+        RuntimeError: Another simulator runs in this domain.
     """
     console = Console()
     stop = threading.Event()
-    with console.status("preparing") as status:
-        simulator = Simulator(
-            config,
-            record=record,
-            overwrite=overwrite,
-            on_phase=lambda phase: status.update(f"preparing: {phase}"),
-        )
-    with stop_at_signals(stop), simulator:
-        print_plan(console, simulator.crafts, config)
-        with StatusLine(console) as line:
-            simulator.board.on_status = line.show
-            code = simulator.run(stop)
-        print_end(console, line.last, record)
+    with Node("simulator") as node:
+        refuse_second(node)
+        with console.status("preparing") as status:
+            simulator = Simulator(
+                config,
+                node,
+                record=record,
+                overwrite=overwrite,
+                on_phase=lambda phase: status.update(f"preparing: {phase}"),
+            )
+        with stop_at_signals(stop), simulator:
+            print_plan(console, simulator.crafts, config)
+            with StatusLine(console) as line:
+                simulator.board.on_status = line.show
+                code = simulator.run(stop)
+            print_end(console, line.last, record)
     return 130 if stop.is_set() else code
