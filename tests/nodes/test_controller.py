@@ -339,6 +339,8 @@ def test_fly_serves_one_simulator_after_the_other(start_fly, paths):
             simulator.say("ended", "it has hit a wall")
             if run_on:
                 process.wait_until_said("it has hit a wall")
+                simulator.say("ended", "it has hit the floor")  # the announcement is looked at before this
+                process.wait_until_said("it has hit the floor")
                 assert process.said.count("flying drone") == count
                 assert process.process.poll() is None
         if run_on:
