@@ -165,9 +165,10 @@ class Bridge:
             for key, link in list(self._links.items()):
                 if link.gone_s is not None and now_s >= link.gone_s:
                     self._close_link(key)
-            for incoming in self._incoming.values():
-                incoming.look()
+            newcomers = [incoming.look() for incoming in self._incoming.values()]
             for feed in self._feeds.values():
+                if any(newcomers):
+                    feed.remind()
                 feed.look()
             self._publish_static()
             if now_s - self._diagnosed_s >= DIAGNOSTICS_INTERVAL_S:

@@ -105,12 +105,12 @@ class Incoming:
             if self._pending is not None and self._pending[0] is target:
                 self._drop_pending("its route is closed")
 
-    def look(self) -> None:
-        """See whether anybody in ROS publishes, and what was lost; send what waits."""
+    def look(self) -> bool:
+        """See who in ROS publishes, and what was lost; send what waits. Returns whether somebody has come."""
         subscription = self.subscription
         if subscription is None:
-            return
-        self.publisher_count = subscription.publisher_count
+            return False
+        before, self.publisher_count = self.publisher_count, subscription.publisher_count
         lost = subscription.lost_count - self._told
         self._told += lost
         with self._lock:
@@ -118,6 +118,7 @@ class Incoming:
                 self._targets[0].tally.receive(lost)
                 self._targets[0].tally.lose("on the way through ROS", lost)
             self._send_pending()
+        return self.publisher_count > before
 
     def take(self, data: bytes) -> None:
         """Take in a message of ROS, from any thread."""

@@ -23,10 +23,11 @@ Convert = Callable[[Any, Context], "Buffer | None"]
 QUEUES: dict[type[Any], int] = {Image: 16, PointCloud: 16, Events: 128}
 """Messages that wait for their conversion; the option `queue` changes it."""
 QUEUE = 1024
-REMIND_S = (0.1, 0.5)
-"""When the last message of a latched topic is sent again after a ROS subscriber has come [s].
+REMIND_S = (0.1, 0.5, 2.0)
+"""When the last message of a latched topic is sent again after somebody in ROS has come [s].
 
-DDS calls a subscriber matched when it knows it, not when the subscriber knows us."""
+DDS calls a subscriber matched when it knows it, not when the subscriber knows us; and who answers a state at
+once may not be heard yet. In lockstep both would wait for ever."""
 
 
 STREAM_S = 0.05
@@ -105,11 +106,23 @@ class Outgoing:
             if self._latched:
                 self._last, self._last_s = bytes(data), time.monotonic()
 
+    def remind(self) -> None:
+        """Send the last message of a latched topic again some times, unless new ones come."""
+        if self._latched:
+            now_s = time.monotonic()
+            self._remind_s = [now_s + delay_s for delay_s in REMIND_S]
+
+    def forget(self) -> None:
+        """Send the last message no more: it is of a publisher that has gone."""
+        with self._lock:
+            self._last = None
+            self._remind_s = []
+
     def _remind(self, count: int) -> None:
         """Send the last message of a latched topic again, if it may have been too early for a newcomer."""
         now_s = time.monotonic()
         if count > self.subscriber_count:
-            self._remind_s = [now_s + delay_s for delay_s in REMIND_S]
+            self.remind()
         while self._remind_s and now_s >= self._remind_s[0]:
             self._remind_s.pop(0)
             with self._lock:
@@ -229,6 +242,18 @@ class Feed:
         """Let a route have no more of them."""
         self._outputs = tuple(other for other in self._outputs if other is not output)
 
+    def _forget(self) -> None:
+        """Keep nothing of publishers that have gone."""
+        with self._lock:
+            self._last = None
+        for output in self._outputs:
+            output.forget()
+
+    def remind(self) -> None:
+        """Let routes of a latched topic send the last message again."""
+        for output in self._outputs:
+            output.remind()
+
     @property
     def active(self) -> bool:
         """Whether it is subscribed to."""
@@ -254,6 +279,8 @@ class Feed:
         elif self._subscriber is not None:
             self.close()
             logger.debug("%s: not needed any more", self.topic)
+        if self._last is not None and self._subscriber is not None and not self._subscriber.publisher_count:
+            self._forget()
         self._count()
 
     def close(self) -> None:

@@ -117,10 +117,10 @@ RULES: tuple[Rule, ...] = (
         "{base}/command_trajectory",
         NEWEST,
     ),
-    Rule("cortex/Reset", "std_msgs/msg/Empty", "call", "{topic}", NEWEST),
-    Rule("cortex/Reset", "neurosim/msg/Reset", "call", "{topic}_to", NEWEST),
-    Rule("cortex/Step", "std_msgs/msg/UInt32", "call", "{topic}", NEWEST),
-    Rule("cortex/Trigger", "std_msgs/msg/Empty", "call", "{topic}", NEWEST),
+    Rule("cortex/Reset", "std_msgs/msg/Empty", "call", "{topic}"),
+    Rule("cortex/Reset", "neurosim/msg/Reset", "call", "{topic}_to"),
+    Rule("cortex/Step", "std_msgs/msg/UInt32", "call", "{topic}"),
+    Rule("cortex/Trigger", "std_msgs/msg/Empty", "call", "{topic}"),
 )
 """The table. A row for a service has the type of its request."""
 

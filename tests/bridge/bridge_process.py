@@ -35,6 +35,12 @@ class BridgeProcess:
             assert chunk, self.said
             self.said += chunk.decode()
 
+    def hear(self) -> None:
+        """Take in what it has said by now."""
+        assert self.process.stderr is not None
+        if select.select([self.process.stderr], [], [], 0.0)[0]:
+            self.said += os.read(self.process.stderr.fileno(), 65536).decode()
+
     def end(self, number: int) -> float:
         """Send a signal; how long it then took to end [s]."""
         begin_s = time.monotonic()

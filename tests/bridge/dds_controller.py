@@ -136,12 +136,15 @@ class Pilot:
 
     def fly(self, mode: str) -> dict[str, Any]:
         law, errors = make_law(mode, self.settings, self.path), Errors(self.path)
-        end_ns, last_ns = round(DURATION_S * 1e9), -1
+        end_ns, last_ns, row = round(DURATION_S * 1e9), -1, numbers()
         while True:
             state = self.odometry.take()
             now_ns = stamp_ns(state.header)
-            if last_ns < 0 < now_ns or now_ns == last_ns:
-                continue  # of the flight before, or once more
+            if last_ns < 0 < now_ns:
+                continue  # of the flight before
+            if now_ns == last_ns:  # once more: nobody has heard the answer
+                self.command(mode, state.header, row.tolist())
+                continue
             last_ns = now_ns
             pose, twist = state.pose.pose, state.twist.twist
             position = numbers(pose.position.x, pose.position.y, pose.position.z)

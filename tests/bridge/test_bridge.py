@@ -101,6 +101,22 @@ def test_a_calibration_that_is_seen_before_its_image():
         assert stamp_ns(together.messages()[0].header) == 7
 
 
+def test_the_state_of_a_simulator_that_has_gone_is_not_repeated(monkeypatch):
+    with rig_of() as rig, Node("another") as another:
+        state = another.publisher("/drone/odometry", msg.Odometry, latch=True)
+        state.publish(odometry(7))
+        ros, moving = rig.opens("/drone/odometry", "/tf")
+        monkeypatch.setattr(outgoing_module, "REMIND_S", (0.5,))
+        with rig.backend.listening("/drone/odometry"):
+            rig.update_until(lambda: ros.sent)
+            another.close()
+            rig.update_until(lambda: rig.reminded("/drone/odometry"))
+            assert len(ros.sent) == 1
+            with rig.backend.listening("/tf"):
+                rig.updates_during()
+                assert moving.sent == []
+
+
 def test_who_comes_later_to_a_latched_state_gets_it():
     """While odometry is subscribed to for one listener, another one on /tf hears of the state that holds."""
     with rig_of() as rig:
@@ -215,6 +231,7 @@ def test_a_latched_state_is_sent_again_to_a_subscriber_that_may_have_been_too_ea
         state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
         state.publish(odometry(0))
         ros, moving = rig.opens("/drone/odometry", "/tf")
+        monkeypatch.setattr(outgoing_module, "REMIND_S", (0.1, 0.3))
         with rig.backend.listening("/drone/odometry"):
             rig.update_until(lambda: len(ros.sent) >= 3)
             assert len(set(ros.sent)) == 1
@@ -573,6 +590,27 @@ def test_state_and_time_are_followed_only_while_somebody_commands():
         assert other.subscriber_count == 0
         rotors.publisher_count = 0
         rig.update_until(lambda: state.subscriber_count == 0)
+
+
+def test_who_comes_to_command_is_told_the_state_again(monkeypatch):
+    """What it answered when DDS knew it only halfway was heard by nobody."""
+    with rig_of() as rig:
+        Craft(rig, motor_speeds=msg.MotorCommand)
+        state = rig.simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        state.publish(odometry(0))
+        (rotors,) = rig.subscribes("/drone/actuators")
+        (ros,) = rig.opens("/drone/odometry")
+        monkeypatch.setattr(outgoing_module, "REMIND_S", ())
+        with rig.listening(state, "/drone/odometry"):
+            wait_for(lambda: ros.sent)
+            rig.updates_during()
+            assert len(ros.sent) == 1
+            monkeypatch.setattr(outgoing_module, "REMIND_S", (0.06,))
+            rotors.publisher_count = 1
+            rig.update_until(lambda: len(ros.sent) == 2)
+            rig.update_until(lambda: rig.reminded("/drone/odometry"))
+        assert ros.sent[0] == ros.sent[1]
+        assert len(ros.sent) == 2
 
 
 def test_a_command_waits_for_a_simulator_that_is_about_to_listen(monkeypatch):
