@@ -8,6 +8,7 @@ messages, which are counted, and shown on /diagnostics.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import threading
 import time
@@ -16,11 +17,12 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
 from cortex import Node, Publisher
-from cortex_ros2_bridge import convert, diagnostics
+from cortex_ros2_bridge import cdr, convert, diagnostics
 from cortex_ros2_bridge.backend.base import Backend, BackendError, RosPublisher
 from cortex_ros2_bridge.config import QOS, BridgeConfig, ConfigError
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.incoming import Caller, Incoming, Target
+from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Whereabouts
 from cortex_ros2_bridge.routes import (
     CORTEX_TYPES,
@@ -235,6 +237,7 @@ class Bridge:
 
     def _open(self, route: Route, seen: Seen, now_s: float) -> list[str]:
         """Open a route; returns why that was not possible."""
+        _warm_up(route.ros_type)
         opens = {"out": self._open_out, "in": self._open_in, "call": self._open_call}
         with contextlib.ExitStack() as stack:
             try:
@@ -437,6 +440,13 @@ class Bridge:
                 self._diagnostics.publish(array)
             except BackendError as error:
                 logger.warning("%s: %s", diagnostics.TOPIC, error)
+
+
+@functools.cache
+def _warm_up(ros_type: str) -> None:
+    """Let code for a type be generated now: with the first message it would hold up a stream for 20 ms."""
+    with contextlib.suppress(ValueError):  # what is wrong with the type is said where it is opened
+        cdr.decode_record(cdr.encode(message_class(ros_type)()), ros_type)
 
 
 def _check_options(config: BridgeConfig) -> None:

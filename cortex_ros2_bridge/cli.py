@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import gc
 import logging
 import os
 import signal
@@ -24,6 +25,8 @@ LIST_S = 1.5
 """How long `--list` and `--print-config` look for nodes [s]."""
 SETTLED_S = 0.3
 """After so long without news, all nodes have been heard [s]."""
+SWITCH_S = 0.5e-3
+"""How long a thread may keep others from running [s]: messages pass on others than what opens routes."""
 EXIT_S = 0.9
 """Longest time to leave in; then the process ends as it is [s]."""
 
@@ -112,6 +115,9 @@ def _bridge(config: BridgeConfig) -> int:
     try:
         with Node(config.node, domain=config.domain) as node, Bridge(config, backend, node) as bridge:
             _say(f"/{config.node}: {backend.name}, {backend.distro}; waiting for Cortex topics, Ctrl-C ends")
+            gc.collect()
+            gc.freeze()  # what is there stays; the collector need not look at it again and again
+            sys.setswitchinterval(SWITCH_S)
             bridge.run(stop)
     finally:
         backend.close()

@@ -21,6 +21,7 @@ from cortex_ros2_bridge import outgoing as outgoing_module
 from cortex_ros2_bridge.backend.base import BackendError
 from cortex_ros2_bridge.config import ConfigError
 from cortex_ros2_bridge.msgs import message_class
+from cortex_ros2_bridge.typestore import typestore
 
 IMU = "/drone/imu -> /drone/imu"
 
@@ -54,6 +55,17 @@ def test_nothing_is_subscribed_to_until_ros_listens():
     assert stamp_ns(got[0].header) == 5_000_000_007
     assert got[0].angular_velocity.z == 3.0
     assert got[0].header.frame_id == "drone/imu"
+
+
+def test_code_for_a_type_is_generated_before_its_first_message():
+    """With the first message it would hold up all streams, for longer than Cortex keeps events at 10 MHz."""
+    store = typestore()
+    for cached in (bridge_module._warm_up.cache_clear, store.cache.clear):
+        cached()
+    with rig_of() as rig:
+        rig.simulator.publisher("/drone/rgb", msg.Image)
+        rig.opens("/drone/rgb/image_raw")
+        assert "sensor_msgs/msg/Image" in store.cache
 
 
 def test_an_image_and_its_calibration_have_one_stamp():
