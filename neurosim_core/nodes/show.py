@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -30,6 +31,8 @@ QUEUE = 4096
 RATE_NS = 1_000_000_000
 """Rates are taken over as much simulated time [ns], or over as many statuses."""
 STATUS_MAX = 50
+APART_S = 1.0
+"""Recordings begin at least so far apart [s]."""
 _AHEAD_NS = 1_000_000_000
 _NAME = "flight {}"
 
@@ -43,6 +46,8 @@ class _Stream(NamedTuple):
     sensor: str
     """Name of the sensor; empty: it is none."""
     subscriber: Subscriber[Any]
+    of_simulator: bool
+    """Whether it is the simulator that sends it, so that what others send is ignored."""
     ordered: bool
     """Whether its stamps tell that a run has begun again."""
     take: Callable[[Any], None]
@@ -55,6 +60,7 @@ class Show:
         self,
         node: Node,
         simulation: msg.Simulation,
+        source: int,
         outlet: Outlet,
         *,
         number: Iterator[int],
@@ -69,6 +75,7 @@ class Show:
         Args:
             node: What to listen through.
             simulation: Announcement of the simulator.
+            source: The publisher that it came from.
             outlet: Where recordings are opened.
             number: Numbers of recordings.
             only: Sensors to show; None: all.
@@ -86,6 +93,7 @@ class Show:
             name: config.of(name).vehicle.airframe().rotor_count for name in config.vehicles
         }
         self._node = node
+        self._siblings = _Siblings(node, source)
         self._outlet = outlet
         self._number = number
         self._window_ns = event_window_ns
@@ -101,6 +109,8 @@ class Show:
         self._streams: list[_Stream] = []
         self.phase = ""
         """As the last status says; empty before the first one."""
+        self._hurried = False
+        self._opened_s = 0.0
         scene.load(config)
         self._logger = self._open()
         self._subscribe()
@@ -110,18 +120,24 @@ class Show:
         """Names of the sensors shown, by vehicle."""
         return {name: [s.name for s in sensors] for name, sensors in self._vehicles.items()}
 
+    @property
+    def settled(self) -> bool:
+        """Whether its recording began long enough ago for another one to begin."""
+        return time.monotonic() - self._opened_s >= APART_S
+
     def read(self) -> None:
         """Take what has come, and log it."""
         for stream in self._streams:
             for _ in range(DRAIN_MAX):
                 try:
-                    message = stream.subscriber.recv(0.0)
+                    message, info = stream.subscriber.recv_with_info(0.0)
                 except TimeoutError:
                     break
                 except TypeMismatch as error:
                     self._say(f"{stream.subscriber.topic} is of another type:\n{error}")
                     continue
-                self._take(stream, message)
+                if not stream.of_simulator or info.source in self._siblings:
+                    self._take(stream, message)
         if self._shapes is None and (shapes := self._scene.shapes()) is not None:
             self._shapes = shapes
             self._logger.log_scene(shapes)
@@ -138,6 +154,7 @@ class Show:
         self._outlet.close_recording(self._logger)
 
     def _open(self) -> RerunLogger:
+        self._opened_s = time.monotonic()
         number = next(self._number)
         logger = RerunLogger(
             self._outlet.open(_NAME.format(number)),
@@ -155,11 +172,15 @@ class Show:
         return logger
 
     def _begin_again(self) -> None:
-        self._outlet.close_recording(self._logger)
-        self._logger = self._open()
         self._command_ns.clear()
         self._statuses.clear()
-        self._say("the simulator has begun again: a new recording")
+        if self.settled:
+            self._outlet.close_recording(self._logger)
+            self._logger = self._open()
+            self._say("the simulator has begun again: a new recording")
+        elif not self._hurried:
+            self._hurried = True
+            self._say(f"the simulator begins again within {APART_S:g} s: such runs share a recording")
 
     def _take(self, stream: _Stream, message: Any) -> None:
         if stream.ordered:
@@ -213,7 +234,8 @@ class Show:
             add(at(sensor.name), kind, on_packet(sensor.name), vehicle, sensor=sensor.name)
         add(at("collision"), msg.Collision, on_packet("collision"), vehicle)
         for mode, command in topics.COMMANDS.items():
-            add(topics.command_topic(vehicle, mode), command, on_command(mode), vehicle, ordered=False)
+            topic = topics.command_topic(vehicle, mode)
+            add(topic, command, on_command(mode), vehicle, of_simulator=False, ordered=False)
         for link in self._links.get(vehicle, ()):
             add(topics.delivery_topic(vehicle, link), msg.Delivery, on_delivery(link), vehicle)
 
@@ -225,11 +247,12 @@ class Show:
         vehicle: str = "",
         *,
         sensor: str = "",
+        of_simulator: bool = True,
         ordered: bool = True,
     ) -> None:
         policy = latest() if message in (msg.Image, msg.Path, msg.SimulatorStatus) else keep_last(QUEUE)
         subscriber = self._node.subscriber(topic, message, policy=policy)
-        self._streams.append(_Stream(topic, vehicle, sensor, subscriber, ordered, take))
+        self._streams.append(_Stream(topic, vehicle, sensor, subscriber, of_simulator, ordered, take))
 
     def _unsubscribe(self) -> None:
         for stream in self._streams:
@@ -287,6 +310,28 @@ class Show:
             key = (stream.vehicle, stream.sensor)
             lost[key] = lost.get(key, 0) + count
         return lost
+
+
+class _Siblings:
+    """The publishers of the node that a publisher belongs to, as far as others do not have them."""
+
+    def __init__(self, node: Node, source: int) -> None:
+        self._node = node
+        self._owners: dict[int, int] = {}
+        self._look()
+        self._owner = self._owners.get(source)
+
+    def __contains__(self, source: int) -> bool:
+        if source not in self._owners:
+            self._look()
+        owner = self._owners.get(source)  # none: it has left, and nobody can tell
+        return owner is None or self._owner is None or owner == self._owner
+
+    def _look(self) -> None:
+        """Remember who has which publisher, since those who leave are forgotten by the node."""
+        self._owners.update(
+            (pub.source, record.node) for record in self._node.nodes() for pub in record.publishers
+        )
 
 
 def _shown(config: SimulationConfig, only: Sequence[str] | None) -> dict[str, tuple[SensorDescription, ...]]:

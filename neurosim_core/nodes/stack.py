@@ -12,6 +12,7 @@ from rich.console import Console
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.nodes.supervisor import Part, run_together
 from neurosim_core.scene.mesh import MeshSceneConfig
+from neurosim_core.view.rerun_outlet import check_new_file
 
 
 def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite: bool) -> int:
@@ -32,8 +33,11 @@ def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite:
 
     Raises:
         ValueError: There is no such viewer.
+        OSError: The viewer cannot write its file, or it is there already.
     """
     viewer_arguments = arguments_of(viewer)
+    if viewer.endswith(".rrd"):
+        check_new_file(Path(viewer))
     with tempfile.TemporaryDirectory(prefix="neurosim-") as folder:
         settings = Path(folder) / "config.yaml"
         settings.write_text(to_yaml(_independent_of_folder(config)), encoding="utf-8")

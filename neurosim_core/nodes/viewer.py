@@ -27,7 +27,7 @@ from neurosim_core.nodes import topics
 from neurosim_core.nodes.console import stop_at_signals
 from neurosim_core.nodes.scene_loader import SceneLoader
 from neurosim_core.nodes.show import Show
-from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet
+from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
 
@@ -54,7 +54,7 @@ def view(
 
     Args:
         how: native (a window), web (a page for the browsers of this machine) or save (files).
-        save: File to write, with "save"; after a reset NAME-2.rrd, ...
+        save: File to write, with "save", which must not be there yet; after a reset NAME-2.rrd, ...
         only: Sensors to show; None: all.
         event_window_s: Time in one picture of events [s].
         image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
@@ -66,11 +66,12 @@ def view(
 
     Raises:
         ValueError: An argument is not what it must be, there is no display, or no such sensor.
+        FileExistsError: The file is there already.
         OSError: The file cannot be written, or the port is taken.
         ViewerEnded: The viewer failed.
         ImportError: Rerun is not installed.
     """
-    _check(how, save=save, event_window_s=event_window_s, image_rate_hz=image_rate_hz, port=port)
+    _check(how, save=save, only=only, event_window_s=event_window_s, image_rate_hz=image_rate_hz, port=port)
     import_rerun()
     console = Console(highlight=False, soft_wrap=True)
 
@@ -114,12 +115,24 @@ def view(
     return status
 
 
-def _check(how: str, *, save: Path | None, event_window_s: float, image_rate_hz: float, port: int) -> None:
+def _check(
+    how: str,
+    *,
+    save: Path | None,
+    only: Sequence[str] | None,
+    event_window_s: float,
+    image_rate_hz: float,
+    port: int,
+) -> None:
     """Refuse arguments of `view` that are not what they must be."""
     if how not in ("native", "web", "save"):
         raise ValueError(f"unknown way to view {how!r}, known: native, web, save")
     if (how == "save") != (save is not None):
         raise ValueError(f"a file to save to goes with how='save', got {how!r} and {save}")
+    if save is not None:
+        check_new_file(save)
+    if only is not None and not all(name.strip() for name in only):
+        raise ValueError(f"sensors to show are names, such as events,imu, got {','.join(only)!r}")
     if not 1e-4 <= event_window_s <= EVENT_WINDOW_MAX_S:
         raise ValueError(f"the event window must be 0.0001 to {EVENT_WINDOW_MAX_S:g} s, got {event_window_s}")
     if not 0.0 < image_rate_hz <= 1000.0:
@@ -172,7 +185,7 @@ def watch(
             now_s = time.monotonic()
             if not outlet.check():
                 return 0
-            found = _announced(announcements, say)
+            found = _announced(announcements, say) if show is None or show.settled else None
             if found is not None and found[1] != source:
                 simulation, source = found
                 shown.close()
@@ -181,6 +194,7 @@ def watch(
                     show = Show(
                         node,
                         simulation,
+                        source,
                         outlet,
                         number=number,
                         only=only,
@@ -201,7 +215,7 @@ def watch(
             if now_s >= send_s:
                 send_s = now_s + SEND_S
                 show.send()
-            if present != (present := announcements.publisher_count > 0) and not present:
+            if present != (present := source in announcements.sources()) and not present:
                 say("the simulator is gone; waiting for the next one (neurosim serve)")
             over = to_the_end and not present and show.phase == "ended"
             over_s = min(over_s, now_s) if over else math.inf

@@ -18,6 +18,24 @@ if TYPE_CHECKING:
 CLOSE_S = 0.3
 
 
+def check_new_file(path: Path) -> None:
+    """Check that a recording can be written to a file of this name without replacing anything.
+
+    Raises:
+        ValueError: The name does not end in .rrd.
+        FileExistsError: It is there already.
+        OSError: There is no such folder, or it is one itself.
+    """
+    if path.is_dir():
+        raise OSError(f"cannot write {path}: it is a folder")
+    if path.suffix != ".rrd":
+        raise ValueError(f"a file of Rerun ends in .rrd, got {path}")
+    if not path.parent.is_dir():
+        raise OSError(f"cannot write {path}: there is no folder {path.parent}")
+    if path.exists():
+        raise FileExistsError(f"{path} is there already: name another file")
+
+
 class Outlet(Protocol):
     """Where recordings are opened.
 
@@ -62,7 +80,7 @@ class ViewerOutlet:
 
 
 class FileOutlet:
-    """Each recording is a file: NAME.rrd, and after a reset the first free of NAME-2.rrd, NAME-3.rrd, ..."""
+    """Each recording is a file: the next of NAME.rrd, NAME-2.rrd, NAME-3.rrd, ... that is not there yet."""
 
     compress = True
 
@@ -70,19 +88,16 @@ class FileOutlet:
         """Refuse at once what cannot be written.
 
         Args:
-            path: The first file; replaced if it is there.
+            path: The first file.
             say: Told what has been written.
 
         Raises:
-            OSError: There is no such folder.
+            ValueError, OSError: As `check_new_file`.
         """
-        if not path.parent.is_dir():
-            raise OSError(f"cannot write {path}: there is no folder {path.parent}")
-        if path.is_dir():
-            raise OSError(f"cannot write {path}: it is a folder")
+        check_new_file(path)
         self._say = say
         numbered = (path.with_name(f"{path.stem}-{k}{path.suffix}") for k in itertools.count(2))
-        self._next = itertools.chain([path], (other for other in numbered if not other.exists()))
+        self._next = (other for other in itertools.chain([path], numbered) if not other.exists())
         self._path = path
 
     def open(self, name: str) -> rr.RecordingStream:

@@ -109,6 +109,16 @@ def test_the_viewer_suits_the_display(monkeypatch, viewer, display, platform, wa
     assert stack.arguments_of(viewer) == wanted
 
 
+def test_a_file_that_is_there_is_refused_before_anything_runs(monkeypatch, tmp_path):
+    monkeypatch.setattr(stack, "run_together", None)
+    file = tmp_path / "live.rrd"
+    file.write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match=r"live.rrd is there already: name another file"):
+        stack.up(SimulationConfig(), viewer=str(file), record=None, overwrite=False)
+    with pytest.raises(OSError, match="there is no folder"):
+        stack.up(SimulationConfig(), viewer=str(tmp_path / "no" / "f.rrd"), record=None, overwrite=False)
+
+
 @pytest.mark.parametrize("viewer", ["rerun", "", "live.mp4", "Native"])
 def test_an_unknown_viewer_is_refused_before_anything_runs(monkeypatch, viewer):
     monkeypatch.setattr(stack, "run_together", None)

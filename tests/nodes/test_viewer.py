@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import os
 import re
 import signal
@@ -26,6 +27,7 @@ from rerun_file import Rows, read, scalars
 
 from cortex import Node
 from cortex import messages as msg
+from neurosim_core.nodes import show as show_module
 from neurosim_core.nodes import viewer as viewer_module
 from neurosim_core.nodes.scene_loader import SceneLoader
 from neurosim_core.nodes.viewer import view, watch
@@ -204,8 +206,9 @@ def test_pictures_are_limited_by_the_wall_clock(tmp_path, box, start):
         assert 5 <= count <= rate_hz * (elapsed_s + late_s), camera  # a busy machine may show fewer
 
 
-def test_a_reset_begins_a_new_file(tmp_path, box, start):
+def test_a_reset_begins_a_new_file(tmp_path, box, start, monkeypatch):
     """What is left over of the run before does not come into it; a file that is there already is kept."""
+    monkeypatch.setattr(show_module, "APART_S", 0.0)
     (tmp_path / "live-2.rrd").write_bytes(b"mine")
     watcher = start(tmp_path / "live.rrd", image_rate_hz=1000.0)
     with FakeSimulator(box) as simulator:
@@ -234,6 +237,77 @@ def test_a_reset_begins_a_new_file(tmp_path, box, start):
     assert [t for t, _ in old[f"{BODY}/rgb/image"]] == [450 * MS]
     assert [t for t, _ in new[f"{BODY}/rgb/image"]] == [50 * MS]
     assert "/world/scene/room/0" in new
+
+
+def test_of_two_simulators_the_newest_is_shown(tmp_path, box, start, monkeypatch):
+    """What the other one sends meanwhile is neither shown nor taken for a reset."""
+    monkeypatch.setattr(show_module, "APART_S", 0.0)
+    watcher = start(tmp_path / "live.rrd")
+    with FakeSimulator(box) as first, FakeSimulator(box) as second:
+        first.announce()
+        first.wait_for_cameras()
+        assert second.odometry.wait_for_subscribers(timeout_s=SOON_S)
+        second.wait_for_cameras()
+
+        number = itertools.count()
+
+        def fly() -> None:
+            for k in itertools.islice(number, 10):
+                second.state(10_000 + k)
+                first.state(k)
+
+        def stamps(rows: Rows) -> list[list[int]]:
+            plots = ("odometry/speed", "odometry/rotor_speed", "imu/specific_force")
+            return [[t for t, _ in scalars(rows, f"/plots/drone/{plot}")] for plot in plots]
+
+        def enough(rows: Rows) -> bool:
+            return all(len(plot) >= 50 for plot in stamps(rows))
+
+        fly()
+        grows_to(tmp_path / "live.rrd", enough, meanwhile=fly)
+        second.announce()
+        wait_for(lambda: (tmp_path / "live-2.rrd").exists())
+        grows_to(tmp_path / "live-2.rrd", enough, meanwhile=fly)
+        second.close()
+        watcher.wait_for("the simulator is gone")
+    watcher.end()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["live-2.rrd", "live.rrd"]
+    assert all(t < 50_000 * MS for plot in stamps(read(tmp_path / "live.rrd")) for t in plot)
+    assert all(t >= 50_000 * MS for plot in stamps(read(tmp_path / "live-2.rrd")) for t in plot)
+
+
+def test_resets_in_quick_succession_share_a_file(tmp_path, box, start, monkeypatch):
+    """Also simulators: a new one is not shown before its time. It is said once."""
+    monkeypatch.setattr(show_module, "APART_S", 1e9)
+    watcher = start(tmp_path / "live.rrd")
+    with FakeSimulator(box) as simulator, FakeSimulator(box) as other:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        other.announce()
+        for _ in range(10):
+            for k in range(3):
+                simulator.state(k)
+        stamps = [5 * MS * k for k in range(3)] * 10
+        speed = "/plots/drone/odometry/speed"
+        grows_to(
+            tmp_path / "live.rrd", lambda rows: sorted(t for t, _ in scalars(rows, speed)) == sorted(stamps)
+        )
+        assert sum("such runs share a recording" in line for line in watcher.said) == 1
+        assert not (tmp_path / "live-2.rrd").exists()
+        monkeypatch.setattr(show_module, "APART_S", 0.0)
+        wait_for(lambda: (tmp_path / "live-2.rrd").exists())
+    watcher.end()
+
+
+def test_a_file_that_comes_up_meanwhile_is_kept(tmp_path, box, start):
+    watcher = start(tmp_path / "live.rrd")
+    watcher.wait_for("waiting for a simulator")
+    (tmp_path / "live.rrd").write_bytes(b"mine")
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+    watcher.end()
+    assert (tmp_path / "live.rrd").read_bytes() == b"mine"
+    assert watcher.said[-1] == f"wrote {tmp_path / 'live-2.rrd'}"
 
 
 def test_only_what_is_shown_is_subscribed_to(tmp_path, box, start):
@@ -368,6 +442,9 @@ def test_waiting_is_interrupted(tmp_path):
         ({"how": "web", "event_window_s": 0.0}, r"the event window must be 0.0001 to 10 s, got 0.0"),
         ({"how": "web", "image_rate_hz": float("nan")}, "the image rate must be above 0"),
         ({"how": "web", "port": 70_000}, "a port is 0 to 65535, got 70000"),
+        ({"how": "web", "only": [""]}, "sensors to show are names, such as events,imu, got ''"),
+        ({"how": "web", "only": ["", ""]}, "got ','"),
+        ({"how": "save", "save": Path("q.txt")}, r"a file of Rerun ends in .rrd, got q.txt"),
         ({"how": "native"}, "no display to open a window on: `neurosim view --web`.*--save"),
     ],
 )
@@ -383,6 +460,11 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path):
         view(how="save", save=tmp_path / "nowhere" / "f.rrd")
     with pytest.raises(OSError, match="it is a folder"):
         view(how="save", save=tmp_path)
+    assert not (tmp_path / "nowhere").exists()
+    (tmp_path / "x.rrd").write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match=r"x.rrd is there already: name another file"):
+        view(how="save", save=tmp_path / "x.rrd")
+    assert (tmp_path / "x.rrd").read_bytes() == b"mine"
 
 
 def test_memory_stays(tmp_path, box, start):
