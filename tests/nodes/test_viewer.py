@@ -183,7 +183,7 @@ def test_what_is_published_is_in_the_file(tmp_path, box, start):
 
 
 def test_pictures_are_limited_by_the_wall_clock(tmp_path, box, start):
-    """Of images that come as fast as they can, 20 a second are shown, of windows of events 50."""
+    """Of images that come up to 500 times a second, 20 are shown, of windows of events 50."""
     file = tmp_path / "live.rrd"
     watcher = start(file, image_rate_hz=20.0)
     with FakeSimulator(box) as simulator:
@@ -194,12 +194,13 @@ def test_pictures_are_limited_by_the_wall_clock(tmp_path, box, start):
             simulator.image(k)
             simulator.sensors["dvs"].publish(make_events(k))
             k += 1
+            time.sleep(2e-3)  # faster ones would keep the interpreter, which the viewer shares here
         elapsed_s = time.monotonic() - begin_s
         simulator.status(50 * MS * k)
         grows_to(file, lambda rows: "/status" in rows)
     watcher.end()
     rows = read(file)
-    assert k > 200
+    assert k > 100
     for camera, rate_hz in (("rgb", 20.0), ("z", 20.0), ("dvs", 50.0)):
         count = len(rows[f"{BODY}/{camera}/image"])
         late_s = 1.0  # half a second at the end, and as much of windows that are ahead
