@@ -101,7 +101,7 @@ class LargeSender:
         self._ring_count = 0
         self._columns: dict[int, Reader] = {}
         self._late: set[int] = set()
-        """Columns of reliable readers that did not make room in time: they hold up nothing until they have."""
+        """Columns of reliable readers that did not make room in time: they hold up nothing until they do."""
         self._inline: list[Reader] = []
         self._pins: deque[_Pin] = deque()
         self._private_bytes = {False: 0, True: 0}
