@@ -81,10 +81,13 @@ class SensorStatus:
     """One sensor of a vehicle."""
 
     vehicle: str
+    """Name of the vehicle."""
     name: str
+    """Name of the sensor."""
     active: bool
-    """Whether it is computed: somebody subscribes or records."""
+    """Whether it is published or recorded; a camera that is not is not rendered either."""
     subscriber_count: UInt32
+    """Who listens."""
     published_count: UInt64
     """Messages since the beginning of the run."""
     dropped_count: UInt64
@@ -104,6 +107,7 @@ class VehicleStatus:
     """How one vehicle is commanded."""
 
     name: str
+    """Name of the vehicle."""
     command_mode: str
     """Mode of the command that holds; empty before the first one."""
     command_count: UInt64
@@ -121,6 +125,7 @@ class VehicleStatus:
     fail_safe_count: UInt64
     """How often it set in."""
     collision_count: UInt64
+    """How often it has begun to touch something."""
     undelivered_count: UInt64 = 0
     """As in `SensorStatus`, of its other topics: odometry, rotor speeds, collisions, deliveries."""
 
@@ -158,7 +163,9 @@ class SimulatorStatus:
     slipped_ns: Annotated[int, Unit("ns")]
     """Wall-clock time by which the run has been held back, since its beginning [ns]."""
     sensors: list[SensorStatus]
+    """All sensors of all vehicles."""
     vehicles: list[VehicleStatus]
+    """All vehicles, in the order of the settings."""
     sequence: UInt64 = 0
     """Counts the messages of one simulator from 0."""
 

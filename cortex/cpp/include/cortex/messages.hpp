@@ -1,4 +1,4 @@
-// Written by `cortex cpp`; do not edit. Types: cortex::messages::AttitudeCommand, cortex::messages::CameraInfo, cortex::messages::Clock, cortex::messages::Collision, cortex::messages::Events, cortex::messages::Image, cortex::messages::Imu, cortex::messages::MotorCommand, cortex::messages::Odometry, cortex::messages::Parameter, cortex::messages::Parameters, cortex::messages::PointCloud, cortex::messages::PoseCommand, cortex::messages::RateThrustCommand, cortex::messages::RotorSpeeds, cortex::messages::Text, cortex::messages::Transform, cortex::messages::VelocityCommand.
+// Written by `cortex cpp`; do not edit. Types: cortex::messages::AttitudeCommand, cortex::messages::CameraInfo, cortex::messages::Clock, cortex::messages::Collision, cortex::messages::Delivery, cortex::messages::Events, cortex::messages::Image, cortex::messages::Imu, cortex::messages::MotorCommand, cortex::messages::Odometry, cortex::messages::Parameter, cortex::messages::Parameters, cortex::messages::Path, cortex::messages::PointCloud, cortex::messages::PoseCommand, cortex::messages::RateThrustCommand, cortex::messages::Reset, cortex::messages::RotorSpeeds, cortex::messages::SensorStatus, cortex::messages::Simulation, cortex::messages::SimulatorReply, cortex::messages::VehicleStatus, cortex::messages::SimulatorStatus, cortex::messages::Step, cortex::messages::Text, cortex::messages::Transform, cortex::messages::Trigger, cortex::messages::VelocityCommand.
 #pragma once
 
 #include <array>
@@ -271,6 +271,64 @@ struct Codec<::cortex::messages::Collision> {
 };
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_Collision_3BC3B9F2DE012E00
+
+#ifndef CORTEX_TYPE_cortex_messages_Delivery_2D8117FB3B19969D
+#define CORTEX_TYPE_cortex_messages_Delivery_2D8117FB3B19969D
+namespace cortex::messages {
+struct Delivery {
+  std::int64_t stamp_ns{};  // ns
+  std::int64_t delivered_ns{};  // ns
+  std::uint64_t size_bytes{};
+  std::uint64_t sequence{};
+
+  friend bool operator==(const Delivery& a, const Delivery& b) {
+    return a.stamp_ns == b.stamp_ns &&
+           a.delivered_ns == b.delivered_ns &&
+           a.size_bytes == b.size_bytes &&
+           a.sequence == b.sequence;
+  }
+  friend bool operator!=(const Delivery& a, const Delivery& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::Delivery> {
+  static constexpr std::string_view name = "cortex/Delivery";
+  static constexpr std::uint64_t fingerprint = 0x2D8117FB3B19969Du;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/Delivery\",\"fields\":[{\"name\":\"stamp_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":"
+      "\"\"},{\"name\":\"delivered_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"size_bytes\",\"ty"
+      "pe\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"sequence\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\""
+      "}]}";
+  static constexpr std::size_t block = 32;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = true;
+  static constexpr bool stamped = true;
+
+  static std::int64_t stamp(const ::cortex::messages::Delivery& message) noexcept {
+    return static_cast<std::int64_t>(message.stamp_ns);
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::Delivery& out) {
+    reader.scalar(at, out.stamp_ns);
+    reader.scalar(at + 8, out.delivered_ns);
+    reader.scalar(at + 16, out.size_bytes);
+    reader.scalar(at + 24, out.sequence);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::Delivery& message) {
+    sink.scalar(at, message.stamp_ns);
+    sink.scalar(at + 8, message.delivered_ns);
+    sink.scalar(at + 16, message.size_bytes);
+    sink.scalar(at + 24, message.sequence);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Delivery& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_Delivery_2D8117FB3B19969D
 
 #ifndef CORTEX_TYPE_cortex_messages_Events_7A86515720EDCDE6
 #define CORTEX_TYPE_cortex_messages_Events_7A86515720EDCDE6
@@ -818,6 +876,80 @@ struct Codec<::cortex::messages::Parameters> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_Parameters_5F1FE3F15D54C917
 
+#ifndef CORTEX_TYPE_cortex_messages_Path_AEE06658D5893930
+#define CORTEX_TYPE_cortex_messages_Path_AEE06658D5893930
+namespace cortex::messages {
+struct Path {
+  std::int64_t stamp_ns{};  // ns
+  cortex::Array<std::int64_t, 1> time_ns{};  // [n], ns
+  cortex::Array<double, 2> position{};  // [n, 3], m, frame world
+  std::string frame_id{};
+  std::uint64_t sequence{};
+
+  friend bool operator==(const Path& a, const Path& b) {
+    return a.stamp_ns == b.stamp_ns &&
+           a.time_ns == b.time_ns &&
+           a.position == b.position &&
+           a.frame_id == b.frame_id &&
+           a.sequence == b.sequence;
+  }
+  friend bool operator!=(const Path& a, const Path& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::Path> {
+  static constexpr std::string_view name = "cortex/Path";
+  static constexpr std::uint64_t fingerprint = 0xAEE06658D5893930u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/Path\",\"fields\":[{\"name\":\"stamp_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},"
+      "{\"name\":\"time_ns\",\"type\":{\"array\":\"int64\",\"shape\":[\"n\"]},\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\""
+      "position\",\"type\":{\"array\":\"float64\",\"shape\":[\"n\",3]},\"unit\":\"m\",\"frame\":\"world\"},{\"name\":\""
+      "frame_id\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"sequence\",\"type\":\"uint64\",\"unit\":\"\","
+      "\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 56;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = true;
+
+  static std::int64_t stamp(const ::cortex::messages::Path& message) noexcept {
+    return static_cast<std::int64_t>(message.stamp_ns);
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::Path& out) {
+    Dimension<MalformedMessage> dimension_n("n");
+    reader.scalar(at, out.stamp_ns);
+    reader.array(at + 8, out.time_ns);
+    dimension_n(out.time_ns.shape()[0], "cortex/Path.time_ns");
+    reader.array(at + 20, out.position);
+    dimension_n(out.position.shape()[0], "cortex/Path.position");
+    check_extent<MalformedMessage>(out.position.shape()[1], 3u, "cortex/Path.position");
+    reader.text(at + 36, out.frame_id);
+    reader.scalar(at + 48, out.sequence);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::Path& message) {
+    Dimension<std::invalid_argument> dimension_n("n");
+    sink.scalar(at, message.stamp_ns);
+    dimension_n(message.time_ns.shape()[0], "cortex/Path.time_ns");
+    sink.array(at + 8, message.time_ns);
+    dimension_n(message.position.shape()[0], "cortex/Path.position");
+    check_extent<std::invalid_argument>(message.position.shape()[1], 3u, "cortex/Path.position");
+    sink.array(at + 20, message.position);
+    sink.text(at + 36, message.frame_id);
+    sink.zero(at + 44, 4);
+    sink.scalar(at + 48, message.sequence);
+  }
+
+  static void draft(Placer& placer, ::cortex::messages::Path& out) {
+    placer.array(out.time_ns, {Placer::Extent{"n", 0}});
+    placer.array(out.position, {Placer::Extent{"n", 0}, Placer::Extent{nullptr, 3u}});
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_Path_AEE06658D5893930
+
 #ifndef CORTEX_TYPE_cortex_messages_PointCloud_C731F8FECE59BAFE
 #define CORTEX_TYPE_cortex_messages_PointCloud_C731F8FECE59BAFE
 namespace cortex::messages {
@@ -1038,6 +1170,130 @@ struct Codec<::cortex::messages::RateThrustCommand> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_RateThrustCommand_91674913A79C2973
 
+#ifndef CORTEX_TYPE_cortex_messages_Reset_F2C3755C865D0572
+#define CORTEX_TYPE_cortex_messages_Reset_F2C3755C865D0572
+namespace cortex::messages {
+struct Reset {
+  std::optional<std::int64_t> seed{};
+  std::string vehicle{};
+  std::optional<std::array<double, 3>> position{};  // m, frame world
+  std::optional<std::array<double, 4>> orientation{};
+  std::optional<std::array<double, 3>> velocity{};  // m/s, frame world
+  std::optional<std::array<double, 3>> body_rate{};  // rad/s, frame body
+
+  friend bool operator==(const Reset& a, const Reset& b) {
+    return a.seed == b.seed &&
+           a.vehicle == b.vehicle &&
+           a.position == b.position &&
+           a.orientation == b.orientation &&
+           a.velocity == b.velocity &&
+           a.body_rate == b.body_rate;
+  }
+  friend bool operator!=(const Reset& a, const Reset& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::Reset> {
+  static constexpr std::string_view name = "cortex/Reset";
+  static constexpr std::uint64_t fingerprint = 0xF2C3755C865D0572u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/Reset\",\"fields\":[{\"name\":\"seed\",\"type\":{\"optional\":\"int64\"},\"unit\":\"\",\"fra"
+      "me\":\"\"},{\"name\":\"vehicle\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"position\",\"type\":{\"o"
+      "ptional\":{\"array\":\"float64\",\"shape\":[3]}},\"unit\":\"m\",\"frame\":\"world\"},{\"name\":\"orientation"
+      "\",\"type\":{\"optional\":{\"array\":\"float64\",\"shape\":[4]}},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"veloc"
+      "ity\",\"type\":{\"optional\":{\"array\":\"float64\",\"shape\":[3]}},\"unit\":\"m/s\",\"frame\":\"world\"},{\"n"
+      "ame\":\"body_rate\",\"type\":{\"optional\":{\"array\":\"float64\",\"shape\":[3]}},\"unit\":\"rad/s\",\"frame"
+      "\":\"body\"}]}";
+  static constexpr std::size_t block = 160;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::Reset& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::Reset& out) {
+    if (reader.present(at)) {
+      auto& item2 = out.seed.emplace();
+      reader.scalar(at + 8, item2);
+    } else {
+      out.seed.reset();
+    }
+    reader.text(at + 16, out.vehicle);
+    if (reader.present(at + 24)) {
+      auto& item2 = out.position.emplace();
+      reader.fixed(at + 24 + 8, item2);
+    } else {
+      out.position.reset();
+    }
+    if (reader.present(at + 56)) {
+      auto& item2 = out.orientation.emplace();
+      reader.fixed(at + 56 + 8, item2);
+    } else {
+      out.orientation.reset();
+    }
+    if (reader.present(at + 96)) {
+      auto& item2 = out.velocity.emplace();
+      reader.fixed(at + 96 + 8, item2);
+    } else {
+      out.velocity.reset();
+    }
+    if (reader.present(at + 128)) {
+      auto& item2 = out.body_rate.emplace();
+      reader.fixed(at + 128 + 8, item2);
+    } else {
+      out.body_rate.reset();
+    }
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::Reset& message) {
+    if (message.seed.has_value()) {
+      sink.scalar(at, std::uint8_t{1});
+      sink.zero(at + 1, 7);
+      sink.scalar(at + 8, (*message.seed));
+    } else {
+      sink.zero(at, 16);
+    }
+    sink.text(at + 16, message.vehicle);
+    if (message.position.has_value()) {
+      sink.scalar(at + 24, std::uint8_t{1});
+      sink.zero(at + 24 + 1, 7);
+      sink.fixed(at + 24 + 8, (*message.position));
+    } else {
+      sink.zero(at + 24, 32);
+    }
+    if (message.orientation.has_value()) {
+      sink.scalar(at + 56, std::uint8_t{1});
+      sink.zero(at + 56 + 1, 7);
+      sink.fixed(at + 56 + 8, (*message.orientation));
+    } else {
+      sink.zero(at + 56, 40);
+    }
+    if (message.velocity.has_value()) {
+      sink.scalar(at + 96, std::uint8_t{1});
+      sink.zero(at + 96 + 1, 7);
+      sink.fixed(at + 96 + 8, (*message.velocity));
+    } else {
+      sink.zero(at + 96, 32);
+    }
+    if (message.body_rate.has_value()) {
+      sink.scalar(at + 128, std::uint8_t{1});
+      sink.zero(at + 128 + 1, 7);
+      sink.fixed(at + 128 + 8, (*message.body_rate));
+    } else {
+      sink.zero(at + 128, 32);
+    }
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Reset& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_Reset_F2C3755C865D0572
+
 #ifndef CORTEX_TYPE_cortex_messages_RotorSpeeds_4479009E8F5E5281
 #define CORTEX_TYPE_cortex_messages_RotorSpeeds_4479009E8F5E5281
 namespace cortex::messages {
@@ -1096,6 +1352,530 @@ struct Codec<::cortex::messages::RotorSpeeds> {
 };
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_RotorSpeeds_4479009E8F5E5281
+
+#ifndef CORTEX_TYPE_cortex_messages_SensorStatus_D4AD0AAC0CCF4967
+#define CORTEX_TYPE_cortex_messages_SensorStatus_D4AD0AAC0CCF4967
+namespace cortex::messages {
+struct SensorStatus {
+  std::string vehicle{};
+  std::string name{};
+  bool active{};
+  std::uint32_t subscriber_count{};
+  std::uint64_t published_count{};
+  std::uint64_t dropped_count{};
+  std::uint64_t injected_lost_count{};
+  std::uint64_t undelivered_count{};
+  std::int64_t late_p99_ns{};  // ns
+
+  friend bool operator==(const SensorStatus& a, const SensorStatus& b) {
+    return a.vehicle == b.vehicle &&
+           a.name == b.name &&
+           a.active == b.active &&
+           a.subscriber_count == b.subscriber_count &&
+           a.published_count == b.published_count &&
+           a.dropped_count == b.dropped_count &&
+           a.injected_lost_count == b.injected_lost_count &&
+           a.undelivered_count == b.undelivered_count &&
+           a.late_p99_ns == b.late_p99_ns;
+  }
+  friend bool operator!=(const SensorStatus& a, const SensorStatus& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::SensorStatus> {
+  static constexpr std::string_view name = "cortex/SensorStatus";
+  static constexpr std::uint64_t fingerprint = 0xD4AD0AAC0CCF4967u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/SensorStatus\",\"fields\":[{\"name\":\"vehicle\",\"type\":\"str\",\"unit\":\"\",\"frame\":\""
+      "\"},{\"name\":\"name\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"active\",\"type\":\"bool\",\"unit\""
+      ":\"\",\"frame\":\"\"},{\"name\":\"subscriber_count\",\"type\":\"uint32\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\""
+      "published_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"dropped_count\",\"type\":\"uin"
+      "t64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"injected_lost_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\""
+      ":\"\"},{\"name\":\"undelivered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"late_p99_n"
+      "s\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 64;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::SensorStatus& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::SensorStatus& out) {
+    reader.text(at, out.vehicle);
+    reader.text(at + 8, out.name);
+    reader.scalar(at + 16, out.active);
+    reader.scalar(at + 20, out.subscriber_count);
+    reader.scalar(at + 24, out.published_count);
+    reader.scalar(at + 32, out.dropped_count);
+    reader.scalar(at + 40, out.injected_lost_count);
+    reader.scalar(at + 48, out.undelivered_count);
+    reader.scalar(at + 56, out.late_p99_ns);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::SensorStatus& message) {
+    sink.text(at, message.vehicle);
+    sink.text(at + 8, message.name);
+    sink.scalar(at + 16, message.active);
+    sink.zero(at + 17, 3);
+    sink.scalar(at + 20, message.subscriber_count);
+    sink.scalar(at + 24, message.published_count);
+    sink.scalar(at + 32, message.dropped_count);
+    sink.scalar(at + 40, message.injected_lost_count);
+    sink.scalar(at + 48, message.undelivered_count);
+    sink.scalar(at + 56, message.late_p99_ns);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::SensorStatus& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_SensorStatus_D4AD0AAC0CCF4967
+
+#ifndef CORTEX_TYPE_cortex_messages_Simulation_8CDBE28B1B7875C6
+#define CORTEX_TYPE_cortex_messages_Simulation_8CDBE28B1B7875C6
+namespace cortex::messages {
+struct Simulation {
+  std::string config{};
+  std::string version{};
+  std::vector<std::string> vehicles{};
+  std::string mode{};
+  double control_rate_hz{};  // Hz
+
+  friend bool operator==(const Simulation& a, const Simulation& b) {
+    return a.config == b.config &&
+           a.version == b.version &&
+           a.vehicles == b.vehicles &&
+           a.mode == b.mode &&
+           a.control_rate_hz == b.control_rate_hz;
+  }
+  friend bool operator!=(const Simulation& a, const Simulation& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::Simulation> {
+  static constexpr std::string_view name = "cortex/Simulation";
+  static constexpr std::uint64_t fingerprint = 0x8CDBE28B1B7875C6u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/Simulation\",\"fields\":[{\"name\":\"config\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},"
+      "{\"name\":\"version\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"vehicles\",\"type\":{\"list\":\"st"
+      "r\"},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"contr"
+      "ol_rate_hz\",\"type\":\"float64\",\"unit\":\"Hz\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 40;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::Simulation& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::Simulation& out) {
+    reader.text(at, out.config);
+    reader.text(at + 8, out.version);
+    {
+      const auto list2 = reader.list(at + 16, 8);
+      out.vehicles.clear();
+      out.vehicles.reserve(list2.count);
+      for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
+        std::string item2{};
+        reader.text(list2.at + k2 * 8, item2);
+        out.vehicles.push_back(std::move(item2));
+      }
+    }
+    reader.text(at + 24, out.mode);
+    reader.scalar(at + 32, out.control_rate_hz);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::Simulation& message) {
+    sink.text(at, message.config);
+    sink.text(at + 8, message.version);
+    {
+      const std::size_t start2 =
+          sink.list(at + 16, message.vehicles.size(), 8, 8);
+      for (std::size_t k2 = 0; k2 < message.vehicles.size(); ++k2) {
+        const auto& item2 = message.vehicles[k2];
+        sink.text(start2 + k2 * 8, item2);
+      }
+    }
+    sink.text(at + 24, message.mode);
+    sink.scalar(at + 32, message.control_rate_hz);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Simulation& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_Simulation_8CDBE28B1B7875C6
+
+#ifndef CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
+#define CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
+namespace cortex::messages {
+struct SimulatorReply {
+  bool accepted{};
+  std::string reason{};
+  std::int64_t stamp_ns{};  // ns
+  std::string phase{};
+
+  friend bool operator==(const SimulatorReply& a, const SimulatorReply& b) {
+    return a.accepted == b.accepted &&
+           a.reason == b.reason &&
+           a.stamp_ns == b.stamp_ns &&
+           a.phase == b.phase;
+  }
+  friend bool operator!=(const SimulatorReply& a, const SimulatorReply& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::SimulatorReply> {
+  static constexpr std::string_view name = "cortex/SimulatorReply";
+  static constexpr std::uint64_t fingerprint = 0x5DCD028328196B99u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/SimulatorReply\",\"fields\":[{\"name\":\"accepted\",\"type\":\"bool\",\"unit\":\"\",\"fram"
+      "e\":\"\"},{\"name\":\"reason\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"stamp_ns\",\"type\":\"int6"
+      "4\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"phase\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 32;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = true;
+
+  static std::int64_t stamp(const ::cortex::messages::SimulatorReply& message) noexcept {
+    return static_cast<std::int64_t>(message.stamp_ns);
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::SimulatorReply& out) {
+    reader.scalar(at, out.accepted);
+    reader.text(at + 4, out.reason);
+    reader.scalar(at + 16, out.stamp_ns);
+    reader.text(at + 24, out.phase);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::SimulatorReply& message) {
+    sink.scalar(at, message.accepted);
+    sink.zero(at + 1, 3);
+    sink.text(at + 4, message.reason);
+    sink.zero(at + 12, 4);
+    sink.scalar(at + 16, message.stamp_ns);
+    sink.text(at + 24, message.phase);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::SimulatorReply& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
+
+#ifndef CORTEX_TYPE_cortex_messages_VehicleStatus_78ECFE6B01F9C7CC
+#define CORTEX_TYPE_cortex_messages_VehicleStatus_78ECFE6B01F9C7CC
+namespace cortex::messages {
+struct VehicleStatus {
+  std::string name{};
+  std::string command_mode{};
+  std::uint64_t command_count{};
+  std::uint64_t refused_count{};
+  std::uint64_t superseded_count{};
+  std::uint64_t lost_count{};
+  std::int64_t command_age_ns{};  // ns
+  bool fail_safe{};
+  std::uint64_t fail_safe_count{};
+  std::uint64_t collision_count{};
+  std::uint64_t undelivered_count{};
+
+  friend bool operator==(const VehicleStatus& a, const VehicleStatus& b) {
+    return a.name == b.name &&
+           a.command_mode == b.command_mode &&
+           a.command_count == b.command_count &&
+           a.refused_count == b.refused_count &&
+           a.superseded_count == b.superseded_count &&
+           a.lost_count == b.lost_count &&
+           a.command_age_ns == b.command_age_ns &&
+           a.fail_safe == b.fail_safe &&
+           a.fail_safe_count == b.fail_safe_count &&
+           a.collision_count == b.collision_count &&
+           a.undelivered_count == b.undelivered_count;
+  }
+  friend bool operator!=(const VehicleStatus& a, const VehicleStatus& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::VehicleStatus> {
+  static constexpr std::string_view name = "cortex/VehicleStatus";
+  static constexpr std::uint64_t fingerprint = 0x78ECFE6B01F9C7CCu;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/VehicleStatus\",\"fields\":[{\"name\":\"name\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}"
+      ",{\"name\":\"command_mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_count\",\"type\":"
+      "\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"refused_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\""
+      "\"},{\"name\":\"superseded_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"lost_count\",\""
+      "type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_age_ns\",\"type\":\"int64\",\"unit\":\"ns\",\""
+      "frame\":\"\"},{\"name\":\"fail_safe\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"fail_safe_coun"
+      "t\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"collision_count\",\"type\":\"uint64\",\"unit\":"
+      "\"\",\"frame\":\"\"},{\"name\":\"undelivered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 88;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::VehicleStatus& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::VehicleStatus& out) {
+    reader.text(at, out.name);
+    reader.text(at + 8, out.command_mode);
+    reader.scalar(at + 16, out.command_count);
+    reader.scalar(at + 24, out.refused_count);
+    reader.scalar(at + 32, out.superseded_count);
+    reader.scalar(at + 40, out.lost_count);
+    reader.scalar(at + 48, out.command_age_ns);
+    reader.scalar(at + 56, out.fail_safe);
+    reader.scalar(at + 64, out.fail_safe_count);
+    reader.scalar(at + 72, out.collision_count);
+    reader.scalar(at + 80, out.undelivered_count);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::VehicleStatus& message) {
+    sink.text(at, message.name);
+    sink.text(at + 8, message.command_mode);
+    sink.scalar(at + 16, message.command_count);
+    sink.scalar(at + 24, message.refused_count);
+    sink.scalar(at + 32, message.superseded_count);
+    sink.scalar(at + 40, message.lost_count);
+    sink.scalar(at + 48, message.command_age_ns);
+    sink.scalar(at + 56, message.fail_safe);
+    sink.zero(at + 57, 7);
+    sink.scalar(at + 64, message.fail_safe_count);
+    sink.scalar(at + 72, message.collision_count);
+    sink.scalar(at + 80, message.undelivered_count);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::VehicleStatus& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_VehicleStatus_78ECFE6B01F9C7CC
+
+#ifndef CORTEX_TYPE_cortex_messages_SimulatorStatus_382EAA25FF6EC90C
+#define CORTEX_TYPE_cortex_messages_SimulatorStatus_382EAA25FF6EC90C
+namespace cortex::messages {
+struct SimulatorStatus {
+  std::int64_t stamp_ns{};  // ns
+  std::int64_t wall_ns{};  // ns, frame CLOCK_REALTIME
+  std::string phase{};
+  std::string reason{};
+  std::string mode{};
+  double real_time_factor_wanted{};
+  double real_time_factor{};
+  std::uint64_t step_count{};
+  std::int64_t step_median_ns{};  // ns
+  std::int64_t step_p99_ns{};  // ns
+  std::int64_t late_median_ns{};  // ns
+  std::int64_t late_p99_ns{};  // ns
+  std::uint64_t overrun_count{};
+  std::int64_t slipped_ns{};  // ns
+  std::vector<::cortex::messages::SensorStatus> sensors{};
+  std::vector<::cortex::messages::VehicleStatus> vehicles{};
+  std::uint64_t sequence{};
+
+  friend bool operator==(const SimulatorStatus& a, const SimulatorStatus& b) {
+    return a.stamp_ns == b.stamp_ns &&
+           a.wall_ns == b.wall_ns &&
+           a.phase == b.phase &&
+           a.reason == b.reason &&
+           a.mode == b.mode &&
+           a.real_time_factor_wanted == b.real_time_factor_wanted &&
+           a.real_time_factor == b.real_time_factor &&
+           a.step_count == b.step_count &&
+           a.step_median_ns == b.step_median_ns &&
+           a.step_p99_ns == b.step_p99_ns &&
+           a.late_median_ns == b.late_median_ns &&
+           a.late_p99_ns == b.late_p99_ns &&
+           a.overrun_count == b.overrun_count &&
+           a.slipped_ns == b.slipped_ns &&
+           a.sensors == b.sensors &&
+           a.vehicles == b.vehicles &&
+           a.sequence == b.sequence;
+  }
+  friend bool operator!=(const SimulatorStatus& a, const SimulatorStatus& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::SimulatorStatus> {
+  static constexpr std::string_view name = "cortex/SimulatorStatus";
+  static constexpr std::uint64_t fingerprint = 0x382EAA25FF6EC90Cu;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/SimulatorStatus\",\"fields\":[{\"name\":\"stamp_ns\",\"type\":\"int64\",\"unit\":\"ns\",\""
+      "frame\":\"\"},{\"name\":\"wall_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"CLOCK_REALTIME\"},{\"name\":"
+      "\"phase\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"reason\",\"type\":\"str\",\"unit\":\"\",\"frame\""
+      ":\"\"},{\"name\":\"mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"real_time_factor_wanted\",\""
+      "type\":\"float64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"real_time_factor\",\"type\":\"float64\",\"unit\":\""
+      "\",\"frame\":\"\"},{\"name\":\"step_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"step_med"
+      "ian_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"step_p99_ns\",\"type\":\"int64\",\"unit\""
+      ":\"ns\",\"frame\":\"\"},{\"name\":\"late_median_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":"
+      "\"late_p99_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"overrun_count\",\"type\":\"uint6"
+      "4\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"slipped_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"nam"
+      "e\":\"sensors\",\"type\":{\"list\":{\"message\":{\"name\":\"cortex/SensorStatus\",\"fields\":[{\"name\":\"ve"
+      "hicle\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"name\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\""
+      "},{\"name\":\"active\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"subscriber_count\",\"type\":\""
+      "uint32\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"published_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":"
+      "\"\"},{\"name\":\"dropped_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"injected_lost_c"
+      "ount\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"undelivered_count\",\"type\":\"uint64\",\"u"
+      "nit\":\"\",\"frame\":\"\"},{\"name\":\"late_p99_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"}]}}},\"unit"
+      "\":\"\",\"frame\":\"\"},{\"name\":\"vehicles\",\"type\":{\"list\":{\"message\":{\"name\":\"cortex/VehicleStatu"
+      "s\",\"fields\":[{\"name\":\"name\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_mode\",\"typ"
+      "e\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\""
+      "\"},{\"name\":\"refused_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"superseded_count"
+      "\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"lost_count\",\"type\":\"uint64\",\"unit\":\"\",\"fr"
+      "ame\":\"\"},{\"name\":\"command_age_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"fail_saf"
+      "e\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"fail_safe_count\",\"type\":\"uint64\",\"unit\":\"\""
+      ",\"frame\":\"\"},{\"name\":\"collision_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"unde"
+      "livered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}}},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"se"
+      "quence\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 136;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = false;
+  static constexpr bool stamped = true;
+
+  static std::int64_t stamp(const ::cortex::messages::SimulatorStatus& message) noexcept {
+    return static_cast<std::int64_t>(message.stamp_ns);
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::SimulatorStatus& out) {
+    reader.scalar(at, out.stamp_ns);
+    reader.scalar(at + 8, out.wall_ns);
+    reader.text(at + 16, out.phase);
+    reader.text(at + 24, out.reason);
+    reader.text(at + 32, out.mode);
+    reader.scalar(at + 40, out.real_time_factor_wanted);
+    reader.scalar(at + 48, out.real_time_factor);
+    reader.scalar(at + 56, out.step_count);
+    reader.scalar(at + 64, out.step_median_ns);
+    reader.scalar(at + 72, out.step_p99_ns);
+    reader.scalar(at + 80, out.late_median_ns);
+    reader.scalar(at + 88, out.late_p99_ns);
+    reader.scalar(at + 96, out.overrun_count);
+    reader.scalar(at + 104, out.slipped_ns);
+    {
+      const auto list2 = reader.list(at + 112, 64);
+      out.sensors.clear();
+      out.sensors.reserve(list2.count);
+      for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
+        ::cortex::messages::SensorStatus item2{};
+        Codec<::cortex::messages::SensorStatus>::decode(reader, list2.at + k2 * 64, item2);
+        out.sensors.push_back(std::move(item2));
+      }
+    }
+    {
+      const auto list2 = reader.list(at + 120, 88);
+      out.vehicles.clear();
+      out.vehicles.reserve(list2.count);
+      for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
+        ::cortex::messages::VehicleStatus item2{};
+        Codec<::cortex::messages::VehicleStatus>::decode(reader, list2.at + k2 * 88, item2);
+        out.vehicles.push_back(std::move(item2));
+      }
+    }
+    reader.scalar(at + 128, out.sequence);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::SimulatorStatus& message) {
+    sink.scalar(at, message.stamp_ns);
+    sink.scalar(at + 8, message.wall_ns);
+    sink.text(at + 16, message.phase);
+    sink.text(at + 24, message.reason);
+    sink.text(at + 32, message.mode);
+    sink.scalar(at + 40, message.real_time_factor_wanted);
+    sink.scalar(at + 48, message.real_time_factor);
+    sink.scalar(at + 56, message.step_count);
+    sink.scalar(at + 64, message.step_median_ns);
+    sink.scalar(at + 72, message.step_p99_ns);
+    sink.scalar(at + 80, message.late_median_ns);
+    sink.scalar(at + 88, message.late_p99_ns);
+    sink.scalar(at + 96, message.overrun_count);
+    sink.scalar(at + 104, message.slipped_ns);
+    {
+      const std::size_t start2 =
+          sink.list(at + 112, message.sensors.size(), 64, 8);
+      for (std::size_t k2 = 0; k2 < message.sensors.size(); ++k2) {
+        const auto& item2 = message.sensors[k2];
+        Codec<::cortex::messages::SensorStatus>::encode(sink, start2 + k2 * 64, item2);
+      }
+    }
+    {
+      const std::size_t start2 =
+          sink.list(at + 120, message.vehicles.size(), 88, 8);
+      for (std::size_t k2 = 0; k2 < message.vehicles.size(); ++k2) {
+        const auto& item2 = message.vehicles[k2];
+        Codec<::cortex::messages::VehicleStatus>::encode(sink, start2 + k2 * 88, item2);
+      }
+    }
+    sink.scalar(at + 128, message.sequence);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::SimulatorStatus& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_SimulatorStatus_382EAA25FF6EC90C
+
+#ifndef CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
+#define CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
+namespace cortex::messages {
+struct Step {
+  std::uint32_t count{};
+  double timeout_s{};  // s
+
+  friend bool operator==(const Step& a, const Step& b) {
+    return a.count == b.count &&
+           a.timeout_s == b.timeout_s;
+  }
+  friend bool operator!=(const Step& a, const Step& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::Step> {
+  static constexpr std::string_view name = "cortex/Step";
+  static constexpr std::uint64_t fingerprint = 0xF36F31368FC43311u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/Step\",\"fields\":[{\"name\":\"count\",\"type\":\"uint32\",\"unit\":\"\",\"frame\":\"\"},{\"na"
+      "me\":\"timeout_s\",\"type\":\"float64\",\"unit\":\"s\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 16;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = true;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::Step& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::Step& out) {
+    reader.scalar(at, out.count);
+    reader.scalar(at + 8, out.timeout_s);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::Step& message) {
+    sink.scalar(at, message.count);
+    sink.zero(at + 4, 4);
+    sink.scalar(at + 8, message.timeout_s);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Step& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
 
 #ifndef CORTEX_TYPE_cortex_messages_Text_62AB79C7A7989E5E
 #define CORTEX_TYPE_cortex_messages_Text_62AB79C7A7989E5E
@@ -1216,6 +1996,50 @@ struct Codec<::cortex::messages::Transform> {
 };
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_Transform_63F69E56AA6773F9
+
+#ifndef CORTEX_TYPE_cortex_messages_Trigger_32A0F962AED85713
+#define CORTEX_TYPE_cortex_messages_Trigger_32A0F962AED85713
+namespace cortex::messages {
+struct Trigger {
+  std::uint64_t sequence{};
+
+  friend bool operator==(const Trigger& a, const Trigger& b) {
+    return a.sequence == b.sequence;
+  }
+  friend bool operator!=(const Trigger& a, const Trigger& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::Trigger> {
+  static constexpr std::string_view name = "cortex/Trigger";
+  static constexpr std::uint64_t fingerprint = 0x32A0F962AED85713u;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/Trigger\",\"fields\":[{\"name\":\"sequence\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\""
+      "}]}";
+  static constexpr std::size_t block = 8;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = true;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::Trigger& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::Trigger& out) {
+    reader.scalar(at, out.sequence);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::Trigger& message) {
+    sink.scalar(at, message.sequence);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Trigger& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_Trigger_32A0F962AED85713
 
 #ifndef CORTEX_TYPE_cortex_messages_VelocityCommand_9298B48D6BE20756
 #define CORTEX_TYPE_cortex_messages_VelocityCommand_9298B48D6BE20756
