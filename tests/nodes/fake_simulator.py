@@ -97,8 +97,8 @@ class FakeSimulator:
             assert publisher.wait_for_subscribers(timeout_s=15.0)
 
     def wait_for_cameras(self) -> None:
-        """Wait until the viewer listens to every sensor."""
-        for publisher in self.sensors.values():
+        """Wait until the viewer listens to every sensor, and to the state."""
+        for publisher in (*self.sensors.values(), self.odometry, self.rotor_speeds):
             assert publisher.wait_for_subscribers(timeout_s=15.0)
 
     def state(self, k: int) -> None:

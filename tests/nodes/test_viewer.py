@@ -99,7 +99,8 @@ def grows_to(
     def fulfilled() -> bool:
         nonlocal rows
         meanwhile()
-        with contextlib.suppress(FileNotFoundError, ValueError):  # it has no recording yet
+        # it has no recording yet, or its last message is half written
+        with contextlib.suppress(FileNotFoundError, ValueError, RuntimeError):
             rows = read(path)
         return bool(rows and check(rows))
 
