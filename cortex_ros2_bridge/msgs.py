@@ -144,11 +144,6 @@ def _ros_class(type_name: str) -> Any | None:
     return getattr(module, name, None)
 
 
-def field_values(message: Any) -> dict[str, Any]:
-    """Return the values of the fields of a message of any origin by name, in their order."""
-    return {name: getattr(message, name) for name in message.get_fields_and_field_types()}
-
-
 def _make_class(type_name: str) -> Any:
     constants, entries = typestore().fielddefs[type_name]
     base = type_name.rpartition("/")[2]

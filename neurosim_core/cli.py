@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import atexit
-import contextlib
 import gc
 import logging
 import os
@@ -13,23 +12,21 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from neurosim_core import __version__
+from neurosim_core.signals import handle_signals, leave_at_once
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
-    atexit.register(
-        gc.freeze
-    )  # else the collector looks at all objects once more: 0.4 s with a scene in memory
+    atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     arguments = _parser().parse_args(argv)
-    with _leave_at_once():
+    with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         _start_warp()
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         try:
@@ -40,43 +37,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print("neurosim: interrupted", file=sys.stderr)
             return 130
-
-
-@contextlib.contextmanager
-def _leave_at_once() -> Iterator[None]:
-    """Let Ctrl-C and `kill` end the process on the spot, which a `KeyboardInterrupt` in an import may not.
-
-    Commands that have something to close install handlers of their own while they have.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread is told of signals
-        return
-
-    def leave(_signal: int, _frame: object) -> None:
-        os.write(2, b"neurosim: interrupted\n")
-        os._exit(130)
-
-    before = {number: signal.signal(number, leave) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let Ctrl-C and `kill` raise a `KeyboardInterrupt`, for what has something to close."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _start_warp() -> None:
@@ -417,7 +377,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     overrides = _overrides(arguments)
     given = arguments.config is not None or overrides
     config = load_config(arguments.config, overrides=overrides) if given else None
-    with _interruptible():
+    with handle_signals(signal.default_int_handler):
         return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
 
@@ -432,7 +392,7 @@ def _up(arguments: argparse.Namespace) -> int:
 def _call(arguments: argparse.Namespace) -> int:
     from neurosim_core.nodes.call import call
 
-    with _interruptible():
+    with handle_signals(signal.default_int_handler):
         return call(arguments)
 
 
@@ -465,7 +425,7 @@ def _bench_closed_loop(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.bench.closed_loop import bench_closed_loop
 
-    with _interruptible():
+    with handle_signals(signal.default_int_handler):
         bench_closed_loop(
             arguments.out,
             Console(),
@@ -486,7 +446,7 @@ def _bench_streaming(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.bench.streaming import bench_streaming
 
-    with _interruptible():
+    with handle_signals(signal.default_int_handler):
         bench_streaming(
             arguments.out,
             Console(),
@@ -506,7 +466,7 @@ def _bench_delay(arguments: argparse.Namespace) -> int:
 
     from neurosim_core.bench.delay import bench_delay
 
-    with _interruptible():
+    with handle_signals(signal.default_int_handler):
         bench_delay(
             arguments.out,
             Console(),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import itertools
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
 from neurosim_core.sensors.rig import Cast
+from neurosim_core.signals import stop_at_signals
 from neurosim_core.simulation import Model, State, load_scene, make_model, make_state, run_model
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.view.overview import FlightSummary, Track, save_overview
@@ -112,9 +112,10 @@ def fly(
     (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
 
     summary = FlightSummary(describe_sensors(config.sensors))
+    stop = threading.Event()
     begin = time.perf_counter()
     with (
-        _stop_at_interrupt() as stop,
+        stop_at_signals(stop),
         _sinks(model, folder, rerun=rerun, console=console) as sinks,
         _progress(console) as progress,
     ):
@@ -220,27 +221,6 @@ def _sinks(
             sinks.append(stack.enter_context(logger).log)
             sinks.append(lambda packet: _log_clearance(logger, model, packet))
         yield sinks
-
-
-@contextlib.contextmanager
-def _stop_at_interrupt() -> Iterator[threading.Event]:
-    """Turn Ctrl-C and `kill` into an event, so that no file is broken off. The second one does."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop  # only the main thread is told of signals
-        return
-
-    def on_interrupt(_signal: int, _frame: object) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _log_clearance(logger: RerunLogger, model: Model, packet: Packet) -> None:

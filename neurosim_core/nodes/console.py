@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -17,26 +14,6 @@ from cortex.messages import SimulatorStatus
 from neurosim_core.config import SimulationConfig
 from neurosim_core.nodes import topics
 from neurosim_core.nodes.craft import Craft
-
-
-@contextlib.contextmanager
-def stop_at_signals(stop: threading.Event) -> Iterator[None]:
-    """Turn SIGINT and SIGTERM into an event: they must not break into the writing of a file. A second may."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread is told of signals
-        return
-
-    def on_signal(_signal: int, _frame: object) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def print_plan(console: Console, crafts: Sequence[Craft], config: SimulationConfig) -> None:

@@ -25,7 +25,7 @@ from neurosim_core.config import SimulationConfig
 from neurosim_core.nodes.audience import Audience
 from neurosim_core.nodes.beginning import Beginning, make_beginning
 from neurosim_core.nodes.cameras import Cameras, sees_inline
-from neurosim_core.nodes.console import StatusLine, print_end, print_plan, stop_at_signals
+from neurosim_core.nodes.console import StatusLine, print_end, print_plan
 from neurosim_core.nodes.craft import Craft
 from neurosim_core.nodes.helm import Command
 from neurosim_core.nodes.meetings import Meetings
@@ -36,6 +36,7 @@ from neurosim_core.nodes.status import Board, Meter
 from neurosim_core.nodes.streaming import Streaming
 from neurosim_core.pacing import Pacer
 from neurosim_core.packets import Packet
+from neurosim_core.signals import stop_at_signals
 from neurosim_core.simulation import Model, make_fleet, warm_up
 from neurosim_core.vehicle import DynamicsError
 

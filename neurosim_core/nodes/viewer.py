@@ -24,9 +24,9 @@ from cortex import messages as msg
 from cortex.schema import TypeMismatch
 from neurosim_core.config import ConfigError
 from neurosim_core.nodes import topics
-from neurosim_core.nodes.console import stop_at_signals
 from neurosim_core.nodes.scene_loader import SceneLoader
 from neurosim_core.nodes.show import Show
+from neurosim_core.signals import stop_at_signals
 from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded

@@ -1,0 +1,43 @@
+"""What Ctrl-C and `kill` do for the time of a block."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+
+@contextlib.contextmanager
+def handle_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Have SIGINT and SIGTERM call a handler; other threads than the main one are not told of signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+@contextlib.contextmanager
+def stop_at_signals(stop: threading.Event) -> Iterator[None]:
+    """Turn signals into an event: they must not break into the writing of a file. A second may."""
+
+    def on_signal(_signal: int, _frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    with handle_signals(on_signal):
+        yield
+
+
+def leave_at_once(_signal: int, _frame: FrameType | None) -> None:
+    """End the process on the spot, as long as nothing is open; imports may swallow a `KeyboardInterrupt`."""
+    os.write(2, b"neurosim: interrupted\n")
+    os._exit(130)
