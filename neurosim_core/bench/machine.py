@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import platform
 import shlex
+import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -13,9 +14,10 @@ from typing import Any
 
 import warp as wp
 
+import neurosim_core
 from neurosim_core import __version__
 
-_LIBRARIES = ("numpy", "warp-lang", "pyzmq")
+_LIBRARIES = ("numpy", "scipy", "warp-lang", "pyzmq")
 
 
 def describe_machine(device: Any) -> list[str]:
@@ -24,17 +26,65 @@ def describe_machine(device: Any) -> list[str]:
     Args:
         device: Where it is computed; anything that `wp.get_device` takes.
     """
-    load = " ".join(f"{value:.2f}" for value in os.getloadavg())
     place = wp.get_device(device)
     lines = [
-        f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}, `{command_line()}`",
-        f"{os.cpu_count()} cores, {processor()}, {platform.system()} {platform.release()}, load {load}",
+        f"{now()}, `{command_line()}`",
+        hardware(),
     ]
     if place.is_cuda:
         lines.append(str(place.name))
-    versions = [f"Neurosim {__version__}", f"Python {platform.python_version()}"]
-    versions += [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
-    return [*lines, ", ".join(versions)]
+    return [*lines, ", ".join(f"{name} {version}" for name, version in versions().items())]
+
+
+def now() -> str:
+    """Return the date and time, for people."""
+    return f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
+
+
+def hardware() -> str:
+    """Return cores, processor, system and its load."""
+    load = " ".join(f"{value:.2f}" for value in os.getloadavg())
+    return f"{os.cpu_count()} cores, {processor()}, {platform.system()} {platform.release()}, load {load}"
+
+
+def accelerators() -> list[str]:
+    """Return the names of the CUDA devices that Warp can use."""
+    return [str(device.name) for device in wp.get_cuda_devices()]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this program and of what it computes with, by name."""
+    own = " ".join(filter(None, (__version__, commit())))
+    return {
+        "Neurosim": own,
+        "Python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in _LIBRARIES},
+    }
+
+
+def commit() -> str:
+    """Return the commit of the checkout that this program runs from, and whether it was changed since.
+
+    Empty: it does not run from a checkout, or there is no git.
+    """
+    root = Path(neurosim_core.__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return ""
+    name = _git(root, "rev-parse", "--short=10", "HEAD")
+    if not name:
+        return ""
+    return f"{name} with changes" if _git(root, "status", "--porcelain", "--untracked-files=no") else name
+
+
+def _git(root: Path, *arguments: str) -> str:
+    """Return what git prints; empty where it fails."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=False, timeout=10.0
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 def command_line() -> str:
