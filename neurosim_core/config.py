@@ -14,6 +14,7 @@ from neurosim_core.control import Se3Config
 from neurosim_core.live import LinkConfig, LiveConfig
 from neurosim_core.render.renderer import RenderConfig, RendererName
 from neurosim_core.scene.apartment import ApartmentConfig
+from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.sensors.rig import (
@@ -133,6 +134,9 @@ class SimulationConfig(Settings):
     result."""
     scene: SceneConfig = ApartmentConfig()
     """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
+    bodies: dict[Name, BodyConfig] = Field(default_factory=dict)
+    """What moves by itself in the scene, by name: {ball: {shape: {kind: sphere}, motion: {...}}}. Cameras see
+    bodies; paths are not planned around them, and running into one is no collision."""
     renderer: RendererName = "warp"
     """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only.
     `synthetic`: a test card that costs next to nothing, to measure everything else."""
@@ -234,8 +238,8 @@ def load_config(
     """Read settings and check them.
 
     Args:
-        source: A YAML file, a mapping with the same keys, or None for the defaults. A relative scene file is
-            looked up beside the YAML file.
+        source: A YAML file, a mapping with the same keys, or None for the defaults. Relative files of the
+            scene and of bodies are looked up beside the YAML file.
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
             another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
             the default set are changed, and new ones added to it.
@@ -311,12 +315,22 @@ def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Make a relative scene file absolute: it is meant relative to the settings file."""
-    scene = raw.get("scene")
-    file = scene.get("file") if isinstance(scene, Mapping) else None
-    if not isinstance(file, str) or Path(file).expanduser().is_absolute():
-        return raw
-    return _merge(raw, {"scene": {"file": str(folder / file)}})
+    """Make relative files of scene and bodies absolute: they are meant relative to the settings file."""
+    places: list[tuple[str, ...]] = [("scene",)]
+    bodies = raw.get("bodies")
+    for name in bodies if isinstance(bodies, Mapping) else ():
+        places += [("bodies", name, "shape"), ("bodies", name, "surface")]
+    for place in places:
+        group: Any = raw
+        for key in place:
+            group = group.get(key) if isinstance(group, Mapping) else None
+        file = group.get("file") if isinstance(group, Mapping) else None
+        if isinstance(file, str) and not Path(file).expanduser().is_absolute():
+            patch: dict[str, Any] = {"file": str(folder / file)}
+            for key in reversed(place):
+                patch = {key: patch}
+            raw = _merge(raw, patch)
+    return raw
 
 
 def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:

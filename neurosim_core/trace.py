@@ -18,7 +18,7 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
-_SLOT_PARAMETER = 6
+_SLOT_PARAMETER = 7
 _LAUNCHES_MAX = 256
 
 
@@ -31,10 +31,12 @@ def _record_state(
     body_rate: wp.array[wp.vec3d],
     rotor_speed: wp.array2d[wp.float64],
     status: wp.array[wp.int32],
+    stamp_ns: wp.array[wp.int64],
     slot: int,
     # Out:
     states_out: wp.array3d[wp.float64],
     status_out: wp.array2d[wp.int32],
+    stamps_out: wp.array2d[wp.int64],
 ) -> None:
     vehicle = wp.tid()
     for axis in range(3):
@@ -46,6 +48,7 @@ def _record_state(
     for rotor in range(rotor_speed.shape[1]):
         states_out[slot, vehicle, 13 + rotor] = rotor_speed[vehicle, rotor]
     status_out[slot, vehicle] = status[vehicle]
+    stamps_out[slot, vehicle] = stamp_ns[vehicle]
 
 
 @wp.kernel
@@ -90,12 +93,14 @@ class Trace:
     Attributes:
         states: States, float64, shape [slot, vehicle, 13 + R].
         status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, vehicle].
+        stamps: Time of each state [ns], int64, shape [slot, vehicle]; only on the device.
         clearance: Room around vehicle 0 as of the last `check_room` [m], float32, shape [slot].
     """
 
     def __init__(self, *, capacity: int, vehicle_count: int, rotor_count: int, device: str) -> None:
         self.states = wp.zeros((capacity, vehicle_count, 13 + rotor_count), dtype=wp.float64, device=device)
         self.status = wp.zeros((capacity, vehicle_count), dtype=wp.int32, device=device)
+        self.stamps = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
         self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
         self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance)]
         self._recording: tuple[Any, Any] = (None, None)
@@ -103,7 +108,7 @@ class Trace:
         self._pose_launches: dict[tuple[int, int, int, int], tuple[Any, wp.Launch]] = {}
 
     def record(self, arrays: Any, slot: int) -> None:
-        """Copy the present state and status of all vehicles into a slot.
+        """Copy the present state, status and time of all vehicles into a slot.
 
         Args:
             arrays: Device arrays of the vehicles (`Multirotor.arrays`).
@@ -120,9 +125,10 @@ class Trace:
                     arrays.body_rate,
                     arrays.rotor_speed,
                     arrays.status,
+                    arrays.stamp_ns,
                     slot,
                 ],
-                outputs=[self.states, self.status],
+                outputs=[self.states, self.status, self.stamps],
                 device=self.states.device,
                 record_cmd=True,
             )

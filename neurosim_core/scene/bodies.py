@@ -1,0 +1,294 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type"
+"""Bodies that move through the scene on prescribed paths: their poses are pure functions of time.
+
+A body is rigid and has a frame O. With t the time since the start of the episode [s], and what is not given
+left out:
+
+    p_WO(t) = position + velocity t + amplitude sin(2 pi f t + phase)             sway, along a line
+              + radius (cos(2 pi n t + phase) e1 + sin(2 pi n t + phase) e2)      orbit, around its centre
+    q_WO(t) = q_rest * exp(spin t)                                                spin, about an axis of O
+
+Bodies are seen, not felt: paths are not planned around them, and running into one is no collision. They are
+lit by the scene and lie in its shadows, but cast none, neither on it nor on each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, field_validator
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.frames import Vector3, quaternion_exp
+from neurosim_core.scene.body_shapes import BoxShape, ShapeConfig, Solid, SurfaceConfig, make_solid
+from neurosim_core.settings import Settings
+
+wp.set_module_options({"enable_backward": False})
+
+_TWO_PI = wp.constant(wp.float64(2.0 * np.pi))
+_S_PER_NS = wp.constant(wp.float64(1e-9))
+
+
+class SwayConfig(Settings):
+    """A sinusoid along a line: amplitude sin(2 pi f t + phase)."""
+
+    amplitude_m: Vector3 = (0.0, 0.5, 0.0)
+    """Largest displacement, a vector in W [m]."""
+    frequency_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.5
+    """Swings to and fro a second [Hz]."""
+    phase_rad: float = 0.0
+    """Phase at t = 0 [rad]."""
+
+
+class OrbitConfig(Settings):
+    """A circle at constant speed around `position_m`; the body does not turn with it (see `spin_rad_s`)."""
+
+    radius_m: Annotated[float, Field(ge=0.0, le=1e4)] = 0.5
+    """Radius of the circle [m]."""
+    rate_hz: Annotated[float, Field(ge=-1000.0, le=1000.0)] = 0.25
+    """Rounds a second [Hz], right-handed about the axis; negative: the other way round."""
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    """Normal of the circle in W, of any length."""
+    phase_rad: float = 0.0
+    """Angle at t = 0 [rad], from e1: the world's x axis projected onto the plane of the circle, or its y axis
+    where x is within 0.5 rad of the normal."""
+
+    @field_validator("axis")
+    @classmethod
+    def _has_a_direction(cls, axis: Vector3) -> Vector3:
+        if not np.linalg.norm(axis) > 1e-9:
+            raise ValueError(f"must not be zero, got {axis}")
+        return axis
+
+    def basis(self) -> NDArray[np.float64]:
+        """Return e1 and e2, where the circle is at angle 0 and a quarter further, shape [2, 3]."""
+        normal = np.array(self.axis) / np.linalg.norm(self.axis)
+        start = np.eye(3)[int(abs(normal[0]) > np.cos(0.5))]
+        first = start - normal * (normal @ start)
+        first /= np.linalg.norm(first)
+        return np.stack([first, np.cross(normal, first)])
+
+
+class MotionConfig(Settings):
+    """The pose of a body as a function of time; parts that are given add up, see `scene.bodies`."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    """Origin of the body in W at rest, the middle of its sway and its orbit [m]."""
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw at t = 0 [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    velocity_m_s: Vector3 = (0.0, 0.0, 0.0)
+    """Constant velocity in W [m/s]."""
+    sway: SwayConfig | None = None
+    """A sinusoid along a line; null: none."""
+    orbit: OrbitConfig | None = None
+    """A circle; null: none."""
+    spin_rad_s: Vector3 = (0.0, 0.0, 0.0)
+    """Constant angular velocity in the frame of the body [rad/s]."""
+
+
+class BodyConfig(Settings):
+    """A rigid body that moves by itself."""
+
+    shape: ShapeConfig = BoxShape()
+    """What it is: {kind: box | sphere | cylinder | mesh, ...}."""
+    surface: SurfaceConfig | None = None
+    """How it looks: {kind: plain | checker | picture, ...}; null: grey, and a mesh as its file says."""
+    motion: MotionConfig = MotionConfig()
+    """Where it is and how it moves."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Body:
+    """A body once its shape is made or loaded."""
+
+    name: str
+    config: BodyConfig
+    solid: Solid
+    corners_m: NDArray[np.float64]
+    """Corners of the bounding box along the axes of O [m], shape [8, 3]."""
+    center_m: NDArray[np.float64]
+    """Centre of a sphere around all points, in O [m], shape [3]."""
+    radius_m: float
+    """Radius of that sphere [m]."""
+
+
+def make_bodies(bodies: Mapping[str, BodyConfig]) -> tuple[Body, ...]:
+    """Make or load the shapes of bodies.
+
+    Raises:
+        SceneError: A file cannot be used.
+    """
+    return tuple(_make_body(name, config) for name, config in bodies.items())
+
+
+def _make_body(name: str, config: BodyConfig) -> Body:
+    solid = make_solid(config.shape, config.surface, name=name)
+    points = solid.vertices[np.unique(solid.faces)].astype(np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    center = 0.5 * (low + high)
+    side = np.indices((2, 2, 2)).reshape(3, 8).T
+    return Body(
+        name=name,
+        config=config,
+        solid=solid,
+        corners_m=np.where(side == 0, low, high),
+        center_m=center,
+        radius_m=float(np.linalg.norm(points - center, axis=1).max()),
+    )
+
+
+def bounding_points(bodies: Sequence[Body]) -> NDArray[np.float64]:
+    """Return the corners of the bounding boxes, each in the frame O of its body [m], shape [B, 8, 3]."""
+    return np.array([body.corners_m for body in bodies], dtype=np.float64).reshape(-1, 8, 3)
+
+
+@wp.struct
+class Motion:
+    """`MotionConfig` on a device."""
+
+    position: wp.vec3d
+    orientation: wp.quatd
+    velocity: wp.vec3d
+    sway: wp.vec3d
+    sway_hz: wp.float64
+    sway_rad: wp.float64
+    orbit_e1: wp.vec3d
+    """Times the radius, as `orbit_e2`."""
+    orbit_e2: wp.vec3d
+    orbit_hz: wp.float64
+    orbit_rad: wp.float64
+    spin: wp.vec3d
+
+
+def upload_motions(bodies: Mapping[str, BodyConfig], device: str) -> wp.array[Motion]:
+    """Return the motions of bodies on a device, shape [B]."""
+    return wp.array([_motion(body.motion) for body in bodies.values()], dtype=Motion, device=device)
+
+
+def _motion(config: MotionConfig) -> Motion:
+    motion = Motion()
+    motion.position = wp.vec3d(*config.position_m)
+    motion.orientation = wp.quatd(*Rotation.from_euler("xyz", config.rpy_rad).as_quat())
+    motion.velocity = wp.vec3d(*config.velocity_m_s)
+    motion.spin = wp.vec3d(*config.spin_rad_s)
+    if config.sway is not None:
+        motion.sway = wp.vec3d(*config.sway.amplitude_m)
+        motion.sway_hz, motion.sway_rad = config.sway.frequency_hz, config.sway.phase_rad
+    if config.orbit is not None:
+        e1, e2 = config.orbit.radius_m * config.orbit.basis()
+        motion.orbit_e1, motion.orbit_e2 = wp.vec3d(*e1), wp.vec3d(*e2)
+        motion.orbit_hz, motion.orbit_rad = config.orbit.rate_hz, config.orbit.phase_rad
+    return motion
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BodyPoses:
+    """Where bodies are at K instants, on a device."""
+
+    p_WO: wp.array2d[wp.vec3d]
+    """Positions [m], shape [K, B]."""
+    q_WO: wp.array2d[wp.quatd]
+    """Orientations, xyzw, shape [K, B]."""
+
+
+def make_body_poses(instant_count: int, body_count: int, device: str) -> BodyPoses:
+    """Allocate poses; they are zero until `pose_bodies` has been launched."""
+    shape = (instant_count, body_count)
+    return BodyPoses(
+        p_WO=wp.zeros(shape, dtype=wp.vec3d, device=device),
+        q_WO=wp.zeros(shape, dtype=wp.quatd, device=device),
+    )
+
+
+@wp.kernel
+def _pose_bodies(
+    # Model:
+    motions: wp.array[Motion],
+    # In:
+    stamps_ns: wp.array2d[wp.int64],
+    vehicle: int,
+    slots: wp.array[int],
+    # Out:
+    p_WO_out: wp.array2d[wp.vec3d],
+    q_WO_out: wp.array2d[wp.quatd],
+) -> None:
+    instant, body = wp.tid()
+    motion = motions[body]
+    time_s = wp.float64(stamps_ns[slots[instant], vehicle]) * _S_PER_NS
+    sway = _TWO_PI * motion.sway_hz * time_s + motion.sway_rad
+    orbit = _TWO_PI * motion.orbit_hz * time_s + motion.orbit_rad
+    p_WO_out[instant, body] = (
+        motion.position
+        + time_s * motion.velocity
+        + wp.sin(sway) * motion.sway
+        + wp.cos(orbit) * motion.orbit_e1
+        + wp.sin(orbit) * motion.orbit_e2
+    )
+    q_WO_out[instant, body] = motion.orientation * quaternion_exp(time_s * motion.spin)
+
+
+def pose_bodies(
+    motions: wp.array[Motion],
+    stamps_ns: wp.array2d[wp.int64],
+    slots: wp.array[int],
+    *,
+    count: int,
+    poses: BodyPoses,
+    vehicle: int = 0,
+) -> None:
+    """Write where bodies are at the first `count` of the given slots; launches one kernel.
+
+    Args:
+        motions: `upload_motions`.
+        stamps_ns: Stamps [ns], shape [slot, vehicle]: `Trace.stamps`.
+        slots: Slots of the instants, shape [K].
+        count: How many of them to use.
+        poses: Overwritten.
+        vehicle: Whose stamps count.
+    """
+    wp.launch(
+        _pose_bodies,
+        dim=(count, motions.shape[0]),
+        inputs=[motions, stamps_ns, vehicle, slots],
+        outputs=[poses.p_WO, poses.q_WO],
+        device=motions.device,
+    )
+
+
+def body_poses(
+    bodies: Mapping[str, BodyConfig], stamps_ns: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where bodies are, on the host.
+
+    Exact to rounding: the error of a phase or angle grows as 1e-16 of its size.
+
+    Args:
+        bodies: Settings by name (`SimulationConfig.bodies`).
+        stamps_ns: Times since the start of the episode [ns], shape [K], integers.
+
+    Returns:
+        p_WO [m], shape [K, B, 3], and q_WO, xyzw, shape [K, B, 4].
+
+    Raises:
+        TypeError: Stamps are not integers.
+    """
+    stamps = np.asarray(stamps_ns)
+    if stamps.size and not np.issubdtype(stamps.dtype, np.integer):
+        raise TypeError(f"stamps_ns must be integers, got {stamps.dtype}")
+    stamps = stamps.astype(np.int64).reshape(-1, 1)
+    poses = make_body_poses(len(stamps), len(bodies), "cpu")
+    if bodies and len(stamps):
+        pose_bodies(
+            upload_motions(bodies, "cpu"),
+            wp.array(stamps, dtype=wp.int64, device="cpu"),
+            wp.array(np.arange(len(stamps), dtype=np.int32), dtype=int, device="cpu"),
+            count=len(stamps),
+            poses=poses,
+        )
+    shape = (len(stamps), len(bodies))
+    return np.array(poses.p_WO.numpy()).reshape(*shape, 3), np.array(poses.q_WO.numpy()).reshape(*shape, 4)
