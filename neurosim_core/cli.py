@@ -14,12 +14,15 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from neurosim_core import __version__
+from neurosim_core.bench import commands as bench
+from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.signals import handle_signals, leave_at_once
+
+if TYPE_CHECKING:
+    _Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,7 +72,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add in (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view, bench.add_parser):
+        add(commands)
+    return parser
 
+
+def _add_run(commands: _Commands) -> None:
     run = commands.add_parser("run", help="fly, record, and draw a picture of it")
     _add_settings(run)
     run.add_argument(
@@ -82,11 +90,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.set_defaults(command=_run)
 
+
+def _add_serve(commands: _Commands) -> None:
     serve = commands.add_parser("serve", help="simulate for controllers in other processes, over Cortex")
     _add_settings(serve)
     _add_live(serve)
     serve.set_defaults(command=_serve)
 
+
+def _add_fly(commands: _Commands) -> None:
     fly = commands.add_parser("fly", help="the controller that follows the path, as a process of its own")
     _add_settings(fly)
     fly.add_argument("--vehicle", metavar="NAME", help="fly only this one (default: all)")
@@ -101,6 +113,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     fly.set_defaults(command=_fly)
 
+
+def _add_up(commands: _Commands) -> None:
     up = commands.add_parser("up", help="simulator, controller and viewer together; Ctrl-C ends all")
     _add_settings(up)
     _add_live(up)
@@ -112,6 +126,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     up.set_defaults(command=_up)
 
+
+def _add_call(commands: _Commands) -> None:
     call = commands.add_parser("call", help="control a running simulator: reset, step, pause, resume, set")
     requests = call.add_subparsers(required=True, metavar="WHAT", dest="what")
     reset = requests.add_parser("reset", help="begin again at stamp 0")
@@ -131,6 +147,8 @@ def _parser() -> argparse.ArgumentParser:
         request.add_argument("--timeout", type=float, default=10.0, metavar="S", help="wait at most [s]")
     call.set_defaults(command=_call)
 
+
+def _add_scene(commands: _Commands) -> None:
     scene = commands.add_parser("scene", help="say what is in a scene file, and draw it")
     scene.add_argument("file", type=Path, help="glTF, GLB, OBJ, PLY or STL")
     scene.add_argument(
@@ -138,6 +156,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     scene.set_defaults(command=_scene)
 
+
+def _add_view(commands: _Commands) -> None:
     view = commands.add_parser("view", help="look at a running simulator, or at a flight, in Rerun")
     view.add_argument(
         "flight",
@@ -166,118 +186,6 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("--no-browser", action="store_true", help="live, --web: print the address only")
     view.set_defaults(command=_view)
 
-    _add_bench(commands.add_parser("bench", help="measure speed on this machine"))
-    return parser
-
-
-def _add_bench(parser: argparse.ArgumentParser) -> None:
-    """What can be measured."""
-    questions = parser.add_subparsers(required=True, metavar="WHAT")
-
-    step = questions.add_parser("step", help="whole steps a second with one event camera")
-    _add_view(step, width=640, height=480, camera="event camera")
-    step.add_argument("--instants", type=int, default=16, metavar="K", help="renders per launch")
-    step.add_argument("--steps", type=int, default=1600, metavar="N", help="renders per repetition (of five)")
-    step.set_defaults(command=_bench_step)
-
-    loop = questions.add_parser(
-        "closed-loop",
-        help="simulator and controller as processes: from command to image, images a second",
-        description="Fly a simulator from another process at several rates, in lockstep and in real time; "
-        "leave closed-loop.csv and closed-loop.png.",
-    )
-    loop.add_argument(
-        "--rates",
-        type=_numbers,
-        default="100,200,500,1000,2000,5000",
-        metavar="HZ,...",
-        help="commands and images a second (default: %(default)s)",
-    )
-    loop.add_argument(
-        "--renderer",
-        default="synthetic",
-        choices=["synthetic", "warp"],
-        help="synthetic: a test card, to measure all but rendering; warp: the scene",
-    )
-    _add_view(loop, width=640, height=480, camera="camera")
-    loop.add_argument(
-        "--seconds", type=float, default=3.0, metavar="S", help="how long to measure each rate [s]"
-    )
-    _add_out(loop, "closed-loop")
-    loop.set_defaults(command=_bench_closed_loop)
-
-    streaming = questions.add_parser(
-        "streaming",
-        help="a flight in real time: how punctual an IMU is beside an event camera",
-        description="Fly in real time with an IMU at 1 kHz and an event camera that is rendered as often as "
-        "this machine can; leave streaming.csv, arrivals.csv and streaming.png.",
-    )
-    _add_view(streaming, width=346, height=260, camera="event camera")
-    streaming.add_argument(
-        "--sampling-rate",
-        type=float,
-        metavar="HZ",
-        help="renders of the event camera a second (default: as this machine can)",
-    )
-    streaming.add_argument(
-        "--seconds", type=float, default=60.0, metavar="S", help="how long to measure [s] (default: 60)"
-    )
-    _add_out(streaming, "streaming")
-    streaming.set_defaults(command=_bench_streaming)
-
-    delay = questions.add_parser(
-        "delay",
-        help="a slow controller in real time against the same delay in lockstep",
-        description="Fly tours with a controller that sleeps, in real time, and with the same delay in "
-        "lockstep, simulated; leave delay.csv.",
-    )
-    delay.add_argument(
-        "--delays",
-        type=_numbers,
-        default="0,0.02,0.05",
-        metavar="S,...",
-        help="what the controller sleeps before each command [s] (default: %(default)s)",
-    )
-    delay.add_argument("--tours", type=int, default=3, metavar="N", help="how many paths to fly")
-    delay.add_argument(
-        "--mode",
-        default="velocity",
-        choices=["motor_speeds", "velocity", "position"],
-        help="what to command (default: velocity)",
-    )
-    delay.add_argument("--seconds", type=float, default=4.0, metavar="S", help="length of a flight [s]")
-    delay.add_argument(
-        "--factor", type=float, default=1.0, metavar="F", help="real-time factor of the slow controller"
-    )
-    _add_out(delay, "delay")
-    delay.set_defaults(command=_bench_delay)
-
-
-def _add_view(parser: argparse.ArgumentParser, *, width: int, height: int, camera: str) -> None:
-    """What is looked at, by what, and where that is computed."""
-    parser.add_argument(
-        "--scene", type=Path, metavar="FILE", help="mesh file; default: the generated apartment"
-    )
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
-    parser.add_argument("--width", type=int, default=width, metavar="PX", help=f"columns of the {camera}")
-    parser.add_argument("--height", type=int, default=height, metavar="PX", help=f"rows of the {camera}")
-
-
-def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
-    parser.add_argument(
-        "--out", type=Path, default=Path(folder), metavar="DIR", help=f"where to leave files (./{folder})"
-    )
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-                     help="any further setting by its dotted key, such as scene.rooms=2")  # fmt: skip
-
-
-def _numbers(text: str) -> list[float]:
-    """Read numbers that are separated by commas."""
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"takes numbers with commas between them, got {text!r}") from None
-
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     """What decides about a run."""
@@ -287,8 +195,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
     parser.add_argument("--seed", type=int, help="seed of the sensor noise")
     parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-                     help="any setting by its dotted key, such as scene.seed=3; may be repeated")  # fmt: skip
+    add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
 
 
 def _add_live(parser: argparse.ArgumentParser) -> None:
@@ -309,7 +216,7 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     Raises:
         ValueError: One is not KEY=VALUE.
     """
-    overrides = _settings(arguments)
+    overrides = read_settings(arguments.settings)
     for key, value in (
         ("duration_s", arguments.duration),
         ("seed", arguments.seed),
@@ -318,21 +225,6 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
         if value is not None:
             overrides[key] = value
     return overrides
-
-
-def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What `--set` gave, by dotted key.
-
-    Raises:
-        ValueError: One is not KEY=VALUE.
-    """
-    settings: dict[str, Any] = {}
-    for setting in arguments.settings:
-        key, separator, text = setting.partition("=")
-        if not separator or not key:
-            raise ValueError(f"--set takes KEY=VALUE, got {setting!r}")
-        settings[key] = yaml.safe_load(text)
-    return settings
 
 
 def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -401,83 +293,6 @@ def _scene(arguments: argparse.Namespace) -> int:
 
     report_scene(arguments.file, arguments.out)
     return 0
-
-
-def _bench_step(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from neurosim_core.bench.step import measure_steps, print_steps
-
-    times = measure_steps(
-        scene=arguments.scene,
-        device=arguments.device,
-        width=arguments.width,
-        height=arguments.height,
-        instants=arguments.instants,
-        step_count=arguments.steps,
-    )
-    print_steps(times, Console())
-    return 0
-
-
-def _bench_closed_loop(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from neurosim_core.bench.closed_loop import bench_closed_loop
-
-    with handle_signals(signal.default_int_handler):
-        bench_closed_loop(
-            arguments.out,
-            Console(),
-            rates_hz=arguments.rates,
-            seconds=arguments.seconds,
-            renderer=arguments.renderer,
-            width=arguments.width,
-            height=arguments.height,
-            device=arguments.device,
-            scene=arguments.scene,
-            settings=_settings(arguments),
-        )
-        return 0
-
-
-def _bench_streaming(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from neurosim_core.bench.streaming import bench_streaming
-
-    with handle_signals(signal.default_int_handler):
-        bench_streaming(
-            arguments.out,
-            Console(),
-            seconds=arguments.seconds,
-            width=arguments.width,
-            height=arguments.height,
-            device=arguments.device,
-            scene=arguments.scene,
-            sampling_rate_hz=arguments.sampling_rate,
-            settings=_settings(arguments),
-        )
-        return 0
-
-
-def _bench_delay(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from neurosim_core.bench.delay import bench_delay
-
-    with handle_signals(signal.default_int_handler):
-        bench_delay(
-            arguments.out,
-            Console(),
-            delays_s=arguments.delays,
-            tours=arguments.tours,
-            mode=arguments.mode,
-            seconds=arguments.seconds,
-            real_time_factor=arguments.factor,
-            settings=_settings(arguments),
-        )
-        return 0
 
 
 def _view(arguments: argparse.Namespace) -> int:

@@ -1,0 +1,405 @@
+"""The command `neurosim bench`: what can be measured, and with which options.
+
+What measures is imported when it is asked for: this module costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from neurosim_core.overrides import add_set_option, read_settings
+from neurosim_core.signals import handle_signals
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from neurosim_core.bench.report import Chapter
+
+Progress: TypeAlias = Callable[[str], None]
+"""Told what is measured next."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A question that a chapter of the report answers."""
+
+    name: str
+    help: str
+    description: str
+    chapter: Callable[[bool, Progress], Chapter]
+    """Measures, quickly if the first argument says so, and returns the answer."""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `bench` to the commands of `neurosim`."""
+    parser = commands.add_parser("bench", help="measure speed and error on this machine")
+    questions = parser.add_subparsers(required=True, metavar="WHAT")
+    for study in STUDIES:
+        _add_study(questions.add_parser(study.name, help=study.help, description=study.description), study)
+    _add_all(questions.add_parser("all", help=f"{', '.join(s.name for s in STUDIES)} in one report"))
+    _add_step(questions.add_parser("step", help="whole steps a second with one event camera"))
+    _add_closed_loop(questions)
+    _add_streaming(questions)
+    _add_delay(questions)
+
+
+def _add_study(parser: argparse.ArgumentParser, study: Study) -> None:
+    _add_out(parser, study.name)
+    _add_quick(parser)
+    parser.set_defaults(command=lambda arguments: _bench_study(study, arguments))
+
+
+def _add_all(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Measure one after the other and leave one report. What fails is said in its chapter, the others "
+        "are measured nevertheless, and the exit status is 1."
+    )
+    _add_out(parser, "report")
+    _add_quick(parser)
+    parser.set_defaults(command=_bench_all)
+
+
+def _add_quick(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--quick", action="store_true", help="a small version, to see what it looks like; figures are rough"
+    )
+
+
+def _add_step(parser: argparse.ArgumentParser) -> None:
+    _add_view(parser, width=640, height=480, camera="event camera")
+    parser.add_argument("--instants", type=int, default=16, metavar="K", help="renders per launch")
+    parser.add_argument(
+        "--steps", type=int, default=1600, metavar="N", help="renders per repetition (of five)"
+    )
+    parser.set_defaults(command=_bench_step)
+
+
+def _add_closed_loop(questions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    loop = questions.add_parser(
+        "closed-loop",
+        help="simulator and controller as processes: from command to image, images a second",
+        description="Fly a simulator from another process at several rates, in lockstep and in real time; "
+        "leave closed-loop.csv and closed-loop.png.",
+    )
+    loop.add_argument(
+        "--rates",
+        type=_numbers,
+        default="100,200,500,1000,2000,5000",
+        metavar="HZ,...",
+        help="commands and images a second (default: %(default)s)",
+    )
+    loop.add_argument(
+        "--renderer",
+        default="synthetic",
+        choices=["synthetic", "warp"],
+        help="synthetic: a test card, to measure all but rendering; warp: the scene",
+    )
+    _add_view(loop, width=640, height=480, camera="camera")
+    loop.add_argument(
+        "--seconds", type=float, default=3.0, metavar="S", help="how long to measure each rate [s]"
+    )
+    _add_out(loop, "closed-loop")
+    _add_set(loop)
+    loop.set_defaults(command=_bench_closed_loop)
+
+
+def _add_streaming(questions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    streaming = questions.add_parser(
+        "streaming",
+        help="a flight in real time: how punctual an IMU is beside an event camera",
+        description="Fly in real time with an IMU at 1 kHz and an event camera that is rendered as often as "
+        "this machine can; leave streaming.csv, arrivals.csv and streaming.png.",
+    )
+    _add_view(streaming, width=346, height=260, camera="event camera")
+    streaming.add_argument(
+        "--sampling-rate",
+        type=float,
+        metavar="HZ",
+        help="renders of the event camera a second (default: as this machine can)",
+    )
+    streaming.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S", help="how long to measure [s] (default: 60)"
+    )
+    _add_out(streaming, "streaming")
+    _add_set(streaming)
+    streaming.set_defaults(command=_bench_streaming)
+
+
+def _add_delay(questions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    delay = questions.add_parser(
+        "delay",
+        help="a slow controller in real time against the same delay in lockstep",
+        description="Fly tours with a controller that sleeps, in real time, and with the same delay in "
+        "lockstep, simulated; leave delay.csv.",
+    )
+    delay.add_argument(
+        "--delays",
+        type=_numbers,
+        default="0,0.02,0.05",
+        metavar="S,...",
+        help="what the controller sleeps before each command [s] (default: %(default)s)",
+    )
+    delay.add_argument("--tours", type=int, default=3, metavar="N", help="how many paths to fly")
+    delay.add_argument(
+        "--mode",
+        default="velocity",
+        choices=["motor_speeds", "velocity", "position"],
+        help="what to command (default: velocity)",
+    )
+    delay.add_argument("--seconds", type=float, default=4.0, metavar="S", help="length of a flight [s]")
+    delay.add_argument(
+        "--factor", type=float, default=1.0, metavar="F", help="real-time factor of the slow controller"
+    )
+    _add_out(delay, "delay")
+    _add_set(delay)
+    delay.set_defaults(command=_bench_delay)
+
+
+def _add_view(parser: argparse.ArgumentParser, *, width: int, height: int, camera: str) -> None:
+    """What is looked at, by what, and where that is computed."""
+    parser.add_argument(
+        "--scene", type=Path, metavar="FILE", help="mesh file; default: the generated apartment"
+    )
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
+    parser.add_argument("--width", type=int, default=width, metavar="PX", help=f"columns of the {camera}")
+    parser.add_argument("--height", type=int, default=height, metavar="PX", help=f"rows of the {camera}")
+
+
+def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    parser.add_argument(
+        "--out", type=Path, default=Path(folder), metavar="DIR", help=f"where to leave files (./{folder})"
+    )
+
+
+def _add_set(parser: argparse.ArgumentParser) -> None:
+    add_set_option(parser, "any further setting by its dotted key, such as scene.rooms=2")
+
+
+def _numbers(text: str) -> list[float]:
+    """Read numbers that are separated by commas."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"takes numbers with commas between them, got {text!r}") from None
+
+
+def _dynamics(quick: bool, progress: Progress) -> Chapter:
+    from neurosim_core.bench.dynamics import dynamics_chapter, measure_dynamics
+
+    return dynamics_chapter(measure_dynamics(quick=quick))
+
+
+def _events(quick: bool, progress: Progress) -> Chapter:
+    from neurosim_core.bench.events import events_chapter, measure_events
+
+    return events_chapter(measure_events(quick=quick))
+
+
+def _pixel(quick: bool, progress: Progress) -> Chapter:
+    from neurosim_core.bench.pixel import measure_pixel, pixel_chapter
+
+    return pixel_chapter(measure_pixel(quick=quick))
+
+
+def _render(quick: bool, progress: Progress) -> Chapter:
+    from neurosim_core.bench.render import measure_render, render_chapter
+
+    return render_chapter(measure_render(quick=quick, progress=progress))
+
+
+def _leave_out(quick: bool, progress: Progress) -> Chapter:
+    from neurosim_core.bench.leave_out import leave_out_chapter, measure_leave_out
+
+    return leave_out_chapter(measure_leave_out(quick=quick, progress=progress))
+
+
+STUDIES: Sequence[Study] = (
+    Study(
+        name="dynamics",
+        help="error against run time of the flight dynamics, and stiff and extreme cases",
+        description="Integrate flights by several methods at several step sizes, against a reference; "
+        "then what is stiff or extreme.",
+        chapter=_dynamics,
+    ),
+    Study(
+        name="events",
+        help="error against run time of the events of a flight",
+        description="Render a flight at fixed rates and as often as its motion asks for, and compare the "
+        "events with those of a far higher rate.",
+        chapter=_events,
+    ),
+    Study(
+        name="pixel",
+        help="a test bench of the event pixel: ramp, step, sine, bar, darkness",
+        description="Show patterns of light to the models of real event cameras, and compare what they do "
+        "with closed forms.",
+        chapter=_pixel,
+    ),
+    Study(
+        name="render",
+        help="error against run time of rendering, and false events from aliasing",
+        description="Render with several settings of sampling and filtering, against many samples a pixel; "
+        "then pan slowly over a fine checkerboard and count false events.",
+        chapter=_render,
+    ),
+    Study(
+        name="leave-out",
+        help="what a scene does not need is not computed: kernels, memory, libraries, time",
+        description="Count what runs with few and with many sensors and terms launch, allocate and import.",
+        chapter=_leave_out,
+    ),
+)
+"""What `neurosim bench all` measures, in this order."""
+
+
+def _bench_study(study: Study, arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    console = Console()
+    with handle_signals(signal.default_int_handler):
+        _write([_measure(study, console, quick=arguments.quick)], arguments.out, console)
+    return 0
+
+
+def _bench_all(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    console = Console()
+    chapters: list[Chapter] = []
+    status = 0
+    with handle_signals(signal.default_int_handler):
+        try:
+            for number, study in enumerate(STUDIES, 1):
+                prefix = f"({number} of {len(STUDIES)}) "
+                try:
+                    chapter = _measure(study, console, quick=arguments.quick, prefix=prefix)
+                except Exception as error:  # whatever it is, it is told, and the other studies go on
+                    chapter, status = _failed(study, error, console, quick=arguments.quick), 1
+                chapters.append(chapter)
+        except KeyboardInterrupt:
+            status = 130
+    if chapters:
+        _write(chapters, arguments.out, console)
+    return status
+
+
+def _measure(study: Study, console: Console, *, quick: bool, prefix: str = "") -> Chapter:
+    """Measure one thing and print it."""
+    from neurosim_core.bench.report import print_chapter
+
+    begin = time.perf_counter()
+    with console.status(f"{prefix}{study.name}") as status:
+        chapter = study.chapter(quick, lambda what: status.update(f"{prefix}{study.name}: {what}"))
+    print_chapter(chapter, console)
+    console.print(f"{study.name} took {time.perf_counter() - begin:.0f} s\n", style="dim", highlight=False)
+    return chapter
+
+
+def _failed(study: Study, error: Exception, console: Console, *, quick: bool) -> Chapter:
+    """Say why something could not be measured, and return a chapter of that."""
+    from neurosim_core.bench.report import Bar, Chapter
+
+    reason = "".join(traceback.format_exception_only(error)).strip()
+    console.print(f"{study.name} failed: {reason}\n", style="bold red", markup=False, highlight=False)
+    trace = "".join(traceback.format_exception(error)).replace("```", "'''")
+    return Chapter(
+        name=study.name,
+        title=f"{study.name}: failed",
+        summary=f"**This could not be measured.** {study.description}\n\n```\n{trace}```",
+        command=f"neurosim bench {study.name}{' --quick' if quick else ''}",
+        bars=[Bar(text="it can be measured", measured=reason, met=False)],
+    )
+
+
+def _write(chapters: Sequence[Chapter], folder: Path, console: Console) -> None:
+    from neurosim_core.bench.figures import can_draw
+    from neurosim_core.bench.report import write_report
+
+    page = write_report(chapters, folder)
+    if not can_draw():
+        console.print("plots are left out: pip install 'neurosim[view]'", style="yellow", markup=False)
+    console.print(f"left in {folder}: {page.name}, report.md, tables and plots", markup=False, soft_wrap=True)
+
+
+def _bench_step(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.step import measure_steps, print_steps
+
+    times = measure_steps(
+        scene=arguments.scene,
+        device=arguments.device,
+        width=arguments.width,
+        height=arguments.height,
+        instants=arguments.instants,
+        step_count=arguments.steps,
+    )
+    print_steps(times, Console())
+    return 0
+
+
+def _bench_closed_loop(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.closed_loop import bench_closed_loop
+
+    with handle_signals(signal.default_int_handler):
+        bench_closed_loop(
+            arguments.out,
+            Console(),
+            rates_hz=arguments.rates,
+            seconds=arguments.seconds,
+            renderer=arguments.renderer,
+            width=arguments.width,
+            height=arguments.height,
+            device=arguments.device,
+            scene=arguments.scene,
+            settings=read_settings(arguments.settings),
+        )
+        return 0
+
+
+def _bench_streaming(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.streaming import bench_streaming
+
+    with handle_signals(signal.default_int_handler):
+        bench_streaming(
+            arguments.out,
+            Console(),
+            seconds=arguments.seconds,
+            width=arguments.width,
+            height=arguments.height,
+            device=arguments.device,
+            scene=arguments.scene,
+            sampling_rate_hz=arguments.sampling_rate,
+            settings=read_settings(arguments.settings),
+        )
+        return 0
+
+
+def _bench_delay(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from neurosim_core.bench.delay import bench_delay
+
+    with handle_signals(signal.default_int_handler):
+        bench_delay(
+            arguments.out,
+            Console(),
+            delays_s=arguments.delays,
+            tours=arguments.tours,
+            mode=arguments.mode,
+            seconds=arguments.seconds,
+            real_time_factor=arguments.factor,
+            settings=read_settings(arguments.settings),
+        )
+        return 0

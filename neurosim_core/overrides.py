@@ -1,0 +1,31 @@
+"""Settings that are given on a command line: `--set KEY=VALUE`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+
+def add_set_option(parser: argparse.ArgumentParser, help_text: str) -> None:
+    """Let a command take `--set KEY=VALUE`, as often as needed; the texts are in `settings`."""
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=help_text
+    )
+
+
+def read_settings(texts: Sequence[str]) -> dict[str, Any]:
+    """Return values by dotted key; a value is read as YAML.
+
+    Raises:
+        ValueError: A text is not KEY=VALUE.
+    """
+    settings: dict[str, Any] = {}
+    for text in texts:
+        key, separator, value = text.partition("=")
+        if not separator or not key:
+            raise ValueError(f"--set takes KEY=VALUE, got {text!r}")
+        settings[key] = yaml.safe_load(value)
+    return settings
