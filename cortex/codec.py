@@ -14,8 +14,9 @@ from cortex.checks import explain
 from cortex.decoder import Decoder, MalformedMessage
 from cortex.draft import Draft, Drafter
 from cortex.encoder import ENCODE_ERRORS, Encoder, join, write
-from cortex.fast import Layout, is_flat, make_decode, make_encode, make_layout
+from cortex.fast import Layout, is_flat, make_decode, make_layout
 from cortex.layout import has_tail, record_dtype
+from cortex.native import make_flat
 from cortex.schema import schema_of
 
 __all__ = ["Codec", "MalformedMessage", "Plan", "codec_of"]
@@ -89,9 +90,12 @@ class Codec:
         """
         if is_flat(self.schema):
             self._layout = make_layout(self.schema, message_type)
-            self.encode = make_encode(self.schema, message_type, self._encode) or self._encode
             self.decode = make_decode(self.schema, message_type, decoder.decode)
-        self._has_short_encode = self.encode != self._encode
+        flat = make_flat(self.schema, message_type)
+        if flat is not None:
+            self.encode = _encode_natively(flat.encode, self._encode)
+            self.decode = _decode_natively(flat.decode, self.decode)
+        self._has_short_encode = flat is not None
         self._drafter = Drafter(self.schema, message_type, encoder)
 
     def plan(self, message: Any) -> Plan:
@@ -172,6 +176,24 @@ class Codec:
             TypeError: As `encode` does.
         """
         return self._drafter.finish(draft)
+
+
+def _encode_natively(
+    native: Callable[[Any, int], bytes | None], fallback: Callable[[Any, int], bytes | None]
+) -> Callable[[Any, int], bytes | None]:
+    def encode(message: Any, limit: int) -> bytes | None:
+        body = native(message, limit)
+        return fallback(message, limit) if body is None else body
+
+    return encode
+
+
+def _decode_natively(native: Callable[..., Any], fallback: Callable[..., Any]) -> Callable[..., Any]:
+    def decode(buffer: Any, offset: int = 0, size: int | None = None) -> Any:
+        message = native(buffer, offset, len(buffer) - offset if size is None else size)
+        return fallback(buffer, offset, size) if message is None else message
+
+    return decode
 
 
 _lock = threading.Lock()

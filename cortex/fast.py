@@ -6,7 +6,6 @@ wrong value, a malformed body) they leave to those, which also know what to say 
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from itertools import accumulate
 from operator import attrgetter
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from cortex.decoder import DECODE_ERRORS
-from cortex.encoder import CODE_OF_DTYPE, ENCODE_ERRORS, PADS, TRUTH_TO_BYTE
+from cortex.encoder import CODE_OF_DTYPE, PADS, TRUTH_TO_BYTE
 from cortex.layout import (
     BODY_LIMIT,
     DTYPE_CODES,
@@ -34,7 +33,6 @@ from cortex.schema import ArrayType, EnumType, FieldType, Schema
 
 Layout: TypeAlias = Callable[[Any], "tuple[list[Any], int]"]
 """A message to the parts of its body and the size of it."""
-Encode: TypeAlias = Callable[[Any, int], "bytes | None"]
 Decode: TypeAlias = Callable[..., Any]
 """Buffer, offset = 0 and size = None to a message."""
 
@@ -111,32 +109,6 @@ def _specials(schema: Schema, cls: type) -> tuple[list[tuple[int, int, Any]], in
         if special is not None:
             result.append((index, *special))
     return result, name_count
-
-
-def only_vector(schema: Schema, cls: type) -> tuple[np.dtype[Any], int] | None:
-    """Return dtype and descriptor code of the vector that ends a type of numbers otherwise; else None."""
-    if not is_flat(schema):
-        return None
-    specials, _ = _specials(schema, cls)
-    if len(specials) != 1 or specials[0][0] != len(schema.fields) - 1:
-        return None
-    _, handling, known = specials[0]
-    return (known.dtype, known.head) if _is_vector(handling, known) else None
-
-
-def fixed_arrays(schema: Schema, cls: type) -> list[tuple[int, np.dtype[Any], tuple[int, ...]]] | None:
-    """Return index, dtype and shape of the fixed arrays of a type which is otherwise numbers; else None."""
-    if not is_flat(schema):
-        return None
-    specials, _ = _specials(schema, cls)
-    if any(handling is not _FIXED for _, handling, _ in specials):
-        return None
-    return [(index, known[0], known[1]) for index, _, known in specials]
-
-
-def block_struct(schema: Schema) -> struct.Struct:
-    """Return the struct of the block of a flat type."""
-    return writing_structs(schema, block_size(schema))[0][0]
 
 
 def getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
@@ -226,106 +198,6 @@ def make_layout(schema: Schema, cls: type) -> Layout:
     return layout
 
 
-def make_encode(schema: Schema, cls: type, fallback: Encode) -> Encode | None:
-    """Build a still faster encoder for two shapes of type: only numbers, and numbers before one vector.
-
-    Args:
-        schema: A flat type.
-        cls: Its class.
-        fallback: Called for whatever is not as usual.
-
-    Returns:
-        The encoder, or None for other shapes.
-    """
-    specials, _ = _specials(schema, cls)
-    if not specials:
-        return _encode_numbers(schema, cls, fallback)
-    index, handling, known = specials[0]
-    if index == len(schema.fields) - 1 and _is_vector(handling, known):
-        encode = _encode_vector(schema, cls, fallback, known)
-        return _encode_stamped(schema, cls, encode, known) if index == 1 else encode
-    return None
-
-
-def _encode_numbers(schema: Schema, cls: type, fallback: Encode) -> Encode:
-    block = block_size(schema)
-    pack = writing_structs(schema, block)[0][0].pack
-    get_all = getter([field.name for field in schema.fields])
-
-    def encode_numbers(message: Any, limit: int) -> bytes | None:
-        try:
-            if message.__class__ is cls and block <= limit:
-                return pack(*get_all(message))
-        except ENCODE_ERRORS:
-            pass
-        return fallback(message, limit)
-
-    return encode_numbers
-
-
-def _encode_vector(schema: Schema, cls: type, fallback: Encode, known: _Array) -> Encode:
-    block = block_size(schema)
-    pack = writing_structs(schema, block)[0][0].pack
-    get_all = getter([field.name for field in schema.fields])
-    dtype, head = known.dtype, known.head
-    itemsize = np.dtype(dtype).itemsize
-    large = -(-block // 64) * 64
-    pad = PADS[large - block]
-
-    def encode_vector(message: Any, limit: int) -> bytes | None:
-        try:
-            *numbers, array = get_all(message)
-            (count,) = array.shape
-            size = count * itemsize
-            if array.dtype is dtype and message.__class__ is cls and large + size < BODY_LIMIT:
-                if size >= LARGE_ARRAY_BYTES:
-                    if large + size > limit:
-                        return None
-                    return b"".join((pack(*numbers, large, head, count), pad, array))
-                if size <= limit - block:
-                    data: bytes = array.tobytes()
-                    return pack(*numbers, block if size else 0, head, count) + data
-        except ENCODE_ERRORS:
-            pass
-        return fallback(message, limit)
-
-    return encode_vector
-
-
-def _encode_stamped(schema: Schema, cls: type, fallback: Encode, known: _Array) -> Encode:
-    # Most messages are a stamp and an array. Naming the stamp saves a fifth of the time.
-    block = block_size(schema)
-    pack = writing_structs(schema, block)[0][0].pack
-    get_all = getter([field.name for field in schema.fields])
-    dtype, head = known.dtype, known.head
-    itemsize = np.dtype(dtype).itemsize
-    large = -(-block // 64) * 64
-    pad = PADS[large - block]
-
-    def encode_stamped(message: Any, limit: int) -> bytes | None:
-        try:
-            stamp, array = get_all(message)
-            (count,) = array.shape
-            size = count * itemsize
-            if array.dtype is dtype and message.__class__ is cls and large + size < BODY_LIMIT:
-                if size >= LARGE_ARRAY_BYTES:
-                    if large + size > limit:
-                        return None
-                    return b"".join((pack(stamp, large, head, count), pad, array))
-                if 0 < size <= limit - block:
-                    data: bytes = array.tobytes()
-                    return pack(stamp, block, head, count) + data
-        except ENCODE_ERRORS:
-            pass
-        return fallback(message, limit)
-
-    return encode_stamped
-
-
-def _is_vector(handling: int, known: Any) -> bool:
-    return handling == _VARIABLE and known.dtype is not None and known.rank == 1 and not known.sizes
-
-
 # Decoding
 
 
@@ -337,89 +209,6 @@ def make_decode(schema: Schema, cls: type, fallback: Decode) -> Decode:
         cls: Its class.
         fallback: Called for whatever is not as it should be.
     """
-    specials, _ = _specials(schema, cls)
-    if not specials:
-        return _decode_numbers(schema, cls, fallback)
-    index, handling, known = specials[0]
-    if index == len(schema.fields) - 1 and _is_vector(handling, known):
-        decode = _decode_vector(schema, cls, fallback, known)
-        return _decode_stamped(schema, cls, decode, known) if index == 1 else decode
-    return _decode_flat(schema, cls, fallback)
-
-
-def _decode_numbers(schema: Schema, cls: type, fallback: Decode) -> Decode:
-    block = block_size(schema)
-    unpack = reading_struct(schema, block).unpack_from
-    shell = cls.__cortex_shell__  # type: ignore[attr-defined]
-
-    def decode_numbers(buffer: Any, offset: int = 0, size: int | None = None) -> Any:
-        try:
-            available = len(buffer) - offset
-            if available == block if size is None else size == block <= available:
-                message = shell(*unpack(buffer, offset))
-                message.__class__ = cls
-                return message
-        except DECODE_ERRORS:
-            pass
-        return fallback(buffer, offset, size)
-
-    return decode_numbers
-
-
-def _decode_vector(schema: Schema, cls: type, fallback: Decode, known: _Array) -> Decode:
-    block = block_size(schema)
-    unpack = reading_struct(schema, block).unpack_from
-    shell = cls.__cortex_shell__  # type: ignore[attr-defined]
-    dtype, head = known.dtype, known.head
-    itemsize = np.dtype(dtype).itemsize
-    ndarray = np.ndarray
-
-    def decode_vector(buffer: Any, offset: int = 0, size: int | None = None) -> Any:
-        try:
-            end = len(buffer) - offset
-            if size is not None and size <= end:
-                end = size
-            elif size is not None:
-                return fallback(buffer, offset, size)
-            *numbers, start, code, count = unpack(buffer, offset)
-            item = count * itemsize
-            if code == head and start + item <= end and block + item <= end < BODY_LIMIT:
-                message = shell(*numbers, ndarray((count,), dtype, buffer, offset + start))
-                message.__class__ = cls
-                return message
-        except DECODE_ERRORS:
-            pass
-        return fallback(buffer, offset, size)
-
-    return decode_vector
-
-
-def _decode_stamped(schema: Schema, cls: type, fallback: Decode, known: _Array) -> Decode:
-    block = block_size(schema)
-    unpack = reading_struct(schema, block).unpack_from
-    shell = cls.__cortex_shell__  # type: ignore[attr-defined]
-    dtype, head = known.dtype, known.head
-    itemsize = np.dtype(dtype).itemsize
-    ndarray = np.ndarray
-
-    def decode_stamped(buffer: Any, offset: int = 0, size: int | None = None) -> Any:
-        try:
-            if size is None:
-                size = len(buffer) - offset
-            stamp, start, code, count = unpack(buffer, offset)
-            fits = block <= start and start + count * itemsize <= size <= len(buffer) - offset
-            if fits and code == head and size < BODY_LIMIT:
-                message = shell(stamp, ndarray(count, dtype, buffer, offset + start))
-                message.__class__ = cls
-                return message
-        except DECODE_ERRORS:
-            pass
-        return fallback(buffer, offset, size)
-
-    return decode_stamped
-
-
-def _decode_flat(schema: Schema, cls: type, fallback: Decode) -> Decode:
     specials, name_count = _specials(schema, cls)
     block = block_size(schema)
     unpack = reading_struct(schema, block).unpack_from

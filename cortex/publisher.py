@@ -151,7 +151,7 @@ class Publisher(Generic[T]):
                         return self._send_strict_all(frame)
                     return True
             elif self._gathers and (self._batch or now_ns - self._last_ns < BURST_NS):
-                record = self._pack_record(message, 0, now_ns, self._inline_max)
+                record = self._pack_record(message, now_ns, self._inline_max)
                 if record is not None:
                     return self._collect(record, now_ns)
             if type(message) is not self._type:

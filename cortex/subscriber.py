@@ -372,7 +372,7 @@ class Subscriber(Generic[T]):
         except zmq.Again:
             return _LOST
         self._exhausted = False
-        if read is not None and frame[:HEAD_SIZE] == link.message_head and (found := read(frame)) is not None:
+        if (found := read(frame)) is not None:
             sequence, publish_ns, message = found
             if sequence == link.expected:
                 link.expected = sequence + 1
@@ -434,14 +434,13 @@ class Subscriber(Generic[T]):
         exhausted = True
         self._drained_ns = monotonic_ns()
         for link in self._rotated():
-            receive, head, decode, read = link.receive, link.message_head, link.codec.decode, link.read
+            receive, read = link.receive, link.read
             for count in range(min(self.policy.depth, DRAIN_MAX)):
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
                     break
-                is_plain = frame[:HEAD_SIZE] == head
-                if is_plain and read is not None and (found := read(frame)) is not None:
+                if (found := read(frame)) is not None:
                     sequence, publish_ns, message = found
                     if sequence == link.expected:
                         link.expected = sequence + 1
@@ -450,43 +449,15 @@ class Subscriber(Generic[T]):
                     if not count & 7:
                         self._time(publish_ns, link)
                     take(message)
-                    continue
-                if not is_plain or len(frame) < HEADER_SIZE:
-                    if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
-                        link.read_batch(frame, messages)
-                        if len(messages) >= DRAIN_MAX:
-                            exhausted = False
-                            break
-                        continue
-                    for item in link.handle(frame):
-                        if item.buffer is None or self._queue:
-                            self._enqueue(item)
-                            continue
-                        try:
-                            take(decode(item.buffer, item.offset, item.size))
-                        except MalformedMessage as error:
-                            link.reject(str(error))
-                        if not count & 7:
-                            self._time(item.publish_ns, link)
-                    if self._queue:
+                elif frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
+                    link.read_batch(frame, messages)
+                    if len(messages) >= DRAIN_MAX:
                         exhausted = False
                         break
-                    continue
-                sequence, _, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
-                if size != len(frame) - HEADER_SIZE:
-                    link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
-                    link.skip(sequence)
-                    continue
-                if sequence == link.expected:
-                    link.expected = sequence + 1
-                elif not link.advance(sequence):
-                    continue
-                if not count & 7:
-                    self._time(publish_ns, link)
-                try:
-                    take(decode(frame, HEADER_SIZE, size))
-                except MalformedMessage as error:
-                    link.reject(str(error))
+                else:
+                    self._take_decoded(link, frame, messages, timed=not count & 7)
+                    if self._queue:
+                        break
             else:
                 exhausted = False
             if self._queue:
@@ -494,6 +465,16 @@ class Subscriber(Generic[T]):
                 break
         self._exhausted = exhausted
         return messages
+
+    def _take_decoded(self, link: Link, frame: bytes, messages: deque[T], *, timed: bool) -> None:
+        """Decode what a frame that is no plain message holds; what cannot be is rejected, or queued."""
+        self._accept(link, frame, timed=timed)
+        while self._queue and self._queue[0].buffer is not None:
+            item = self._queue.popleft()
+            try:
+                messages.append(self._decode(item))
+            except MalformedMessage as error:
+                link.reject(str(error))
 
     def _time(self, publish_ns: int, link: Link) -> None:
         """Add to the histogram: of plain messages the first of a wake-up and every eighth (all cost 10 %)."""

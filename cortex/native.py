@@ -1,0 +1,80 @@
+"""The short cuts of `_flat.c`, where they were compiled; without them everything works, more slowly.
+
+`CORTEX_PURE_PYTHON=1` leaves them out, to compare or to find a fault.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from typing import Any
+
+from cortex.fast import describe_arrays
+from cortex.layout import (
+    LARGE_ARRAY_BYTES,
+    SCALAR_CODES,
+    array_dtype,
+    block_size,
+    fixed_bytes,
+    measure_fields,
+)
+from cortex.schema import ArrayType, FieldType, Schema
+
+_Flat: Any = None
+if not os.environ.get("CORTEX_PURE_PYTHON"):
+    with contextlib.suppress(ImportError):  # there was no compiler when this was installed
+        from cortex._flat import Flat as _Flat
+_NUMBER, _BOOL, _FIXED, _VARIABLE, _STR, _BYTES = range(6)
+_RANK_MAX = 8
+_SHARED_MAX = 16
+_FIELDS_MAX = 64
+
+
+def make_flat(schema: Schema, cls: type, head: bytes = b"") -> Any:
+    """Return what writes and reads the messages of a type, or None if the short cuts do not serve it.
+
+    Args:
+        schema: Of the type.
+        cls: Its class.
+        head: The first 24 bytes of a publisher's frames, if it is to make or read them.
+    """
+    fields = schema.fields
+    if _Flat is None or not 0 < len(fields) <= _FIELDS_MAX:
+        return None
+    known, shared = describe_arrays([field.type for field in fields])
+    if shared > _SHARED_MAX:
+        return None
+    rows = []
+    for field, array, offset in zip(fields, known, measure_fields(schema)[0], strict=True):
+        row = _row(field.type, array)
+        if row is None:
+            return None
+        kind, code, *rest = row
+        rows.append((field.name, kind, code, offset, *rest))
+    names = [field.name for field in fields]
+    stamp = names.index("stamp_ns") if "stamp_ns" in names else -1
+    if stamp >= 0 and not (isinstance(fields[stamp].type, str) and "int" in fields[stamp].type):
+        stamp = -1
+    return _Flat(cls, rows, block_size(schema), stamp, head)
+
+
+def _row(kind: FieldType, array: Any) -> tuple[Any, ...] | None:
+    """Kind, code, dtype, sizes, names and head of a field; None if it is none of those served."""
+    if array is not None:
+        if array.dtype is None or array.rank > _RANK_MAX:
+            return None
+        sizes, names = [-1] * array.rank, [-1] * array.rank
+        for axis, size in array.sizes:
+            sizes[axis] = size
+        for axis, name in array.names:
+            names[axis] = name
+        return _VARIABLE, "-", array.dtype, tuple(sizes), tuple(names), array.head
+    if isinstance(kind, ArrayType):
+        if fixed_bytes(kind) >= LARGE_ARRAY_BYTES or len(kind.shape) > _RANK_MAX:
+            return None
+        return _FIXED, "-", array_dtype(kind), kind.shape, (-1,) * len(kind.shape), 0
+    if not isinstance(kind, str):
+        return None
+    if kind in ("bool", "str", "bytes"):
+        return {"bool": _BOOL, "str": _STR, "bytes": _BYTES}[kind], "-", None, (), (), 0
+    return _NUMBER, SCALAR_CODES[kind], None, (), (), 0

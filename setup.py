@@ -1,0 +1,10 @@
+"""What pyproject.toml cannot say: the one module in C, left out where it cannot be compiled."""
+
+import numpy
+from setuptools import Extension, setup
+
+setup(
+    ext_modules=[
+        Extension("cortex._flat", ["cortex/_flat.c"], include_dirs=[numpy.get_include()], optional=True),
+    ]
+)
