@@ -166,6 +166,35 @@ def _sample_level(texels: wp.array[wp.uint32], level: wp.vec3i, u: float, v: flo
 
 
 @wp.func
+def sample_finest(
+    texels: wp.array[wp.uint32], levels: wp.array[wp.vec3i], texture: wp.vec2i, uv: wp.vec2
+) -> wp.vec3:
+    """Return the linear light of a texture's finest level, bilinear between texels; see `sample_texture`.
+
+    It aliases where texels are smaller than pixels.
+    """
+    u = uv[0] - wp.floor(uv[0])
+    v = 1.0 - (uv[1] - wp.floor(uv[1]))
+    return _sample_level(texels, levels[texture[0]], u, v)
+
+
+@wp.func
+def sample_nearest(
+    texels: wp.array[wp.uint32], levels: wp.array[wp.vec3i], texture: wp.vec2i, uv: wp.vec2
+) -> wp.vec3:
+    """Return the linear light of the nearest texel of a texture's finest level; see `sample_texture`.
+
+    It aliases where texels are smaller than pixels, and has steps where they are larger.
+    """
+    level = levels[texture[0]]
+    u = uv[0] - wp.floor(uv[0])
+    v = 1.0 - (uv[1] - wp.floor(uv[1]))
+    col = wp.min(int(u * float(level[1])), level[1] - 1)
+    row = wp.min(int(v * float(level[2])), level[2] - 1)
+    return decode_texel(texels[level[0] + row * level[1] + col])
+
+
+@wp.func
 def sample_texture(
     texels: wp.array[wp.uint32],
     levels: wp.array[wp.vec3i],

@@ -12,6 +12,8 @@ from neurosim_core.scene.materials import (
     mean_albedo,
     mip_chain,
     pack_textures,
+    sample_finest,
+    sample_nearest,
     sample_texture,
     srgb_to_linear,
 )
@@ -31,19 +33,39 @@ def _sample(
     color_out[k] = sample_texture(texels, levels, texture, uv[k], lod[k])
 
 
+@wp.kernel
+def _sample_finest_level(
+    texels: wp.array[wp.uint32],
+    levels: wp.array[wp.vec3i],
+    texture: wp.vec2i,
+    uv: wp.array[wp.vec2],
+    nearest: bool,
+    color_out: wp.array[wp.vec3],
+):
+    k = wp.tid()
+    if nearest:
+        color_out[k] = sample_nearest(texels, levels, texture, uv[k])
+    else:
+        color_out[k] = sample_finest(texels, levels, texture, uv[k])
+
+
 def sample(srgb, uv, lod, device):
+    """Sample a texture trilinearly, or at its finest level if `lod` is "finest" or "nearest"."""
     packed = pack_textures([Material(name="m", texture=Texture(name="t", srgb=srgb))])
     uv = np.asarray(uv, np.float32).reshape(-1, 2)
-    lod = np.broadcast_to(np.float32(lod), len(uv))
     color = wp.zeros(len(uv), dtype=wp.vec3, device=device)
     inputs = [
         wp.array(packed.texels, dtype=wp.uint32, device=device),
         wp.array(packed.levels, dtype=wp.vec3i, device=device),
         wp.vec2i(*packed.material_texture[0].tolist()),
         wp.array(uv, dtype=wp.vec2, device=device),
-        wp.array(lod, dtype=float, device=device),
     ]
-    wp.launch(_sample, dim=len(uv), inputs=inputs, outputs=[color], device=device)
+    if isinstance(lod, str):
+        kernel, inputs = _sample_finest_level, [*inputs, lod == "nearest"]
+    else:
+        lods = np.broadcast_to(np.float32(lod), len(uv))
+        kernel, inputs = _sample, [*inputs, wp.array(lods, dtype=float, device=device)]
+    wp.launch(kernel, dim=len(uv), inputs=inputs, outputs=[color], device=device)
     return color.numpy()
 
 
@@ -121,6 +143,25 @@ def test_between_levels_light_is_linear(device):
     np.testing.assert_array_equal(sample(srgb, uv, -3.0, device), sample(srgb, uv, 0.0, device))
     mean = srgb_to_linear(srgb).mean(axis=(0, 1))
     np.testing.assert_allclose(sample(srgb, uv, 99.0, device)[0], mean, rtol=2e-3)  # half a step of 10 bits
+
+
+def test_nearest_texel_is_the_one_that_contains_the_point(device):
+    srgb = noise(5, 7, seed=4)
+    uv = np.random.default_rng(5).uniform(-3.0, 3.0, (500, 2)).astype(np.float32)
+    uv = np.concatenate([uv, [[0.0, 0.0], [1.0, 1.0], [-1e-9, 1e-9]]]).astype(np.float32)
+    texel = np.mod(uv, np.float32(1.0)) * [7, 5]  # np.mod of -1e-9 is 1.0: the last column
+    column = np.minimum(texel[:, 0].astype(int), 6)
+    row = np.minimum((5.0 - texel[:, 1]).astype(int), 4)  # v = 1 is the top
+    expected = srgb_to_linear(srgb)[row, column]
+    np.testing.assert_allclose(
+        sample(srgb, uv, "nearest", device), expected, atol=1.1e-3
+    )  # 10 bits of the root of blue
+
+
+def test_finest_level_is_level_0(device):
+    srgb = noise(9, 4, seed=6)
+    uv = np.random.default_rng(7).uniform(-3.0, 3.0, (500, 2))
+    np.testing.assert_array_equal(sample(srgb, uv, "finest", device), sample(srgb, uv, 0.0, device))
 
 
 def test_shared_textures_are_packed_once():
