@@ -1,42 +1,17 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-"""RKMK4: the classical Runge-Kutta method in the exponential chart of SO(3), with a moment-matched motor lag.
-
-Within a step the attitude is R = R_0 exp(u) and u' = dexp^-1(w) = w + u x w / 2 + u x (u x w) / 12, which is
-as many terms as order 4 needs. Rotations about a fixed axis are exact. Forces are computed in the body frame
-B0 of the start of the step; gravity is added to velocity and position in closed form. See `motor` for what
-the stages see of the rotors.
-
-Reference: Munthe-Kaas (1998), Runge-Kutta methods on Lie groups.
-"""
+"""The kernels of a batch: fixed steps first, and adaptive ones for the vehicles where those do not do."""
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from neurosim_core.frames import quaternion_exp
-from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
-
-STATUS_OK = wp.constant(wp.int32(0))
-STATUS_COMMAND = wp.constant(wp.int32(1))
-STATUS_VELOCITY = wp.constant(wp.int32(2))
-STATUS_BODY_RATE = wp.constant(wp.int32(3))
-
-STATUS_TERMS = ("ok", "rotor_speed_command", "velocity", "body_rate")
-"""What each status code means: the quantity that was not finite or left what the step can resolve."""
-
-GUARD_ABSOLUTE = 1e-3
-"""Guard: largest embedded error estimate of one step at rest [m/s, rad/s]."""
-GUARD_RELATIVE = 1e-2
-"""Guard: largest embedded error estimate of one step as a share of speed and body rate."""
-
-
-_vec7d = wp.types.vector(length=7, dtype=wp.float64)
-# Taylor coefficients in t^2, the highest first; what is left out is below 1e-16 for t < 1/2
-_SINE_SERIES = wp.constant(_vec7d(*((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6, -1, -1))))
-_COSINE_SERIES = wp.constant(_vec7d(*((-1.0) ** k / math.factorial(2 * k + 2) for k in range(6, -1, -1))))
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, vec10d
+from neurosim_core.vehicle.dormand_prince import RotorSums, make_dormand_prince
+from neurosim_core.vehicle.equations import make_equations
+from neurosim_core.vehicle.rkmk4 import make_rkmk4
+from neurosim_core.vehicle.status import STATUS_COMMAND, STATUS_OK
 
 
 class Kernels(NamedTuple):
@@ -48,67 +23,23 @@ class Kernels(NamedTuple):
     """Evaluates linear and angular acceleration at the current state."""
 
 
-@wp.func
-def _chart_rate(u: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
-    turn = wp.cross(u, w)
-    return w + wp.float64(0.5) * turn + wp.cross(u, turn) / wp.float64(12.0)
-
-
-@wp.func
-def _rotation_series(u: wp.vec3d) -> wp.vec2d:
-    """Return a = sin(t) / t and b = (1 - cos(t)) / t^2, t = |u|: exp(u) x = x + a u x x + b u x (u x x)."""
-    t2 = wp.dot(u, u)
-    a = wp.float64(0.0)
-    b = wp.float64(0.0)
-    for term in range(7):
-        a = a * t2 + _SINE_SERIES[term]
-        b = b * t2 + _COSINE_SERIES[term]
-    if t2 > wp.float64(0.25):
-        t = wp.sqrt(t2)
-        a = wp.sin(t) / t
-        b = (wp.float64(1.0) - wp.cos(t)) / t2
-    return wp.vec2d(a, b)
-
-
 @functools.cache
-def make_kernels(terms: frozenset[str]) -> Kernels:
-    """Return the kernels that compute only the given terms (see `multirotor.TERMS`)."""
+def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
+    """Return the kernels that compute only the given terms (see `multirotor.TERMS`).
+
+    Args:
+        terms: What is computed.
+        adaptive: Take no fixed steps.
+    """
     motor_lag = "motor_lag" in terms
     air_terms = any(term in terms for term in AIR_TERMS)
     wind = air_terms and "wind" in terms
-    full_inertia = "full_inertia" in terms
-    wrench = make_wrench(terms)
-    rotor_wrench = make_wrench(terms & {"rotor_drag", "flapping"})  # linear in the sums over the rotors
-    module = wp.get_module("neurosim_core.vehicle.integrator." + ("_".join(sorted(terms)) or "rigid"))
-
-    @wp.func
-    def solve_inertia(airframe: Airframe, torque: wp.vec3d) -> wp.vec3d:
-        if wp.static(full_inertia):
-            return airframe.inertia_inverse * torque
-        else:
-            return wp.cw_mul(airframe.inertia_diagonal_inverse, torque)
-
-    @wp.func
-    def angular_acceleration(airframe: Airframe, torque: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
-        momentum = wp.cw_mul(airframe.inertia_diagonal, w)
-        if wp.static(full_inertia):
-            momentum = airframe.inertia * w
-        return solve_inertia(airframe, torque - wp.cross(w, momentum))
-
-    @wp.func
-    def rates(
-        airframe: Airframe, quadratic: wp.vec4d, linear: vec10d, u: wp.vec3d, air_0: wp.vec3d, w: wp.vec3d
-    ):
-        """Specific force in B0 and angular acceleration in B, where B is B0 turned by exp(u)."""
-        series = _rotation_series(u)
-        air = air_0
-        if wp.static(air_terms):
-            turn = wp.cross(u, air_0)
-            air = air_0 - series[0] * turn + series[1] * wp.cross(u, turn)
-        force, torque = wrench(airframe, quadratic, linear, air, w)
-        swing = wp.cross(u, force)
-        force_0 = force + series[0] * swing + series[1] * wp.cross(u, swing)
-        return airframe.mass_inverse * force_0, angular_acceleration(airframe, torque, w)
+    equations = make_equations(terms, air_terms=air_terms)
+    wrench, angular_acceleration = equations.wrench, equations.angular_acceleration
+    fly_fixed = make_rkmk4(terms, equations, air_terms=air_terms, wind=wind)
+    fly_adaptive = make_dormand_prince(terms, equations, air_terms=air_terms, wind=wind)
+    name = "_".join(sorted(terms)) or "rigid"
+    module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}" + (".adaptive" if adaptive else ""))
 
     @wp.kernel(module=module, enable_backward=False)
     def advance(
@@ -122,6 +53,10 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
         step_s: wp.float64,
         step_count: wp.int32,
         duration_ns: wp.int64,
+        lag_rate: wp.float64,
+        rtol: wp.float64,
+        atol: wp.float64,
+        evaluation_count_max: wp.int32,
         # In:
         rotor_speed_command: wp.array2d[wp.float64],
         # In/out:
@@ -132,6 +67,8 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
         rotor_speed: wp.array2d[wp.float64],
         stamp_ns: wp.array[wp.int64],
         status: wp.array[wp.int32],
+        redone_count: wp.array[wp.int64],
+        evaluation_count: wp.array[wp.int64],
     ):
         vehicle = wp.tid()
         if status[vehicle] != STATUS_OK:
@@ -166,100 +103,34 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
         v = velocity[vehicle]
         q = orientation[vehicle]
         w = body_rate[vehicle]
-        down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
-
-        h = step_s
-        half = wp.float64(0.5) * h
-        sixth = h / wp.float64(6.0)
-        two = wp.float64(2.0)
-        absolute2 = wp.static(wp.float64(GUARD_ABSOLUTE**2))
-        relative2 = wp.static(wp.float64(GUARD_RELATIVE**2))
-
-        remaining = wp.float64(1.0)
-        failure = STATUS_OK
-        done = wp.int32(0)
-        for _step in range(step_count):
-            quadratic_1 = quadratic_cc
-            quadratic_2 = quadratic_cc
-            quadratic_4 = quadratic_cc
-            linear_1 = linear_c
-            linear_2 = linear_c
-            linear_4 = linear_c
+        remaining = wp.float64(0.0)
+        redo = wp.bool(True)
+        if wp.static(not adaptive):
+            x, v, q, w, remaining, redo = fly_fixed(
+                airframe, quadratic_cc, quadratic_cd, quadratic_dd, linear_c, linear_d,
+                speed_nodes, square_nodes, decay, step_s, step_count, x, v, q, w,
+            )  # fmt: skip
+        if redo:
+            rotors = RotorSums()
+            rotors.quadratic_cc = quadratic_cc
+            rotors.quadratic_cd = quadratic_cd
+            rotors.quadratic_dd = quadratic_dd
+            rotors.linear_c = linear_c
+            rotors.linear_d = linear_d
+            rotors.lag_rate = lag_rate
+            duration_s = wp.float64(step_count) * step_s
+            x, v, q, w, used, failure = fly_adaptive(
+                airframe, rotors, duration_s, step_s, rtol, atol, evaluation_count_max,
+                position[vehicle], velocity[vehicle], orientation[vehicle], body_rate[vehicle],
+            )  # fmt: skip
+            evaluation_count[vehicle] += wp.int64(used)
+            if wp.static(not adaptive):
+                redone_count[vehicle] += wp.int64(1)
+            if failure != STATUS_OK:
+                status[vehicle] = failure
+                return
             if wp.static(motor_lag):
-                quadratic_1 += speed_nodes[0] * quadratic_cd + square_nodes[0] * quadratic_dd
-                quadratic_2 += speed_nodes[1] * quadratic_cd + square_nodes[1] * quadratic_dd
-                quadratic_4 += speed_nodes[2] * quadratic_cd + square_nodes[2] * quadratic_dd
-                if wp.static(air_terms):
-                    linear_1 += speed_nodes[0] * linear_d
-                    linear_2 += speed_nodes[1] * linear_d
-                    linear_4 += speed_nodes[2] * linear_d
-
-            air_0 = v
-            down_0 = down
-            if wp.static(air_terms):
-                if wp.static(wind):
-                    air_0 = wp.quat_rotate_inv(q, v - airframe.wind)
-                else:
-                    air_0 = wp.quat_rotate_inv(q, v)
-                down_0 = wp.quat_rotate_inv(q, down)
-
-            force_1, torque_1 = wrench(airframe, quadratic_1, linear_1, air_0, w)
-            a_1 = airframe.mass_inverse * force_1
-            w_1 = angular_acceleration(airframe, torque_1, w)
-
-            u_2 = half * w
-            rate_2 = w + half * w_1
-            a_2, w_2 = rates(airframe, quadratic_2, linear_2, u_2, air_0 + half * (a_1 + down_0), rate_2)
-            u_rate_2 = _chart_rate(u_2, rate_2)
-
-            u_3 = half * u_rate_2
-            rate_3 = w + half * w_2
-            a_3, w_3 = rates(airframe, quadratic_2, linear_2, u_3, air_0 + half * (a_2 + down_0), rate_3)
-            u_rate_3 = _chart_rate(u_3, rate_3)
-
-            u_4 = h * u_rate_3
-            rate_4 = w + h * w_3
-            a_4, w_4 = rates(airframe, quadratic_4, linear_4, u_4, air_0 + h * (a_3 + down_0), rate_4)
-            u_rate_4 = _chart_rate(u_4, rate_4)
-
-            v_next = v + h * down + wp.quat_rotate(q, sixth * (a_1 + two * (a_2 + a_3) + a_4))
-            w_next = w + sixth * (w_1 + two * (w_2 + w_3) + w_4)
-            u = sixth * (w + two * (u_rate_2 + u_rate_3) + u_rate_4)
-
-            # guard: the embedded estimate, less what the lag alone puts into it (it is integrated exactly)
-            a_error = a_1 - a_2 - a_3 + a_4
-            w_error = w_1 - w_2 - w_3 + w_4
-            if wp.static(motor_lag):
-                lag_force, lag_torque = rotor_wrench(
-                    airframe,
-                    quadratic_1 - two * quadratic_2 + quadratic_4,
-                    linear_1 - two * linear_2 + linear_4,
-                    air_0,
-                    w,
-                )
-                a_error -= airframe.mass_inverse * lag_force
-                w_error -= solve_inertia(airframe, lag_torque)
-            # written so that a NaN trips it
-            if not (sixth * sixth * wp.length_sq(a_error) <= absolute2 + relative2 * wp.length_sq(v_next)):
-                failure = STATUS_VELOCITY
-                break
-            if not (sixth * sixth * wp.length_sq(w_error) <= absolute2 + relative2 * wp.length_sq(w_next)):
-                failure = STATUS_BODY_RATE
-                break
-
-            x += h * v + half * h * down + wp.quat_rotate(q, h * sixth * (a_1 + a_2 + a_3))
-            v = v_next
-            w = w_next
-            q = q * quaternion_exp(u)
-            # one Newton step towards unit length: exact to rounding this close to it
-            q = (wp.float64(1.5) - wp.float64(0.5) * wp.dot(q, q)) * q
-            done += 1
-            if wp.static(motor_lag):
-                remaining *= decay
-                quadratic_cd = decay * quadratic_cd
-                quadratic_dd = decay * decay * quadratic_dd
-                if wp.static(air_terms):
-                    linear_d = decay * linear_d
+                remaining = wp.exp(-lag_rate * duration_s)
 
         position[vehicle] = x
         velocity[vehicle] = v
@@ -269,14 +140,11 @@ def make_kernels(terms: frozenset[str]) -> Kernels:
             c = wp.clamp(
                 rotor_speed_command[vehicle, rotor], airframe.rotor_speed_min, airframe.rotor_speed_max
             )
-            if done == 0:
-                c = rotor_speed[vehicle, rotor]
             if wp.static(motor_lag):
                 rotor_speed[vehicle, rotor] = c + remaining * (rotor_speed[vehicle, rotor] - c)
             else:
                 rotor_speed[vehicle, rotor] = c
-        stamp_ns[vehicle] += wp.int64(done) * duration_ns / wp.int64(step_count)
-        status[vehicle] = failure
+        stamp_ns[vehicle] += duration_ns
 
     @wp.kernel(module=module, enable_backward=False)
     def accelerate(

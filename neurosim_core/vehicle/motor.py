@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 _SERIES_BELOW = 0.3
 """Below, the closed forms of the moments cancel; 14 terms of the series are exact to rounding there."""
+_RATE_MAX_1_S = 1e300  # so that rate t is 0 at t = 0 also for tau = 0
 
 
 class LagConstants(NamedTuple):
@@ -24,12 +25,15 @@ class LagConstants(NamedTuple):
     """exp(-2 z s) projected likewise: weights of (Omega_0 - c)^2 in Omega^2."""
     decay: float
     """exp(-z): what is left of Omega_0 - c after the step."""
+    rate_1_s: float
+    """1 / tau [1/s], finite: Omega_0 - c decays with exp(-rate t)."""
 
 
 def lag_constants(step_s: float, time_constant_s: float) -> LagConstants:
     """Return the constants of one step; a time constant of 0 means that the speed follows at once."""
     z = step_s / time_constant_s if time_constant_s > 0.0 else math.inf
-    return LagConstants(_projected_exponential(z), _projected_exponential(2.0 * z), math.exp(-z))
+    rate_1_s = min(z / step_s, _RATE_MAX_1_S)
+    return LagConstants(_projected_exponential(z), _projected_exponential(2.0 * z), math.exp(-z), rate_1_s)
 
 
 def _projected_exponential(z: float) -> tuple[float, float, float]:

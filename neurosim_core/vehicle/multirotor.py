@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import warp as wp
@@ -23,11 +23,15 @@ from neurosim_core.vehicle.aerodynamics import (
     vec8d,
     vec10d,
 )
-from neurosim_core.vehicle.integrator import STATUS_TERMS, make_kernels
+from neurosim_core.vehicle.integrator import make_kernels
 from neurosim_core.vehicle.motor import lag_constants
+from neurosim_core.vehicle.status import STATUS_TERMS
 
 TERMS = ("motor_lag", *AIR_TERMS, "wind", "full_inertia")
 """Terms of the equations of motion that a vehicle may do without."""
+
+Integrator = Literal["rkmk4", "dormand_prince"]
+"""How a vehicle is integrated: see `Multirotor`."""
 
 _BLOCK_DIM = 32  # threads per CUDA block: a few thousand vehicles then reach every multiprocessor
 _LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
@@ -150,11 +154,20 @@ class Acceleration(NamedTuple):
     """dw/dt in B [rad/s^2], [N, 3]."""
 
 
-class DynamicsError(ArithmeticError):
-    """The motion of a vehicle left what a step can resolve, or its command was not finite.
+class Effort(NamedTuple):
+    """What the adaptive integrator did for each vehicle since the reset, on the host."""
 
-    The vehicle is held at its last good state until it is reset; other vehicles of the batch are not
-    affected.
+    redone_count: NDArray[np.int64]
+    """Intervals that fixed steps could not resolve and that were redone, [N]."""
+    evaluation_count: NDArray[np.int64]
+    """Evaluations of the right-hand side in adaptive steps, [N]; fixed steps take 4 each, not counted."""
+
+
+class DynamicsError(ArithmeticError):
+    """The motion of a vehicle cannot be integrated, or its command was not finite.
+
+    The vehicle is held at its last good state, the beginning of the interval that failed, until it is reset;
+    other vehicles of the batch are not affected.
 
     Attributes:
         stamp_ns: Time of the last good state [ns].
@@ -203,7 +216,11 @@ class MultirotorArrays:
     stamp_ns: wp.array[wp.int64]
     """Time of each vehicle's state [ns], [N]; stops where a vehicle is held."""
     status: wp.array[wp.int32]
-    """0, or why a vehicle is held: index into `integrator.STATUS_TERMS`, [N]."""
+    """0, or why a vehicle is held: index into `status.STATUS_TERMS`, [N]."""
+    redone_count: wp.array[wp.int64]
+    """Intervals redone with adaptive steps since the reset, [N]."""
+    evaluation_count: wp.array[wp.int64]
+    """Evaluations of the right-hand side in adaptive steps since the reset, [N]."""
 
 
 class Multirotor:
@@ -214,18 +231,29 @@ class Multirotor:
     captured in a CUDA graph. Rotor speed commands outside the range of the rotors saturate, as they do in a
     motor controller.
 
-    A vehicle whose motion cannot be resolved (see `DynamicsError`) stops at its last good state: its `status`
-    is set on the device, and `check` raises. The criterion is RK4's embedded difference h/6 |k1 - k2 - k3 +
-    k4| on velocity and body rate, against sqrt(1e-3^2 + (1e-2 |.|)^2); it catches blow-up and is no estimate
-    of accuracy.
+    An interval is what one call of `advance` covers. It is flown in equal steps of RKMK4 (`rkmk4.py`). Where
+    these do not resolve the motion of a vehicle, its interval is flown again from its beginning in adaptive
+    steps of Dormand-Prince 5(4) (`dormand_prince.py`), on the device, and counted (`effort`). The criterion
+    is RK4's embedded difference h/6 |k1 - k2 - k3 + k4| on velocity and body rate, against sqrt(1e-3^2 +
+    (1e-2 |.|)^2); it catches blow-up and is no estimate of accuracy. A vehicle that adaptive steps cannot
+    move either stops at the beginning of the interval: its `status` is set on the device, and `check` raises
+    DynamicsError.
 
     Args:
         config: Parameters, the same for all vehicles.
         count: Number of vehicles N.
         device: Warp device.
-        max_step_ns: Longest integration step [ns].
+        max_step_ns: Longest integration step [ns]. Adaptive steps begin with it, and may be longer.
         terms: Terms to compile in, of `TERMS`; by default those that the parameters need. More than needed
             change nothing but the speed.
+        integrator: rkmk4: as above. dormand_prince: adaptive steps only.
+        rtol: Of adaptive steps: largest error of one, as a share of displacement and rotation in the step, of
+            velocity and of body rate.
+        atol: What is added to that [m, m/s, rad, rad/s].
+        evaluation_count_max: The most evaluations of the right-hand side for one interval of one vehicle.
+
+    Raises:
+        ValueError: An argument is out of range, or there is no such device.
     """
 
     def __init__(
@@ -236,6 +264,10 @@ class Multirotor:
         device: str = "cpu",
         max_step_ns: int = 1_000_000,
         terms: Iterable[str] | None = None,
+        integrator: Integrator = "rkmk4",
+        rtol: float = 1e-6,
+        atol: float = 1e-8,
+        evaluation_count_max: int = 100_000,
     ) -> None:
         if count < 1:
             raise ValueError(f"count must be >= 1, got {count}")
@@ -246,6 +278,14 @@ class Multirotor:
             raise ValueError(
                 f"terms must hold {config.terms()}, which the parameters need, and be of {TERMS}, got {terms}"
             )
+        if integrator not in get_args(Integrator):
+            raise ValueError(f"integrator must be of {get_args(Integrator)}, got {integrator!r}")
+        if not 1e-14 <= rtol <= 0.1:
+            raise ValueError(f"rtol must be in [1e-14, 0.1], got {rtol}")
+        if not 0.0 < atol < np.inf:
+            raise ValueError(f"atol must be > 0 and finite, got {atol}")
+        if not 7 <= evaluation_count_max < 2**31 - 7:
+            raise ValueError(f"evaluation_count_max must be in [7, 2^31 - 7), got {evaluation_count_max}")
         self.config = config
         self.count = count
         self.device = wp.get_device(device)
@@ -268,21 +308,12 @@ class Multirotor:
             angular_acceleration=zeros(count, wp.vec3d),
             stamp_ns=zeros(count, wp.int64),
             status=zeros(count, wp.int32),
+            redone_count=zeros(count, wp.int64),
+            evaluation_count=zeros(count, wp.int64),
         )
-        self._kernels = make_kernels(frozenset(self.terms))
-        position = np.array(config.rotor_position_m)
-        drag = np.array([config.rotor_drag_kg, config.rotor_drag_kg, config.rotor_inflow_kg])
-        quadratic = quadratic_weights(
-            position,
-            np.array(config.rotor_direction, dtype=np.float64),
-            thrust=config.thrust_coefficient_n_s2,
-            torque=config.torque_coefficient_n_m_s2,
-        )
-        self._model = [
-            _airframe(config, position, drag),
-            wp.array(quadratic, dtype=wp.vec4d, device=self.device),
-            wp.array(linear_weights(position, drag), dtype=vec10d, device=self.device),
-        ]
+        self._kernels = make_kernels(frozenset(self.terms), adaptive=integrator == "dormand_prince")
+        self._adaptive = (rtol, atol, evaluation_count_max)
+        self._model = make_airframe(config, self.device)
         self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
         self.reset()
@@ -331,8 +362,8 @@ class Multirotor:
         ]
         for array, value in rows:
             array.assign(value)
-        arrays.stamp_ns.zero_()
-        arrays.status.zero_()
+        for counter in (arrays.stamp_ns, arrays.status, arrays.redone_count, arrays.evaluation_count):
+            counter.zero_()
         self._stamp_ns = 0
 
     def step(self, rotor_speed_command: ArrayLike, duration_ns: int) -> None:
@@ -435,6 +466,12 @@ class Multirotor:
         a = self.arrays
         return Acceleration(np.array(a.acceleration.numpy()), np.array(a.angular_acceleration.numpy()))
 
+    @property
+    def effort(self) -> Effort:
+        """What adaptive steps were needed for since the reset, on the host; waits for the device."""
+        a = self.arrays
+        return Effort(np.array(a.redone_count.numpy()), np.array(a.evaluation_count.numpy()))
+
     def _rows(self, value: ArrayLike, name: str, width: int) -> NDArray[np.float64]:
         return as_rows(value, name=name, count=self.count, width=width)
 
@@ -457,10 +494,13 @@ class Multirotor:
                 step_s,
                 step_count,
                 duration_ns,
+                lag.rate_1_s,
+                *self._adaptive,
                 a.rotor_speed_command,
             ],
             outputs=[
                 a.position, a.velocity, a.orientation, a.body_rate, a.rotor_speed, a.stamp_ns, a.status,
+                a.redone_count, a.evaluation_count,
             ],
             device=self.device,
             block_dim=_BLOCK_DIM,
@@ -470,6 +510,37 @@ class Multirotor:
             del self._launches[next(iter(self._launches))]
         self._launches[duration_ns] = launch
         return launch
+
+
+class AirframeArrays(NamedTuple):
+    """Parameters of a multirotor as the kernels read them."""
+
+    airframe: Airframe
+    quadratic_weight: wp.array[wp.vec4d]
+    """See `aerodynamics.quadratic_weights`, [R]."""
+    linear_weight: wp.array[vec10d]
+    """See `aerodynamics.linear_weights`, [R]."""
+
+
+def make_airframe(config: MultirotorConfig, device: Any) -> AirframeArrays:
+    """Put the parameters of a multirotor on a device.
+
+    Raises:
+        ValueError: There is no such device.
+    """
+    position = np.array(config.rotor_position_m)
+    drag = np.array([config.rotor_drag_kg, config.rotor_drag_kg, config.rotor_inflow_kg])
+    quadratic = quadratic_weights(
+        position,
+        np.array(config.rotor_direction, dtype=np.float64),
+        thrust=config.thrust_coefficient_n_s2,
+        torque=config.torque_coefficient_n_m_s2,
+    )
+    return AirframeArrays(
+        _airframe(config, position, drag),
+        wp.array(quadratic, dtype=wp.vec4d, device=device),
+        wp.array(linear_weights(position, drag), dtype=vec10d, device=device),
+    )
 
 
 def _airframe(config: MultirotorConfig, position: NDArray[np.float64], drag: NDArray[np.float64]) -> Airframe:

@@ -64,8 +64,11 @@ def derivative(config: MultirotorConfig, y, rotor_speed):
     return np.concatenate([v, a, q_rate, np.linalg.solve(inertia, torque - cross(w, inertia @ w))])
 
 
-def solve(config: MultirotorConfig, state: MultirotorState, commands, hold_s: float):
-    """The state after each command, each held for `hold_s`, with the motor in closed form: list of states."""
+def solve(config: MultirotorConfig, state: MultirotorState, commands, hold_s: float, *, stiff: bool = False):
+    """The state after each command, each held for `hold_s`, with the motor in closed form: list of states.
+
+    DOP853 at 1e-12, or for stiff vehicles Radau at 1e-11.
+    """
     y = np.concatenate([state.position, state.velocity, state.orientation, state.body_rate])
     speed = np.array(state.rotor_speed)
     tau = config.motor_time_constant_s
@@ -81,8 +84,8 @@ def solve(config: MultirotorConfig, state: MultirotorState, commands, hold_s: fl
             lambda t, y, at=at: derivative(config, y, at(t)),
             (0.0, hold_s),
             y,
-            method="DOP853",
-            rtol=1e-12,
+            method="Radau" if stiff else "DOP853",
+            rtol=1e-11 if stiff else 1e-12,
             atol=1e-13,
             first_step=min(1e-4, 0.1 * tau) if tau > 0.0 else 1e-4,
         )

@@ -1,0 +1,239 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+"""Dormand-Prince 5(4) with adaptive steps, in the exponential chart of SO(3), with the exact motor lag.
+
+Each step begins in a new chart, u = 0. What is controlled is the largest of the embedded errors of
+displacement, velocity, rotation and body rate, each in the Euclidean norm against atol + rtol |.|, where
+displacement and rotation are those of the step: so the origin of the world does not matter. The controller is
+proportional-integral with the constants of DOPRI5.
+
+Reference: Dormand, Prince (1980), A family of embedded Runge-Kutta formulae; Hairer, Norsett, Wanner (1993),
+Solving ordinary differential equations I, II.4 and IV.2 (the stabilised controller).
+"""
+
+from typing import Any
+
+import warp as wp
+
+from neurosim_core.frames import quaternion_exp
+from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
+from neurosim_core.vehicle.chart import chart_rate
+from neurosim_core.vehicle.equations import Equations
+from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_OK, STATUS_VELOCITY
+
+_PROPORTIONAL = wp.constant(wp.float64(0.2 - 0.75 * 0.04))
+_INTEGRAL = wp.constant(wp.float64(0.04))
+_SAFETY = wp.constant(wp.float64(0.9))
+_SHRINK = wp.constant(wp.float64(0.2))
+_GROWTH = wp.constant(wp.float64(10.0))
+_STEP_MIN = wp.constant(wp.float64(1e-14))  # as a share of the duration
+_ROTATION_MAX_RAD = wp.constant(wp.float64(2.0))  # in one step; the chart ends at 2 pi
+
+_vec12d = wp.types.vector(length=12, dtype=wp.float64)
+
+
+@wp.struct
+class RotorSums:
+    """Sums over the rotors as functions of time: constant, decaying, and decaying twice as fast."""
+
+    quadratic_cc: wp.vec4d  # of `aerodynamics.quadratic_weights` times Omega^2 = c^2 + 2 c d + d^2
+    quadratic_cd: wp.vec4d
+    quadratic_dd: wp.vec4d
+    linear_c: vec10d  # of `aerodynamics.linear_weights` times Omega = c + d
+    linear_d: vec10d
+    lag_rate: wp.float64  # 1 / time constant [1/s]
+
+
+@wp.func
+def _part(y: _vec12d, first: wp.int32) -> wp.vec3d:
+    return wp.vec3d(y[first], y[first + 1], y[first + 2])
+
+
+@wp.func
+def _joined(displacement: wp.vec3d, v: wp.vec3d, u: wp.vec3d, w: wp.vec3d) -> _vec12d:
+    return _vec12d(
+        displacement[0],
+        displacement[1],
+        displacement[2],
+        v[0],
+        v[1],
+        v[2],
+        u[0],
+        u[1],
+        u[2],
+        w[0],
+        w[1],
+        w[2],
+    )
+
+
+@wp.func
+def _larger(a: wp.float64, b: wp.float64) -> wp.float64:
+    """Return the larger one, or NaN if one is NaN."""
+    if a >= b:
+        return a
+    if b > a:
+        return b
+    return a + b
+
+
+@wp.func
+def _scaled_error(
+    error: _vec12d, y: _vec12d, first: wp.int32, size_0: wp.float64, rtol: wp.float64, atol: wp.float64
+) -> wp.float64:
+    size = wp.max(size_0, wp.length(_part(y, first)))
+    return wp.length(_part(error, first)) / (atol + rtol * size)
+
+
+def make_dormand_prince(terms: frozenset[str], equations: Equations, *, air_terms: bool, wind: bool) -> Any:
+    """Return the device function that moves one vehicle by a duration.
+
+    Its arguments: the airframe; the sums over the rotors; duration and first trial step [s]; relative and
+    absolute tolerance, the latter in [m, m/s, rad, rad/s]; the most evaluations of the right-hand side;
+    position [m] and velocity [m/s] in W, attitude, body rate [rad/s].
+    It returns the last four, the number of evaluations, and why it failed or STATUS_OK.
+    """
+    motor_lag = "motor_lag" in terms
+    rates = equations.rates
+
+    @wp.func
+    def derivative(
+        airframe: Airframe,
+        rotors: RotorSums,
+        t: wp.float64,
+        q: wp.quatd,
+        y: _vec12d,
+    ):
+        """d/dt of displacement, velocity, rotation vector, body rate; q is the attitude at u = 0."""
+        quadratic = rotors.quadratic_cc
+        linear = rotors.linear_c
+        if wp.static(motor_lag):
+            left = wp.exp(-rotors.lag_rate * t)
+            quadratic = quadratic + left * rotors.quadratic_cd + left * left * rotors.quadratic_dd
+            if wp.static(air_terms):
+                linear = linear + left * rotors.linear_d
+        v = _part(y, 3)
+        u = _part(y, 6)
+        w = _part(y, 9)
+        air = v
+        if wp.static(wind):
+            air -= airframe.wind
+        force_0, spin = rates(airframe, quadratic, linear, u, wp.quat_rotate_inv(q, air), w)
+        a = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity) + wp.quat_rotate(q, force_0)
+        return _joined(v, a, chart_rate(u, w), spin)
+
+    @wp.func
+    def fly_adaptive(
+        airframe: Airframe,
+        rotors: RotorSums,
+        duration_s: wp.float64,
+        first_step_s: wp.float64,
+        rtol: wp.float64,
+        atol: wp.float64,
+        evaluation_count_max: wp.int32,
+        x_0: wp.vec3d,
+        v_0: wp.vec3d,
+        q_0: wp.quatd,
+        w_0: wp.vec3d,
+    ):
+        zero = wp.vec3d()
+        x = x_0
+        q = q_0
+        y = _joined(zero, v_0, zero, w_0)
+        t = wp.float64(0.0)
+        h = wp.min(first_step_s, duration_s)
+        error_before = wp.float64(1e-4)
+        growth = _GROWTH
+        failure = STATUS_OK
+        k1 = derivative(airframe, rotors, t, q, y)
+        evaluation_count = wp.int32(1)
+        while t < duration_s:
+            h = wp.min(h, _ROTATION_MAX_RAD / (wp.length(_part(y, 9)) + wp.float64(1e-9)))
+            last = bool(t + wp.float64(1.01) * h >= duration_s)
+            if last:
+                h = duration_s - t
+            y2 = y + h * wp.static(wp.float64(1 / 5)) * k1
+            k2 = derivative(airframe, rotors, t + wp.static(wp.float64(1 / 5)) * h, q, y2)
+            y3 = y + h * (wp.static(wp.float64(3 / 40)) * k1 + wp.static(wp.float64(9 / 40)) * k2)
+            k3 = derivative(airframe, rotors, t + wp.static(wp.float64(3 / 10)) * h, q, y3)
+            y4 = y + h * (
+                wp.static(wp.float64(44 / 45)) * k1
+                - wp.static(wp.float64(56 / 15)) * k2
+                + wp.static(wp.float64(32 / 9)) * k3
+            )
+            k4 = derivative(airframe, rotors, t + wp.static(wp.float64(4 / 5)) * h, q, y4)
+            y5 = y + h * (
+                wp.static(wp.float64(19372 / 6561)) * k1
+                - wp.static(wp.float64(25360 / 2187)) * k2
+                + wp.static(wp.float64(64448 / 6561)) * k3
+                - wp.static(wp.float64(212 / 729)) * k4
+            )
+            k5 = derivative(airframe, rotors, t + wp.static(wp.float64(8 / 9)) * h, q, y5)
+            y6 = y + h * (
+                wp.static(wp.float64(9017 / 3168)) * k1
+                - wp.static(wp.float64(355 / 33)) * k2
+                + wp.static(wp.float64(46732 / 5247)) * k3
+                + wp.static(wp.float64(49 / 176)) * k4
+                - wp.static(wp.float64(5103 / 18656)) * k5
+            )
+            k6 = derivative(airframe, rotors, t + h, q, y6)
+            y7 = y + h * (
+                wp.static(wp.float64(35 / 384)) * k1
+                + wp.static(wp.float64(500 / 1113)) * k3
+                + wp.static(wp.float64(125 / 192)) * k4
+                - wp.static(wp.float64(2187 / 6784)) * k5
+                + wp.static(wp.float64(11 / 84)) * k6
+            )
+            k7 = derivative(airframe, rotors, t + h, q, y7)
+            evaluation_count += 6
+            difference = h * (
+                wp.static(wp.float64(71 / 57600)) * k1
+                - wp.static(wp.float64(71 / 16695)) * k3
+                + wp.static(wp.float64(71 / 1920)) * k4
+                - wp.static(wp.float64(17253 / 339200)) * k5
+                + wp.static(wp.float64(22 / 525)) * k6
+                - wp.static(wp.float64(1 / 40)) * k7
+            )
+            v_size = wp.length(_part(y, 3))
+            w_size = wp.length(_part(y, 9))
+            none = wp.float64(0.0)
+            v_error = _larger(
+                _scaled_error(difference, y7, 0, none, rtol, atol),
+                _scaled_error(difference, y7, 3, v_size, rtol, atol),
+            )
+            w_error = _larger(
+                _scaled_error(difference, y7, 6, none, rtol, atol),
+                _scaled_error(difference, y7, 9, w_size, rtol, atol),
+            )
+            error = _larger(v_error, w_error)
+            if error <= wp.float64(1.0):  # false for NaN
+                t += h
+                x += _part(y7, 0)
+                u = _part(y7, 6)
+                q = q * quaternion_exp(u)
+                # one Newton step towards unit length: exact to rounding this close to it
+                q = (wp.float64(1.5) - wp.float64(0.5) * wp.dot(q, q)) * q
+                y = _joined(zero, _part(y7, 3), zero, _part(y7, 9))
+                # the last stage is the first of the next step, where u' = w
+                k1 = _joined(_part(y7, 3), _part(k7, 3), _part(y7, 9), _part(k7, 9))
+                scaled = wp.pow(wp.max(error, wp.float64(1e-10)), _PROPORTIONAL)
+                h *= wp.clamp(_SAFETY * wp.pow(error_before, _INTEGRAL) / scaled, _SHRINK, growth)
+                error_before = wp.max(error, wp.float64(1e-4))
+                growth = _GROWTH
+                if last:
+                    t = duration_s
+            else:
+                shrink = _SHRINK
+                if error > wp.float64(1.0) and error < wp.float64(1e100):
+                    shrink = wp.max(_SHRINK, _SAFETY / wp.pow(error, _PROPORTIONAL))
+                h *= shrink
+                growth = wp.float64(1.0)
+            if t < duration_s and (evaluation_count >= evaluation_count_max or h < _STEP_MIN * duration_s):
+                failure = STATUS_VELOCITY
+                spins = w_error > v_error or not wp.isfinite(wp.length(_part(k1, 9)))
+                if spins and wp.isfinite(wp.length(_part(k1, 3))):
+                    failure = STATUS_BODY_RATE
+                break
+        return x, _part(y, 3), q, _part(y, 9), evaluation_count, failure
+
+    return fly_adaptive

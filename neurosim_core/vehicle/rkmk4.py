@@ -1,0 +1,161 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+"""RKMK4: the classical Runge-Kutta method in the exponential chart of SO(3), with a moment-matched motor lag.
+
+Rotations about a fixed axis are exact. Forces are computed in the body frame B0 of the start of the step;
+gravity is added to velocity and position in closed form. See `motor` for what the stages see of the rotors.
+
+The guard is the embedded difference h/6 |k1 - k2 - k3 + k4| on velocity and body rate; it catches blow-up and
+is no estimate of accuracy.
+
+Reference: Munthe-Kaas (1998), Runge-Kutta methods on Lie groups.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from neurosim_core.frames import quaternion_exp
+from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.chart import chart_rate_4
+from neurosim_core.vehicle.equations import Equations
+
+GUARD_ABSOLUTE = 1e-3
+"""Guard: largest embedded error estimate of one step at rest [m/s, rad/s]."""
+GUARD_RELATIVE = 1e-2
+"""Guard: largest embedded error estimate of one step as a share of speed and body rate."""
+
+
+def make_rkmk4(terms: frozenset[str], equations: Equations, *, air_terms: bool, wind: bool) -> Any:
+    """Return the device function that moves one vehicle by a number of equal steps.
+
+    Its arguments: the airframe; of the sums over the rotors (`aerodynamics.quadratic_weights`) the parts that
+    are constant, decay, and decay twice as fast; of those of `aerodynamics.linear_weights` the first two;
+    `LagConstants`; length [s] and number of steps; position [m] and velocity [m/s] in W, attitude, body rate
+    [rad/s]. It returns the last four, what is left of the decaying part, and whether the guard tripped; then
+    the others mean nothing.
+    """
+    motor_lag = "motor_lag" in terms
+    rotor_wrench = make_wrench(terms & {"rotor_drag", "flapping"})  # linear in the sums over the rotors
+    wrench, solve_inertia, angular_acceleration, rates = equations
+
+    @wp.func
+    def fly_fixed(
+        airframe: Airframe,
+        quadratic_cc: wp.vec4d,
+        quadratic_cd_0: wp.vec4d,
+        quadratic_dd_0: wp.vec4d,
+        linear_c: vec10d,
+        linear_d_0: vec10d,
+        speed_nodes: wp.vec3d,
+        square_nodes: wp.vec3d,
+        decay: wp.float64,
+        step_s: wp.float64,
+        step_count: wp.int32,
+        x_0: wp.vec3d,
+        v_0: wp.vec3d,
+        q_0: wp.quatd,
+        w_0: wp.vec3d,
+    ):
+        x = x_0
+        v = v_0
+        q = q_0
+        w = w_0
+        quadratic_cd = quadratic_cd_0
+        quadratic_dd = quadratic_dd_0
+        linear_d = linear_d_0
+        down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
+
+        h = step_s
+        half = wp.float64(0.5) * h
+        sixth = h / wp.float64(6.0)
+        two = wp.float64(2.0)
+        absolute2 = wp.static(wp.float64(GUARD_ABSOLUTE**2))
+        relative2 = wp.static(wp.float64(GUARD_RELATIVE**2))
+
+        remaining = wp.float64(1.0)
+        tripped = wp.bool(False)
+        for _step in range(step_count):
+            quadratic_1 = quadratic_cc
+            quadratic_2 = quadratic_cc
+            quadratic_4 = quadratic_cc
+            linear_1 = linear_c
+            linear_2 = linear_c
+            linear_4 = linear_c
+            if wp.static(motor_lag):
+                quadratic_1 += speed_nodes[0] * quadratic_cd + square_nodes[0] * quadratic_dd
+                quadratic_2 += speed_nodes[1] * quadratic_cd + square_nodes[1] * quadratic_dd
+                quadratic_4 += speed_nodes[2] * quadratic_cd + square_nodes[2] * quadratic_dd
+                if wp.static(air_terms):
+                    linear_1 += speed_nodes[0] * linear_d
+                    linear_2 += speed_nodes[1] * linear_d
+                    linear_4 += speed_nodes[2] * linear_d
+
+            air_0 = v
+            down_0 = down
+            if wp.static(air_terms):
+                if wp.static(wind):
+                    air_0 = wp.quat_rotate_inv(q, v - airframe.wind)
+                else:
+                    air_0 = wp.quat_rotate_inv(q, v)
+                down_0 = wp.quat_rotate_inv(q, down)
+
+            force_1, torque_1 = wrench(airframe, quadratic_1, linear_1, air_0, w)
+            a_1 = airframe.mass_inverse * force_1
+            w_1 = angular_acceleration(airframe, torque_1, w)
+
+            u_2 = half * w
+            rate_2 = w + half * w_1
+            a_2, w_2 = rates(airframe, quadratic_2, linear_2, u_2, air_0 + half * (a_1 + down_0), rate_2)
+            u_rate_2 = chart_rate_4(u_2, rate_2)
+
+            u_3 = half * u_rate_2
+            rate_3 = w + half * w_2
+            a_3, w_3 = rates(airframe, quadratic_2, linear_2, u_3, air_0 + half * (a_2 + down_0), rate_3)
+            u_rate_3 = chart_rate_4(u_3, rate_3)
+
+            u_4 = h * u_rate_3
+            rate_4 = w + h * w_3
+            a_4, w_4 = rates(airframe, quadratic_4, linear_4, u_4, air_0 + h * (a_3 + down_0), rate_4)
+            u_rate_4 = chart_rate_4(u_4, rate_4)
+
+            v_next = v + h * down + wp.quat_rotate(q, sixth * (a_1 + two * (a_2 + a_3) + a_4))
+            w_next = w + sixth * (w_1 + two * (w_2 + w_3) + w_4)
+            u = sixth * (w + two * (u_rate_2 + u_rate_3) + u_rate_4)
+
+            # guard: the embedded estimate, less what the lag alone puts into it (it is integrated exactly)
+            a_error = a_1 - a_2 - a_3 + a_4
+            w_error = w_1 - w_2 - w_3 + w_4
+            if wp.static(motor_lag):
+                lag_force, lag_torque = rotor_wrench(
+                    airframe,
+                    quadratic_1 - two * quadratic_2 + quadratic_4,
+                    linear_1 - two * linear_2 + linear_4,
+                    air_0,
+                    w,
+                )
+                a_error -= airframe.mass_inverse * lag_force
+                w_error -= solve_inertia(airframe, lag_torque)
+            # written so that a NaN trips it
+            if not (sixth * sixth * wp.length_sq(a_error) <= absolute2 + relative2 * wp.length_sq(v_next)):
+                tripped = True
+                break
+            if not (sixth * sixth * wp.length_sq(w_error) <= absolute2 + relative2 * wp.length_sq(w_next)):
+                tripped = True
+                break
+
+            x += h * v + half * h * down + wp.quat_rotate(q, h * sixth * (a_1 + a_2 + a_3))
+            v = v_next
+            w = w_next
+            q = q * quaternion_exp(u)
+            # one Newton step towards unit length: exact to rounding this close to it
+            q = (wp.float64(1.5) - wp.float64(0.5) * wp.dot(q, q)) * q
+            if wp.static(motor_lag):
+                remaining *= decay
+                quadratic_cd = decay * quadratic_cd
+                quadratic_dd = decay * decay * quadratic_dd
+                if wp.static(air_terms):
+                    linear_d = decay * linear_d
+        return x, v, q, w, remaining, tripped
+
+    return fly_fixed

@@ -1,0 +1,11 @@
+"""Why a vehicle is held: the codes in `MultirotorArrays.status`."""
+
+import warp as wp
+
+STATUS_OK = wp.constant(wp.int32(0))
+STATUS_COMMAND = wp.constant(wp.int32(1))
+STATUS_VELOCITY = wp.constant(wp.int32(2))
+STATUS_BODY_RATE = wp.constant(wp.int32(3))
+
+STATUS_TERMS = ("ok", "rotor_speed_command", "velocity", "body_rate")
+"""What each status code means: the quantity that was not finite or that cannot be integrated."""
