@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neurosim_core.settings import Settings
+
+TextureFilter = Literal["trilinear", "bilinear", "nearest"]
+"""Names of the ways to read a texture; see `RenderConfig.texture_filter`."""
 
 
 class LightingConfig(Settings):
@@ -49,3 +52,15 @@ class RenderConfig(Settings):
     mip_bias: float = Field(default=0.0, ge=-4.0, le=4.0)
     """Added to the level of the texture that the footprint of a ray asks for; negative is sharper and
     aliases."""
+    texture_filter: TextureFilter = "trilinear"
+    """How textures are read. `trilinear`: averaged over the footprint of the ray (mip-mapped). `bilinear`: at
+    full resolution, interpolated between texels; `nearest`: at full resolution, the nearest texel. The latter
+    two alias, which event cameras see as events that no sensor gives."""
+
+    @model_validator(mode="after")
+    def _bias_has_levels(self) -> RenderConfig:
+        if self.mip_bias != 0.0 and self.texture_filter != "trilinear":
+            raise ValueError(
+                f"mip_bias is for texture_filter trilinear, got {self.mip_bias:g} with {self.texture_filter}"
+            )
+        return self

@@ -331,6 +331,18 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
             light[touched, side, channel] = total[touched] / count[touched]
 
 
+def shading_mesh(scene: Scene, device: str) -> wp.Mesh:
+    """Return the triangles of a scene that cast shadows: all that do not emit light."""
+    dark = np.array([max(m.emission) <= 0.0 for m in scene.materials])[scene.face_material]
+    shading = scene.faces[dark] if dark.any() else np.zeros((1, 3), dtype=np.int32)  # a point hides nothing
+    return wp.Mesh(
+        wp.array(scene.vertices, dtype=wp.vec3, device=device),
+        wp.array(shading.reshape(-1), dtype=int, device=device),
+        bvh_constructor="sah",
+        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
+    )
+
+
 def bake_light(
     scene: Scene, mesh: RefinedMesh, config: LightingConfig, *, device: str
 ) -> NDArray[np.float32]:
@@ -356,14 +368,7 @@ def bake_light(
     group, example = _group_corners(mesh, normals)
     order = np.argsort(group, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
-    dark = np.array([max(m.emission) <= 0.0 for m in scene.materials])[scene.face_material]
-    shading = scene.faces[dark] if dark.any() else np.zeros((1, 3), dtype=np.int32)  # a point hides nothing
-    occluders = wp.Mesh(
-        wp.array(scene.vertices, dtype=wp.vec3, device=device),
-        wp.array(shading.reshape(-1), dtype=int, device=device),
-        bvh_constructor="sah",
-        bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
-    )
+    occluders = shading_mesh(scene, device)
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
     openness = wp.empty(2 * len(example), dtype=float, device=device)
     lamps = np.array([lamp.position_m for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)

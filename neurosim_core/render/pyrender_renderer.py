@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-call"
+# mypy: disable-error-code="no-untyped-call,attr-defined"
 """The second renderer: rgb and depth through pyrender and OpenGL, to check the first one against.
 
 Geometry, visibility, perspective and texture filtering are OpenGL's; light is that of `lighting`, as colours
@@ -10,8 +10,8 @@ from __future__ import annotations
 import ctypes.util
 import os
 import warnings
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,14 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from neurosim_core.render.body_arrays import join_bodies
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
-from neurosim_core.render.lighting import bake_light, refine
+from neurosim_core.render.lighting import RefinedMesh, bake_light, refine
 from neurosim_core.render.warp_renderer import auto_exposure
+from neurosim_core.scene.bodies import Body, BodyPoses, body_poses
 from neurosim_core.scene.materials import mean_albedo, pack_textures
-from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.scene import Material, Scene
 
 _NEAR_M = 0.02
 _OPENGL_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -48,6 +50,8 @@ class PyrenderScene:
     nodes: Any
     """pyrender.Scene."""
     exposure: float
+    bodies: tuple[Any, ...] = ()
+    """The pyrender.Node of each body."""
 
 
 def _import_pyrender() -> Any:
@@ -57,7 +61,7 @@ def _import_pyrender() -> Any:
             raise PyrenderError(_INSTALL_OPENGL)
         os.environ["PYOPENGL_PLATFORM"] = "egl"
     if not hasattr(np, "infty"):
-        np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201  removed in NumPy 2.0, used by pyrender 0.1.45
+        np.infty = np.inf  # noqa: NPY201  removed in NumPy 2.0, used by pyrender 0.1.45
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of libraries that pyrender brings
@@ -67,16 +71,19 @@ def _import_pyrender() -> Any:
     return pyrender
 
 
-def upload_pyrender_scene(scene: Scene, config: RenderConfig, *, device: str) -> PyrenderScene:
+def upload_pyrender_scene(
+    scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body] = ()
+) -> PyrenderScene:
     """Light a scene and hand it to pyrender.
 
     Each side of a surface is a copy with its own light; OpenGL culls the one that is turned away. Faces that
-    emit show only their emission.
+    emit show only their emission. Bodies keep the light that they have at stamp 0, wherever they move.
 
     Args:
         scene: What to render.
         config: How to light it; mip levels and samples are OpenGL's own.
         device: Where light is baked.
+        bodies: What moves in the scene.
 
     Raises:
         PyrenderError: pyrender is not installed or there is no OpenGL.
@@ -92,7 +99,53 @@ def upload_pyrender_scene(scene: Scene, config: RenderConfig, *, device: str) ->
     nodes = pyrender.Scene(
         bg_color=[*_to_display(exposure * np.array(scene.sky)), 1.0], ambient_light=[1.0] * 3
     )
-    for index, material in enumerate(scene.materials):
+    nodes.add(_mesh(pyrender, mesh, light, material_of, scene.materials, exposure))
+    return PyrenderScene(
+        scene=scene,
+        config=config,
+        nodes=nodes,
+        exposure=exposure,
+        bodies=tuple(
+            nodes.add(_body_mesh(pyrender, body, scene, config, exposure, device)) for body in bodies
+        ),
+    )
+
+
+def _body_mesh(
+    pyrender: Any, body: Body, scene: Scene, config: RenderConfig, exposure: float, device: str
+) -> Any:
+    joined = join_bodies([body], material_count=0, instance_count=0)
+    p_WO, q_WO = body_poses({body.name: body.config}, [0])
+    R_WO = Rotation.from_quat(q_WO[0, 0])
+    placed = replace(
+        joined.mesh,
+        vertices=(R_WO.apply(joined.mesh.vertices) + p_WO[0, 0]).astype(np.float32),
+        normals=R_WO.apply(joined.mesh.normals).astype(np.float32),
+    )
+    light = bake_light(scene, placed, config.lighting, device=device)
+    return _mesh(pyrender, joined.mesh, light, joined.material, joined.materials, exposure)
+
+
+def _mesh(
+    pyrender: Any,
+    mesh: RefinedMesh,
+    light: NDArray[np.float32],
+    material_of: NDArray[np.int32],
+    materials: Sequence[Material],
+    exposure: float,
+) -> Any:
+    """Return faces as pyrender.Mesh.
+
+    Args:
+        pyrender: The module.
+        mesh: The faces.
+        light: What a white surface shows, linear, shape [2, F, 3, 3]: front and back, face, corner, RGB.
+        material_of: Index into `materials` of each face, shape [F].
+        materials: How they look.
+        exposure: Factor from linear radiance to the linear value 1.0 of a picture.
+    """
+    sides = []
+    for index, material in enumerate(materials):
         chosen = np.flatnonzero(material_of == index)
         if not chosen.size:
             continue
@@ -104,7 +157,6 @@ def upload_pyrender_scene(scene: Scene, config: RenderConfig, *, device: str) ->
             metallicFactor=0.0,
             doubleSided=False,
         )
-        sides = []
         for side, corners in enumerate(((0, 1, 2), (0, 2, 1))):
             vertices = mesh.faces[chosen][:, corners].reshape(-1)
             color = np.ones((vertices.size, 4), dtype=np.float32)
@@ -119,8 +171,7 @@ def upload_pyrender_scene(scene: Scene, config: RenderConfig, *, device: str) ->
                     material=look,
                 )
             )
-        nodes.add(pyrender.Mesh(primitives=sides))
-    return PyrenderScene(scene=scene, config=config, nodes=nodes, exposure=exposure)
+    return pyrender.Mesh(primitives=sides)
 
 
 def _to_display(linear: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -183,6 +234,7 @@ class PyrenderRenderer:
         image_slot: wp.array[int],
         *,
         instant_count: int,
+        bodies: BodyPoses | None = None,
     ) -> None:
         """Render those of the first `instant_count` poses that have an image slot; see `Renderer.render`."""
         rotations = Rotation.from_quat(q_WC.numpy()[:instant_count]).as_matrix()
@@ -190,9 +242,9 @@ class PyrenderRenderer:
         for instant in range(instant_count):
             if slots[instant] < 0:
                 continue
-            T_WC = np.eye(4)
-            T_WC[:3, :3] = rotations[instant]
-            T_WC[:3, 3] = positions[instant]
+            if bodies is not None:
+                self._place_bodies(bodies.p_WO.numpy()[instant], bodies.q_WO.numpy()[instant])
+            T_WC = _matrix(rotations[instant], positions[instant])
             node = self._scene.nodes.add(self._camera, pose=T_WC @ _OPENGL_FROM_OPTICAL)
             self._scene.nodes.main_camera_node = node
             if self.rgb is not None:
@@ -204,6 +256,18 @@ class PyrenderRenderer:
                 )
                 self.depth.numpy()[slots[instant]] = np.where(depth > 0.0, depth, np.inf)
             self._scene.nodes.remove_node(node)
+
+    def _place_bodies(self, p_WO: NDArray[np.float64], q_WO: NDArray[np.float64]) -> None:
+        rotations = Rotation.from_quat(q_WO).as_matrix()
+        for node, rotation, position in zip(self._scene.bodies, rotations, p_WO, strict=True):
+            self._scene.nodes.set_pose(node, _matrix(rotation, position))
+
+
+def _matrix(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = position
+    return matrix
 
 
 def _open_context(pyrender: Any, width: int, height: int) -> Any:

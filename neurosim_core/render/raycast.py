@@ -1,4 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
+# mypy: disable-error-code="call-overload,no-untyped-def"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches and typed literals have a meaning in kernels)
 """The ray caster: one kernel factory, specialised on the outputs asked for and the terms of the scene.
@@ -16,9 +17,10 @@ from typing import NamedTuple
 
 import warp as wp
 
+from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
-from neurosim_core.scene.materials import sample_texture
+from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
 """Everything that a cast can answer."""
@@ -28,6 +30,7 @@ TILE = 8
 
 _COSINE_MIN = wp.constant(0.05)
 _FAR_M = wp.constant(1.0e9)
+_OFFSET_M = wp.constant(1.0e-3)
 
 
 class Terms(NamedTuple):
@@ -43,11 +46,20 @@ class Terms(NamedTuple):
     """Radiance is the mean over several rays per pixel."""
     embree: int = 0
     """Embree finds what rays hit, so many at once (`embree.packet_width`), on the CPU only; 0: Warp does."""
+    finest_level: bool = False
+    """Textures are read at their finest level, however large the footprint of a ray is."""
+    nearest_texel: bool = False
+    """With `finest_level`: as they are stored, not interpolated."""
+    bodies: bool = False
+    """Bodies move through the scene."""
 
 
 @wp.struct
 class SceneData:
-    """The arrays of a scene that the kernel reads. Corner k of face f is at 3 f + k."""
+    """The arrays of a scene that the kernel reads. Corner k of face f is at 3 f + k.
+
+    Of moving bodies, material, instance, texture coordinates and density follow those of the scene.
+    """
 
     mesh: wp.uint64
     embree_scene: wp.uint64
@@ -112,11 +124,44 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     with_instance = "instance" in outputs
     with_radiance = with_log or with_rgb
     textured = terms.textured
+    finest_level = terms.finest_level
+    nearest_texel = terms.nearest_texel
     emissive = terms.emissive
     with_images = len(outputs) > int(with_log)
     baked = terms.baked
     supersampled = terms.supersampled
     with_geometry = with_depth or with_normal or with_instance
+    with_bodies = terms.bodies
+
+    @wp.func
+    def surface_albedo(scene: SceneData, spread_rad: float, facing: float, hit: Hit) -> wp.vec3:
+        material = scene.face_material[hit.face]
+        albedo = scene.base_color[material]
+        if wp.static(textured):
+            texture = scene.material_texture[material]
+            if texture[1] > 0:
+                corner = 3 * hit.face
+                uv = (
+                    hit.u * scene.corner_uv[corner]
+                    + hit.v * scene.corner_uv[corner + 1]
+                    + (1.0 - hit.u - hit.v) * scene.corner_uv[corner + 2]
+                )
+                if wp.static(nearest_texel):
+                    albedo = wp.cw_mul(albedo, sample_nearest(scene.texels, scene.levels, texture, uv))
+                elif wp.static(finest_level):
+                    albedo = wp.cw_mul(albedo, sample_finest(scene.texels, scene.levels, texture, uv))
+                else:
+                    footprint_m = spread_rad * hit.t / wp.max(wp.abs(facing), _COSINE_MIN)
+                    lod = wp.log2(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
+                    albedo = wp.cw_mul(albedo, sample_texture(scene.texels, scene.levels, texture, uv, lod))
+        return albedo
+
+    @wp.func
+    def emitted(scene: SceneData, hit: Hit) -> wp.vec3:
+        emission = wp.vec3(0.0)
+        if wp.static(emissive):
+            emission = scene.emission[scene.face_material[hit.face]]
+        return emission
 
     @wp.func
     def shade(scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit) -> wp.vec3:
@@ -127,19 +172,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         v = hit.v
         w = 1.0 - u - v
         facing = wp.dot(ray, hit.normal)
-        material = scene.face_material[hit.face]
-        albedo = scene.base_color[material]
-        if wp.static(textured):
-            texture = scene.material_texture[material]
-            if texture[1] > 0:
-                uv = (
-                    u * scene.corner_uv[corner]
-                    + v * scene.corner_uv[corner + 1]
-                    + w * scene.corner_uv[corner + 2]
-                )
-                footprint_m = spread_rad * hit.t / wp.max(wp.abs(facing), _COSINE_MIN)
-                lod = wp.log2(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
-                albedo = wp.cw_mul(albedo, sample_texture(scene.texels, scene.levels, texture, uv, lod))
+        albedo = surface_albedo(scene, spread_rad, facing, hit)
         if wp.static(baked):
             side = wp.where(facing > 0.0, 1, 0)
             light = (
@@ -165,10 +198,94 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     scene.light_intensity[lamp],
                     scene.light_radius_m,
                 )
-        emission = wp.vec3(0.0)
-        if wp.static(emissive):
-            emission = scene.emission[material]
-        return reflect_light(albedo, light, emission)
+        return reflect_light(albedo, light, emitted(scene, hit))
+
+    @wp.func
+    def meet_bodies(bodies: BodyData, instant: int, ray_C: wp.vec3, q_WC: wp.quat, hit: Hit):
+        # What the ray hits first, `hit` or a point of a body, and which body, -1: none.
+        nearest = Hit()
+        nearest.face = hit.face
+        nearest.t = wp.where(hit.face >= 0, hit.t, _FAR_M)
+        nearest.u = hit.u
+        nearest.v = hit.v
+        nearest.normal = hit.normal
+        met = int(-1)
+        for body in range(bodies.mesh.shape[0]):
+            sphere = bodies.sphere_C[instant, body]
+            center = wp.vec3(sphere[0], sphere[1], sphere[2])
+            radius = sphere[3]
+            along = wp.dot(center, ray_C)
+            beside = center - along * ray_C
+            if along > -radius and along - radius < nearest.t and wp.dot(beside, beside) < radius * radius:
+                q_OC = bodies.q_OC[instant, body]
+                ray_O = wp.quat_rotate(q_OC, ray_C)
+                query = wp.mesh_query_ray(bodies.mesh[body], bodies.p_OC[instant, body], ray_O, nearest.t)
+                if query.result:
+                    nearest.face = bodies.first_face[body] + query.face
+                    nearest.t = query.t
+                    nearest.u = query.u
+                    nearest.v = query.v
+                    nearest.normal = wp.quat_rotate(q_WC, wp.quat_rotate_inv(q_OC, query.normal))
+                    met = body
+        return nearest, met
+
+    @wp.func
+    def shade_body(
+        scene: SceneData,
+        bodies: BodyData,
+        instant: int,
+        body: int,
+        q_WC: wp.quat,
+        ray: wp.vec3,
+        origin: wp.vec3,
+        spread_rad: float,
+        hit: Hit,
+    ) -> wp.vec3:
+        # Bodies move under lights that stand still, so nothing is baked: light is found here, and shadows.
+        facing = wp.dot(ray, hit.normal)
+        corner = 3 * (hit.face - bodies.first_face[0])
+        normal_O = (
+            hit.u * bodies.corner_normal[corner]
+            + hit.v * bodies.corner_normal[corner + 1]
+            + (1.0 - hit.u - hit.v) * bodies.corner_normal[corner + 2]
+        )
+        normal_C = wp.quat_rotate_inv(bodies.q_OC[instant, body], normal_O)
+        normal = wp.normalize(wp.quat_rotate(q_WC, normal_C))
+        outwards = hit.normal
+        if facing > 0.0:
+            normal = -normal
+            outwards = -outwards
+        point = origin + hit.t * ray
+        light = ambient_light(normal, scene.ambient_up, scene.ambient_down)
+        for lamp in range(scene.light_position.shape[0]):
+            position = scene.light_position[lamp]
+            part = point_light(point, normal, position, scene.light_intensity[lamp], scene.light_radius_m)
+            if wp.static(baked):
+                if wp.max(part) > 0.0:
+                    start = point + _OFFSET_M * outwards
+                    to_lamp = position - start
+                    distance = wp.length(to_lamp)
+                    if wp.mesh_query_ray_anyhit(bodies.shading, start, to_lamp / distance, distance):
+                        part = wp.vec3(0.0)
+            light += part
+        return reflect_light(surface_albedo(scene, spread_rad, facing, hit), light, emitted(scene, hit))
+
+    @wp.func
+    def radiance_of(
+        scene: SceneData,
+        bodies: BodyData,
+        instant: int,
+        body: int,
+        q_WC: wp.quat,
+        ray: wp.vec3,
+        origin: wp.vec3,
+        spread_rad: float,
+        hit: Hit,
+    ) -> wp.vec3:
+        if wp.static(with_bodies):
+            if body >= 0:
+                return shade_body(scene, bodies, instant, body, q_WC, ray, origin, spread_rad, hit)
+        return shade(scene, ray, origin, spread_rad, hit)
 
     @wp.func
     def write_geometry(
@@ -233,6 +350,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         image_slot: wp.array[int],
+        bodies: BodyData,
         # Out:
         log_radiance_out: wp.array3d[float],
         rgb_out: wp.array4d[wp.uint8],
@@ -274,9 +392,12 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             hit.u = query.u
             hit.v = query.v
             hit.normal = query.normal
+            body = int(-1)
+            if wp.static(with_bodies):
+                hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
             if wp.static(with_radiance):
                 if wp.static(not supersampled) or layer > 0:
-                    radiance += shade(scene, ray, origin, ray_C[3], hit)
+                    radiance += radiance_of(scene, bodies, instant, body, q, ray, origin, ray_C[3], hit)
             if wp.static(with_geometry):
                 if slot >= 0 and layer == 0:
                     write_geometry(
@@ -303,6 +424,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         p_WC: wp.array[wp.vec3],
         q_WC: wp.array[wp.quat],
         image_slot: wp.array[int],
+        bodies: BodyData,
         # Out:
         log_radiance_out: wp.array3d[float],
         rgb_out: wp.array4d[wp.uint8],
@@ -359,9 +481,16 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     hit.u = u[lane]
                     hit.v = v[lane]
                     hit.normal = wp.normalize(normal[lane])
+                    body = int(-1)
+                    if wp.static(with_bodies):
+                        hit, body = meet_bodies(
+                            bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
+                        )
                     if wp.static(with_radiance):
                         if wp.static(not supersampled) or layer > 0:
-                            radiance[lane] += shade(scene, ray[lane], origin, ray_C[3], hit)
+                            radiance[lane] += radiance_of(
+                                scene, bodies, instant, body, q, ray[lane], origin, ray_C[3], hit
+                            )
                     if wp.static(with_geometry):
                         if slot >= 0 and layer == 0:
                             write_geometry(
@@ -410,6 +539,10 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much
     as along. The short side or the geometric mean would keep more detail there, but alias along the surface,
     and aliasing makes events that no sensor sees. |cos| counts as at least 0.05.
+
+    Bodies are met after the scene: of each whose sphere the ray passes, the tree is asked in the frame of the
+    body, no further than the nearest hit so far. Their light is found for each pixel: ambient, and the lamps
+    that no part of the scene hides from it (all lamps, where the scene itself is unshadowed).
 
     Raises:
         ValueError: If an output is unknown or none is asked for.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, Literal, Protocol
 
 import warp as wp
@@ -13,6 +13,7 @@ from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderSce
 from neurosim_core.render.synthetic_renderer import SyntheticRenderer, SyntheticScene
 from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer
 from neurosim_core.render.warp_renderer import upload_scene as upload_warp_scene
+from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
 
 __all__ = [
@@ -44,7 +45,8 @@ class Renderer(Protocol):
     normal: Any
     """Normal of the surface in W, towards the camera, zero where nothing is hit, vec3 [M, H, W]."""
     instance: Any
-    """Index into `Scene.instance_names`, -1 where nothing is hit, int32 [M, H, W]."""
+    """Index into the names of the scene's instances and then of the bodies (`SceneArrays.instance_names`), -1
+    where nothing is hit, int32 [M, H, W]."""
 
     def render(
         self,
@@ -53,6 +55,7 @@ class Renderer(Protocol):
         image_slot: wp.array[int],
         *,
         instant_count: int,
+        bodies: BodyPoses | None = None,
     ) -> None:
         """Render the first `instant_count` poses.
 
@@ -61,11 +64,17 @@ class Renderer(Protocol):
             q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
             image_slot: Where the images of an instant go, shape [K]; -1: nowhere.
             instant_count: How many of the K instants are rendered.
+            bodies: Where bodies are at the instants; not needed without bodies.
         """
 
 
 def upload_scene(
-    scene: Scene, config: RenderConfig, *, device: str, renderer: RendererName = "warp"
+    scene: Scene,
+    config: RenderConfig,
+    *,
+    device: str,
+    renderer: RendererName = "warp",
+    bodies: Sequence[Body] = (),
 ) -> SceneOnDevice:
     """Prepare a scene for a renderer.
 
@@ -75,15 +84,20 @@ def upload_scene(
         device: Where Warp renders, and where light is baked.
         renderer: `warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only.
             `synthetic`: a test card that costs next to nothing, on CPU and CUDA; the scene is not seen.
+        bodies: What moves in the scene.
 
     Raises:
+        ValueError: The synthetic renderer is asked to show bodies.
         PyrenderError: pyrender cannot be used here.
     """
     if renderer == "pyrender":
-        return upload_pyrender_scene(scene, config, device=device)
+        return upload_pyrender_scene(scene, config, device=device, bodies=bodies)
     if renderer == "synthetic":
+        if bodies:
+            names = ", ".join(body.name for body in bodies)
+            raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")
         return SyntheticScene(scene=scene, config=config, device=device)
-    return upload_warp_scene(scene, config, device=device)
+    return upload_warp_scene(scene, config, device=device, bodies=bodies)
 
 
 def make_renderer(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
+from neurosim_core.scene.bodies import BodyPoses
 from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Scene
 
@@ -220,8 +221,9 @@ class SyntheticRenderer:
         image_slot: wp.array[int],
         *,
         instant_count: int,
+        bodies: BodyPoses | None = None,
     ) -> None:
-        """Draw the cards of the first `instant_count` poses; see `Renderer.render`."""
+        """Draw the cards of the first `instant_count` poses; see `Renderer.render`. Bodies are not seen."""
         key = (p_WC.ptr, q_WC.ptr, image_slot.ptr, instant_count)
         launches = self._launches.get(key)
         if launches is None:

@@ -5,21 +5,37 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.render.body_arrays import (
+    BodyArrays,
+    join_bodies,
+    make_body_data,
+    place_camera,
+    upload_bodies,
+)
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.embree import PACKET, EmbreeError, EmbreeTree, packet_width
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine, spread_order
+from neurosim_core.render.lighting import (
+    RefinedMesh,
+    bake_light,
+    corner_normals,
+    refine,
+    shading_mesh,
+    spread_order,
+)
 from neurosim_core.render.raycast import TILE, SceneData, Terms, raycast_kernel
+from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.source import unique_name
 
 _logger = logging.getLogger(__name__)
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -40,6 +56,10 @@ class SceneArrays:
     """Face of the scene that each face of `mesh` is a part of, shape [F]."""
     embree: EmbreeTree | None
     """The triangles of `mesh`, if Embree finds what the rays of cameras hit."""
+    bodies: BodyArrays | None
+    """What moves in the scene; None: nothing does."""
+    instance_names: tuple[str, ...]
+    """Names of the instances: those of the scene, then of the bodies."""
     terms: Terms
     data: SceneData
     exposure: float
@@ -53,27 +73,38 @@ class SceneArrays:
         return self.mesh.id
 
 
-def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays:
+def upload_scene(
+    scene: Scene, config: RenderConfig, device: str, *, bodies: Sequence[Body] = ()
+) -> SceneArrays:
     """Bring a scene to a device: refine and light it, pack its textures, build its tree.
 
     Args:
         scene: What to render.
         config: How to light it, and who casts rays on a CPU.
         device: "cpu", "cuda:0", …
+        bodies: What moves in the scene.
 
     Raises:
         EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.
     """
     baked = config.lighting.mode == "baked"
     mesh = refine(scene, config.lighting.edge_max_m if baked else None)
-    packed = pack_textures(scene.materials)
+    joined = join_bodies(
+        bodies, material_count=len(scene.materials), instance_count=len(scene.instance_names)
+    )
+    materials = (*scene.materials, *joined.materials)
+    packed = pack_textures(materials)
     material = scene.face_material[mesh.origin]
+    textured = bool((packed.material_texture[:, 1] > 0).any())
     terms = Terms(
-        textured=bool((packed.material_texture[:, 1] > 0).any()),
-        emissive=any(max(m.emission) > 0.0 for m in scene.materials),
+        textured=textured,
+        emissive=any(max(m.emission) > 0.0 for m in materials),
         baked=baked,
         supersampled=config.samples_per_pixel > 1,
         embree=_embree_width(config, device),
+        finest_level=textured and config.texture_filter != "trilinear",
+        nearest_texel=textured and config.texture_filter == "nearest",
+        bodies=bool(bodies),
     )
     start = time.perf_counter()
     light: NDArray[np.float32] | None = None
@@ -83,7 +114,7 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
     exposure = config.exposure
     if exposure == "auto":
         assert light is not None
-        exposure = auto_exposure(mesh, light, mean_albedo(scene.materials, packed)[material])
+        exposure = auto_exposure(mesh, light, mean_albedo(materials, packed)[material])
 
     points = wp.array(mesh.vertices, dtype=wp.vec3, device=device)
     indices = wp.array(mesh.faces.reshape(-1), dtype=int, device=device)
@@ -99,13 +130,17 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
         data.embree_intersect = wp.uint64(embree.intersect)
-    data.face_material = wp.array(material, dtype=int, device=device)
-    data.face_instance = wp.array(scene.face_instance[mesh.origin], dtype=int, device=device)
-    data.base_color = wp.array(_rows([m.base_color for m in scene.materials]), dtype=wp.vec3, device=device)
-    data.emission = wp.array(_rows([m.emission for m in scene.materials]), dtype=wp.vec3, device=device)
+    instance = scene.face_instance[mesh.origin]
+    data.face_material = wp.array(np.append(material, joined.material), dtype=int, device=device)
+    data.face_instance = wp.array(np.append(instance, joined.instance), dtype=int, device=device)
+    data.base_color = wp.array(_rows([m.base_color for m in materials]), dtype=wp.vec3, device=device)
+    data.emission = wp.array(_rows([m.emission for m in materials]), dtype=wp.vec3, device=device)
     if terms.textured:
-        data.face_lod = wp.array(_texel_density(mesh, material, packed), dtype=float, device=device)
-        data.corner_uv = wp.array(mesh.uv[mesh.faces].reshape(-1, 2), dtype=wp.vec2, device=device)
+        surfaces = ((mesh, material), (joined.mesh, joined.material))
+        density = np.concatenate([_texel_density(m, owner, packed) for m, owner in surfaces])
+        uv = np.concatenate([m.uv[m.faces].reshape(-1, 2) for m, _ in surfaces])
+        data.face_lod = wp.array(density, dtype=float, device=device)
+        data.corner_uv = wp.array(uv, dtype=wp.vec2, device=device)
         data.material_texture = wp.array(packed.material_texture, dtype=wp.vec2i, device=device)
         data.levels = wp.array(packed.levels, dtype=wp.vec3i, device=device)
         data.texels = wp.array(packed.texels, dtype=wp.uint32, device=device)
@@ -114,6 +149,7 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         data.corner_light = wp.array(light.reshape(2, -1, 3), dtype=wp.vec3, device=device)
     else:
         data.corner_normal = wp.array(corner_normals(mesh).reshape(-1, 3), dtype=wp.vec3, device=device)
+    if bodies or not baked:
         positions, intensities = [x.position_m for x in scene.lights], [x.intensity for x in scene.lights]
         data.light_position = wp.array(_rows(positions), dtype=wp.vec3, device=device)
         data.light_intensity = wp.array(_rows(intensities), dtype=wp.vec3, device=device)
@@ -124,6 +160,7 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
     data.mip_bias = config.mip_bias
     data.dark_floor = config.dark_floor
     data.exposure = exposure
+    taken: set[str] = set()
     return SceneArrays(
         scene=scene,
         config=config,
@@ -131,6 +168,18 @@ def upload_scene(scene: Scene, config: RenderConfig, device: str) -> SceneArrays
         mesh=tree,
         face_origin=wp.array(mesh.origin, dtype=int, device=device),
         embree=embree,
+        bodies=upload_bodies(
+            bodies,
+            joined,
+            scene_face_count=len(mesh.faces),
+            shading=shading_mesh(scene, device) if baked else None,
+            device=device,
+        )
+        if bodies
+        else None,
+        instance_names=tuple(
+            unique_name(name, taken) for name in (*scene.instance_names, *(body.name for body in bodies))
+        ),
         terms=terms,
         data=data,
         exposure=exposure,
@@ -250,6 +299,7 @@ class WarpRenderer:
         rays = _ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
         self._rays = wp.array(rays, dtype=wp.vec4, device=device)
+        self._body_data = make_body_data(arrays.bodies, instant_count, device)
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
@@ -268,6 +318,7 @@ class WarpRenderer:
         image_slot: wp.array[int],
         *,
         instant_count: int,
+        bodies: BodyPoses | None = None,
     ) -> None:
         """Render the first `instant_count` poses into the outputs.
 
@@ -276,7 +327,18 @@ class WarpRenderer:
             q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
             image_slot: Where the images of an instant go, shape [K]; -1: nowhere.
             instant_count: How many of the K instants are rendered.
+            bodies: Where bodies are at the instants; not needed without bodies.
+
+        Raises:
+            ValueError: The scene has bodies and there are no poses of them.
         """
+        if self._arrays.bodies is not None:
+            if bodies is None:
+                names = ", ".join(body.name for body in self._arrays.bodies.bodies)
+                raise ValueError(f"bodies move in this scene ({names}): render() needs their poses")
+            place_camera(
+                self._arrays.bodies, bodies, p_WC, q_WC, instant_count=instant_count, data=self._body_data
+            )
         launch_split(
             self._kernel,
             dim=instant_count * self._instant_threads,
@@ -289,6 +351,7 @@ class WarpRenderer:
                 p_WC,
                 q_WC,
                 image_slot,
+                self._body_data,
             ],
             outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
             device=self._arrays.device,
