@@ -7,7 +7,7 @@ import importlib.util
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -306,6 +306,8 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
     if model.casts:
         casts = "; ".join(_describe_cast(cast) for cast in model.casts)
         facts.add_row("renders", f"{counts['renders']:,} ({casts})")
+        if model.schedule.sparse:
+            facts.add_row("left out", _describe_left_out(counts))
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")
@@ -340,7 +342,21 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
 
 
 def _describe_cast(cast: Cast) -> str:
-    return f"{cast.lens.width}x{cast.lens.height} at {cast.rate.rate_hz:g} Hz for {', '.join(cast.names)}"
+    limit_px = cast.max_displacement_px
+    where = "" if limit_px is None else f" where something moves {limit_px:g} px"
+    return (
+        f"{cast.lens.width}x{cast.lens.height} at {cast.rate.rate_hz:g} Hz{where} for {', '.join(cast.names)}"
+    )
+
+
+def _describe_left_out(counts: Mapping[str, int]) -> str:
+    coarse = counts["coarse ticks"]
+    advice = (
+        f"; after {coarse:,} renders one step of the clock is too long: raise sampling_rate_hz"
+        if coarse
+        else ""
+    )
+    return f"{counts['ticks left out']:,} ticks without a render{advice}"
 
 
 def _describe_collisions(report: Report) -> str:

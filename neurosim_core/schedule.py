@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from neurosim_core.clock import Rate
 
+TICKS_PER_INSTANT = 4
+"""How many times as many ticks a batch takes of a cast that renders only some of them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
@@ -18,7 +21,13 @@ class Schedule:
     casts: tuple[Rate, ...]
     """Clocks of the casts."""
     instants_per_launch: int
-    """The most instants of one cast in one batch."""
+    """The most instants of one cast in one batch; of a sparse cast, times TICKS_PER_INSTANT."""
+    sparse: frozenset[int] = frozenset()
+    """Indices of the casts that render only some of their ticks."""
+
+    def ticks_per_batch(self, cast: int) -> int:
+        """Return the most ticks of a cast in one batch."""
+        return self.instants_per_launch * (TICKS_PER_INSTANT if cast in self.sparse else 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +46,12 @@ class Boundary:
 def batch_end_ns(schedule: Schedule, start_ns: int, limit_ns: int) -> int:
     """Return where the batch that follows `start_ns` ends: at most at `limit_ns`.
 
-    It ends where the fastest cast has as many instants as one launch takes; a rig without cameras counts
+    It ends where the first of the casts has as many ticks as one launch takes; a rig without cameras counts
     commands instead.
     """
     rates = schedule.casts or (schedule.control,)
-    return min([limit_ns, *(_tick_after(rate, start_ns, schedule.instants_per_launch) for rate in rates)])
+    ends = (_tick_after(rate, start_ns, schedule.ticks_per_batch(cast)) for cast, rate in enumerate(rates))
+    return min([limit_ns, *ends])
 
 
 def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]:
@@ -67,8 +77,8 @@ def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]
 def boundary_count_max(schedule: Schedule) -> int:
     """Return a bound on the number of boundaries in any batch."""
     rates = [schedule.control, *schedule.samplers, *schedule.casts]
-    shortest_hz = max(rate.rate_hz for rate in schedule.casts or (schedule.control,))
-    span_s = schedule.instants_per_launch / shortest_hz
+    shortest = schedule.casts or (schedule.control,)
+    span_s = min(schedule.ticks_per_batch(cast) / rate.rate_hz for cast, rate in enumerate(shortest))
     return sum(int(span_s * rate.rate_hz) + 2 for rate in rates) + 1
 
 

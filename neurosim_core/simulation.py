@@ -35,14 +35,17 @@ from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, ImuSample, Odometry, Packet
 from neurosim_core.render.renderer import SceneOnDevice, upload_scene
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
+from neurosim_core.scene.bodies import Body, make_bodies
 from neurosim_core.scene.freespace import FreeSpace, make_free_space
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Scene
 from neurosim_core.schedule import Boundary, Schedule, batch_end_ns, boundaries, boundary_count_max
 from neurosim_core.sensors.cast import (
     CastState,
+    Choice,
     Instants,
     Look,
+    choose_ticks,
     close_eyes,
     flush_events,
     is_due,
@@ -73,6 +76,8 @@ class Model:
     config: SimulationConfig
     device: str
     scene: Scene
+    bodies: tuple[Body, ...]
+    """What moves in the scene besides the vehicle."""
     free_space: FreeSpace
     path: Path
     airframe: MultirotorConfig
@@ -129,6 +134,8 @@ class Batch:
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
     seen: Sequence[tuple[CastState, Instants]] = ()
+    choices: Sequence[Choice] = ()
+    """What adaptive casts render of it."""
 
 
 class Pilot(NamedTuple):
@@ -162,8 +169,11 @@ class State:
     render_stream: wp.Stream | None
     event_stream: wp.Stream | None
     """Where events are found, while the next batch is rendered."""
+    choice_stream: wp.Stream | None
+    """Where adaptive casts choose what to render, ahead of the renderers."""
     overlaps: bool
-    """Parts of a batch are launched on their own; on a CUDA device with one lane, all as one graph."""
+    """Parts of a batch are launched on their own; on a CUDA device with one lane, all as one graph, unless an
+    adaptive cast has to wait for the flight."""
     flown: Sequence[Milestone]
     """For each batch that may be flown and not looked at, its end on `flight_stream`."""
     rendered: Milestone
@@ -194,7 +204,7 @@ class State:
     failure: DynamicsError | None = None
     """The integration failed; packets up to its stamp have been returned."""
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    """steps, commands, renders, events dropped, collisions."""
+    """steps, commands, renders, ticks left out, coarse ticks, events dropped, collisions."""
     wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Wall-clock time by phase [s]."""
 
@@ -243,6 +253,7 @@ def make_fleet(
     device = _device(config.device)
     with phase("scene"):
         scene = load_scene(config.scene)
+        bodies = make_bodies(config.bodies)
     with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
     members = {name: config.of(name) for name in config.vehicles}
@@ -251,10 +262,12 @@ def make_fleet(
     seeing = any(plan_casts(member.sensors) for member in members.values())
     with phase("light"):
         scene_on_device = (
-            upload_scene(scene, config.render, device=device, renderer=config.renderer) if seeing else None
+            upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)
+            if seeing
+            else None
         )
     return {
-        name: _make_member(member, device, scene, free_space, paths[name], scene_on_device, setup_s)
+        name: _make_member(member, device, scene, bodies, free_space, paths[name], scene_on_device, setup_s)
         for name, member in members.items()
     }
 
@@ -283,6 +296,7 @@ def _make_member(
     config: SimulationConfig,
     device: str,
     scene: Scene,
+    bodies: tuple[Body, ...],
     free_space: FreeSpace,
     path: Path,
     scene_on_device: SceneOnDevice | None,
@@ -297,6 +311,7 @@ def _make_member(
         config=config,
         device=device,
         scene=scene,
+        bodies=bodies,
         free_space=free_space,
         path=path,
         airframe=config.vehicle.airframe(),
@@ -306,6 +321,7 @@ def _make_member(
             samplers=tuple(Rate(s.rate_hz) for s in samplers.values()),
             casts=tuple(cast.rate for cast in casts),
             instants_per_launch=config.instants_per_launch,
+            sparse=frozenset(i for i, cast in enumerate(casts) if cast.max_displacement_px is not None),
         ),
         samplers=tuple(samplers),
         scene_on_device=scene_on_device if casts else None,
@@ -368,7 +384,7 @@ def make_state(
     return State(
         vehicle=vehicle,
         rotor_speeds=HostInput(vehicle.arrays.rotor_speed_command),
-        overlaps=lane_count > 1 or wp.get_device(device).is_cpu,
+        overlaps=lane_count > 1 or wp.get_device(device).is_cpu or bool(model.schedule.sparse),
         controller=make_controller(
             "path", model.airframe, config.control.gains, device=device, paths=model.path
         ),
@@ -383,11 +399,12 @@ def make_state(
                 cast,
                 config.sensors,
                 model.scene_on_device,
-                capacity=config.instants_per_launch,
+                capacity=model.schedule.ticks_per_batch(index),
                 lane_count=lane_count,
                 device=device,
+                bodies=config.bodies,
             )
-            for cast in model.casts
+            for index, cast in enumerate(model.casts)
             if model.scene_on_device is not None
         ],
         imus=imus,
@@ -399,6 +416,7 @@ def make_state(
         flight_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
         render_stream=make_stream(device) if lane_count > 1 else None,
         event_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
+        choice_stream=make_stream(device, urgent=True) if lane_count > 1 and model.schedule.sparse else None,
         flown=[Milestone(device) for _ in range(flight_lane_count)],
         rendered=Milestone(device),
         graphs=Graphs(device),
@@ -686,7 +704,7 @@ def _launch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_l
         _launch_flight(state, batch, key, flight)
         _look(model, state, batch)
     else:  # all of it as one graph
-        looks = _plan_looks(state, batch)
+        looks = _plan_looks(state, batch, _choose(model, state, batch))
         with timed(state.wall_s, "flight and render"):
             state.graphs.run(
                 (key, *(look.key for look in looks)), lambda: (flight(), *(look.render() for look in looks))
@@ -772,20 +790,24 @@ def _fly(
 
 def _look(model: Model, state: State, batch: Batch) -> None:
     """Let the cameras that are wanted see a batch, and launch the copies to the host."""
+    due = _choose(model, state, batch)
     with timed(state.wall_s, "render"), on(state.render_stream):
         state.flown[batch.number % state.flight_lane_count].hold()
-        looks = _plan_looks(state, batch)
+        looks = _plan_looks(state, batch, due)
         for look in looks:
-            state.graphs.run(look.key, look.render)
+            if look.key is None:
+                look.render()
+            else:
+                state.graphs.run(look.key, look.render)
         state.rendered.set()
     with on(state.event_stream):
         state.rendered.hold()
         _scan(state, batch, looks)
 
 
-def _plan_looks(state: State, batch: Batch) -> list[Look]:
-    """Return what the casts with cameras that are wanted have to render of a batch."""
-    looks = []
+def _choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
+    """Return which boundaries of a batch each cast has to render; adaptive casts wait for the flight."""
+    chosen, choices = [], []
     for index, cast in enumerate(state.casts):
         close_eyes(cast, batch.wanted)
         due = [
@@ -793,18 +815,38 @@ def _plan_looks(state: State, batch: Batch) -> list[Look]:
             for place, boundary in enumerate(batch.boundaries)
             if index in boundary.casts and is_due(cast, boundary.stamp_ns, batch.wanted)
         ]
-        if due:
-            looks.append(
-                plan_look(
+        if cast.rule is not None:
+            with timed(state.wall_s, "choice of renders"), on(state.choice_stream):
+                state.flown[batch.number % state.flight_lane_count].hold()
+                choice = choose_ticks(
                     cast,
                     state.trace,
                     slots=[batch.slot + place for place in due],
                     stamps_ns=[batch.boundaries[place].stamp_ns for place in due],
-                    lane=batch.number % len(state.lanes),
+                    end_ns=model.duration_ns,
                     wanted=batch.wanted,
                 )
-            )
-    return looks
+            choices.append(choice)
+            due = [due[place] for place in choice.places]
+        chosen.append(due)
+    batch.choices = choices
+    return chosen
+
+
+def _plan_looks(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> list[Look]:
+    """Return what the casts have to render of a batch: at the boundaries chosen for each."""
+    return [
+        plan_look(
+            cast,
+            state.trace,
+            slots=[batch.slot + place for place in places],
+            stamps_ns=[batch.boundaries[place].stamp_ns for place in places],
+            lane=batch.number % len(state.lanes),
+            wanted=batch.wanted,
+        )
+        for cast, places in zip(state.casts, chosen, strict=True)
+        if places
+    ]
 
 
 def _scan(state: State, batch: Batch, looks: Sequence[Look]) -> None:
@@ -844,6 +886,9 @@ def _read_cameras(state: State, batch: Batch) -> list[Packet]:
     with timed(state.wall_s, "camera read-back"):
         state.lanes[batch.number % len(state.lanes)].wait()
     state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
+    for choice in batch.choices:
+        state.counts["ticks left out"] += choice.left_out_count
+        state.counts["coarse ticks"] += choice.coarse_count
     with timed(state.wall_s, "events"):
         for cast, instants in batch.seen:
             events = read_events(cast, instants, until_ns=batch.until_ns)

@@ -99,12 +99,13 @@ class HostInput:
         array: Contiguous.
 
     Attributes:
+        array: The array on the device.
         rows: What is uploaded, as NumPy; on a CPU the array itself. To be left alone until the device has
             come past the `upload`.
     """
 
     def __init__(self, array: Any) -> None:
-        self._array = array
+        self.array = array
         self._copied = array.device.is_cuda
         self._host = wp.empty_like(array, device="cpu", pinned=True) if self._copied else array
         self.rows: NDArray[Any] = self._host.numpy()
@@ -112,7 +113,7 @@ class HostInput:
     def upload(self) -> None:
         """Launch the copy to the device."""
         if self._copied:
-            wp.copy(self._array, self._host)
+            wp.copy(self.array, self._host)
 
 
 class HostCopy:

@@ -498,3 +498,89 @@ def test_what_was_measured_before_a_failure_is_returned(outside_model):
         assert all(p.stamp_ns <= state.failure.stamp_ns for p in packets)
         with pytest.raises(DynamicsError):
             fly_on(model, state, None)
+
+
+ADAPTIVE = {
+    "events": {**SENSORS["events"], "sampling_rate_hz": 2000, "max_displacement_px": 0.3},
+    "imu": SENSORS["imu"],
+}
+
+
+def events_of(packets: list[Packet], sensor: str = "events") -> list[tuple[Any, ...]]:
+    return content(of(packets, sensor))
+
+
+def test_adaptive_sampling_leaves_ticks_out_and_every_packet_comes(settings):
+    model = simulation.make_model(ns.load_config({**settings, "sensors": ADAPTIVE}))
+    state = simulation.make_state(model)
+    packets = of(list(simulation.run_model(model, state)), "events")
+    assert [p.stamp_ns for p in packets] == [k * 10_000_000 for k in range(1, 21)]
+    assert state.counts["renders"] + state.counts["ticks left out"] == 401
+    assert 21 < state.counts["renders"] < 200  # the ends of packets, and more
+    assert sum(len(p.t) for p in packets) > 1000
+
+
+def test_a_displacement_that_nothing_stays_below_gives_the_events_of_the_fixed_rate(settings):
+    fixed = {"events": {**SENSORS["events"], "sampling_rate_hz": 1000}}
+    every = {"events": {**fixed["events"], "max_displacement_px": 1e-6}}
+    path = {"kind": "circle", "radius_m": 0.5, "center_m": [0.0, 0.0, 1.5], "ramp_s": 0.1}
+    runs = [fly(settings, sensors=sensors, path=path) for sensors in (fixed, every)]
+    assert sum(len(packet.t) for packet in runs[0]) > 1000
+    assert events_of(runs[0]) == events_of(runs[1])
+
+
+@pytest.mark.parametrize("lane_count", [1, 2, 3])
+@pytest.mark.parametrize("instants", [1, 5, 64])
+def test_adaptive_events_do_not_depend_on_batches(settings, lane_count, instants):
+    expected = fly(settings, sensors=ADAPTIVE)
+    got = fly_ahead(settings, lane_count, sensors=ADAPTIVE, instants_per_launch=instants)
+    assert content(got) == content(expected)
+
+
+def test_adaptive_events_do_not_depend_on_the_other_cameras(settings):
+    """Nor on whether somebody looks at them."""
+    alone = fly(settings, sensors=ADAPTIVE)
+    others = {
+        **ADAPTIVE,
+        "rgb": SENSORS["rgb"],
+        "depth": SENSORS["depth"],
+        "coarse": {**ADAPTIVE["events"], "max_displacement_px": 2.0},
+        "slow": {**ADAPTIVE["events"], "packet_rate_hz": 25},
+    }
+    together = fly(settings, sensors=others)
+    assert events_of(together) == events_of(alone)
+    seen_alone = fly(settings, sensors={"rgb": SENSORS["rgb"], "events": ADAPTIVE["events"]})
+    assert content(of(together, "rgb")) == content(of(seen_alone, "rgb"))
+
+
+def test_where_a_collision_ends_adaptive_events_does_not_depend_on_the_size_of_a_launch(settings):
+    crash = {**settings, "path": THROUGH_THE_WALL, "duration_s": 3.0, "sensors": ADAPTIVE}
+    one, other = (fly(crash, instants_per_launch=k) for k in (3, 50))
+    assert of(one, "collision")
+    assert content(one) == content(other)
+
+
+def test_adaptive_cameras_in_another_thread_yield_the_same(settings):
+    config = ns.load_config({**settings, "sensors": ADAPTIVE})
+    model = simulation.make_model(config)
+    stepped, flown = (simulation.make_state(model, flight_lane_count=lanes) for lanes in (1, 8))
+    speeds = [[460.0, 480.0, 470.0, 455.0]] * 10 + [[450.0, 440.0, 460.0, 470.0]] * 10
+    expected = [p for command in speeds for p in simulation.step(model, stepped, command)]
+    got: list[Packet] = []
+    waiting: list[simulation.Batch] = []
+    for command in speeds:
+        packets, batches = simulation.fly_period(model, flown, command)
+        got += packets
+        waiting += batches
+        while len(waiting) > 3:
+            got += simulation.see(model, flown, waiting.pop(0))
+    for batch in waiting:
+        got += simulation.see(model, flown, batch)
+    assert events_of(got) == events_of(expected)
+    assert sum(len(packet.t) for packet in of(got, "events")) > 50
+
+
+def test_an_adaptive_camera_needs_a_renderer_that_knows_where_things_are(settings):
+    model = simulation.make_model(ns.load_config({**settings, "sensors": ADAPTIVE, "renderer": "synthetic"}))
+    with pytest.raises(ValueError, match="needs the renderer 'warp'"):
+        simulation.make_state(model)

@@ -6,7 +6,7 @@ has been read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,9 +17,19 @@ from numpy.typing import NDArray
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Image, ImageEncoding, Packet
 from neurosim_core.render.renderer import Renderer, SceneOnDevice, make_renderer
+from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.scene.bodies import (
+    BodyConfig,
+    BodyPoses,
+    Motion,
+    make_body_poses,
+    pose_bodies,
+    upload_motions,
+)
+from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig, SensorConfig
-from neurosim_core.streams import HostCopy
+from neurosim_core.streams import HostCopy, HostInput
 from neurosim_core.trace import Trace
 
 _ENCODING: dict[str, ImageEncoding] = {"rgb": "rgb8", "depth": "32FC1"}
@@ -38,6 +48,8 @@ class EventChannel:
     """Number of the next packet."""
     watching: bool = False
     """It has a reference, and saw every instant that was rendered since."""
+    seen_ns: int = 0
+    """The last instant that it saw and that counts [ns]."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -67,8 +79,16 @@ class CastState:
     q_BC: wp.quatd
     p_WC: wp.array[wp.vec3]
     q_WC: wp.array[wp.quat]
+    motions: wp.array[Motion] | None = None
+    """Of the bodies; None: nothing moves but the vehicle."""
+    body_poses: BodyPoses | None = None
+    """Where bodies are at the instants."""
     slots: dict[tuple[int, ...], wp.array[int]] = field(default_factory=dict)
     """Lists of slots on the device: the same few come again and again."""
+    rule: DisplacementRule | None = None
+    """Chooses the ticks that are rendered; None: all are."""
+    chosen_slots: Sequence[HostInput] = ()
+    """Slots of the ticks chosen, for each lane: they do not come again."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,6 +117,7 @@ def make_cast_state(
     capacity: int,
     lane_count: int,
     device: str,
+    bodies: Mapping[str, BodyConfig] | None = None,
 ) -> CastState:
     """Allocate the buffers of a cast.
 
@@ -107,6 +128,10 @@ def make_cast_state(
         capacity: The most instants of one batch.
         lane_count: The most batches under way.
         device: Where to compute.
+        bodies: What moves in the scene.
+
+    Raises:
+        ValueError: The renderer cannot say what moves how far, and the cast is adaptive.
     """
     image_sensors = {name: sensors[name] for name in cast.image_cameras}
     # of n consecutive ticks of the cast, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
@@ -145,6 +170,7 @@ def make_cast_state(
     for name, sensor in image_sensors.items():
         assert isinstance(sensor, ImageSensorConfig)
         images[name] = ImageChannel(output=sensor.kind, rate=Rate(sensor.rate_hz))
+    p_BC, q_BC = wp.vec3d(*cast.mount.position_m), wp.quatd(*cast.mount.optical_quaternion())
     return CastState(
         device=device,
         capacity=capacity,
@@ -156,16 +182,79 @@ def make_cast_state(
         ],
         events=events,
         images=images,
-        p_BC=wp.vec3d(*cast.mount.position_m),
-        q_BC=wp.quatd(*cast.mount.optical_quaternion()),
+        p_BC=p_BC,
+        q_BC=q_BC,
         p_WC=wp.zeros(capacity, dtype=wp.vec3, device=device),
         q_WC=wp.zeros(capacity, dtype=wp.quat, device=device),
+        motions=upload_motions(bodies, device) if bodies else None,
+        body_poses=make_body_poses(capacity, len(bodies), device) if bodies else None,
+        rule=_make_rule(cast, scene, p_BC, q_BC),
+        chosen_slots=[HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(lane_count)]
+        if cast.max_displacement_px is not None
+        else (),
+    )
+
+
+def _make_rule(cast: Cast, scene: SceneOnDevice, p_BC: wp.vec3d, q_BC: wp.quatd) -> DisplacementRule | None:
+    if cast.max_displacement_px is None:
+        return None
+    if not isinstance(scene, SceneArrays):
+        raise ValueError(
+            f"max_displacement_px of {', '.join(cast.event_cameras)} needs the renderer 'warp': "
+            "the others do not know where things are"
+        )
+    return DisplacementRule(
+        scene, cast.lens, max_displacement_px=cast.max_displacement_px, rate=cast.rate, p_BC=p_BC, q_BC=q_BC
     )
 
 
 def is_due(cast: CastState, stamp_ns: int, wanted: Collection[str]) -> bool:
     """Return whether a camera that is wanted sees the tick of a cast."""
     return any(name in wanted for name in cast.events) or bool(_pictures_due(cast, stamp_ns, wanted))
+
+
+class Choice(NamedTuple):
+    """What is rendered of the ticks that a cast sees in a batch."""
+
+    places: Sequence[int]
+    """Indices of the ticks that are rendered."""
+    left_out_count: int = 0
+    """Ticks that are not rendered."""
+    coarse_count: int = 0
+    """Renders after which something moves further by the next tick than it should between renders."""
+
+
+def choose_ticks(
+    cast: CastState,
+    trace: Trace,
+    slots: Sequence[int],
+    stamps_ns: Sequence[int],
+    *,
+    end_ns: int,
+    wanted: Collection[str],
+) -> Choice:
+    """Return which of the ticks that are due an adaptive cast has to render, and wait until that is known.
+
+    These are the ticks that its rule asks for, the ends of packets, the last tick of the run, and the first
+    tick that a camera sees.
+
+    Args:
+        cast: Adaptive; its rule moves on to the end of the batch.
+        trace: Where the states of the batch are.
+        slots: Slots of the ticks in the trace.
+        stamps_ns: Their stamps.
+        end_ns: End of the run [ns].
+        wanted: Names of the cameras that look.
+    """
+    assert cast.rule is not None
+    if not slots:
+        return Choice(places=[])
+    channels = [channel for name, channel in cast.events.items() if name in wanted]
+    last_ns = cast.rate.stamp_ns(cast.rate.first_tick(end_ns + 1) - 1)
+    forced = [s == last_ns or any(c.packets.has_tick(s) for c in channels) for s in stamps_ns]
+    forced[0] |= not all(channel.watching for channel in channels)
+    places = cast.rule.choose(trace.states, slots, stamps_ns, forced)
+    return Choice(places, len(slots) - len(places), cast.rule.coarse_count)
 
 
 def _pictures_due(cast: CastState, stamp_ns: int, wanted: Collection[str]) -> list[str]:
@@ -177,8 +266,8 @@ class Look(NamedTuple):
 
     cast: CastState
     instants: Instants
-    key: Hashable
-    """Same key, same launches."""
+    key: Hashable | None
+    """Same key, same launches; None: they do not come again."""
     render: Callable[[], Any]
     """Launches the rendering and the copy of the pictures; returns what must be kept for a graph of it."""
 
@@ -210,13 +299,25 @@ def plan_look(
         pictures += [(stamp_ns, used, name) for name in due]
         image_slots.append(used if due else -1)
         used += bool(due)
-    from_slots, to_slots = _slots_on_device(cast, slots), _slots_on_device(cast, image_slots)
+    key: Hashable | None = (id(cast), lane, tuple(slots), tuple(image_slots))
+    chosen = None
+    if cast.rule is not None:
+        key, chosen = None, cast.chosen_slots[lane]
+        chosen.rows[: len(slots)] = slots
+    from_slots = _slots_on_device(cast, slots) if chosen is None else chosen.array
+    to_slots = _slots_on_device(cast, image_slots)
 
     def render() -> tuple[Any, Any]:
+        if chosen is not None:
+            chosen.upload()
         trace.camera_poses(
             from_slots, count=len(slots), p_BC=cast.p_BC, q_BC=cast.q_BC, p_WC=cast.p_WC, q_WC=cast.q_WC
         )
-        cast.renderers[lane].render(cast.p_WC, cast.q_WC, to_slots, instant_count=len(slots))
+        if cast.motions is not None and cast.body_poses is not None:
+            pose_bodies(cast.motions, trace.stamps, from_slots, count=len(slots), poses=cast.body_poses)
+        cast.renderers[lane].render(
+            cast.p_WC, cast.q_WC, to_slots, instant_count=len(slots), bodies=cast.body_poses
+        )
         for copy in cast.picture_copies[lane].values():
             copy.fetch(0, used)
         return from_slots, to_slots
@@ -227,7 +328,7 @@ def plan_look(
         pictures=tuple(pictures),
         events=tuple(name for name in cast.events if name in wanted),
     )
-    return Look(cast, instants, (id(cast), lane, tuple(slots), tuple(image_slots)), render)
+    return Look(cast, instants, key, render)
 
 
 def close_eyes(cast: CastState, wanted: Collection[str]) -> None:
@@ -269,6 +370,7 @@ def read_events(cast: CastState, instants: Instants, *, until_ns: int) -> list[E
         stamps = (stamp for stamp in instants.stamps_ns if begun_ns < stamp <= until_ns)
         ends = [stamp for stamp in stamps if channel.packets.has_tick(stamp)]
         fed = instants.stamps_ns[-1] > channel.camera.stamp_ns
+        channel.seen_ns = max((s for s in instants.stamps_ns if s <= until_ns), default=channel.seen_ns)
         packets += channel.camera.collect_windows(ends, scan_count=int(fed))
         channel.sequence += len(ends)
     return packets
@@ -276,12 +378,11 @@ def read_events(cast: CastState, instants: Instants, *, until_ns: int) -> list[E
 
 def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     """Return the packets whose windows have begun and not ended, cut at the last instant until a stamp."""
-    end_ns = cast.rate.stamp_ns(cast.rate.first_tick(until_ns + 1) - 1)
     packets: list[Events] = []
     for channel in cast.events.values():
         if not channel.watching:
             continue
-        cut_ns = min(end_ns, channel.camera.stamp_ns)
+        cut_ns = min(until_ns, channel.seen_ns)
         if channel.camera.window_start_ns < cut_ns:
             packets += channel.camera.collect_windows([cut_ns], scan_count=0)
             channel.sequence += 1

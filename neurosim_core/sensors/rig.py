@@ -6,7 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -37,6 +37,10 @@ class EventSensorConfig(CameraConfig):
     """The law of its pixels."""
     sampling_rate_hz: RateHz = 500.0
     """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
+    max_displacement_px: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+    """Adaptive sampling: a tick of the sampling rate is rendered only if without it some point would have
+    moved further than this between two renders [px]; ends of packets are always rendered. `sampling_rate_hz`
+    is then the finest step, and may be high, such as 10000. null: every tick is rendered."""
     packet_rate_hz: RateHz | None = None
     """How many packets of events are sent a second [Hz]; each holds the events of its whole window. null: the
     highest rate up to 100 Hz that divides the sampling rate."""
@@ -111,6 +115,8 @@ class Cast:
     """Names of the cameras that take a picture at every n-th instant."""
     outputs: frozenset[str]
     """What a ray answers."""
+    max_displacement_px: float | None = None
+    """Rays are cast only at the instants that this asks for (`sensors.displacement`); None: at all."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -123,39 +129,71 @@ def plan_casts(sensors: dict[str, SensorConfig]) -> tuple[Cast, ...]:
 
     Event cameras with the same lens, mount and sampling rate share a cast. An image camera joins the first
     cast with its lens and mount whose ticks contain all its own; so whether it exists does not change which
-    instants an event camera sees.
+    instants an event camera sees. For the same reason adaptive event cameras share a cast only if they ask
+    for the same renders, and image cameras do not join them.
     """
-    casts: list[tuple[PinholeConfig, Mount, float, list[str], list[str]]] = []
+    plans: list[_Plan] = []
 
-    def join(camera: CameraConfig, rate_hz: float, name: str, *, event: bool) -> None:
-        for lens, mount, cast_rate_hz, event_names, image_names in casts:
-            fits = rate_hz == cast_rate_hz if event else _divides(rate_hz, cast_rate_hz)
-            if lens == camera.lens and mount == camera.mount and fits:
-                (event_names if event else image_names).append(name)
+    def join(camera: CameraConfig, clock: _Clock, name: str, *, event: bool) -> None:
+        for plan in plans:
+            fits = clock == plan.clock if event else plan.clock.contains(clock)
+            if plan.lens == camera.lens and plan.mount == camera.mount and fits:
+                (plan.events if event else plan.images).append(name)
                 return
-        casts.append((camera.lens, camera.mount, rate_hz, [name] if event else [], [] if event else [name]))
+        names: tuple[list[str], list[str]] = ([name], []) if event else ([], [name])
+        plans.append(_Plan(camera.lens, camera.mount, clock, *names))
 
     images = {n: s for n, s in sensors.items() if isinstance(s, ImageSensorConfig)}
     for name, sensor in sensors.items():
         if isinstance(sensor, EventSensorConfig):
-            join(sensor, sensor.sampling_rate_hz, name, event=True)
+            join(sensor, _event_clock(sensor), name, event=True)
     for name, image in sorted(
         images.items(), key=lambda item: -item[1].rate_hz
     ):  # fastest first: others may join
-        join(image, image.rate_hz, name, event=False)
+        join(image, _Clock(image.rate_hz), name, event=False)
     return tuple(
         Cast(
-            lens=lens,
-            mount=mount,
-            rate=Rate(rate_hz),
-            event_cameras=tuple(event_names),
-            image_cameras=tuple(image_names),
+            lens=plan.lens,
+            mount=plan.mount,
+            rate=Rate(plan.clock.rate_hz),
+            event_cameras=tuple(plan.events),
+            image_cameras=tuple(plan.images),
             outputs=frozenset(
-                (["log_radiance"] if event_names else []) + [images[n].kind for n in image_names]
+                (["log_radiance"] if plan.events else []) + [images[n].kind for n in plan.images]
             ),
+            max_displacement_px=plan.clock.max_displacement_px,
         )
-        for lens, mount, rate_hz, event_names, image_names in casts
+        for plan in plans
     )
+
+
+class _Clock(NamedTuple):
+    """When a camera needs rays."""
+
+    rate_hz: float
+    max_displacement_px: float | None = None
+    packets: Rate | None = None
+    """Ticks that an adaptive camera always needs."""
+
+    def contains(self, other: _Clock) -> bool:
+        """Whether every tick of another clock is rendered by this one."""
+        return self.max_displacement_px is None and _divides(other.rate_hz, self.rate_hz)
+
+
+class _Plan(NamedTuple):
+    """A cast that cameras may still join."""
+
+    lens: PinholeConfig
+    mount: Mount
+    clock: _Clock
+    events: list[str]
+    images: list[str]
+
+
+def _event_clock(sensor: EventSensorConfig) -> _Clock:
+    if sensor.max_displacement_px is None:
+        return _Clock(sensor.sampling_rate_hz)
+    return _Clock(sensor.sampling_rate_hz, sensor.max_displacement_px, sensor.packets)
 
 
 def _divides(rate_hz: float, faster_hz: float) -> bool:

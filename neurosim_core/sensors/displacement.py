@@ -1,0 +1,413 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
+# mypy: disable-error-code="valid-type,call-overload,assignment,untyped-decorator"
+"""Adaptive sampling in time: which ticks of an event camera's clock have to be rendered.
+
+Between two renders log radiance is taken as linear in time, which is good as long as nothing moves far across
+the pixels. The rule of ESIM renders again after
+
+    t_{k+1} - t_k = lambda_v / max_x |V(x; t_k)|
+
+where V is the motion field [px/s] of the scene seen from the moving camera, and lambda_v the displacement
+allowed between two renders [px]. Here the flight is known before the look, so the motion field is not
+extrapolated over the whole interval. With x_i(t) the pixel in which point i of the scene is seen, tick k is
+rendered if
+
+    max_i |x_i(t_{k+1}) - x_i(t_last)| > max_displacement_px
+
+where t_last is the last tick that was rendered and i runs over points that are visible at t_last or at
+t_{k+1}. So it is rendered if to leave it out would let something move too far by the next tick. The pose at
+t_{k+1} is that of the vehicle at t_k, moved on by the twist that it has there: the choice needs no future
+command. That is exact up to half an acceleration times the square of one tick.
+
+The points are what a coarse grid of rays hits, cast at t_last: one ray for each square of PROBE_SPACING_PX,
+shifted from render to render by a low-discrepancy sequence, and the corners of the picture, where rotation
+and approach move fastest. A ray that hits nothing gives a point at infinity, which moves with rotation only.
+
+Limit: an object that no ray hits is not seen to move. It is narrower than the spacing, and it moves at most
+by f |t| / z px relative to the far background, for the translation t of the camera between two renders and
+its distance z. As the grid shifts, it is found sooner or later while it is in view.
+
+Reference: Rebecq, Gehrig, Scaramuzza (2018), ESIM: an Open Event Camera Simulator, section 3.2 (adaptive
+sampling by the maximum displacement between two successive frames).
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from neurosim_core.clock import NS_PER_S, Rate
+from neurosim_core.frames import quaternion_exp
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.launch import launch_split
+from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.streams import HostCopy, HostInput, Milestone
+
+PROBE_SPACING_PX = 16
+"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render."""
+
+_BLOCK = 64
+"""Ticks that are chosen from together."""
+_AHEAD_ON_CPU = 16
+"""Ticks after a render that a CPU looks at together; most renders come earlier than the end of a batch."""
+_CHUNK_ON_CUDA = 64
+"""Probes that one thread compares there."""
+_SHIFT = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the low-discrepancy sequence of Roberts (2018), R2: powers of the inverse plastic number."""
+_FAR_M = wp.constant(1.0e9)
+_Z_MIN = wp.constant(wp.float64(1.0e-6))
+"""Least cosine to the optical axis of what counts as in front of the camera."""
+_BORDER_PX = wp.constant(wp.float64(1.0e-6))
+"""Rounding of a projection to the border of the picture."""
+
+
+@wp.struct
+class _Pinhole:
+    """A lens in pixels."""
+
+    fx: wp.float64
+    fy: wp.float64
+    cx: wp.float64
+    cy: wp.float64
+    width: wp.float64
+    height: wp.float64
+
+
+@wp.struct
+class _Poses:
+    """Poses T_WC of the camera at the ticks of a batch and one tick after each; row 0: at the last render."""
+
+    p_WC: wp.array[wp.vec3d]
+    q_WC: wp.array[wp.quatd]
+    p_next_WC: wp.array[wp.vec3d]
+    q_next_WC: wp.array[wp.quatd]
+
+
+@wp.kernel(enable_backward=False)
+def _load_poses(
+    # Model:
+    p_BC: wp.vec3d,
+    q_BC: wp.quatd,
+    # In:
+    states: wp.array3d[wp.float64],
+    vehicle: int,
+    slots: wp.array[int],
+    step_s: wp.array[wp.float64],
+    # Out:
+    poses_out: _Poses,
+) -> None:
+    tick = wp.tid()
+    slot = slots[tick]
+    p_WB = wp.vec3d(states[slot, vehicle, 0], states[slot, vehicle, 1], states[slot, vehicle, 2])
+    q_WB = wp.quatd(
+        states[slot, vehicle, 3], states[slot, vehicle, 4], states[slot, vehicle, 5], states[slot, vehicle, 6]
+    )
+    v_W = wp.vec3d(states[slot, vehicle, 7], states[slot, vehicle, 8], states[slot, vehicle, 9])
+    w_B = wp.vec3d(states[slot, vehicle, 10], states[slot, vehicle, 11], states[slot, vehicle, 12])
+    poses_out.p_WC[tick + 1] = p_WB + wp.quat_rotate(q_WB, p_BC)
+    poses_out.q_WC[tick + 1] = q_WB * q_BC
+    q_next_WB = q_WB * quaternion_exp(step_s[tick] * w_B)
+    poses_out.p_next_WC[tick + 1] = p_WB + step_s[tick] * v_W + wp.quat_rotate(q_next_WB, p_BC)
+    poses_out.q_next_WC[tick + 1] = q_next_WB * q_BC
+
+
+@wp.func
+def _probe_pixel(
+    probe: int, columns: int, count: int, spacing: float, shift: wp.vec2, lens: _Pinhole
+) -> wp.vec2d:
+    """Return where in the picture a probe looks [px]: the corners come last, after the grid."""
+    corner = probe - count + 4
+    if corner >= 0:
+        return wp.vec2d(wp.float64(corner % 2) * lens.width, wp.float64(corner // 2) * lens.height)
+    x = (float(probe % columns - 1) + shift[0]) * spacing
+    y = (float(probe // columns - 1) + shift[1]) * spacing
+    return wp.vec2d(wp.float64(x), wp.float64(y))
+
+
+@wp.kernel(enable_backward=False)
+def _cast_probes(
+    first: int,
+    # Model:
+    mesh: wp.uint64,
+    lens: _Pinhole,
+    columns: int,
+    spacing: float,
+    # In:
+    first_row: int,
+    poses: _Poses,
+    shifts: wp.array[wp.vec2],
+    # Out:
+    points_out: wp.array2d[wp.vec4d],
+) -> None:
+    index = first + wp.tid()
+    count = points_out.shape[1]
+    row = first_row + index // count
+    probe = index % count
+    pixel = _probe_pixel(probe, columns, count, spacing, shifts[row], lens)
+    ray_C = wp.vec3d((pixel[0] - lens.cx) / lens.fx, (pixel[1] - lens.cy) / lens.fy, wp.float64(1.0))
+    ray = wp.quat_rotate(poses.q_WC[row], wp.normalize(ray_C))
+    origin = poses.p_WC[row]
+    query = wp.mesh_query_ray(mesh, wp.vec3(origin), wp.vec3(ray), _FAR_M)
+    if query.result:
+        point = origin + wp.float64(query.t) * ray
+        points_out[row, probe] = wp.vec4d(point[0], point[1], point[2], wp.float64(1.0))
+    else:
+        points_out[row, probe] = wp.vec4d(ray[0], ray[1], ray[2], wp.float64(0.0))
+
+
+@wp.func
+def _see(point: wp.vec4d, p_WC: wp.vec3d, q_WC: wp.quatd, lens: _Pinhole) -> wp.vec3d:
+    """Return column and row [px] of a point (x, y, z, 1) or a direction (x, y, z, 0), and 1 if in front."""
+    ray = wp.quat_rotate_inv(q_WC, wp.vec3d(point[0], point[1], point[2]) - point[3] * p_WC)
+    if ray[2] <= _Z_MIN * wp.length(ray):
+        return wp.vec3d(wp.float64(0.0))
+    return wp.vec3d(lens.fx * ray[0] / ray[2] + lens.cx, lens.fy * ray[1] / ray[2] + lens.cy, wp.float64(1.0))
+
+
+@wp.func
+def _in_picture(seen: wp.vec3d, lens: _Pinhole) -> bool:
+    return (
+        seen[2] > wp.float64(0.0)
+        and seen[0] >= -_BORDER_PX
+        and seen[0] <= lens.width + _BORDER_PX
+        and seen[1] >= -_BORDER_PX
+        and seen[1] <= lens.height + _BORDER_PX
+    )
+
+
+@wp.func
+def _displacement(before: wp.vec3d, after: wp.vec3d, lens: _Pinhole) -> float:
+    """Return how far a point moved in the picture [px]: 0 if it is in neither, inf if it went behind."""
+    if not (_in_picture(before, lens) or _in_picture(after, lens)):
+        return 0.0
+    if before[2] == wp.float64(0.0) or after[2] == wp.float64(0.0):
+        return float(wp.inf)
+    return float(wp.length(wp.vec2d(after[0] - before[0], after[1] - before[1])))
+
+
+@wp.kernel(enable_backward=False)
+def _compare(
+    first: int,
+    # Model:
+    lens: _Pinhole,
+    # In:
+    first_row: int,
+    first_tick: int,
+    tick_count: int,
+    chunk: int,
+    poses: _Poses,
+    points: wp.array2d[wp.vec4d],
+    # In/out:
+    moved: wp.array2d[float],
+) -> None:
+    index = first + wp.tid()
+    probes = points.shape[1]
+    chunks = (probes + chunk - 1) // chunk
+    begin = (index % chunks) * chunk
+    tick = first_tick + index // chunks % tick_count
+    row = first_row + index // chunks // tick_count
+    if tick < row:
+        return
+    most = float(0.0)  # noqa: UP018  (a literal would be a constant)
+    for probe in range(begin, wp.min(begin + chunk, probes)):
+        point = points[row, probe]
+        before = _see(point, poses.p_WC[row], poses.q_WC[row], lens)
+        after = _see(point, poses.p_next_WC[tick], poses.q_next_WC[tick], lens)
+        most = wp.max(most, _displacement(before, after, lens))
+    wp.atomic_max(moved, row, tick, most)
+
+
+@wp.kernel(enable_backward=False)
+def _carry_row(
+    # In:
+    row: int,
+    # In/out:
+    poses: _Poses,
+    points: wp.array2d[wp.vec4d],
+) -> None:
+    probe = wp.tid()
+    points[0, probe] = points[row, probe]
+    if probe == 0:
+        poses.p_WC[0] = poses.p_WC[row]
+        poses.q_WC[0] = poses.q_WC[row]
+
+
+class DisplacementRule:
+    """Chooses the ticks to be rendered; remembers the last one, and what was seen there.
+
+    What it chooses depends on the flight and on the ticks that must be rendered, not on how ticks are cut
+    into calls of `choose`.
+
+    Attributes:
+        coarse_count: Ticks of the last `choose` from which to the next something moves further than allowed:
+            the clock is too slow to keep the bound there.
+    """
+
+    def __init__(
+        self,
+        arrays: SceneArrays,
+        lens: PinholeConfig,
+        *,
+        max_displacement_px: float,
+        rate: Rate,
+        p_BC: wp.vec3d,
+        q_BC: wp.quatd,
+        spacing_px: int = PROBE_SPACING_PX,
+    ) -> None:
+        """Allocate the buffers.
+
+        Args:
+            arrays: The scene.
+            lens: Of the camera.
+            max_displacement_px: How far a point may move between two renders [px].
+            rate: The clock whose ticks are chosen from.
+            p_BC: Position of the camera on the body [m].
+            q_BC: Orientation of the camera against the body, xyzw.
+            spacing_px: Distance between probes [px].
+        """
+        self.coarse_count = 0
+        self._limit_px = max_displacement_px
+        self._rate = rate
+        self._mount = (p_BC, q_BC)
+        self._mesh = arrays.mesh_id
+        self._device = device = arrays.device
+        self._on_cpu = wp.get_device(device).is_cpu
+        self._spacing_px = float(spacing_px)
+        self._columns = math.ceil(lens.width / spacing_px) + 2  # one beyond each border
+        self._probe_count = self._columns * (math.ceil(lens.height / spacing_px) + 2) + 4
+        self._lens = _Pinhole()
+        self._lens.fx, self._lens.fy, self._lens.cx, self._lens.cy = lens.intrinsics()
+        self._lens.width, self._lens.height = lens.width, lens.height
+        rows = _BLOCK + 1
+
+        def zeros(shape: Any, dtype: Any) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self._poses = _Poses()
+        self._poses.p_WC, self._poses.p_next_WC = zeros(rows, wp.vec3d), zeros(rows, wp.vec3d)
+        self._poses.q_WC, self._poses.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
+        self._points = zeros((rows, self._probe_count), wp.vec4d)
+        self._moved = zeros((rows, rows), float)
+        self._moved_on_host = HostCopy(self._moved)
+        self._slots, self._step_s = zeros(_BLOCK, int), zeros(_BLOCK, wp.float64)
+        self._shifts = zeros(rows, wp.vec2)
+        self._inputs = [HostInput(array) for array in (self._slots, self._step_s, self._shifts)]
+        self._done = Milestone(device)
+        self._started = False
+        self._measured: dict[int, int] = {}
+
+    def choose(
+        self,
+        states: Any,
+        slots: Sequence[int],
+        stamps_ns: Sequence[int],
+        forced: Sequence[bool],
+        *,
+        vehicle: int = 0,
+    ) -> list[int]:
+        """Return which ticks are to be rendered, as indices into `slots`, and wait for them.
+
+        Args:
+            states: Where the flight is, as in `Trace.states`, float64, shape [slot, vehicle, >= 13].
+            slots: Slots of consecutive ticks of the clock.
+            stamps_ns: Their stamps [ns], later than those of the call before.
+            forced: Ticks that are rendered in any case; the very first always is.
+            vehicle: Which vehicle carries the camera.
+        """
+        self.coarse_count = 0
+        chosen: list[int] = []
+        for begin in range(0, len(slots), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            self._load(states, slots[block], stamps_ns[block], vehicle)
+            chosen += [begin + tick for tick in self._choose(forced[block])]
+        return chosen
+
+    def _choose(self, forced: Sequence[bool]) -> list[int]:
+        """Return which ticks of a block to render, and keep what is seen at the last of them."""
+        count = len(forced)
+        if not self._on_cpu:
+            self._measure(1, count, 0, count + 1, 0, count + 1)
+        chosen: list[int] = []
+        last = 0
+        for tick, must in enumerate(forced, start=1):
+            if must or not self._started or self._moved_px(last, tick, count) > self._limit_px:
+                chosen.append(tick - 1)
+                last = tick
+                self._started = True
+        self.coarse_count += sum(self._moved_px(t + 1, t + 1, count) > self._limit_px for t in chosen)
+        if last > 0:
+            wp.launch(
+                _carry_row,
+                dim=self._probe_count,
+                inputs=[last],
+                outputs=[self._poses, self._points],
+                device=self._device,
+            )
+        return chosen
+
+    def _load(self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int], vehicle: int) -> None:
+        """Bring the poses of a block to the device."""
+        count = len(slots)
+        first = self._rate.first_tick(stamps_ns[0])
+        ends_ns = [self._rate.stamp_ns(first + index + 1) for index in range(count)]
+        of_slots, of_steps, of_shifts = (given.rows for given in self._inputs)
+        of_slots[:count] = slots
+        of_steps[:count] = (np.array(ends_ns) - np.array(stamps_ns)) / NS_PER_S
+        of_shifts[1 : count + 1] = np.outer(np.arange(first, first + count), _SHIFT) % 1.0
+        for given in self._inputs:
+            given.upload()
+        wp.launch(
+            _load_poses,
+            dim=count,
+            inputs=[*self._mount, states, vehicle, self._slots, self._step_s],
+            outputs=[self._poses],
+            device=self._device,
+        )
+        self._moved.zero_()
+        self._measured = {}
+
+    def _moved_px(self, row: int, tick: int, count: int) -> float:
+        """Return the largest displacement from a render in a row to the tick after another row [px]."""
+        if self._on_cpu and tick >= self._measured.get(row, -1):
+            begin = self._measured.get(row, row)
+            end = min(max(begin, tick) + _AHEAD_ON_CPU, count + 1)
+            fresh = row not in self._measured and row > 0
+            self._measure(row, int(fresh), row, 1, begin, end - begin)
+            self._measured[row] = end
+        return float(self._moved_on_host.view(row, 1)[0, tick])
+
+    def _measure(
+        self, cast_row: int, cast_count: int, row: int, row_count: int, tick: int, tick_count: int
+    ) -> None:
+        """Cast the probes of some rows, compare those of some rows with some ticks, and wait."""
+        if cast_count > 0:
+            launch_split(
+                _cast_probes,
+                dim=cast_count * self._probe_count,
+                inputs=[
+                    self._mesh,
+                    self._lens,
+                    self._columns,
+                    self._spacing_px,
+                    cast_row,
+                    self._poses,
+                    self._shifts,
+                ],
+                outputs=[self._points],
+                device=self._device,
+            )
+        chunk = self._probe_count if self._on_cpu else _CHUNK_ON_CUDA
+        launch_split(
+            _compare,
+            dim=row_count * tick_count * -(-self._probe_count // chunk),
+            inputs=[self._lens, row, tick, tick_count, chunk, self._poses, self._points],
+            outputs=[self._moved],
+            device=self._device,
+        )
+        self._moved_on_host.fetch(row, row_count)
+        self._done.set()
+        self._done.wait()
