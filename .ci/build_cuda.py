@@ -52,7 +52,13 @@ def make_kernels() -> None:
         for _ in run({"duration_s": 0.02, "device": "cpu", "scene": scene, "sensors": SENSORS,
                       "render": {"lighting": {"mode": lighting}}}):  # fmt: skip
             pass
-    raycast_kernel(OUTPUTS, Terms(textured=True, emissive=True, baked=True, supersampled=True))
+    everything = Terms(textured=True, emissive=True, baked=True, supersampled=True)
+    for terms in (
+        everything,
+        everything._replace(finest_level=True),
+        everything._replace(finest_level=True, nearest_texel=True),
+    ):
+        raycast_kernel(OUTPUTS, terms)
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
         for mode in MODES:

@@ -205,6 +205,27 @@ def test_zooming_out_never_aliases(device):
     assert np.abs(np.diff(log, axis=0)).max() < 5e-3
 
 
+@pytest.mark.parametrize("filtering", ["bilinear", "nearest"])
+def test_unfiltered_textures_alias(device, filtering):
+    """Of squares smaller than pixels, point samples see one or the other, or what is between two texels."""
+    config = UNSHADOWED.model_copy(update={"texture_filter": filtering})
+    scene = textured_plane(checkerboard(64, texels_per_square=4), size_m=4.0, repeats=8.0)
+    lens = PinholeConfig(width=40, height=40, horizontal_fov_rad=0.1)
+    # 2.6 m / 40 px is 8.33 squares per pixel: neighbouring pixels see other places of a square
+    pose = [((0.0, 0.0, 26.0), LOOK_DOWN)]
+    log = render(scene, lens, pose, outputs=("log_radiance",), config=config, device=device)["log_radiance"]
+    radiance = np.exp(log) - config.dark_floor
+    plain = np.isclose(radiance, 0.0, atol=1e-6) | np.isclose(radiance, 1.0, atol=1e-5)
+    # of a square of 4 x 4 texels the middle 3 x 3 are away from others: 9 / 16 of the area, if interpolated
+    assert plain.all() if filtering == "nearest" else 0.4 < plain.mean() < 0.7
+    assert radiance.std() > 0.35  # of black and white 0.5; of the mean 0
+
+
+def test_a_bias_is_for_levels():
+    with pytest.raises(ValueError, match="mip_bias is for texture_filter trilinear, got -1 with nearest"):
+        RenderConfig(mip_bias=-1.0, texture_filter="nearest")
+
+
 def test_outputs_of_a_known_view(device):
     """Instances, normals towards the camera, sRGB codes, and what is written where nothing is hit."""
     materials = (
