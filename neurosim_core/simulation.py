@@ -16,6 +16,7 @@ Who commands from outside goes from one control period to the next: `step` flies
 from __future__ import annotations
 
 import itertools
+import logging
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
@@ -62,6 +63,8 @@ from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_s
 from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace, TraceRows
 from neurosim_core.trajectory import Path, make_path
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig
+
+logger = logging.getLogger(__name__)
 
 COLLISION = "collision"
 """Name under which collisions are reported."""
@@ -204,7 +207,8 @@ class State:
     failure: DynamicsError | None = None
     """The integration failed; packets up to its stamp have been returned."""
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    """steps, commands, renders, ticks left out, coarse ticks, events dropped, collisions."""
+    """steps, commands, redone intervals (of the dynamics, in adaptive steps), renders, ticks left out, coarse
+    ticks, events dropped, collisions."""
     wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """Wall-clock time by phase [s]."""
 
@@ -356,7 +360,12 @@ def make_state(
     if lane_count is None:
         ahead = wp.get_device(device).is_cuda and config.renderer != "pyrender"
         lane_count = _LANES_ON_CUDA if ahead else 1
-    vehicle = Multirotor(model.airframe, count=1, device=device, max_step_ns=to_ns(config.vehicle.max_step_s))
+    vehicle = Multirotor(
+        model.airframe,
+        device=device,
+        max_step_ns=to_ns(config.vehicle.max_step_s),
+        integrator=config.vehicle.integrator,
+    )
     begin = model.path.evaluate([0])
     half_yaw = 0.5 * begin.yaw[0]
     chosen = start or StartState()
@@ -402,6 +411,7 @@ def make_state(
                 capacity=model.schedule.ticks_per_batch(index),
                 lane_count=lane_count,
                 device=device,
+                seed=config.seed if seed is None else seed,
                 bodies=config.bodies,
             )
             for index, cast in enumerate(model.casts)
@@ -865,6 +875,7 @@ def _read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     state.stamp_ns = batch.boundaries[-1].stamp_ns
     state.counts["steps"] += batch.step_count
     state.counts["commands"] += batch.command_count
+    _count_redone(state, int(rows.redone[-1].sum()))
     if rows.status[-1].any():
         state.failure = _failure(state.vehicle)
         state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
@@ -878,6 +889,15 @@ def _read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
         header = {"stamp_ns": reached[-1], "sequence": 0, "sensor": "odometry"}
         state.last = _odometry(rows.states[len(reached) - 1, 0], header)
     return packets
+
+
+def _count_redone(state: State, redone_count: int) -> None:
+    if redone_count > 0 and not state.counts["redone intervals"]:
+        logger.info(
+            "vehicle: steps of %g ms are too long at times; such intervals are redone with adaptive steps",
+            1e-6 * state.vehicle.max_step_ns,
+        )
+    state.counts["redone intervals"] = redone_count
 
 
 def _read_cameras(state: State, batch: Batch) -> list[Packet]:
