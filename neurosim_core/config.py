@@ -27,7 +27,7 @@ from neurosim_core.sensors.rig import (
 )
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
-from neurosim_core.vehicle import MultirotorConfig, preset
+from neurosim_core.vehicle import Integrator, MultirotorConfig, preset
 
 
 class ConfigError(ValueError):
@@ -43,6 +43,9 @@ class VehicleConfig(Settings):
     """Parameters of the airframe to change, by name (see `MultirotorConfig`), such as {mass_kg: 0.6}."""
     max_step_s: Annotated[float, Field(gt=0.0, le=0.1)] = 0.001
     """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
+    integrator: Integrator = "rkmk4"
+    """rkmk4: fixed steps, and adaptive ones for intervals that these cannot resolve. dormand_prince: adaptive
+    steps only."""
     collision_radius_m: Annotated[float, Field(gt=0.0)] = 0.2
     """Radius of the sphere around the vehicle that must not touch the scene [m]."""
     on_collision: Literal["end", "report"] = "end"

@@ -18,7 +18,7 @@ VELOCITY = slice(7, 10)
 BODY_RATE = slice(10, 13)
 ROTOR_SPEED = slice(13, None)
 """Where each part of a state stands in a row of a `Trace`."""
-_SLOT_PARAMETER = 7
+_SLOT_PARAMETER = 8
 _LAUNCHES_MAX = 256
 
 
@@ -32,11 +32,13 @@ def _record_state(
     rotor_speed: wp.array2d[wp.float64],
     status: wp.array[wp.int32],
     stamp_ns: wp.array[wp.int64],
+    redone_count: wp.array[wp.int64],
     slot: int,
     # Out:
     states_out: wp.array3d[wp.float64],
     status_out: wp.array2d[wp.int32],
     stamps_out: wp.array2d[wp.int64],
+    redone_out: wp.array2d[wp.int64],
 ) -> None:
     vehicle = wp.tid()
     for axis in range(3):
@@ -49,6 +51,7 @@ def _record_state(
         states_out[slot, vehicle, 13 + rotor] = rotor_speed[vehicle, rotor]
     status_out[slot, vehicle] = status[vehicle]
     stamps_out[slot, vehicle] = stamp_ns[vehicle]
+    redone_out[slot, vehicle] = redone_count[vehicle]
 
 
 @wp.kernel
@@ -85,6 +88,8 @@ class TraceRows(NamedTuple):
     """Shape [slot, vehicle]."""
     clearance: NDArray[np.float32]
     """[m], shape [slot]."""
+    redone: NDArray[np.int64]
+    """Shape [slot, vehicle]."""
 
 
 class Trace:
@@ -94,6 +99,7 @@ class Trace:
         states: States, float64, shape [slot, vehicle, 13 + R].
         status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, vehicle].
         stamps: Time of each state [ns], int64, shape [slot, vehicle]; only on the device.
+        redone: Intervals redone so far (`MultirotorArrays.redone_count`), shape [slot, vehicle].
         clearance: Room around vehicle 0 as of the last `check_room` [m], float32, shape [slot].
     """
 
@@ -101,8 +107,9 @@ class Trace:
         self.states = wp.zeros((capacity, vehicle_count, 13 + rotor_count), dtype=wp.float64, device=device)
         self.status = wp.zeros((capacity, vehicle_count), dtype=wp.int32, device=device)
         self.stamps = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
+        self.redone = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
         self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
-        self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance)]
+        self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance, self.redone)]
         self._recording: tuple[Any, Any] = (None, None)
         self._room_checks: dict[tuple[int, int, float], tuple[DistanceField, wp.Launch]] = {}
         self._pose_launches: dict[tuple[int, int, int, int], tuple[Any, wp.Launch]] = {}
@@ -126,9 +133,10 @@ class Trace:
                     arrays.rotor_speed,
                     arrays.status,
                     arrays.stamp_ns,
+                    arrays.redone_count,
                     slot,
                 ],
-                outputs=[self.states, self.status, self.stamps],
+                outputs=[self.states, self.status, self.stamps, self.redone],
                 device=self.states.device,
                 record_cmd=True,
             )

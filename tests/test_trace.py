@@ -25,6 +25,7 @@ def test_camera_pose_is_body_pose_times_mount(device):
         rotor_speed=wp.array(rng.normal(size=(1, 6)), dtype=wp.float64, device=device),
         status=wp.array([7], dtype=wp.int32, device=device),
         stamp_ns=wp.array([2**53 + 1], dtype=wp.int64, device=device),
+        redone_count=wp.array([3], dtype=wp.int64, device=device),
     )
     trace = Trace(capacity=3, vehicle_count=1, rotor_count=6, device=device)
     trace.record(arrays, 2)
@@ -32,6 +33,7 @@ def test_camera_pose_is_body_pose_times_mount(device):
     wp.synchronize_device(device)
     rows = trace.numpy(1, 2)
     assert rows.status.tolist() == [[0], [7]]
+    assert rows.redone.tolist() == [[0], [3]]
     assert trace.stamps.numpy().tolist() == [[0], [0], [2**53 + 1]]
     state = rows.states[1, 0]
     for part, array in (

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pytest
 import warp as wp
 from multirotor_oracle import NO_AERO, angle, solve
 
+from neurosim_core import load_config, simulation
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 MS = 1_000_000
@@ -164,6 +167,28 @@ def test_a_redone_interval_is_that_of_adaptive_steps(device):
         assert vehicle.effort.redone_count[0] == (integrator == "rkmk4")
     for redone, adaptive in zip(*ends, strict=True):
         assert redone == pytest.approx(adaptive, rel=1e-13, abs=1e-15)  # compiled apart
+
+
+def test_a_run_counts_redone_intervals(caplog, device):
+    settings = {
+        "device": device,
+        "scene": {"kind": "apartment", "rooms": 1},
+        "vehicle": {"parameters": {"inertia_kg_m2": scaled_inertia(1e-4)}},
+        "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
+        "path": {"kind": "hover"},
+    }
+    for stiff in (False, True):
+        config = load_config(settings if stiff else {**settings, "vehicle": {}})
+        model = simulation.make_model(config)
+        state = simulation.make_state(model)
+        with caplog.at_level(logging.INFO, logger="neurosim_core.simulation"):
+            for _ in range(3):
+                simulation.step(model, state, [500.0, 520.0, 480.0, 510.0])
+        assert (state.counts["redone intervals"] > 0) == stiff
+        assert state.counts["redone intervals"] == state.vehicle.effort.redone_count.sum()
+    assert [record.getMessage() for record in caplog.records if "redone" in record.getMessage()] == [
+        "vehicle: steps of 1 ms are too long at times; such intervals are redone with adaptive steps"
+    ]
 
 
 # Tolerance
