@@ -302,7 +302,8 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
         f"{simulated_s:.3f} s in {report.flight_s:.1f} s: real-time factor {report.real_time_factor:.2f} "
         f"(and {report.setup_s:.1f} s of set-up)",
     )
-    facts.add_row("steps", f"{counts['steps']:,} of the dynamics, {counts['commands']:,} commands")
+    redone = f" ({counts['redone intervals']:,} intervals redone)" if counts["redone intervals"] else ""
+    facts.add_row("steps", f"{counts['steps']:,} of the dynamics{redone}, {counts['commands']:,} commands")
     if model.casts:
         casts = "; ".join(_describe_cast(cast) for cast in model.casts)
         facts.add_row("renders", f"{counts['renders']:,} ({casts})")
