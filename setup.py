@@ -5,6 +5,6 @@ from setuptools import Extension, setup
 
 setup(
     ext_modules=[
-        Extension("cortex._flat", ["cortex/_flat.c"], include_dirs=[numpy.get_include()], optional=True),
+        Extension("cortex._native", ["cortex/_native.c"], include_dirs=[numpy.get_include()], optional=True),
     ]
 )

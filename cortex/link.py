@@ -104,7 +104,7 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read = make_reader(codec, self.message_head)
+        self.read, self.drain = make_reader(codec, self.message_head)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,

@@ -1,4 +1,4 @@
-"""The short cuts of `_flat.c`, where they were compiled; without them everything works, more slowly.
+"""The short cuts of `_native.c`, where they were compiled; without them everything works, more slowly.
 
 `CORTEX_PURE_PYTHON=1` leaves them out, to compare or to find a fault.
 """
@@ -21,9 +21,13 @@ from cortex.layout import (
 from cortex.schema import ArrayType, FieldType, Schema
 
 _Flat: Any = None
+NativeGate: Any = None
+"""Sends small messages; see `gate.py`. There is one wherever `make_flat` returns something."""
 if not os.environ.get("CORTEX_PURE_PYTHON"):
     with contextlib.suppress(ImportError):  # there was no compiler when this was installed
-        from cortex._flat import Flat as _Flat
+        from cortex import _native
+
+        _Flat, NativeGate = _native.Flat, _native.Gate
 _NUMBER, _BOOL, _FIXED, _VARIABLE, _STR, _BYTES = range(6)
 _RANK_MAX = 8
 _SHARED_MAX = 16
@@ -51,10 +55,8 @@ def make_flat(schema: Schema, cls: type, head: bytes = b"") -> Any:
             return None
         kind, code, *rest = row
         rows.append((field.name, kind, code, offset, *rest))
-    names = [field.name for field in fields]
-    stamp = names.index("stamp_ns") if "stamp_ns" in names else -1
-    if stamp >= 0 and not (isinstance(fields[stamp].type, str) and "int" in fields[stamp].type):
-        stamp = -1
+    stamps = [k for k, field in enumerate(fields) if field.name == "stamp_ns" and "int" in str(field.type)]
+    stamp = stamps[0] if stamps and isinstance(fields[stamps[0]].type, str) else -1
     return _Flat(cls, rows, block_size(schema), stamp, head)
 
 
@@ -75,6 +77,7 @@ def _row(kind: FieldType, array: Any) -> tuple[Any, ...] | None:
         return _FIXED, "-", array_dtype(kind), kind.shape, (-1,) * len(kind.shape), 0
     if not isinstance(kind, str):
         return None
-    if kind in ("bool", "str", "bytes"):
-        return {"bool": _BOOL, "str": _STR, "bytes": _BYTES}[kind], "-", None, (), (), 0
-    return _NUMBER, SCALAR_CODES[kind], None, (), (), 0
+    special = {"bool": _BOOL, "str": _STR, "bytes": _BYTES}.get(str(kind))
+    if special is not None:
+        return special, "-", None, (), (), 0
+    return _NUMBER, SCALAR_CODES[str(kind)], None, (), (), 0

@@ -14,13 +14,13 @@ import zmq
 
 from cortex.codec import Codec
 from cortex.context import Closed
+from cortex.gate import Gate, LongGate, make_gate
 from cortex.large import LargeSender, Reader, Slot, Stamps
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
-from cortex.packer import make_packers
+from cortex.packer import make_record_packer
 from cortex.stats import PublisherCounters
 from cortex.wire import (
     BATCH,
-    HEADER_SIZE,
     LARGE,
     MESSAGE,
     RECORD,
@@ -71,7 +71,6 @@ class Publisher(Generic[T]):
         self.codec = codec
         self.source = secrets.randbits(64) or 1
         self.latch = latch
-        self._bytes = 0
         self._timeouts = 0
         self._skipped = 0
         stamped = codec.stamp_of is not None
@@ -81,25 +80,29 @@ class Publisher(Generic[T]):
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         self._batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
-        self._pack, self._pack_record = make_packers(codec, self._head)
+        self._pack_record = make_record_packer(codec, self._head)
         self._plain = not latch and not coalesce
         self._gathers = coalesce and not latch
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
-        self._acquire, self._release = outlets.lock.acquire, outlets.lock.release
+        self._gate: Gate = make_gate(
+            codec,
+            self._head,
+            outlets.lock,
+            slowly=self._publish_slowly,
+            retry=self._send_strict_all,
+            limit=inline_max,
+        )
+        """Sends small messages if they go to one outlet and nothing special is to be done."""
         self._large_lock = threading.Lock()
         self._large = LargeSender(
             self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
         )
         self._readers: dict[bytes, Reader] = {}
-        self._only_send: Callable[..., Any] | None = None
-        """Where small messages go if that is one outlet and nothing special is to be done."""
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_outlets: tuple[Outlet, ...] = ()
-        self._sequence = 0
         self._latched = b""
-        self._refresh_ns = 0
         self._was_large = False
         self._crowded = False
         self._told = 0
@@ -133,24 +136,16 @@ class Publisher(Generic[T]):
             ValueError: A field's value does not fit its type.
             Closed: The publisher was closed.
         """
-        self._acquire()
+        return self._gate(message)
+
+    def _publish_slowly(self, message: T) -> bool:
+        """Send a message that the gate cannot."""
+        self._lock.acquire()
         try:
             now_ns = monotonic_ns()
-            if now_ns >= self._refresh_ns:
+            if now_ns >= self._gate.refresh_ns:
                 self._prepare(now_ns)
-            send = self._only_send
-            if send is not None:
-                sequence = self._sequence
-                frame = self._pack(message, sequence, now_ns, self._inline_max)
-                if frame is not None:
-                    self._sequence = sequence + 1
-                    self._bytes += len(frame) - HEADER_SIZE
-                    try:
-                        send(frame, DONTWAIT)
-                    except zmq.Again:
-                        return self._send_strict_all(frame)
-                    return True
-            elif self._gathers and (self._batch or now_ns - self._last_ns < BURST_NS):
+            if self._gathers and (self._batch or now_ns - self._last_ns < BURST_NS):
                 record = self._pack_record(message, now_ns, self._inline_max)
                 if record is not None:
                     return self._collect(record, now_ns)
@@ -158,7 +153,7 @@ class Publisher(Generic[T]):
                 raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
             if not self._readers and not self.latch:
                 self._flush()
-                self._sequence += 1
+                self._gate.sequence += 1
                 return True
             if self._was_large:  # the next is most likely large, too
                 prepared: Any = self.codec.plan(message)
@@ -175,7 +170,7 @@ class Publisher(Generic[T]):
             ours = self._large_lock.acquire(blocking=False)
             slot = self._acquire_slot(prepared.size) if ours else None
         finally:
-            self._release()
+            self._lock.release()
         if not ours:
             self._large_lock.acquire()
             with self._lock:
@@ -239,7 +234,7 @@ class Publisher(Generic[T]):
             with self._large_lock, self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
-                slot = self._large.renew(slot, size, self._sequence)
+                slot = self._large.renew(slot, size, self._gate.sequence)
                 if slot is None:
                     raise RuntimeError(f"{self.topic}: every slot is out on loan; the message is lost")
                 self._publish_slot(slot, size, stamp_ns, now_ns)
@@ -251,9 +246,9 @@ class Publisher(Generic[T]):
             if self._batch or now_ns - self._last_ns < BURST_NS:
                 return self._collect(RECORD.pack(stamp_ns, now_ns, size, 0) + body + bytes(-size % 8), now_ns)
             self._last_ns = now_ns
-        self._bytes += size
-        sequence = self._sequence
-        self._sequence = sequence + 1
+        self._gate.bytes += size
+        sequence = self._gate.sequence
+        self._gate.sequence = sequence + 1
         frame = self._head + REST.pack(sequence, stamp_ns, now_ns, size, 0) + body
         if self.latch:
             self._latched = frame
@@ -293,7 +288,7 @@ class Publisher(Generic[T]):
                         self._outlets.note(
                             f"{self.topic}: a reliable subscriber was too late and lost a message"
                         )
-                    self._late[outlet] = self._sequence
+                    self._late[outlet] = self._gate.sequence
                     self._route()
                     outlet.send_anyway(frame, flags)
                     return False
@@ -305,12 +300,12 @@ class Publisher(Generic[T]):
         """Add a message of a burst to the batch, and send that when it is full or old; the lock is held."""
         batch = self._batch
         if not batch:
-            self._batch_sequence = self._sequence
+            self._batch_sequence = self._gate.sequence
             self._batch_start_ns = now_ns
             if self._on_batch is not None:
                 self._on_batch()
         self._last_ns = now_ns
-        self._sequence += 1
+        self._gate.sequence += 1
         batch.append(record)
         self._batch_bytes += len(record)
         if (
@@ -326,9 +321,9 @@ class Publisher(Generic[T]):
         if not self._batch:
             return True
         records = b"".join(self._batch)
-        self._bytes += len(records) - RECORD.size * len(self._batch)
+        self._gate.bytes += len(records) - RECORD.size * len(self._batch)
         first = self._batch_sequence
-        rest = REST.pack(first, 0, self._batch_start_ns, len(records), self._sequence - first)
+        rest = REST.pack(first, 0, self._batch_start_ns, len(records), self._gate.sequence - first)
         self._batch.clear()
         self._batch_bytes = 0
         frame = self._batch_head + rest + records
@@ -354,10 +349,10 @@ class Publisher(Generic[T]):
 
     def _acquire_slot(self, size: int) -> Slot | None:
         """Find memory for a large message; both locks are held."""
-        slot = self._large.acquire(size, self._sequence, exact=self.codec.fixed_size is not None)
+        slot = self._large.acquire(size, self._gate.sequence, exact=self.codec.fixed_size is not None)
         if slot is None:
             self._flush()
-            self._sequence += 1
+            self._gate.sequence += 1
             self._skipped += 1
         return slot
 
@@ -379,9 +374,9 @@ class Publisher(Generic[T]):
         on_time &= not self._large.is_leaving_out
         if self._closed:
             self._check_open()
-        stamps = Stamps(self._sequence, stamp_ns, now_ns)
-        self._sequence += 1
-        self._bytes += size
+        stamps = Stamps(self._gate.sequence, stamp_ns, now_ns)
+        self._gate.sequence += 1
+        self._gate.bytes += size
         if self.latch:
             head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
             self._latched = head + slot.buffer[:size].tobytes()
@@ -394,7 +389,7 @@ class Publisher(Generic[T]):
     def _block(self) -> None:
         """Make other threads wait until this message is sent; the lock is held."""
         self._blocked = True
-        self._refresh_ns = 0  # they look at this
+        self._gate.refresh_ns = 0  # they look at this
 
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
@@ -405,7 +400,7 @@ class Publisher(Generic[T]):
             finally:
                 self._lock.acquire()
         self._check_open()
-        self._refresh_ns = now_ns + REFRESH_NS
+        self._gate.refresh_ns = now_ns + REFRESH_NS
         self._outlets.refresh_if_older(now_ns - REFRESH_NS)
 
     def _check_open(self) -> None:
@@ -424,7 +419,7 @@ class Publisher(Generic[T]):
         reader = self._large.admit(key, request, outlet)
         self._readers[key] = reader
         self._route()
-        sequence = self._batch_sequence if self._batch else self._sequence
+        sequence = self._batch_sequence if self._batch else self._gate.sequence
         answer = self._large.answer(reader, sequence, self._latched)
         if outlet.strict:
             if not outlet.try_send(answer):
@@ -454,7 +449,7 @@ class Publisher(Generic[T]):
         self._lossy_sends = tuple(outlet.send for outlet in outlets if not outlet.strict)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
         usual = self._plain and not self._was_large and not self._late and len(outlets) == 1
-        self._only_send = next(iter(outlets)).send if usual else None
+        self._gate.send = next(iter(outlets)).send if usual else None
 
     def tick(self, now_ns: int) -> None:
         """Free what the sockets have sent, end a burst; called by the node now and then."""
@@ -462,9 +457,9 @@ class Publisher(Generic[T]):
             try:
                 if not self._closed:
                     self._large.prune()
-                    if self._told != self._sequence:
-                        self._told, self._tell_after_ns = self._sequence, SILENCE_NS
-                    if self._readers and now_ns - self._refresh_ns > self._tell_after_ns:
+                    if self._told != self._gate.sequence:
+                        self._told, self._tell_after_ns = self._gate.sequence, SILENCE_NS
+                    if self._readers and now_ns - self._gate.refresh_ns > self._tell_after_ns:
                         self._tell_sequence(now_ns)
             finally:
                 self._lock.release()
@@ -476,18 +471,18 @@ class Publisher(Generic[T]):
         """
         if self._batch or self._blocked:
             return
-        frame = self._batch_head + REST.pack(self._sequence, 0, now_ns, 0, 0)
+        frame = self._batch_head + REST.pack(self._gate.sequence, 0, now_ns, 0, 0)
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
         for outlet in self._strict_outlets:
             outlet.try_send(frame)
-        self._tell_after_ns = min(2 * self._tell_after_ns, now_ns - self._refresh_ns + SILENCE_MAX_NS)
+        self._tell_after_ns = min(2 * self._tell_after_ns, now_ns - self._gate.refresh_ns + SILENCE_MAX_NS)
 
     @property
     def counters(self) -> PublisherCounters:
         """What has been published so far."""
         with self._lock:
-            return PublisherCounters(self._sequence, self._bytes, self._timeouts, self._skipped)
+            return PublisherCounters(self._gate.sequence, self._gate.bytes, self._timeouts, self._skipped)
 
     @property
     def subscriber_count(self) -> int:
@@ -510,9 +505,8 @@ class Publisher(Generic[T]):
     def disown(self) -> None:
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old one may have been held at the fork
-        self._acquire, self._release = self._lock.acquire, self._lock.release
+        self._gate = LongGate(self._publish_slowly)
         self._closed = True
-        self._refresh_ns = 0
 
     def close(self, linger_s: float = LINGER_S) -> None:
         """Send what is held back, and leave the topic.
@@ -524,7 +518,7 @@ class Publisher(Generic[T]):
             if self._closed:
                 return
             self._closed = True
-            self._refresh_ns = 0  # so that `publish` looks
+            self._gate.refresh_ns = 0  # so that `publish` looks
             if not self._outlets.closed:
                 self._flush()
         backoff = Backoff(linger_s)

@@ -43,6 +43,11 @@ class PublisherCounters:
     A `keep_last` subscriber copies them if it comes in time; else they are lost to it, and counted there."""
 
 
+def note_latency(histogram: list[int], latency_ns: int) -> None:
+    """Count a latency."""
+    histogram[min(max(latency_ns, 0).bit_length(), len(histogram) - 1)] += 1
+
+
 def quantile_ns(histogram: Sequence[int], fraction: float) -> float:
     """A quantile of a latency histogram [ns], interpolated within its bucket; nan for an empty one."""
     total = sum(histogram)

@@ -24,7 +24,7 @@ from cortex.link import BLOCK_MS, WHOLE_BATCH, Item, Link, make
 from cortex.loop_reader import LoopReader
 from cortex.policy import Policy
 from cortex.schema import Schema, TypeMismatch
-from cortex.stats import BUCKETS, SubscriberCounters
+from cortex.stats import SubscriberCounters, note_latency
 from cortex.turn import Turn
 from cortex.wakeup import Wakeup
 from cortex.wire import HEAD_SIZE, HEADER_SIZE, PREFIX_SIZE, RECORD, REST
@@ -244,7 +244,6 @@ class Subscriber(Generic[T]):
             if not self.policy.reliable and (
                 not queue
                 or self.policy.depth < DRAIN_MAX
-                or not self._exhausted
                 or monotonic_ns() - self._drained_ns > FRESH_NS
             ):
                 self._drain()
@@ -384,24 +383,32 @@ class Subscriber(Generic[T]):
         return _LOST
 
     def _drain(self) -> None:
-        """Read what has arrived into the queue; the lock is held."""
+        """Read what has arrived into the queue; the lock is held.
+
+        Where only the last messages count, that ends with the first message that was published meanwhile: a
+        publisher that is faster than we are would keep us here.
+        """
         exhausted = True
-        self._drained_ns = monotonic_ns()
-        links = self._rotated()
+        begin_ns = monotonic_ns()
+        links, queue, reliable = self._rotated(), self._queue, self.policy.reliable
         for index, link in enumerate(links):
             receive = link.receive
             budget = DRAIN_LOSSY_MAX
-            if self.policy.reliable:
-                budget = -(-(self.policy.depth - len(self._queue)) // (len(links) - index))
+            if reliable:
+                budget = -(-(self.policy.depth - len(queue)) // (len(links) - index))
             for count in range(budget):
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
                     break
                 self._accept(link, frame, timed=count & 7 == 0)
+                if not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns:
+                    exhausted = False
+                    break
             else:
                 exhausted = False
         self._exhausted = exhausted
+        self._drained_ns = monotonic_ns()
 
     def _accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
         """Put the message of a frame into the queue; the lock is held."""
@@ -430,45 +437,40 @@ class Subscriber(Generic[T]):
         what follows it waits in the socket, so that the order is kept.
         """
         messages: deque[T] = deque()
-        take = messages.append
         exhausted = True
         self._drained_ns = monotonic_ns()
         for link in self._rotated():
-            receive, read = link.receive, link.read
-            for count in range(min(self.policy.depth, DRAIN_MAX)):
-                try:
-                    frame = receive(DONTWAIT)
-                except zmq.Again:
+            left = min(self.policy.depth, DRAIN_MAX)
+            while left > 0 and not self._queue:
+                link.expected, count, frame = link.drain(
+                    link.receive,
+                    zmq.Again,
+                    messages,
+                    link.expected,
+                    left,
+                    self.counters.latency,
+                    link.clock_offset_ns,
+                )
+                left -= count
+                if frame is None:
                     break
-                if (found := read(frame)) is not None:
-                    sequence, publish_ns, message = found
-                    if sequence == link.expected:
-                        link.expected = sequence + 1
-                    elif not link.advance(sequence):
-                        continue
-                    if not count & 7:
-                        self._time(publish_ns, link)
-                    take(message)
-                elif frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
-                    link.read_batch(frame, messages)
-                    if len(messages) >= DRAIN_MAX:
-                        exhausted = False
-                        break
-                else:
-                    self._take_decoded(link, frame, messages, timed=not count & 7)
-                    if self._queue:
-                        break
-            else:
+                left -= 1
+                self._take_decoded(link, frame, messages)
+                if len(messages) >= DRAIN_MAX:
+                    left = 0
+            if left <= 0 or self._queue:
                 exhausted = False
             if self._queue:
-                exhausted = False
                 break
         self._exhausted = exhausted
         return messages
 
-    def _take_decoded(self, link: Link, frame: bytes, messages: deque[T], *, timed: bool) -> None:
-        """Decode what a frame that is no plain message holds; what cannot be is rejected, or queued."""
-        self._accept(link, frame, timed=timed)
+    def _take_decoded(self, link: Link, frame: bytes, messages: deque[T]) -> None:
+        """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
+        if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
+            link.read_batch(frame, messages)
+            return
+        self._accept(link, frame, timed=True)
         while self._queue and self._queue[0].buffer is not None:
             item = self._queue.popleft()
             try:
@@ -478,8 +480,7 @@ class Subscriber(Generic[T]):
 
     def _time(self, publish_ns: int, link: Link) -> None:
         """Add to the histogram: of plain messages the first of a wake-up and every eighth (all cost 10 %)."""
-        latency_ns = monotonic_ns() - publish_ns - link.clock_offset_ns
-        self.counters.latency[min(max(latency_ns, 0).bit_length(), BUCKETS - 1)] += 1
+        note_latency(self.counters.latency, monotonic_ns() - publish_ns - link.clock_offset_ns)
 
     def _enqueue(self, item: Item) -> None:
         queue, depth = self._queue, self.policy.depth

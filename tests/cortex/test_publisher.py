@@ -384,7 +384,7 @@ def test_closing_while_another_thread_is_held_up(node):
     for thread in threads:
         thread.start()
     published = -1
-    while published != (published := publisher._sequence) or published < 100:
+    while published != (published := publisher._gate.sequence) or published < 100:
         time.sleep(0.05)
     begin = time.monotonic()
     publisher.close()

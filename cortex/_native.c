@@ -1,6 +1,6 @@
-/* Short cuts for flat message types, in C: what `fast.py` and `packer.py` do, in a fifth of the time.
+/* The way of a small message, in C: what `fast.py`, `gate.py` and `drain` of `subscriber.py` do, in a fifth of the time.
 
-   A `Flat` is made once per message type. It writes a message as a frame, as a record of a batch or as a bare body,
+   A `Flat` is made once per message type and publisher. It writes a message as a frame, as a record of a batch or as a bare body,
    and reads a frame or a body back. It is strict: of whatever is not exactly as usual (another class, an integer
    that is no `int`, a wrong dtype or shape, a malformed body) it returns None, and the Python code does the work,
    or says what is wrong. So it never raises for a message's content, and both ways give the same bytes.
@@ -12,6 +12,7 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#include <time.h>
 #include <structmember.h>
 
 #define NPY_NO_DEPRECATED_API NPY_1_19_API_VERSION
@@ -261,6 +262,19 @@ static int write_body(const Flat *flat, PyObject *message, Layout *layout, char 
     return 1;
 }
 
+static PyObject *dont_wait; /* the flag of ZeroMQ, as an int */
+
+/* The clock of Python's `time.monotonic_ns`. */
+static int64_t monotonic_ns(void) {
+#ifdef __APPLE__
+    return (int64_t)clock_gettime_nsec_np(CLOCK_UPTIME_RAW);
+#else
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+#endif
+}
+
 static PyObject *none_or_error(PyObject *made) {
     Py_XDECREF(made);
     if (PyErr_Occurred()) return NULL;
@@ -271,6 +285,24 @@ static int arguments_are(Py_ssize_t count, Py_ssize_t wanted) {
     if (count == wanted) return 1;
     PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", wanted, count);
     return 0;
+}
+
+/* A whole frame; NULL without error if the message is not as usual. */
+static PyObject *make_frame(
+    const Flat *flat, PyObject *message, uint64_t sequence, int64_t publish_ns, Py_ssize_t limit) {
+    Layout layout = {.stamp_ns = 0};
+    if (!flat->has_head || !lay_out(flat, message, &layout) || layout.end > limit) return NULL;
+    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + layout.end);
+    if (frame == NULL) return NULL;
+    char *out = PyBytes_AS_STRING(frame);
+    if (!write_body(flat, message, &layout, out + HEADER_SIZE)) {
+        Py_DECREF(frame);
+        return NULL;
+    }
+    memcpy(out, flat->head, HEAD_SIZE);
+    const uint64_t rest[5] = {sequence, (uint64_t)layout.stamp_ns, (uint64_t)publish_ns, (uint64_t)layout.end, 0};
+    memcpy(out + HEAD_SIZE, rest, sizeof rest);
+    return frame;
 }
 
 PyDoc_STRVAR(frame_doc,
@@ -285,17 +317,8 @@ static PyObject *flat_frame(Flat *flat, PyObject *const *arguments, Py_ssize_t c
     const int64_t publish_ns = PyLong_AsLongLong(arguments[2]);
     const Py_ssize_t limit = PyLong_AsSsize_t(arguments[3]);
     if (PyErr_Occurred()) return NULL;
-    if (!flat->has_head) Py_RETURN_NONE;
-    Layout layout = {.stamp_ns = 0};
-    if (!lay_out(flat, message, &layout) || layout.end > limit) Py_RETURN_NONE;
-    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + layout.end);
-    if (frame == NULL) return NULL;
-    char *out = PyBytes_AS_STRING(frame);
-    if (!write_body(flat, message, &layout, out + HEADER_SIZE)) return none_or_error(frame);
-    memcpy(out, flat->head, HEAD_SIZE);
-    const uint64_t rest[5] = {sequence, (uint64_t)layout.stamp_ns, (uint64_t)publish_ns, (uint64_t)layout.end, 0};
-    memcpy(out + HEAD_SIZE, rest, sizeof rest);
-    return frame;
+    PyObject *frame = make_frame(flat, message, sequence, publish_ns, limit);
+    return frame == NULL ? none_or_error(NULL) : frame;
 }
 
 PyDoc_STRVAR(record_doc,
@@ -423,30 +446,102 @@ PyDoc_STRVAR(read_doc,
 "A frame to its sequence, publish_ns and message; None if it does not begin with the head, or is not as usual.\n"
 "Arrays of the message are read-only views of the frame.");
 
-static PyObject *flat_read(Flat *flat, PyObject *frame) {
-    if (!flat->has_head || !PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) < HEADER_SIZE) Py_RETURN_NONE;
+/* What a plain frame of this publisher says; NULL without error if it is none. */
+static PyObject *read_frame(const Flat *flat, PyObject *frame, uint64_t *sequence, int64_t *publish_ns) {
+    if (!flat->has_head || !PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) < HEADER_SIZE) return NULL;
     const char *bytes = PyBytes_AS_STRING(frame);
-    if (memcmp(bytes, flat->head, HEAD_SIZE)) Py_RETURN_NONE;
+    if (memcmp(bytes, flat->head, HEAD_SIZE)) return NULL;
     uint64_t rest[5];
     memcpy(rest, bytes + HEAD_SIZE, sizeof rest);
     const Py_ssize_t size = PyBytes_GET_SIZE(frame) - HEADER_SIZE;
-    if (rest[3] != (uint64_t)size) Py_RETURN_NONE;
-    PyObject *message = read_body(flat, frame, bytes + HEADER_SIZE, size);
+    if (rest[3] != (uint64_t)size) return NULL;
+    *sequence = rest[0];
+    *publish_ns = (int64_t)rest[2];
+    return read_body(flat, frame, bytes + HEADER_SIZE, size);
+}
+
+static PyObject *flat_read(Flat *flat, PyObject *frame) {
+    uint64_t sequence;
+    int64_t publish_ns;
+    PyObject *message = read_frame(flat, frame, &sequence, &publish_ns);
     if (message == NULL) return none_or_error(NULL);
-    PyObject *result = PyTuple_New(3);
-    PyObject *sequence = PyLong_FromUnsignedLongLong(rest[0]);
-    PyObject *publish_ns = PyLong_FromLongLong((int64_t)rest[2]);
-    if (result == NULL || sequence == NULL || publish_ns == NULL) {
-        Py_XDECREF(result);
-        Py_XDECREF(sequence);
-        Py_XDECREF(publish_ns);
-        Py_DECREF(message);
+    return Py_BuildValue("KLN", (unsigned long long)sequence, (long long)publish_ns, message);
+}
+
+PyDoc_STRVAR(drain_doc,
+"drain($self, receive, again, messages, expected, limit, latency, clock_offset_ns, /)\n--\n\n"
+"Read plain frames that follow one another, and append their messages.\n\n"
+"Args:\n"
+"    receive: Called with DONTWAIT (1); returns a frame.\n"
+"    again: What it raises when there is none.\n"
+"    messages: A deque or list; its `append` is called.\n"
+"    expected: Sequence of the next message; -1: not known.\n"
+"    limit: Most messages to read.\n"
+"    latency: Counts by powers of two of a nanosecond; every eighth message is entered.\n"
+"    clock_offset_ns: What to add to the publisher's clock to read it on ours [ns].\n\n"
+"Returns:\n"
+"    The sequence expected next, how many were read, and what ended it: None where there were no more or the limit\n"
+"    was reached, or a frame that was taken from the socket and is something else, or out of sequence.\n");
+
+static int note_latency(PyObject *latency, int64_t elapsed_ns) {
+    Py_ssize_t bucket = 0;
+    for (uint64_t left = elapsed_ns > 0 ? (uint64_t)elapsed_ns : 0; left; left >>= 1) ++bucket;
+    const Py_ssize_t last = PyList_GET_SIZE(latency) - 1;
+    if (bucket > last) bucket = last;
+    const long long count = PyLong_AsLongLong(PyList_GET_ITEM(latency, bucket));
+    if (count == -1 && PyErr_Occurred()) return 0;
+    PyObject *more = PyLong_FromLongLong(count + 1);
+    return more != NULL && PyList_SetItem(latency, bucket, more) == 0;
+}
+
+static PyObject *flat_drain(Flat *flat, PyObject *const *arguments, Py_ssize_t count) {
+    if (!arguments_are(count, 7)) return NULL;
+    PyObject *receive = arguments[0], *again = arguments[1], *messages = arguments[2], *latency = arguments[5];
+    int64_t expected = PyLong_AsLongLong(arguments[3]);
+    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[4]);
+    const int64_t clock_offset_ns = PyLong_AsLongLong(arguments[6]);
+    if (PyErr_Occurred()) return NULL;
+    if (!PyList_Check(latency) || PyList_GET_SIZE(latency) == 0) {
+        PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
         return NULL;
     }
-    PyTuple_SET_ITEM(result, 0, sequence);
-    PyTuple_SET_ITEM(result, 1, publish_ns);
-    PyTuple_SET_ITEM(result, 2, message);
-    return result;
+    PyObject *append = PyObject_GetAttrString(messages, "append");
+    if (append == NULL) return NULL;
+    PyObject *frame = NULL;
+    Py_ssize_t read = 0;
+    for (; read < limit; ++read) {
+        PyObject *flags[2] = {NULL, dont_wait};
+        frame = PyObject_Vectorcall(receive, flags + 1, 1 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+        if (frame == NULL) {
+            if (!PyErr_ExceptionMatches(again)) goto failed;
+            PyErr_Clear();
+            break;
+        }
+        uint64_t sequence;
+        int64_t publish_ns;
+        if (flat->has_head && PyBytes_CheckExact(frame) && PyBytes_GET_SIZE(frame) >= HEADER_SIZE) {
+            memcpy(&sequence, PyBytes_AS_STRING(frame) + HEAD_SIZE, 8);
+            if (sequence != (uint64_t)expected) break;
+        }
+        PyObject *message = read_frame(flat, frame, &sequence, &publish_ns);
+        if (message == NULL) {
+            if (PyErr_Occurred()) goto failed;
+            break;
+        }
+        Py_CLEAR(frame);
+        expected += 1;
+        PyObject *appended = PyObject_CallOneArg(append, message);
+        Py_DECREF(message);
+        if (appended == NULL) goto failed;
+        Py_DECREF(appended);
+        if (read % 8 == 0 && !note_latency(latency, monotonic_ns() - publish_ns - clock_offset_ns)) goto failed;
+    }
+    Py_DECREF(append);
+    return Py_BuildValue("LnN", (long long)expected, read, frame != NULL ? frame : Py_NewRef(Py_None));
+failed:
+    Py_XDECREF(frame);
+    Py_DECREF(append);
+    return NULL;
 }
 
 PyDoc_STRVAR(decode_doc,
@@ -613,6 +708,7 @@ static PyMethodDef flat_methods[] = {
     {"record", (PyCFunction)(void (*)(void))flat_record, METH_FASTCALL, record_doc},
     {"encode", (PyCFunction)(void (*)(void))flat_encode, METH_FASTCALL, encode_doc},
     {"read", (PyCFunction)flat_read, METH_O, read_doc},
+    {"drain", (PyCFunction)(void (*)(void))flat_drain, METH_FASTCALL, drain_doc},
     {"decode", (PyCFunction)(void (*)(void))flat_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };
@@ -629,7 +725,7 @@ PyDoc_STRVAR(flat_doc,
 
 static PyTypeObject FlatType = {
     PyVarObject_HEAD_INIT(NULL, 0)
-    .tp_name = "cortex._flat.Flat",
+    .tp_name = "cortex._native.Flat",
     .tp_doc = flat_doc,
     .tp_basicsize = sizeof(Flat),
     .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC,
@@ -640,21 +736,172 @@ static PyTypeObject FlatType = {
     .tp_methods = flat_methods,
 };
 
-static struct PyModuleDef flat_module = {
+/* Gate */
+
+typedef struct {
+    PyObject_HEAD
+    vectorcallfunc vectorcall;
+    Flat *flat;
+    PyObject *acquire, *release, *slowly, *retry, *again;
+    PyObject *send; /* NULL or None: every message goes the long way */
+    Py_ssize_t limit;
+    uint64_t sequence;
+    int64_t bytes;
+    int64_t refresh_ns;
+} Gate;
+
+PyDoc_STRVAR(gate_doc,
+"Gate(flat, acquire, release, slowly, retry, again, limit)\n--\n\n"
+"Called with a message, it sends it; see `gate.py`, which does the same in Python.\n\n"
+"Args:\n"
+"    flat: Makes the frames; has a head.\n"
+"    acquire: Takes the lock.\n"
+"    release: Gives it back.\n"
+"    slowly: Called without the lock with a message that has to go the long way.\n"
+"    retry: Called with the lock held and a frame that `send` had no room for.\n"
+"    again: What `send` raises then.\n"
+"    limit: Most bytes of a body.\n");
+
+/* Send with the lock held; NULL without error if the message has to go the long way. */
+static PyObject *gate_send(Gate *gate, PyObject *message) {
+    if (gate->send == NULL || gate->send == Py_None) return NULL;
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns) return NULL;
+    PyObject *frame = make_frame(gate->flat, message, gate->sequence, now_ns, gate->limit);
+    if (frame == NULL) return NULL;
+    gate->sequence += 1;
+    gate->bytes += PyBytes_GET_SIZE(frame) - HEADER_SIZE;
+    PyObject *send = Py_NewRef(gate->send);
+    PyObject *arguments[3] = {NULL, frame, dont_wait};
+    PyObject *sent = PyObject_Vectorcall(send, arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+    Py_DECREF(send);
+    PyObject *result = NULL;
+    if (sent != NULL) {
+        Py_DECREF(sent);
+        result = Py_NewRef(Py_True);
+    } else if (PyErr_ExceptionMatches(gate->again)) {
+        PyErr_Clear();
+        result = PyObject_CallOneArg(gate->retry, frame);
+    }
+    Py_DECREF(frame);
+    return result;
+}
+
+static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t flags, PyObject *keywords) {
+    Gate *gate = (Gate *)self;
+    if (PyVectorcall_NARGS(flags) != 1 || (keywords != NULL && PyTuple_GET_SIZE(keywords))) {
+        PyErr_SetString(PyExc_TypeError, "publish() takes one message, by position");
+        return NULL;
+    }
+    PyObject *acquired = PyObject_CallNoArgs(gate->acquire);
+    if (acquired == NULL) return NULL;
+    Py_DECREF(acquired);
+    PyObject *result = gate_send(gate, arguments[0]);
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    PyObject *released = PyObject_CallNoArgs(gate->release);
+    if (released == NULL) {
+        Py_XDECREF(result);
+        Py_XDECREF(type);
+        Py_XDECREF(value);
+        Py_XDECREF(traceback);
+        return NULL;
+    }
+    Py_DECREF(released);
+    if (type != NULL) {
+        PyErr_Restore(type, value, traceback);
+        return NULL;
+    }
+    return result != NULL ? result : PyObject_CallOneArg(gate->slowly, arguments[0]);
+}
+
+static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
+    static char *names[] = {"flat", "acquire", "release", "slowly", "retry", "again", "limit", NULL};
+    PyObject *flat, *acquire, *release, *slowly, *retry, *again;
+    Py_ssize_t limit;
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOn:Gate", names, &FlatType, &flat, &acquire, &release,
+                                     &slowly, &retry, &again, &limit))
+        return NULL;
+    Gate *gate = (Gate *)type->tp_alloc(type, 0);
+    if (gate == NULL) return NULL;
+    gate->vectorcall = gate_call;
+    gate->flat = (Flat *)Py_NewRef(flat);
+    gate->acquire = Py_NewRef(acquire);
+    gate->release = Py_NewRef(release);
+    gate->slowly = Py_NewRef(slowly);
+    gate->retry = Py_NewRef(retry);
+    gate->again = Py_NewRef(again);
+    gate->limit = limit;
+    return (PyObject *)gate;
+}
+
+static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
+    Py_VISIT(gate->flat);
+    Py_VISIT(gate->acquire);
+    Py_VISIT(gate->release);
+    Py_VISIT(gate->slowly);
+    Py_VISIT(gate->retry);
+    Py_VISIT(gate->again);
+    Py_VISIT(gate->send);
+    return 0;
+}
+
+static int gate_clear(Gate *gate) {
+    Py_CLEAR(gate->flat);
+    Py_CLEAR(gate->acquire);
+    Py_CLEAR(gate->release);
+    Py_CLEAR(gate->slowly);
+    Py_CLEAR(gate->retry);
+    Py_CLEAR(gate->again);
+    Py_CLEAR(gate->send);
+    return 0;
+}
+
+static void gate_dealloc(Gate *gate) {
+    PyObject_GC_UnTrack(gate);
+    gate_clear(gate);
+    Py_TYPE(gate)->tp_free((PyObject *)gate);
+}
+
+static PyMemberDef gate_members[] = {
+    {"send", T_OBJECT, offsetof(Gate, send), 0, "Takes a frame and flags; None: every message goes the long way."},
+    {"sequence", T_ULONGLONG, offsetof(Gate, sequence), 0, "Of the next message."},
+    {"bytes", T_LONGLONG, offsetof(Gate, bytes), 0, "Of all bodies so far."},
+    {"refresh_ns", T_LONGLONG, offsetof(Gate, refresh_ns), 0, "When the next message goes the long way."},
+    {NULL, 0, 0, 0, NULL},
+};
+
+static PyTypeObject GateType = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "cortex._native.Gate",
+    .tp_doc = gate_doc,
+    .tp_basicsize = sizeof(Gate),
+    .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_HAVE_VECTORCALL,
+    .tp_vectorcall_offset = offsetof(Gate, vectorcall),
+    .tp_call = PyVectorcall_Call,
+    .tp_new = gate_new,
+    .tp_traverse = (traverseproc)gate_traverse,
+    .tp_clear = (inquiry)gate_clear,
+    .tp_dealloc = (destructor)gate_dealloc,
+    .tp_members = gate_members,
+};
+
+static struct PyModuleDef native_module = {
     PyModuleDef_HEAD_INIT,
-    .m_name = "cortex._flat",
-    .m_doc = "Short cuts for flat message types, in C.",
+    .m_name = "cortex._native",
+    .m_doc = "The way of a small message, in C.",
     .m_size = -1,
 };
 
-PyMODINIT_FUNC PyInit__flat(void) {
+PyMODINIT_FUNC PyInit__native(void) {
     import_array();
-    if (PyType_Ready(&FlatType) < 0) return NULL;
-    PyObject *module = PyModule_Create(&flat_module);
+    if (PyType_Ready(&FlatType) < 0 || PyType_Ready(&GateType) < 0) return NULL;
+    dont_wait = PyLong_FromLong(1);
+    if (dont_wait == NULL) return NULL;
+    PyObject *module = PyModule_Create(&native_module);
     if (module == NULL) return NULL;
-    Py_INCREF(&FlatType);
-    if (PyModule_AddObject(module, "Flat", (PyObject *)&FlatType) < 0) {
-        Py_DECREF(&FlatType);
+    if (PyModule_AddObjectRef(module, "Flat", (PyObject *)&FlatType) < 0
+        || PyModule_AddObjectRef(module, "Gate", (PyObject *)&GateType) < 0) {
         Py_DECREF(module);
         return NULL;
     }

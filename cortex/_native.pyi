@@ -1,0 +1,40 @@
+from collections.abc import Callable
+from typing import Any
+
+class Flat:
+    def __init__(
+        self, cls: type, fields: list[tuple[Any, ...]], block: int, stamp: int, head: bytes
+    ) -> None: ...
+    def frame(self, message: Any, sequence: int, publish_ns: int, limit: int, /) -> bytes | None: ...
+    def record(self, message: Any, publish_ns: int, limit: int, /) -> bytes | None: ...
+    def encode(self, message: Any, limit: int, /) -> bytes | None: ...
+    def read(self, frame: bytes, /) -> tuple[int, int, Any] | None: ...
+    def decode(self, buffer: Any, offset: int, size: int, /) -> Any: ...
+    def drain(
+        self,
+        receive: Callable[[int], Any],
+        again: type[BaseException],
+        messages: Any,
+        expected: int,
+        limit: int,
+        latency: list[int],
+        clock_offset_ns: int,
+        /,
+    ) -> tuple[int, int, bytes | None]: ...
+
+class Gate:
+    send: Callable[..., Any] | None
+    sequence: int
+    bytes: int
+    refresh_ns: int
+    def __init__(
+        self,
+        flat: Flat,
+        acquire: Callable[[], Any],
+        release: Callable[[], Any],
+        slowly: Callable[[Any], bool],
+        retry: Callable[[Any], bool],
+        again: type[BaseException],
+        limit: int,
+    ) -> None: ...
+    def __call__(self, message: Any, /) -> bool: ...

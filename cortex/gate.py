@@ -1,0 +1,73 @@
+"""The way of a small message out: `publish` where nothing special is to be done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import zmq
+
+from cortex.codec import Codec
+from cortex.native import NativeGate, make_flat
+from cortex.raw import RawMessage
+
+monotonic_ns = time.monotonic_ns
+
+
+class Gate(Protocol):
+    """Sends the messages of one publisher, and counts them."""
+
+    send: Callable[..., Any] | None
+    """Takes a frame and flags; None: every message goes the long way."""
+    sequence: int
+    """Of the next message."""
+    bytes: int
+    """Of all bodies so far."""
+    refresh_ns: int
+    """When the next message goes the long way, on the monotonic clock."""
+
+    def __call__(self, message: Any, /) -> bool:
+        """Send a message; False if a reliable subscriber lost it."""
+        ...
+
+
+class LongGate:
+    """Where a message cannot be sent at once: each goes the long way, whatever `send` is."""
+
+    def __init__(self, slowly: Callable[[Any], bool]) -> None:
+        self.send: Callable[..., Any] | None = None
+        self.sequence = 0
+        self.bytes = 0
+        self.refresh_ns = 0
+        self._slowly = slowly
+
+    def __call__(self, message: Any, /) -> bool:
+        """Send a message; False if a reliable subscriber lost it."""
+        return self._slowly(message)
+
+
+def make_gate(
+    codec: Codec,
+    head: bytes,
+    lock: Any,
+    *,
+    slowly: Callable[[Any], bool],
+    retry: Callable[[bytes], bool],
+    limit: int,
+) -> Gate:
+    """Build the gate of one publisher.
+
+    Args:
+        codec: Of its type.
+        head: What its frames begin with: the first 24 bytes of the header.
+        lock: Held while sending.
+        slowly: Called without the lock with a message that has to go the long way.
+        retry: Called with the lock held and a frame for which `send` had no room.
+        limit: Most bytes of a body that is sent so.
+    """
+    flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
+    if flat is None:
+        return LongGate(slowly)
+    gate: Gate = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
+    return gate
