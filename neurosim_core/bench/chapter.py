@@ -177,9 +177,16 @@ def print_table(table: Table, console: Console) -> None:
     """Print a table with its title and note."""
     numeric = numeric_columns(table)
     grid = rich.table.Table(box=None, pad_edge=False, header_style="bold")
-    for key, heading in table.columns.items():
-        grid.add_column(Text(heading), justify="right" if key in numeric else "left")
-    for row in cells(table):
+    rows = cells(table)
+    for column, (key, heading) in enumerate(table.columns.items()):
+        width = max((len(row[column]) for row in rows), default=0)
+        grid.add_column(
+            Text(heading),
+            justify="right" if key in numeric else "left",
+            min_width=width if key in numeric else None,  # headings may be broken, numbers not
+            overflow="fold",
+        )
+    for row in rows:
         grid.add_row(*map(Text, row))
     console.print(Text(table.title, style="bold"), soft_wrap=True)
     console.print(grid, highlight=False)
