@@ -80,7 +80,7 @@ class Model:
     device: str
     scene: Scene
     bodies: tuple[Body, ...]
-    """What moves in the scene besides the vehicle."""
+    """What moves in the scene besides the vehicle; not loaded without cameras."""
     free_space: FreeSpace
     path: Path
     airframe: MultirotorConfig
@@ -257,13 +257,13 @@ def make_fleet(
     device = _device(config.device)
     with phase("scene"):
         scene = load_scene(config.scene)
-        bodies = make_bodies(config.bodies)
+        members = {name: config.of(name) for name in config.vehicles}
+        seeing = any(plan_casts(member.sensors) for member in members.values())
+        bodies = make_bodies(config.bodies) if seeing else ()
     with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
-    members = {name: config.of(name) for name in config.vehicles}
     with phase("path"):
         paths = {name: _plan(member, free_space) for name, member in members.items()}
-    seeing = any(plan_casts(member.sensors) for member in members.values())
     with phase("light"):
         scene_on_device = (
             upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from neurosim_core.scene.apartment.geometry import Part, grid_surface, merge, picture_quad, without_slivers
-from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import LinearRgb, Material, Texture
-from neurosim_core.scene.source import Axis, SceneError, decode_picture, linear_to_srgb8
+from neurosim_core.scene.source import Axis, SceneError, linear_to_srgb8
 from neurosim_core.settings import Settings
 
 _SIDES = 128
@@ -161,6 +160,8 @@ def _material(surface: SurfaceConfig, name: str) -> tuple[Material, tuple[float,
         texture = Texture(name=name, srgb=texels)
         period = 2.0 * surface.square_m
         return Material(name=name, base_color=(1.0, 1.0, 1.0), texture=texture), (period, period)
+    from neurosim_core.scene.source import decode_picture  # brings a library for pictures
+
     path = surface.file.expanduser()
     try:
         data = path.read_bytes()
@@ -242,6 +243,8 @@ def _mesh(shape: MeshShape, surface: SurfaceConfig | None, name: str) -> Solid:
         raise SceneError(
             f"body {name!r}: a mesh wears the surface of its file, or a plain one, not {surface.kind!r}"
         )
+    from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene  # brings libraries for meshes
+
     scene = load_mesh_scene(
         MeshSceneConfig(
             file=shape.file, unit_m=shape.unit_m, up_axis=shape.up_axis, position_m=shape.offset_m
