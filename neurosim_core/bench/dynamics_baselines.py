@@ -1,0 +1,300 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+"""Integrators to compare with, which are no part of the product: explicit Euler, RK4, implicit midpoint.
+
+Each integrates the vehicle's own equations (`aerodynamics.make_wrench`) with the rotor speeds as part of the
+state, for vehicles of four rotors, and is compiled by Warp like the product's kernels, on the same arrays:
+
+    euler     explicit Euler on the components of the quaternion, normalised after each step
+    rk4       classical Runge-Kutta on the same, as most simulators have it
+    midpoint  implicit midpoint with R_1 = R_0 cay(h w_m), which keeps energy and momentum of a free body
+              (Lie-Poisson); solved by fixed-point iteration, the motor's part in closed form
+
+They have no guard: what they cannot resolve becomes infinite or NaN.
+
+Reference: Hairer, Lubich, Wanner (2006), Geometric Numerical Integration, II.1 and VII.5.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+
+_ITERATION_COUNT_MAX = wp.constant(100)
+"""Fixed-point iterations of one step; where they contract at all, a dozen reach rounding."""
+
+
+@wp.struct
+class Motion:
+    """What is integrated, and likewise its rate."""
+
+    position: wp.vec3d
+    """p_WB [m]."""
+    velocity: wp.vec3d
+    """v_WB in W [m/s]."""
+    orientation: wp.quatd
+    """q_WB; within a step not of unit length."""
+    body_rate: wp.vec3d
+    """w_WB in B [rad/s]."""
+    rotor_speed: wp.vec4d
+    """[rad/s]."""
+
+
+class Baselines(NamedTuple):
+    """The kernels of one set of terms. Those that advance take the same arguments."""
+
+    derivative: Any
+    """Evaluates the rate of (position, velocity, orientation, body rate) for given rotor speeds."""
+    euler: Any
+    rk4: Any
+    midpoint: Any
+
+
+@wp.func
+def _moved(s: Motion, rate: Motion, h: wp.float64) -> Motion:
+    moved = Motion()
+    moved.position = s.position + h * rate.position
+    moved.velocity = s.velocity + h * rate.velocity
+    moved.orientation = s.orientation + h * rate.orientation
+    moved.body_rate = s.body_rate + h * rate.body_rate
+    moved.rotor_speed = s.rotor_speed + h * rate.rotor_speed
+    return moved
+
+
+@functools.cache
+def make_baselines(terms: frozenset[str]) -> Baselines:
+    """Return the baselines with the given terms (of `multirotor.TERMS`) in them."""
+    motor_lag = "motor_lag" in terms
+    full_inertia = "full_inertia" in terms
+    wrench = make_wrench(terms)
+    module = wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'rigid'}")
+
+    @wp.func
+    def angular_acceleration(airframe: Airframe, torque: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
+        if wp.static(full_inertia):
+            return airframe.inertia_inverse * (torque - wp.cross(w, airframe.inertia * w))
+        else:
+            momentum = wp.cw_mul(airframe.inertia_diagonal, w)
+            return wp.cw_mul(airframe.inertia_diagonal_inverse, torque - wp.cross(w, momentum))
+
+    @wp.func
+    def body_wrench(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        attitude: wp.quatd,
+        velocity: wp.vec3d,
+        w: wp.vec3d,
+        rotor_speed: wp.vec4d,
+    ):
+        quadratic = wp.vec4d()
+        linear = vec10d()
+        for rotor in range(4):
+            quadratic += rotor_speed[rotor] * rotor_speed[rotor] * quadratic_weight[rotor]
+            linear += rotor_speed[rotor] * linear_weight[rotor]
+        air = wp.quat_rotate_inv(attitude, velocity - airframe.wind)
+        return wrench(airframe, quadratic, linear, air, w)
+
+    @wp.func
+    def motion_rate(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        time_constant_s: wp.float64,
+        command: wp.vec4d,
+        s: Motion,
+    ) -> Motion:
+        attitude = wp.normalize(s.orientation)
+        w = s.body_rate
+        force, torque = body_wrench(
+            airframe, quadratic_weight, linear_weight, attitude, s.velocity, w, s.rotor_speed
+        )
+        down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
+        rate = Motion()
+        rate.position = s.velocity
+        rate.velocity = down + airframe.mass_inverse * wp.quat_rotate(attitude, force)
+        rate.orientation = wp.float64(0.5) * (s.orientation * wp.quatd(w[0], w[1], w[2], wp.float64(0.0)))
+        rate.body_rate = angular_acceleration(airframe, torque, w)
+        if wp.static(motor_lag):
+            rate.rotor_speed = (command - s.rotor_speed) / time_constant_s
+        return rate
+
+    @wp.func
+    def load(
+        vehicle: int,
+        position: wp.array[wp.vec3d],
+        velocity: wp.array[wp.vec3d],
+        orientation: wp.array[wp.quatd],
+        body_rate: wp.array[wp.vec3d],
+        rotor_speed: wp.array2d[wp.float64],
+        command: wp.vec4d,
+    ) -> Motion:
+        s = Motion()
+        s.position = position[vehicle]
+        s.velocity = velocity[vehicle]
+        s.orientation = orientation[vehicle]
+        s.body_rate = body_rate[vehicle]
+        s.rotor_speed = command
+        if wp.static(motor_lag):
+            for rotor in range(4):
+                s.rotor_speed[rotor] = rotor_speed[vehicle, rotor]
+        return s
+
+    @wp.func
+    def clamped(airframe: Airframe, rotor_speed_command: wp.array2d[wp.float64], vehicle: int) -> wp.vec4d:
+        command = wp.vec4d()
+        for rotor in range(4):
+            command[rotor] = wp.clamp(
+                rotor_speed_command[vehicle, rotor], airframe.rotor_speed_min, airframe.rotor_speed_max
+            )
+        return command
+
+    @wp.func
+    def euler_step(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        time_constant_s: wp.float64,
+        h: wp.float64,
+        command: wp.vec4d,
+        s: Motion,
+    ) -> Motion:
+        rate = motion_rate(airframe, quadratic_weight, linear_weight, time_constant_s, command, s)
+        end = _moved(s, rate, h)
+        end.orientation = wp.normalize(end.orientation)
+        return end
+
+    @wp.func
+    def rk4_step(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        time_constant_s: wp.float64,
+        h: wp.float64,
+        command: wp.vec4d,
+        s: Motion,
+    ) -> Motion:
+        half = wp.float64(0.5) * h
+        third = h / wp.float64(3.0)
+        sixth = h / wp.float64(6.0)
+        k_1 = motion_rate(airframe, quadratic_weight, linear_weight, time_constant_s, command, s)
+        s_2 = _moved(s, k_1, half)
+        k_2 = motion_rate(airframe, quadratic_weight, linear_weight, time_constant_s, command, s_2)
+        s_3 = _moved(s, k_2, half)
+        k_3 = motion_rate(airframe, quadratic_weight, linear_weight, time_constant_s, command, s_3)
+        s_4 = _moved(s, k_3, h)
+        k_4 = motion_rate(airframe, quadratic_weight, linear_weight, time_constant_s, command, s_4)
+        end = _moved(_moved(_moved(_moved(s, k_1, sixth), k_2, third), k_3, third), k_4, sixth)
+        end.orientation = wp.normalize(end.orientation)
+        return end
+
+    @wp.func
+    def midpoint_step(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        time_constant_s: wp.float64,
+        h: wp.float64,
+        command: wp.vec4d,
+        s: Motion,
+    ) -> Motion:
+        half = wp.float64(0.5) * h
+        down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
+        speed = s.rotor_speed
+        if wp.static(motor_lag):
+            share = half / time_constant_s
+            speed = (s.rotor_speed + share * command) / (wp.float64(1.0) + share)
+        v = s.velocity
+        w = s.body_rate
+        turned = s.orientation
+        for _iteration in range(_ITERATION_COUNT_MAX):
+            u = half * w
+            cayley = wp.normalize(wp.quatd(u[0], u[1], u[2], wp.float64(1.0)))
+            turned = s.orientation * cayley
+            middle = wp.normalize(s.orientation + turned)
+            force, torque = body_wrench(airframe, quadratic_weight, linear_weight, middle, v, w, speed)
+            a = down + airframe.mass_inverse * wp.quat_rotate(middle, force)
+            v_next = s.velocity + half * a
+            w_next = s.body_rate + half * angular_acceleration(airframe, torque, w)
+            change = wp.length(v_next - v) + wp.length(w_next - w)
+            size = wp.length(v_next) + wp.length(w_next)
+            v = v_next
+            w = w_next
+            if change <= wp.float64(1.0e-15) * size:
+                break
+        end = Motion()
+        end.position = s.position + h * v
+        end.velocity = wp.float64(2.0) * v - s.velocity
+        end.body_rate = wp.float64(2.0) * w - s.body_rate
+        end.orientation = wp.normalize(turned)
+        end.rotor_speed = speed
+        if wp.static(motor_lag):
+            end.rotor_speed = wp.float64(2.0) * speed - s.rotor_speed
+        return end
+
+    def make_advance(step: Any) -> Any:
+        @wp.kernel(module=module, enable_backward=False)
+        def advance(
+            # Model:
+            airframe: Airframe,
+            quadratic_weight: wp.array[wp.vec4d],
+            linear_weight: wp.array[vec10d],
+            time_constant_s: wp.float64,
+            step_s: wp.float64,
+            step_count: wp.int32,
+            # In:
+            rotor_speed_command: wp.array2d[wp.float64],
+            # In/out:
+            position: wp.array[wp.vec3d],
+            velocity: wp.array[wp.vec3d],
+            orientation: wp.array[wp.quatd],
+            body_rate: wp.array[wp.vec3d],
+            rotor_speed: wp.array2d[wp.float64],
+        ):
+            vehicle = wp.tid()
+            command = clamped(airframe, rotor_speed_command, vehicle)
+            s = load(vehicle, position, velocity, orientation, body_rate, rotor_speed, command)
+            for _step in range(step_count):
+                s = step(airframe, quadratic_weight, linear_weight, time_constant_s, step_s, command, s)
+            position[vehicle] = s.position
+            velocity[vehicle] = s.velocity
+            orientation[vehicle] = s.orientation
+            body_rate[vehicle] = s.body_rate
+            for rotor in range(4):
+                rotor_speed[vehicle, rotor] = s.rotor_speed[rotor]
+
+        return advance
+
+    @wp.kernel(module=module, enable_backward=False)
+    def derivative(
+        # Model:
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        # In:
+        y: wp.array[wp.float64],
+        # Out:
+        rate_out: wp.array[wp.float64],
+    ):
+        s = Motion()
+        for axis in range(3):
+            s.position[axis] = y[axis]
+            s.velocity[axis] = y[3 + axis]
+            s.body_rate[axis] = y[10 + axis]
+        s.orientation = wp.quatd(y[6], y[7], y[8], y[9])
+        for rotor in range(4):
+            s.rotor_speed[rotor] = y[13 + rotor]
+        one = wp.float64(1.0)
+        rate = motion_rate(airframe, quadratic_weight, linear_weight, one, s.rotor_speed, s)
+        for axis in range(3):
+            rate_out[axis] = rate.position[axis]
+            rate_out[3 + axis] = rate.velocity[axis]
+            rate_out[10 + axis] = rate.body_rate[axis]
+        for part in range(4):
+            rate_out[6 + part] = rate.orientation[part]
+
+    return Baselines(
+        derivative, make_advance(euler_step), make_advance(rk4_step), make_advance(midpoint_step)
+    )
