@@ -48,7 +48,12 @@ def call(arguments: argparse.Namespace) -> int:
     reply = _ask(service, request, timeout_s)
     at = f"{reply.phase} at {reply.stamp_ns / NS_PER_S:g} s"
     if reply.accepted:
-        console.print(at)
+        changed = (
+            [f"{key} = {value}" for key, value in request.to_dict().items()]
+            if isinstance(request, Parameters)
+            else []
+        )
+        console.print("; ".join([*changed, at]), markup=False, soft_wrap=True)
         return 0
     console.print(f"[red]refused[/] ({at}): {escape(reply.reason)}", soft_wrap=True)
     return 1

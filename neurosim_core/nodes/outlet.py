@@ -357,14 +357,18 @@ class Outlet:
             self.announce_link(name)
 
     def _describe(self, sensor: Any, node: Node) -> tuple[Publisher[Any], ...]:
-        """Publish where a sensor sits and, for a camera, how it projects."""
-        transform = node.publisher(
-            topics.transform_topic(self.vehicle, sensor.name), msg.Transform, latch=True
-        )
-        transform.publish(translate.mount_transform(self.vehicle, sensor))
+        """Publish where a sensor sits, unless that is the body itself, and how a camera projects."""
+        publishers: list[Publisher[Any]] = []
+
+        def announce(topic: str, message: Any) -> None:
+            publisher = node.publisher(topic, type(message), latch=True)
+            publisher.publish(message)
+            publishers.append(publisher)
+
+        transform = translate.mount_transform(self.vehicle, sensor)
+        if transform.child != transform.parent:
+            announce(topics.transform_topic(self.vehicle, sensor.name), transform)
         info = translate.camera_info(self.vehicle, sensor)
-        if info is None:
-            return (transform,)
-        lens = node.publisher(topics.info_topic(self.vehicle, sensor.name), msg.CameraInfo, latch=True)
-        lens.publish(info)
-        return transform, lens
+        if info is not None:
+            announce(topics.info_topic(self.vehicle, sensor.name), info)
+        return tuple(publishers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping
 
@@ -37,7 +38,11 @@ def change(config: SimulationConfig, values: Mapping[str, Value]) -> SimulationC
     """
     for key, value in values.items():
         if not any(pattern.fullmatch(key) for pattern in _PATTERNS):
-            raise ValueError(f"{key} cannot be changed while it runs; what can: {', '.join(CHANGEABLE)}")
+            close = difflib.get_close_matches(key, CHANGEABLE, n=1, cutoff=0.8)
+            hint = f" (did you mean {close[0]}?)" if close else ""
+            raise ValueError(
+                f"{key} cannot be changed while it runs{hint}; what can: {', '.join(CHANGEABLE)}"
+            )
         if value is None:
             raise ValueError(f"{key}: no value is given")
     try:

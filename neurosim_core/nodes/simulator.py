@@ -44,6 +44,8 @@ _SWITCH_S = 2e-4
 """How long the thread that renders may keep the interpreter from the one that flies [s], in place of 5 ms."""
 LATE_S = 0.1
 """A command that takes longer than this is said to be waited for [s]."""
+FIRST_STEP_S = 2.0
+"""How long steps that are to begin the run wait for its first command [s]."""
 
 
 class Simulator:
@@ -285,6 +287,9 @@ class Simulator:
             self._audience.look()
             craft.greet()
             self._tell()
+            if self._tick == 0 and self._steps and time.monotonic() - begin_s > FIRST_STEP_S:
+                self._steps.stop(f"nobody has sent {craft.name} a command yet: time begins with the first")
+                return True
             return self._is_called()
 
         command = craft.inbox.wait(
@@ -295,8 +300,8 @@ class Simulator:
         self._reason = ""
         if command is None and deadline_s is not None and time.monotonic() >= deadline_s:
             self._fail(
-                f"no command for {craft.name} within {live.command_deadline_s:g} s at control period "
-                f"{self._tick}: {craft.describe_silence()}"
+                f"no command for {craft.name} within live.command_deadline_s = {live.command_deadline_s:g} s "
+                f"at control period {self._tick}: {craft.describe_silence()}"
             )
         return command
 

@@ -74,7 +74,10 @@ def test_requests_arrive_as_they_are_meant(asked, capsys):
     assert capsys.readouterr().out == "paused at 1.5 s\n"
     for words in (("reset",), ("step", "12"), ("step",), ("pause",), ("resume",)):
         assert ask(*words) == 0
+    capsys.readouterr()
     assert ask("set", "live.real_time_factor=2", "live.fail_safe=cut", "links.imu.latency_s=0.008") == 0
+    changed = "live.real_time_factor = 2; live.fail_safe = cut; links.imu.latency_s = 0.008"
+    assert capsys.readouterr().out == f"{changed}; paused at 1.5 s\n"
     first, *others = requests
     assert (first.seed, first.vehicle, first.position.tolist()) == (7, "red", [1.0, -2.0, 0.5])
     steps = [Step(12, timeout_s=20.0), Step(1, timeout_s=20.0)]  # no longer than we wait

@@ -221,6 +221,11 @@ def test_what_cannot_be_changed_is_refused_with_what_can(key: str):
     assert all(name in str(caught.value) for name in CHANGEABLE)
 
 
+def test_a_misspelt_key_is_answered_with_the_one_that_was_meant():
+    with pytest.raises(ValueError, match=r"did you mean live\.real_time_factor\?"):
+        change(make_config(), {"live.realtime_factor": 1.0})
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [("links.camera.loss", 0.1), ("links.imu.loss", 1.5), ("live.real_time_factor", -1.0)],

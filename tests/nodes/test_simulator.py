@@ -129,7 +129,7 @@ def test_lockstep_ends_with_an_error_when_no_command_comes():
         rig.send(rig.hover(), stamp_ns=77)
         assert rig.join() == 1
         reason = rig.wait_for_status(lambda status: status.phase == "ended").reason
-    assert "no command for drone within 0.2 s at control period 2" in reason
+    assert "no command for drone within live.command_deadline_s = 0.2 s at control period 2" in reason
     assert "mode motor_speeds that answers the odometry of 10000000 ns" in reason
     assert "1 publisher(s)" in reason
     assert "answered 77 ns" in reason
@@ -569,6 +569,16 @@ def test_pause_ends_steps_that_wait_for_a_command():
         stepping.join(SOON_S)
         assert not replies[0].accepted
         assert replies[0].reason == "paused"
+
+
+def test_steps_before_the_first_command_are_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("neurosim_core.nodes.simulator.FIRST_STEP_S", 0.1)
+    with LiveRig(make_config(**LOCKSTEP)) as rig:
+        rig.call("/pause", Trigger())
+        reply = rig.call("/step", Step(count=5))
+        assert not reply.accepted
+        assert reply.reason == "nobody has sent drone a command yet: time begins with the first"
+        assert reply.phase == "paused"
 
 
 def _first(rig: LiveRig, count: int = 6) -> list[bytes]:
