@@ -9,7 +9,7 @@
 /VEHICLE/collision                Collision
 /VEHICLE/SENSOR                   Events, Image, Imu or Odometry
 /VEHICLE/SENSOR/info              CameraInfo of a camera (latched)
-/VEHICLE/SENSOR/transform         Transform: where the sensor sits (latched)
+/VEHICLE/SENSOR/transform         Transform: where the sensor sits, if not at the body itself (latched)
 /VEHICLE/LINK/delivery            Delivery: what a simulated link did to each message
 /VEHICLE/command/MODE             what the vehicle is told to do; see COMMANDS
 /reset /step /pause /resume /set_parameters    services; see SERVICES
