@@ -6,13 +6,15 @@ import hashlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from neurosim_core.scene.scene import LinearRgb, Material, Texture
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 Axis = Literal["x", "y", "z"]
 
@@ -93,6 +95,8 @@ def decode_picture(data: bytes | Image.Image, *, file: str, name: str) -> NDArra
     Raises:
         SceneError: If the bytes are no picture, or a truncated one.
     """
+    from PIL import Image, UnidentifiedImageError
+
     try:
         with Image.open(io.BytesIO(data)) if isinstance(data, bytes) else data as picture:
             if picture.mode.startswith("I"):  # convert("RGB") would clip 16 bits at 255
