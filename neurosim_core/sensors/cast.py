@@ -117,6 +117,7 @@ def make_cast_state(
     capacity: int,
     lane_count: int,
     device: str,
+    seed: int = 0,
     bodies: Mapping[str, BodyConfig] | None = None,
 ) -> CastState:
     """Allocate the buffers of a cast.
@@ -128,6 +129,7 @@ def make_cast_state(
         capacity: The most instants of one batch.
         lane_count: The most batches under way.
         device: Where to compute.
+        seed: Seed of the noise of event cameras.
         bodies: What moves in the scene.
 
     Raises:
@@ -161,6 +163,7 @@ def make_cast_state(
                 height=cast.lens.height,
                 device=device,
                 sensor=name,
+                seed=seed,
                 scan_count_max=lane_count,
                 on_host=True,
             ),

@@ -20,9 +20,8 @@ Rounded down to the microsecond, a crossing gets its time; rounded up to the nan
 exactly with the stamps of windows. `mark_late` sets `late` on events that share the microsecond of a window's
 end but come after it, so that windows are contiguous in the sorted keys.
 
-Where pixel noise enters later: low-pass and shot noise change `sample` where `walk` reads it, mismatch and
-leak change `_level`, refractory time suppresses `_emit` (never the crossing). Each becomes a `wp.static`
-branch at that place, with its state beside `up` and `down`.
+Pixels that are not ideal have a scan of their own, made to measure, in `event_noise`; levels, the tie rule
+and keys are those of this module.
 """
 
 import warp as wp
@@ -36,9 +35,9 @@ TILE_SIZE = wp.constant(256)
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
 
-_OPEN = wp.constant(0)
-_PUT = wp.constant(1)
-_CLOSE = wp.constant(2)
+OPEN = wp.constant(0)
+PUT = wp.constant(1)
+CLOSE = wp.constant(2)
 
 _HALF_ULP = wp.constant(wp.float64(2.0**-24))
 """Of a float32 in [1, 2)."""
@@ -46,9 +45,9 @@ _ROUNDING = wp.constant(wp.float64(2.0**-50))
 """Bound of the relative error of the sums in a level."""
 _STEP_ROUNDING = wp.constant(wp.float64(2.0**-23))
 """Relative error of k C computed in float32: half an ulp for C, and half an ulp for the product."""
-_LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
+LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
 _TICKS_PER_NS = wp.constant(wp.float64(1024.0))
-_COLUMN_SHIFT = wp.constant(wp.int64(SUB_BITS))
+COLUMN_SHIFT = wp.constant(wp.int64(SUB_BITS))
 _US = wp.constant(wp.int64(1000))
 
 
@@ -105,18 +104,19 @@ class Pixel:
     if (slot < (int64_t)keys.shape[0]) keys.data[slot] = key;
 #endif
 """)
-def _write(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
-    """Append a key (step _PUT) and count it, also where there is no room for it.
+def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
+    """Append a key (step PUT) and count it, also where there is no room for it.
 
-    Every thread of a block comes here once before with _OPEN, and once after with _CLOSE.
+    Every thread of a block comes here once before with OPEN, and once after with CLOSE.
     """
     ...
 
 
 @wp.func
-def _level(
+def level_at(
     base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
 ) -> wp.float64:
+    """Return the level after so many crossings, from the log radiance of the reset."""
     rise = wp.float64(up) * threshold_on
     fall = wp.float64(down) * threshold_off
     step = rise - fall
@@ -141,21 +141,41 @@ def _bound(level: wp.float64, base: wp.float64, half_ulp: wp.float64, direction:
 
 
 @wp.func
-def _bounds(
-    base_32: wp.float32,
+def quiet_range(
+    base: wp.float64,
     up: wp.int32,
     down: wp.int32,
     threshold_on: wp.float64,
     threshold_off: wp.float64,
 ) -> wp.vec2:
     """Return the samples that reach the level below and the level above; between them a pixel is quiet."""
-    base = wp.float64(base_32)
-    half_ulp = _half_ulp(base_32)
-    lower = _level(base, up, down + 1, threshold_on, threshold_off)
-    upper = _level(base, up + 1, down, threshold_on, threshold_off)
+    half_ulp = _half_ulp(wp.float32(base))
+    lower = level_at(base, up, down + 1, threshold_on, threshold_off)
+    upper = level_at(base, up + 1, down, threshold_on, threshold_off)
     return wp.vec2(
         _bound(lower, base, half_ulp, wp.float64(-1.0)), _bound(upper, base, half_ulp, wp.float64(1.0))
     )
+
+
+@wp.func
+def key_after(
+    elapsed_ns: wp.float64,
+    start_ns: wp.int64,
+    place: wp.int64,
+    time_shift: wp.int32,
+    polarity: wp.int32,
+) -> wp.int64:
+    """Return the key of an event some time, rounded to 2^-10 ns, after a stamp."""
+    ticks = wp.int64(wp.rint(elapsed_ns * _TICKS_PER_NS))
+    ticks = wp.max(ticks, wp.int64(1))  # an interval does not hold its start: that is the window before
+    whole_ns = ticks >> wp.int64(10)
+    down_ns = start_ns + whole_ns
+    up_ns = down_ns
+    if ticks > (whole_ns << wp.int64(10)):
+        up_ns += wp.int64(1)
+    time_us = down_ns // _US
+    sub_ns = up_ns - time_us * _US
+    return (time_us << wp.int64(time_shift)) | place | wp.int64(polarity << 10) | sub_ns
 
 
 @wp.func
@@ -171,16 +191,7 @@ def _key(
 ) -> wp.int64:
     """Return the key of the crossing of a level on the line from (start_ns, last) to (end_ns, sample)."""
     fraction = wp.min((level - last) / (sample - last), wp.float64(1.0))
-    ticks = wp.int64(wp.rint(wp.float64(end_ns - start_ns) * fraction * _TICKS_PER_NS))
-    ticks = wp.max(ticks, wp.int64(1))  # an interval does not hold its start: that is the window before
-    whole_ns = ticks >> wp.int64(10)
-    down_ns = start_ns + whole_ns
-    up_ns = down_ns
-    if ticks > (whole_ns << wp.int64(10)):
-        up_ns += wp.int64(1)
-    time_us = down_ns // _US
-    sub_ns = up_ns - time_us * _US
-    return (time_us << wp.int64(time_shift)) | place | wp.int64(polarity << 10) | sub_ns
+    return key_after(wp.float64(end_ns - start_ns) * fraction, start_ns, place, time_shift, polarity)
 
 
 @wp.func_native("""
@@ -257,7 +268,7 @@ def walk(
     base = wp.float64(base_32)
     up = state.up
     down = state.down
-    quiet = _bounds(base_32, up, down, threshold_on, threshold_off)
+    quiet = quiet_range(base, up, down, threshold_on, threshold_off)
     last = state.last
     if lead > 0:
         last = log_radiance[lead - 1, pixel]
@@ -268,15 +279,15 @@ def walk(
         sample = log_radiance[frame, pixel]
         if sample > quiet[0] and sample < quiet[1]:
             last = sample
-        elif wp.abs(sample) <= _LIMIT:
+        elif wp.abs(sample) <= LIMIT:
             up_before = up
             down_before = down
             while sample >= quiet[1]:
                 up += 1
-                quiet = _bounds(base_32, up, down, threshold_on, threshold_off)
+                quiet = quiet_range(base, up, down, threshold_on, threshold_off)
             while sample <= quiet[0]:
                 down += 1
-                quiet = _bounds(base_32, up, down, threshold_on, threshold_off)
+                quiet = quiet_range(base, up, down, threshold_on, threshold_off)
             found = up - up_before + down - down_before
             if tabulate:
                 wp.atomic_add(table, frame, row, found)
@@ -284,7 +295,7 @@ def walk(
                 polarity = wp.where(up > up_before, 1, 0)
                 for event in range(found):
                     step = event + 1
-                    level = _level(
+                    level = level_at(
                         base,
                         up_before + step * polarity,
                         down_before + step * (1 - polarity),
@@ -301,7 +312,7 @@ def walk(
                         time_shift,
                         polarity,
                     )
-                    _write(_PUT, key, keys, counters)
+                    write_key(PUT, key, keys, counters)
             last = sample
         else:
             if invalid_count == 0:
@@ -355,7 +366,7 @@ def screen(
     end = wp.min(begin + TILE_SIZE, end_pixel)
     for pixel in range(begin, end):
         before = crossed[pixel]
-        quiet = _bounds(base[pixel], before[0], before[1], threshold_on, threshold_off)
+        quiet = quiet_range(wp.float64(base[pixel]), before[0], before[1], threshold_on, threshold_off)
         low_out[pixel] = quiet[0]
         high_out[pixel] = quiet[1]
     _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)
@@ -415,7 +426,7 @@ def scan(
         table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
     """
     pixel = first_pixel + wp.tid()
-    _write(_OPEN, wp.int64(0), keys_out, counters_out)
+    write_key(OPEN, wp.int64(0), keys_out, counters_out)
     if pixel < end_pixel:
         state = Pixel()
         before = crossed[pixel]
@@ -426,7 +437,7 @@ def scan(
         else:
             state.last = last[pixel]
             row = pixel // width
-            place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << _COLUMN_SHIFT)
+            place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
             state = walk(
                 tabulate,
                 pixel,
@@ -454,7 +465,7 @@ def scan(
                 flat = wp.int64(state.invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
                 wp.atomic_add(counters_out, 1, wp.int64(state.invalid_count))
                 wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
-    _write(_CLOSE, wp.int64(0), keys_out, counters_out)
+    write_key(CLOSE, wp.int64(0), keys_out, counters_out)
 
 
 @wp.kernel
@@ -570,8 +581,8 @@ def decode(
     key = keys[event]
     one = wp.int64(1)
     row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
-    column_mask = (one << (wp.int64(row_shift) - _COLUMN_SHIFT)) - one
+    column_mask = (one << (wp.int64(row_shift) - COLUMN_SHIFT)) - one
     t_out[event] = time_origin_us + (key >> wp.int64(time_shift))
-    x_out[event] = wp.uint16((key >> _COLUMN_SHIFT) & column_mask)
+    x_out[event] = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
     y_out[event] = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
     polarity_out[event] = wp.uint8((key >> wp.int64(10)) & one)

@@ -3,8 +3,8 @@
 
 Each pixel holds a reference log radiance L_ref. Between two frames log radiance is linear in time; each time
 it reaches L_ref + threshold_on (or L_ref - threshold_off) an event is emitted at the crossing time, and L_ref
-becomes the level crossed. The tie rule is in `EventCamera`; the kernels and the place of later noise terms
-are in `event_scan`.
+becomes the level crossed. The tie rule is in `EventCamera`; the kernels are in `event_scan`. Pixels that are
+not ideal are in `event_noise`, and the arbiter that reads them out in `event_readout`.
 
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """
@@ -20,15 +20,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from pydantic import Field
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_scan
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_noise import PixelNoise, terms_of
+from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
-from neurosim_core.settings import Settings
 from neurosim_core.streams import HostCopy, Milestone, make_stream, on
+
+__all__ = ["EventCamera", "EventCameraConfig"]
 
 _log = logging.getLogger(__name__)
 
@@ -36,22 +39,6 @@ _BLOCK_SIZE = 256
 _PIXELS_PER_THREAD_MIN = 16_384
 _COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
 """Types of the times, columns, rows and polarities that are handed out."""
-
-
-class EventCameraConfig(Settings):
-    """An ideal event camera: the same two thresholds in every pixel, no noise, no dead time.
-
-    What counts as reaching a threshold, when samples are rounded to float32, is in `EventCamera`.
-    """
-
-    threshold_on: float = Field(default=0.2, ge=1e-3, le=100.0)
-    """Rise of log radiance (natural logarithm) that fires an event of polarity 1."""
-    threshold_off: float = Field(default=0.2, ge=1e-3, le=100.0)
-    """Fall of log radiance (natural logarithm) that fires an event of polarity 0."""
-    event_count_max: int = Field(default=1 << 24, ge=1, le=1 << 30)
-    """Most events between two frames. When there are more, the rows from the top are kept as long as they
-    fit; the events of the others are lost, and counted in `Events.dropped_count`. The buffer grows up to this
-    size times the frames of a batch as needed, 8 bytes per event; sorting takes about 40 bytes per event."""
 
 
 @dataclass
@@ -106,18 +93,25 @@ class EventCamera:
     At other levels an event may be early by the time that the signal takes to change by these roundings,
     about one ulp (5e-7 at 5). A crossing found so is stamped at the sample.
 
+    With a readout, events are stamped when they are read: those of a window may have happened before it, and
+    those that wait at its end come later.
+
     Args:
-        config: Thresholds and limits.
+        config: Thresholds, limits, and what is not ideal.
         width: Width of the sensor [px], 1 to 65536.
         height: Height of the sensor [px], 1 to 65536.
         device: Warp device; on "cpu" the scan is split over the cores.
-        sensor: Name of the sensor in the packets.
+        sensor: Name of the sensor in the packets; cameras with different names have independent noise.
+        seed: Seed of the run for all noise, 0 <= seed < 2^64.
         scan_count_max: How many stacks may be fed before the first of them is collected.
         on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
 
+    Attributes:
+        terms: What is compiled in beyond the ideal pixel, some of `event_noise.TERMS`.
+
     Raises:
-        ValueError: If width or height is out of range.
+        ValueError: If width, height or seed is out of range.
     """
 
     def __init__(
@@ -128,12 +122,15 @@ class EventCamera:
         height: int,
         device: str = "cpu",
         sensor: str = "",
+        seed: int = 0,
         scan_count_max: int = 1,
         on_host: bool = False,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
                 raise ValueError(f"{name} must be in [1, 65536], got {value}")
+        if not 0 <= seed < 1 << 64:
+            raise ValueError(f"seed must be in [0, 2^64), got {seed}")
         self.config = config
         self.width = width
         self.height = height
@@ -150,7 +147,18 @@ class EventCamera:
         self._last = [self._empty(pixel_count, wp.float32) for _ in ring]
         self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in ring]
         self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
-        self._screened = self.device.is_cpu
+        self.terms = terms_of(config)
+        self._noise: PixelNoise | None = None
+        if self.terms:
+            self._noise = PixelNoise(
+                config,
+                pixel_count=pixel_count,
+                ring_size=len(ring),
+                seed=seed,
+                sensor=sensor,
+                device=self.device,
+            )
+        self._screened = self.device.is_cpu and self._noise is None
         scratch = pixel_count if self._screened else 0
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._table = self._empty((1, height), wp.int32)
@@ -165,6 +173,15 @@ class EventCamera:
         self._order = self._empty(0, wp.int32)
         self._columns: list[tuple[Any, HostCopy]] = []
         self._make_window_buffers(16)
+        self._readout: Readout | None = None
+        if config.readout is not None:
+            self._readout = Readout(
+                config.readout,
+                height=height,
+                row_shift=self._row_shift,
+                time_shift=self._time_shift,
+                device=self.device,
+            )
         wp.load_module(event_scan, device=self.device)
 
         self._now_ns: int | None = None
@@ -208,6 +225,10 @@ class EventCamera:
         wp.copy(self._base, frame.flatten())
         wp.copy(self._last[0], self._base)
         self._crossed[0].zero_()
+        if self._noise is not None:
+            self._noise.reset(self._base, int(stamp_ns))
+        if self._readout is not None:
+            self._readout.reset(int(stamp_ns))
         self._now_ns = self._fed_ns = int(stamp_ns)
         self._forget()
         self._sequence = sequence
@@ -344,6 +365,7 @@ class EventCamera:
         self._under_way.clear()
         self._state = 0
         self._key_count = 0
+        self._read_count = 0
         self._dropped: list[tuple[int, int]] = []
         self._drop_reported = False
         self._sequence = 0
@@ -426,26 +448,40 @@ class EventCamera:
                 )
             block = _BLOCK_SIZE if self.device.is_cuda else 1
             blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
+            noise, origin_ns = self._noise, scan.origin_us * NS_PER_US
+            own = [*thresholds] if noise is None else noise.inputs()
+            frames = [self._lead] if noise is None else []
+            since = [] if noise is None else [noise.since_reset_ns(origin_ns)]
+            memory = [[] if noise is None else [noise.memory(slot)] for slot in (before, after)]
             wp.launch(
-                event_scan.scan,
+                event_scan.scan if noise is None else noise.scan,
                 dim=blocks * block,  # whole blocks: their threads reserve slots together
                 block_dim=_BLOCK_SIZE,
                 inputs=[
-                    *thresholds,
+                    *own,
                     self.width,
                     self._row_shift,
                     self._time_shift,
                     *extent,
                     scan.stamps,
+                    *since,
                     frame_count,
-                    self._lead,
+                    *frames,
                     scan.row_limit,
                     self._base,
                     self._last[before],
                     self._crossed[before],
+                    *memory[0],
                     tabulate,
                 ],
-                outputs=[self._last[after], self._crossed[after], chunk.keys, chunk.counters, self._table],
+                outputs=[
+                    self._last[after],
+                    self._crossed[after],
+                    *memory[1],
+                    chunk.keys,
+                    chunk.counters,
+                    self._table,
+                ],
                 device=self.device,
             )
             chunk.counters_on_host.fetch(0, 3)
@@ -576,6 +612,8 @@ class EventCamera:
         """Sort the keys, hand out those of the windows that end so, and carry the others over."""
         if not ends:
             return []
+        if self._readout is not None:
+            self._read_out(self._readout)
         columns, cuts = self._decode(ends) if self._key_count > 0 else ([], [0] * len(ends))
         packets = []
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
@@ -603,6 +641,23 @@ class EventCamera:
             self._window_start_ns = end_ns
         self._carry_over(cuts[-1])
         return packets
+
+    def _read_out(self, readout: Readout) -> None:
+        """Put the events that the arbiter reads until now in place of those that have happened."""
+        first, count = self._read_count, self._key_count - self._read_count
+        self._key_count += readout.waiting_count
+        self._reserve_keys(kept=first + count)
+        read = readout.read(
+            self._keys,
+            first=first,
+            count=count,
+            spare=self._spare_keys,
+            order=self._order,
+            origin_us=self._origin_us,
+            now_ns=self._require_reset(),
+        )
+        self._key_count = first + read
+        self._dropped += readout.take_dropped()
 
     def _decode(self, ends: list[int]) -> tuple[list[Any], list[int]]:
         """Sort the keys and return them as columns, and the index of the first key after each window."""
@@ -662,6 +717,7 @@ class EventCamera:
             self._copy_keys(self._keys, first, count, self._spare_keys, 0, origin_us - self._origin_us)
             self._keys, self._spare_keys = self._spare_keys, self._keys
         self._key_count = count
+        self._read_count = count
         self._origin_us = origin_us
 
 

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.sensors.events import EventCameraConfig
+from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.settings import Settings
 

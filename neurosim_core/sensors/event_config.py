@@ -1,0 +1,191 @@
+"""What decides the events of a camera: thresholds, and how its pixels and its readout depart from the ideal.
+
+Every group is optional. What is left out is not compiled and allocates nothing; the kernels are in
+`event_scan` (ideal pixels), `event_noise` and `event_readout`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from neurosim_core.sensors.event_presets import PRESETS
+from neurosim_core.settings import Settings
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Rate = Annotated[float, Field(ge=0.0, le=1e6)]
+Decades = Annotated[float, Field(ge=0.0, le=2.0)]
+
+
+class ThresholdSpreadConfig(Settings):
+    """Mismatch: the thresholds of a pixel differ from the nominal ones by normal numbers that stay."""
+
+    on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold upwards, in log radiance."""
+    off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold downwards, in log radiance."""
+    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
+    """Smaller thresholds are raised to this one."""
+
+
+class LowPassConfig(Settings):
+    """The photoreceptor: first order, the slower the darker.
+
+    With I the radiance at the pixel, I_w that of white and I_d what the dark current stands for, the 3 dB
+    frequency is cutoff_hz min((I + I_d) / (I_w + I_d), 1).
+    """
+
+    cutoff_hz: Annotated[float, Field(gt=0.0, le=1e12)] = 3000.0
+    """3 dB frequency at `white_radiance` [Hz]; above it the bias limits it, and it grows no more."""
+    dark_radiance: Annotated[float, Field(ge=0.0)] = 0.08
+    """Radiance that the dark current is worth: it keeps the time constant of a black pixel finite."""
+
+
+class LeakConfig(Settings):
+    """Leak of the reset switch: the reference falls, so that a still pixel fires ON events steadily."""
+
+    rate_hz: Rate = 0.1
+    """Events a second and pixel in a still scene [Hz]."""
+    spread_decades: Decades = 0.1
+    """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+
+
+class ShotNoiseConfig(Settings):
+    """Events without cause, a Poisson process in each pixel; fewer where it is bright."""
+
+    rate_hz: Rate = 1.0
+    """Events a second and pixel in the dark, of both polarities together [Hz]."""
+    bright_factor: Share = 0.25
+    """Factor on the rate at `white_radiance` and above; it falls linearly with radiance."""
+    on_fraction: Share = 0.5
+    """Share of ON events."""
+    spread_decades: Decades = 0.1
+    """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+
+
+class HotPixelConfig(Settings):
+    """A few pixels that fire all the time, at random."""
+
+    fraction: Share = 1e-4
+    """Share of hot pixels; which ones is drawn once."""
+    rate_hz: Rate = 100.0
+    """Events a second of a hot pixel [Hz]."""
+    on_fraction: Share = 1.0
+    """Share of ON events."""
+
+
+class StochasticConfig(Settings):
+    """DVS-Voltmeter: the voltage of a pixel is a Brownian motion with drift, events are first passages.
+
+    With L the radiance in units of white_radiance / 255, the voltage moves with
+
+        mean rate  k1 d/dt ln(L + k2) + k4 + k5 L,    standard deviation  k3 sqrt(L) / (L + k2) + k6,
+
+    per microsecond and root microsecond, and fires at +1 and -1. `threshold_on` and `threshold_off` do not
+    count (k1 holds them), only their spread does.
+
+    Reference: Lin, Ma, Guo, Wen (2022), DVS-Voltmeter: stochastic process-based event simulator for dynamic
+    vision sensors, ECCV, eq. (10) and (11), where d/dt ln(L + k2) is taken between frames; its published code
+    has the parameters.
+    """
+
+    k1: Annotated[float, Field(ge=0.0, le=1e4)]
+    """Events per e-fold of light; its inverse is the threshold."""
+    k2: Annotated[float, Field(ge=0.0, le=1e6)]
+    """Light that the dark current is worth [white / 255]."""
+    k3: Annotated[float, Field(ge=0.0, le=1e3)]
+    """Photon noise."""
+    k4: Annotated[float, Field(ge=0.0, le=1.0)]
+    """Leak in the dark [1/us]."""
+    k5: Annotated[float, Field(ge=0.0, le=1.0)]
+    """Leak by parasitic photocurrent, for each unit of light [1/us]."""
+    k6: Annotated[float, Field(ge=0.0, le=1.0)]
+    """Noise that does not depend on light [1/sqrt(us)]."""
+    random_phase: bool = True
+    """Begin at voltages drawn from 0 ... 1, as a camera that has been running; false: at 0, as published."""
+
+
+class ReadoutConfig(Settings):
+    """The arbiter between the pixels and the bus: events wait for it, and are stamped when they are read.
+
+    `event`: one event at a time, in the order in which they came. `row`: the row with the oldest event that
+    waits is read at once, all its events get the same stamp; it takes row_s + n / bandwidth_hz.
+    """
+
+    kind: Literal["event", "row"] = "event"
+    """Who is read together: one event, or all that wait in a row."""
+    bandwidth_hz: Annotated[float, Field(ge=1.0, le=1e12)] = 12e6
+    """Events a second that can be read [Hz]."""
+    row_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """`row`: time to reach a row, before its events are read [s]."""
+    queue_length: Annotated[int, Field(ge=1, le=1 << 26)] = 65_536
+    """Most events that wait; those that come while so many do are lost, and counted in
+    `Events.dropped_count`."""
+
+
+class EventCameraConfig(Settings):
+    """An event camera, by default ideal: the same two thresholds in every pixel, no noise, no dead time.
+
+    What counts as reaching a threshold, when samples are rounded to float32, is in `EventCamera`.
+    """
+
+    preset: str | None = None
+    """A sensor whose settings these are, unless given here: dvs128, davis240c, davis346, gen3, gen4, imx636,
+    v2e_clean, v2e_noisy, voltmeter_dvs240 or voltmeter_dvs346 (sources in event_presets.py). Single keys win,
+    and null turns a group off: {preset: davis346, leak: {rate_hz: 0.2}, shot_noise: null}."""
+    threshold_on: float = Field(default=0.2, ge=1e-3, le=100.0)
+    """Rise of log radiance (natural logarithm) that fires an event of polarity 1."""
+    threshold_off: float = Field(default=0.2, ge=1e-3, le=100.0)
+    """Fall of log radiance (natural logarithm) that fires an event of polarity 0."""
+    white_radiance: float = Field(default=1.0, gt=0.0, le=1e30)
+    """Radiance that `low_pass`, `shot_noise` and `stochastic` take for white, the brightest of a picture."""
+    threshold_spread: ThresholdSpreadConfig | None = None
+    """Thresholds that differ from pixel to pixel, and stay: {on: 0.03, off: 0.03, minimum: 0.01}, standard
+    deviations in log radiance; null: none."""
+    low_pass: LowPassConfig | None = None
+    """Finite bandwidth of the photoreceptor, falling with light: {cutoff_hz: 3000, dark_radiance: 0.08};
+    null: infinitely fast."""
+    refractory_s: float = Field(default=0.0, ge=0.0, le=10.0)
+    """Time after each event in which a pixel is held in reset; its reference is the signal at its end [s]."""
+    leak: LeakConfig | None = None
+    """ON events of still pixels, at a steady rate: {rate_hz: 0.1, spread_decades: 0.1}; null: none."""
+    shot_noise: ShotNoiseConfig | None = None
+    """Random events, more of them in the dark: {rate_hz: 1, bright_factor: 0.25, on_fraction: 0.5,
+    spread_decades: 0.1}; null: none."""
+    hot_pixels: HotPixelConfig | None = None
+    """Pixels that fire all the time: {fraction: 1e-4, rate_hz: 100, on_fraction: 1}; null: none."""
+    stochastic: StochasticConfig | None = None
+    """Brownian motion in place of thresholds, DVS-Voltmeter: {k1: .., .. k6: .., random_phase: true}; instead
+    of low_pass, leak and shot_noise. null: thresholds."""
+    readout: ReadoutConfig | None = None
+    """Arbiter with limited bandwidth: {kind: event or row, bandwidth_hz: 12e6, row_s: 0, queue_length:
+    65536}; null: all events at once."""
+    event_count_max: int = Field(default=1 << 24, ge=1, le=1 << 30)
+    """Most events between two frames. When there are more, the rows from the top are kept as long as they
+    fit; the events of the others are lost, and counted in `Events.dropped_count`. The buffer grows up to this
+    size times the frames of a batch as needed, 8 bytes per event; sorting takes about 40 bytes per event."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, given: Any) -> Any:
+        name = given.get("preset") if isinstance(given, Mapping) else None
+        if not isinstance(name, str):
+            return given
+        if name not in PRESETS:
+            raise ValueError(f"unknown preset {name!r}, known: {', '.join(PRESETS)}")
+        filled = dict(PRESETS[name].pixel)
+        for key, value in given.items():
+            old = filled.get(key)
+            merged = isinstance(old, Mapping) and isinstance(value, Mapping)
+            filled[key] = {**(old or {}), **value} if merged else value
+        return filled
+
+    @model_validator(mode="after")
+    def _law_is_one(self) -> EventCameraConfig:
+        if self.stochastic is not None:
+            for name in ("low_pass", "leak", "shot_noise"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} must be null where stochastic is given, which has its own")
+        return self

@@ -1,0 +1,975 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
+# mypy: disable-error-code="call-overload,untyped-decorator,assignment,no-untyped-def,valid-type,return-value"
+"""The scan of event pixels that are not ideal, made to measure: only the terms that are asked for.
+
+The signal of a pixel, its log radiance through the photoreceptor plus what its reference has leaked, is known
+in closed form between frames. Events are taken one after the other, at the time at which the signal reaches a
+level, or at which noise fires; so refractory time and noise act at their own times, wherever frames lie.
+
+**Photoreceptor** (term low_pass). tau(I) dy/dt = L - y, solved exactly for log radiance L that is linear in
+time and tau that is constant; an interval is cut where L moves by more than 1/8, and tau is taken in the
+middle of each piece. One pole is what measurements show (v2e).
+
+**Mismatch** (spread). Thresholds of each pixel are normal numbers, drawn once, at least `minimum`.
+
+**Leak** (leak). The reference falls by rate times ON threshold, so a still pixel fires ON events at `rate`. A
+pixel begins at a random phase, as if it had been on for long.
+
+**Refractory time** (refractory). After an event a pixel is held in reset, and its reference is the signal at
+the end of that: a ramp of slope s fires every t_ref + C / s.
+
+**Shot noise, hot pixels** (spontaneous). One Poisson process for each pixel, drawn as waiting times of its
+largest rate and thinned to the rate at the light of that instant. A noise event resets a pixel like any
+other: its reference becomes the signal.
+
+**First passage** (stochastic). DVS-Voltmeter: voltage is a Brownian motion with constant drift and spread
+between frames. Its increment is drawn, then whether the bridge between its ends touched a threshold, and
+when: with t the first time in an interval of length T, t / (T - t) is inverse Gaussian. This is the law in
+continuous time, whatever the frames, but that a piece of at most a quarter of a threshold of noise is taken
+to touch one threshold only (an error below e^-32).
+
+Every number is addressed by seed, name of the sensor, pixel, and the number of the event or the stamp of the
+frame; numbers in time also by the stamp of the reset, so that noise does not come again after a gap. None
+depends on how frames are split into calls, nor on threads.
+
+Reference: Hu, Liu, Delbruck (2021), v2e: from video frames to realistic DVS events, CVPRW; Nozaki, Delbruck
+(2017), Temperature and parasitic photocurrent effects in dynamic vision sensors; Lin et al. (2022),
+DVS-Voltmeter, ECCV; Beghin, Orsingher (1999), On the maximum of the generalized Brownian bridge; Michael,
+Schucany, Haas (1976), Generating random variates using transformations with multiple roots.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from neurosim_core.random import normal2, random_bits, stream_id, uniform2
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_scan import (
+    CLOSE,
+    COLUMN_SHIFT,
+    LIMIT,
+    OPEN,
+    PUT,
+    key_after,
+    level_at,
+    quiet_range,
+    write_key,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+TERMS = ("spread", "low_pass", "refractory", "leak", "spontaneous", "stochastic")
+"""All terms that may be compiled in."""
+
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_TWO = wp.constant(wp.float64(2.0))
+_NEVER = wp.constant(wp.int64(2**62))
+_PIECE = wp.constant(wp.float64(0.125))
+"""Change of log radiance over which tau is held constant."""
+_PIECE_COUNT_MAX = wp.constant(1024)
+_FULL_SCALE = wp.constant(wp.float64(255.0))
+_DRAW_BITS = wp.constant(wp.int64(12))
+_NEWTON_STEPS_MAX = wp.constant(64)
+_NEWTON_NS = wp.constant(wp.float64(1e-4))
+
+
+@wp.struct
+class _Model:
+    """Parameters as the kernel reads them, times in ns; arrays of absent terms are empty."""
+
+    threshold_on: wp.float64
+    threshold_off: wp.float64
+    white_radiance: wp.float64
+    refractory_ns: wp.float64
+    corner_per_ns: wp.float64  # 1 / tau at white
+    dark_radiance: wp.float64
+    bright_factor: wp.float64
+    shot_on_fraction: wp.float64
+    hot_on_fraction: wp.float64
+    k1: wp.float64
+    k2: wp.float64
+    k3: wp.float64  # per root ns
+    k4: wp.float64  # per ns
+    k5: wp.float64
+    k6: wp.float64
+    seed: wp.uint64  # of numbers in time
+    spontaneous_stream: wp.uint32
+    step_stream: wp.uint32
+    touch_stream: wp.uint32
+    thresholds: wp.array[wp.vec2d]  # ON, OFF
+    leak: wp.array[wp.vec2d]  # cycles per ns, phase in cycles
+    rates: wp.array[wp.vec2d]  # shot noise in the dark and hot pixel, per ns
+
+
+@wp.struct
+class Memory:
+    """What pixels remember beside their last sample and the levels they crossed, shape [pixel]."""
+
+    reference: wp.array[wp.float64]
+    """What `base` is to an ideal pixel; changes when a pixel is reset (refractory, spontaneous)."""
+    filtered: wp.array[wp.float64]
+    """Output of the photoreceptor."""
+    held_ns: wp.array[wp.float64]
+    """Time in reset that is left; negative: not in reset."""
+    next_ns: wp.array[wp.int64]
+    """Time of the next noise event that may be, since the reset."""
+    noise_count: wp.array[wp.int32]
+    """Its number."""
+    voltage: wp.array[wp.float64]
+    """Of the Brownian motion, in thresholds."""
+
+
+@wp.struct
+class _Pixel:
+    """One pixel in registers."""
+
+    on: wp.float64
+    off: wp.float64
+    reference: wp.float64
+    up: wp.int32
+    down: wp.int32
+    fold: wp.int32  # whole cycles of leak: they count against `up`
+    held_ns: wp.float64  # end of reset, since the frame before
+    next_ns: wp.int64
+    noise_count: wp.int32
+    shot_rate: wp.float64
+    hot_rate: wp.float64
+    voltage: wp.float64
+
+
+@wp.struct
+class _Signal:
+    """start + slope (t - begin) + decay (exp(-(t - begin) / tau) - 1), for t in (begin, end]."""
+
+    begin: wp.float64
+    end: wp.float64
+    start: wp.float64
+    slope: wp.float64
+    decay: wp.float64
+    tau: wp.float64
+    last: wp.float64
+    """Value at the end."""
+
+
+@wp.struct
+class _Crossing:
+    time_ns: wp.float64
+    polarity: wp.int32
+    """-1: none."""
+    voltage: wp.float64
+
+
+@wp.func
+def _line_at(signal: _Signal, time_ns: wp.float64) -> wp.float64:
+    if time_ns >= signal.end:
+        return signal.last
+    share = (time_ns - signal.begin) / (signal.end - signal.begin)
+    return signal.start + (signal.last - signal.start) * share
+
+
+@wp.func
+def _curve_at(signal: _Signal, time_ns: wp.float64) -> wp.float64:
+    if time_ns >= signal.end:
+        return signal.last
+    elapsed = time_ns - signal.begin
+    return signal.start + signal.slope * elapsed + signal.decay * (wp.exp(-elapsed / signal.tau) - _ONE)
+
+
+@wp.func
+def _reached(value: wp.float64, quiet: wp.vec2) -> wp.int32:
+    """Return the polarity of the event of a signal that came to a value; -1: none."""
+    if value >= wp.float64(quiet[1]):
+        return 1
+    if value <= wp.float64(quiet[0]):
+        return 0
+    return -1
+
+
+@wp.func
+def _line_crossing(
+    signal: _Signal, now: wp.float64, end: wp.float64, quiet: wp.vec2, lower: wp.float64, upper: wp.float64
+) -> _Crossing:
+    """Find the first level that a line reaches in (now, end]."""
+    crossing = _Crossing()
+    crossing.polarity = _reached(_line_at(signal, end), quiet)
+    if crossing.polarity >= 0:
+        level = wp.where(crossing.polarity == 1, upper, lower)
+        rise = signal.last - signal.start
+        time_ns = now
+        if rise != _ZERO:
+            # the same operations as for an ideal pixel, whose events are these to the bit
+            fraction = wp.min((level - signal.start) / rise, _ONE)
+            time_ns = signal.begin + (signal.end - signal.begin) * fraction
+        crossing.time_ns = wp.clamp(time_ns, now, end)
+    return crossing
+
+
+@wp.func
+def _curve_root(signal: _Signal, begin: wp.float64, end: wp.float64, level: wp.float64) -> wp.float64:
+    """Return when the signal, monotone in (begin, end], reaches a level; the end if that is by rounding.
+
+    Newton's method from the end where the curve lies on the side of its bend, from where it cannot overshoot.
+    """
+    at_begin = _curve_at(signal, begin) - level
+    at_end = _curve_at(signal, end) - level
+    if at_begin == _ZERO or at_begin * at_end > _ZERO:
+        return wp.where(at_begin == _ZERO, begin, end)
+    time_ns = wp.where(at_end * signal.decay > _ZERO, end, begin)
+    value = wp.where(at_end * signal.decay > _ZERO, at_end, at_begin)
+    if signal.decay == _ZERO:
+        value = at_begin
+        time_ns = begin
+    for _step in range(_NEWTON_STEPS_MAX):
+        steepness = signal.slope - signal.decay / signal.tau * wp.exp(-(time_ns - signal.begin) / signal.tau)
+        if steepness == _ZERO:
+            break
+        before = time_ns
+        time_ns = wp.clamp(time_ns - value / steepness, begin, end)
+        elapsed = time_ns - signal.begin
+        value = signal.start + signal.slope * elapsed - level
+        value += signal.decay * (wp.exp(-elapsed / signal.tau) - _ONE)
+        if wp.abs(time_ns - before) <= _NEWTON_NS:
+            break
+    return time_ns
+
+
+@wp.func
+def _curve_crossing(
+    signal: _Signal, now: wp.float64, end: wp.float64, quiet: wp.vec2, lower: wp.float64, upper: wp.float64
+) -> _Crossing:
+    """Find the first level that the photoreceptor's output reaches in (now, end].
+
+    It turns at most once, where its derivative is zero; before and after that it is monotone.
+    """
+    crossing = _Crossing()
+    crossing.polarity = -1
+    middle = now
+    if signal.slope * signal.decay > _ZERO:
+        ratio = signal.decay / (signal.tau * signal.slope)
+        if ratio > _ONE:
+            turn = signal.begin + signal.tau * wp.log(ratio)
+            if turn > now and turn < end:
+                middle = turn
+    if middle > now:
+        crossing.polarity = _reached(_curve_at(signal, middle), quiet)
+        if crossing.polarity >= 0:
+            level = wp.where(crossing.polarity == 1, upper, lower)
+            crossing.time_ns = _curve_root(signal, now, middle, level)
+            return crossing
+    crossing.polarity = _reached(_curve_at(signal, end), quiet)
+    if crossing.polarity >= 0:
+        level = wp.where(crossing.polarity == 1, upper, lower)
+        crossing.time_ns = _curve_root(signal, middle, end, level)
+    return crossing
+
+
+@wp.func
+def _inverse_gaussian(
+    mean: wp.float64, shape: wp.float64, normal: wp.float64, uniform: wp.float64
+) -> wp.float64:
+    """Return an inverse Gaussian number made of a normal and a uniform one (Michael, Schucany, Haas)."""
+    a = mean * normal * normal / (_TWO * shape)
+    factor = _ONE + a + wp.sqrt(a * (a + _TWO))
+    small = mean / factor
+    return wp.where(uniform * (mean + small) <= mean, small, mean * factor)
+
+
+@wp.func
+def _touch(near: wp.float64, far: wp.float64, variance: wp.float64) -> wp.float64:
+    """Return the probability that a Brownian bridge touches a threshold.
+
+    Args:
+        near: Distance of its begin to the threshold, > 0.
+        far: Distance of its end; <= 0: beyond.
+        variance: Of a free motion of this length.
+    """
+    if far <= _ZERO:
+        return _ONE
+    if variance <= _ZERO:
+        return _ZERO
+    return wp.exp(-_TWO * near * far / variance)
+
+
+@wp.func
+def _first_passage(
+    voltage: wp.float64,
+    on: wp.float64,
+    off: wp.float64,
+    drift: wp.float64,
+    deviation: wp.float64,
+    now: wp.float64,
+    end: wp.float64,
+    step: wp.vec2d,
+    touch: wp.vec2d,
+) -> _Crossing:
+    """Move the voltage from now to the end, or to where it first touches +on or -off.
+
+    Args:
+        voltage: Between -off and on.
+        on: Threshold upwards.
+        off: Threshold downwards.
+        drift: Per ns.
+        deviation: Per root ns.
+        now: Begin [ns].
+        end: End [ns].
+        step: Two normal numbers.
+        touch: Two uniform numbers.
+    """
+    span_ns = end - now
+    variance = deviation * deviation * span_ns
+    arrival = voltage + drift * span_ns + wp.sqrt(variance) * step[0]
+    touch_on = _touch(on - voltage, on - arrival, variance)
+    touch_off = _touch(voltage + off, arrival + off, variance)
+    crossing = _Crossing()
+    crossing.polarity = -1
+    crossing.voltage = arrival
+    if arrival >= on:
+        crossing.polarity = wp.where(touch[0] < touch_off, 0, 1)
+    elif arrival <= -off:
+        crossing.polarity = wp.where(touch[0] < touch_on, 1, 0)
+    elif touch[0] < touch_on:
+        crossing.polarity = 1
+    elif touch[0] < touch_on + touch_off:
+        crossing.polarity = 0
+    if crossing.polarity >= 0:
+        near = wp.where(crossing.polarity == 1, on - voltage, voltage + off)
+        far = wp.abs(wp.where(crossing.polarity == 1, on - arrival, arrival + off))
+        ratio = near / wp.max(far, wp.float64(1e-12) * near)
+        if variance > _ZERO:
+            ratio = _inverse_gaussian(ratio, near * near / variance, step[1], touch[1])
+        crossing.time_ns = wp.clamp(now + span_ns * (ratio / (_ONE + ratio)), now, end)
+        crossing.voltage = _ZERO
+    return crossing
+
+
+@wp.func
+def _wait_ns(rate: wp.float64, uniform: wp.float64) -> wp.int64:
+    """Return an exponential waiting time, at least 1 ns."""
+    if rate <= _ZERO:
+        return _NEVER
+    return wp.max(wp.int64(wp.ceil(wp.min(-wp.log(uniform) / rate, wp.float64(1e18)))), wp.int64(1))
+
+
+@wp.func
+def _spontaneous(model: _Model, index: wp.int32, state: _Pixel) -> wp.vec2d:
+    """Return two uniform numbers for the wait for a noise event and for what becomes of it."""
+    return uniform2(random_bits(model.seed, model.spontaneous_stream, wp.int64(state.noise_count), index))
+
+
+@wp.func
+def _noise_polarity(model: _Model, state: _Pixel, log_radiance: wp.float64, uniform: wp.float64) -> wp.int32:
+    """Return the polarity of a noise event that may be; -1: at this light it is none."""
+    place = uniform * (state.shot_rate + state.hot_rate)
+    if place < state.hot_rate:
+        return wp.where(place < state.hot_rate * model.hot_on_fraction, 1, 0)
+    place -= state.hot_rate
+    light = wp.min(wp.exp(log_radiance) / model.white_radiance, _ONE)
+    rate = state.shot_rate * (_ONE + (model.bright_factor - _ONE) * light)
+    if place >= rate:
+        return -1
+    return wp.where(place < rate * model.shot_on_fraction, 1, 0)
+
+
+@functools.cache
+def make_scan(terms: frozenset[str]) -> Any:
+    """Return the kernel that scans pixels with only the given `TERMS`."""
+    if unknown := terms - set(TERMS):
+        raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
+    spread = "spread" in terms
+    low_pass = "low_pass" in terms
+    refractory = "refractory" in terms
+    leak = "leak" in terms
+    spontaneous = "spontaneous" in terms
+    stochastic = "stochastic" in terms
+    resets = refractory or spontaneous
+    value_at = _curve_at if low_pass else _line_at
+    find_crossing = _curve_crossing if low_pass else _line_crossing
+
+    @wp.func
+    def range_of(state: _Pixel) -> wp.vec2:
+        return quiet_range(state.reference, state.up - state.fold, state.down, state.on, state.off)
+
+    @wp.func
+    def next_noise(model: _Model, pixel: wp.int32, state: _Pixel) -> _Pixel:
+        state.noise_count += 1
+        wait = _wait_ns(state.shot_rate + state.hot_rate, _spontaneous(model, pixel, state)[0])
+        state.next_ns = wp.min(state.next_ns + wait, _NEVER)
+        return state
+
+    @wp.func
+    def release(signal: _Signal, time_ns: wp.float64, state: _Pixel) -> _Pixel:
+        """Let the reference be the signal at a time."""
+        if wp.static(stochastic):
+            state.voltage = _ZERO
+        else:
+            state.reference = value_at(signal, time_ns)
+            state.up = state.fold
+            state.down = 0
+        state.held_ns = -_ONE
+        return state
+
+    @wp.func
+    def react(
+        model: _Model,
+        pixel: wp.int32,
+        row: wp.int32,
+        place: wp.int64,
+        time_shift: wp.int32,
+        signal: _Signal,
+        drift: wp.float64,
+        deviation: wp.float64,
+        first_light: wp.float64,
+        light_slope: wp.float64,
+        start_ns: wp.int64,
+        since_ns: wp.int64,
+        frame: wp.int32,
+        row_limit: wp.int32,
+        tabulate: wp.bool,
+        state: _Pixel,
+        quiet: wp.vec2,
+        table: wp.array2d[wp.int32],
+        keys: wp.array[wp.int64],
+        counters: wp.array[wp.int64],
+    ) -> _Pixel:
+        """Take a pixel over one piece of the signal, event by event."""
+        now = signal.begin
+        draw = wp.int64(0)
+        while now < signal.end:
+            if wp.static(refractory):
+                if state.held_ns > signal.end:
+                    break
+                if state.held_ns >= _ZERO:
+                    now = wp.max(now, state.held_ns)
+                    state = release(signal, now, state)
+                    quiet = range_of(state)
+            end = signal.end
+            noisy = wp.bool(False)
+            if wp.static(spontaneous):
+                while wp.float64(state.next_ns - since_ns) <= now:  # in reset
+                    state = next_noise(model, pixel, state)
+                noise_ns = wp.float64(state.next_ns - since_ns)
+                if noise_ns <= end:
+                    end = noise_ns
+                    noisy = wp.bool(True)
+
+            crossing = _Crossing()
+            if wp.static(stochastic):
+                ratio = wp.min(state.on, state.off) / wp.max(deviation, wp.float64(1e-30))
+                longest_ns = ratio * ratio / wp.float64(16.0)
+                if end - now > longest_ns:
+                    end = wp.min(now + wp.max(longest_ns, _ONE), end)
+                    noisy = wp.bool(False)
+                step = (since_ns << _DRAW_BITS) + draw
+                draw += wp.int64(1)
+                crossing = _first_passage(
+                    state.voltage,
+                    state.on,
+                    state.off,
+                    drift,
+                    deviation,
+                    now,
+                    end,
+                    normal2(random_bits(model.seed, model.step_stream, step, pixel)),
+                    uniform2(random_bits(model.seed, model.touch_stream, step, pixel)),
+                )
+                state.voltage = crossing.voltage
+            else:
+                lower = level_at(state.reference, state.up - state.fold, state.down + 1, state.on, state.off)
+                upper = level_at(state.reference, state.up - state.fold + 1, state.down, state.on, state.off)
+                crossing = find_crossing(signal, now, end, quiet, lower, upper)
+
+            polarity = crossing.polarity
+            reset = wp.bool(False)
+            if polarity >= 0:
+                now = crossing.time_ns
+            else:
+                now = end
+                if wp.static(spontaneous):  # noqa: SIM102, one of them is for the compiler
+                    if noisy:
+                        light = first_light + light_slope * now
+                        polarity = _noise_polarity(model, state, light, _spontaneous(model, pixel, state)[1])
+                        state = next_noise(model, pixel, state)
+                        reset = wp.bool(True)
+            if polarity >= 0:
+                if tabulate:
+                    wp.atomic_add(table, frame, row, 1)
+                elif row < row_limit:
+                    key = key_after(now, start_ns, place, time_shift, polarity)
+                    write_key(PUT, key, keys, counters)
+                if not reset:
+                    state.up += polarity
+                    state.down += 1 - polarity
+                if wp.static(refractory):  # noqa: SIM102
+                    if model.refractory_ns > _ZERO:
+                        state.held_ns = now + model.refractory_ns
+                        reset = wp.bool(False)
+                if reset:
+                    state = release(signal, now, state)
+                quiet = range_of(state)
+        return state
+
+    @wp.kernel(
+        module=wp.get_module("neurosim_core.sensors.event_noise." + ("_".join(sorted(terms)) or "ideal")),
+        enable_backward=False,
+    )
+    def scan(
+        # Model:
+        model: _Model,
+        width: wp.int32,
+        row_shift: wp.int32,
+        time_shift: wp.int32,
+        # In:
+        first_pixel: wp.int32,
+        end_pixel: wp.int32,
+        log_radiance: wp.array2d[wp.float32],
+        stamps: wp.array[wp.int64],
+        since_reset_ns: wp.int64,
+        frame_count: wp.int32,
+        row_limit: wp.array[wp.int32],
+        base: wp.array[wp.float32],
+        last: wp.array[wp.float32],
+        crossed: wp.array[wp.vec2i],
+        before: Memory,
+        tabulate: wp.bool,
+        # Out:
+        last_out: wp.array[wp.float32],
+        crossed_out: wp.array[wp.vec2i],
+        after: Memory,
+        keys_out: wp.array[wp.int64],
+        counters_out: wp.array[wp.int64],
+        table_out: wp.array2d[wp.int32],
+    ):
+        """Take the pixels [first_pixel, end_pixel) over `frame_count` frames, like `event_scan.scan`."""
+        pixel = first_pixel + wp.tid()
+        write_key(OPEN, wp.int64(0), keys_out, counters_out)
+        if pixel < end_pixel:
+            row = pixel // width
+            place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+            state = _Pixel()
+            state.on = model.threshold_on
+            state.off = model.threshold_off
+            if wp.static(spread):
+                state.on = model.thresholds[pixel][0]
+                state.off = model.thresholds[pixel][1]
+            if wp.static(stochastic):
+                state.on = state.on / model.threshold_on
+                state.off = state.off / model.threshold_off
+                state.voltage = before.voltage[pixel]
+            state.reference = wp.float64(base[pixel])
+            if wp.static(resets):
+                state.reference = before.reference[pixel]
+            state.up = crossed[pixel][0]
+            state.down = crossed[pixel][1]
+            state.held_ns = -_ONE
+            if wp.static(refractory):
+                state.held_ns = before.held_ns[pixel]
+            if wp.static(spontaneous):
+                state.next_ns = before.next_ns[pixel]
+                state.noise_count = before.noise_count[pixel]
+                state.shot_rate = model.rates[pixel][0]
+                state.hot_rate = model.rates[pixel][1]
+            filtered = _ZERO
+            if wp.static(low_pass):
+                filtered = before.filtered[pixel]
+            sample_before = last[pixel]
+            invalid_count = wp.int32(0)
+            invalid_first = wp.int32(0)
+            quiet = range_of(state)
+
+            for frame in range(frame_count):
+                sample = log_radiance[frame, pixel]
+                if wp.abs(sample) <= LIMIT:
+                    start_ns = stamps[frame]
+                    since_ns = start_ns + since_reset_ns
+                    span_ns = wp.float64(stamps[frame + 1] - start_ns)
+                    light = wp.float64(sample_before)
+                    light_slope = (wp.float64(sample) - light) / span_ns
+                    leaked = _ZERO
+                    leak_slope = _ZERO
+                    if wp.static(leak):
+                        cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
+                        whole = wp.floor(cycles)
+                        state.fold = wp.int32(whole)
+                        leaked = (cycles - whole) * state.on
+                        leak_slope = model.leak[pixel][0] * state.on
+                        quiet = range_of(state)
+                    drift = _ZERO
+                    deviation = _ZERO
+                    if wp.static(stochastic):
+                        scale = _FULL_SCALE / model.white_radiance
+                        dn_begin = scale * wp.exp(light)
+                        dn_end = scale * wp.exp(wp.float64(sample))
+                        dn = (dn_begin + dn_end) / _TWO
+                        drift = model.k1 * wp.log((dn_end + model.k2) / (dn_begin + model.k2)) / span_ns
+                        drift += model.k4 + model.k5 * dn
+                        deviation = model.k3 * wp.sqrt(dn) / (dn + model.k2) + model.k6
+
+                    pieces = wp.int32(1)
+                    if wp.static(low_pass):
+                        rise = wp.abs(wp.float64(sample) - light)
+                        pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
+                    for piece in range(pieces):
+                        signal = _Signal()
+                        signal.begin = span_ns * (wp.float64(piece) / wp.float64(pieces))
+                        signal.end = span_ns * (wp.float64(piece + 1) / wp.float64(pieces))
+                        busy = wp.bool(True)
+                        if wp.static(low_pass):
+                            length_ns = signal.end - signal.begin
+                            light_begin = light + light_slope * signal.begin
+                            middle = light_begin + light_slope * length_ns / _TWO
+                            share = (wp.exp(middle) + model.dark_radiance) / (
+                                model.white_radiance + model.dark_radiance
+                            )
+                            signal.tau = _ONE / (model.corner_per_ns * wp.min(share, _ONE))
+                            decay = filtered - light_begin + light_slope * signal.tau
+                            gain = wp.exp(-length_ns / signal.tau) - _ONE
+                            signal.start = filtered + leaked + leak_slope * signal.begin
+                            signal.slope = light_slope + leak_slope
+                            signal.decay = decay
+                            filtered = filtered + light_slope * length_ns + decay * gain
+                            signal.last = filtered + leaked + leak_slope * signal.end
+                        elif wp.static(not stochastic):
+                            signal.start = light + leaked
+                            signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
+                            busy = _reached(signal.last, quiet) >= 0
+                            if wp.static(refractory):
+                                busy = busy or state.held_ns >= _ZERO
+                            if wp.static(spontaneous):
+                                busy = busy or wp.float64(state.next_ns - since_ns) <= span_ns
+                        if busy:
+                            state = react(
+                                model,
+                                pixel,
+                                row,
+                                place,
+                                time_shift,
+                                signal,
+                                drift,
+                                deviation,
+                                light,
+                                light_slope,
+                                start_ns,
+                                since_ns,
+                                frame,
+                                row_limit[frame],
+                                tabulate,
+                                state,
+                                quiet,
+                                table_out,
+                                keys_out,
+                                counters_out,
+                            )
+                            quiet = range_of(state)
+                    if wp.static(refractory):  # noqa: SIM102
+                        if state.held_ns >= _ZERO:
+                            state.held_ns = wp.max(state.held_ns - span_ns, _ZERO)
+                    sample_before = sample
+                else:
+                    if invalid_count == 0:
+                        invalid_first = frame
+                    invalid_count += 1
+
+            if not tabulate:
+                last_out[pixel] = sample_before
+                crossed_out[pixel] = wp.vec2i(state.up, state.down)
+                if wp.static(resets):
+                    after.reference[pixel] = state.reference
+                if wp.static(low_pass):
+                    after.filtered[pixel] = filtered
+                if wp.static(refractory):
+                    after.held_ns[pixel] = state.held_ns
+                if wp.static(spontaneous):
+                    after.next_ns[pixel] = state.next_ns
+                    after.noise_count[pixel] = state.noise_count
+                if wp.static(stochastic):
+                    after.voltage[pixel] = state.voltage
+                if invalid_count > 0:
+                    pixel_count = base.shape[0]
+                    flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
+                    wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
+                    wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+        write_key(CLOSE, wp.int64(0), keys_out, counters_out)
+
+    return scan
+
+
+@wp.kernel
+def _draw_thresholds(
+    # Model:
+    nominal: wp.vec2d,
+    deviation: wp.vec2d,
+    minimum: wp.float64,
+    seed: wp.uint64,
+    stream: wp.uint32,
+    # Out:
+    threshold_out: wp.array[wp.vec2d],
+) -> None:
+    pixel = wp.tid()
+    value = nominal + wp.cw_mul(deviation, normal2(random_bits(seed, stream, wp.int64(0), pixel)))
+    threshold_out[pixel] = wp.vec2d(wp.max(value[0], minimum), wp.max(value[1], minimum))
+
+
+@wp.func
+def _spread_rate(rate: wp.float64, decades: wp.float64, normal: wp.float64) -> wp.float64:
+    return rate * wp.exp(wp.log(wp.float64(10.0)) * decades * normal)
+
+
+@wp.kernel
+def _draw_leak(
+    # Model:
+    rate_per_ns: wp.float64,
+    decades: wp.float64,
+    seed: wp.uint64,
+    rate_stream: wp.uint32,
+    phase_stream: wp.uint32,
+    # Out:
+    leak_out: wp.array[wp.vec2d],
+) -> None:
+    pixel = wp.tid()
+    normal = normal2(random_bits(seed, rate_stream, wp.int64(0), pixel))
+    phase = uniform2(random_bits(seed, phase_stream, wp.int64(0), pixel))[0]
+    if rate_per_ns == _ZERO:
+        phase = _ZERO
+    leak_out[pixel] = wp.vec2d(_spread_rate(rate_per_ns, decades, normal[0]), phase)
+
+
+@wp.kernel
+def _draw_rates(
+    # Model:
+    shot_per_ns: wp.float64,
+    decades: wp.float64,
+    hot_fraction: wp.float64,
+    hot_per_ns: wp.float64,
+    seed: wp.uint64,
+    rate_stream: wp.uint32,
+    hot_stream: wp.uint32,
+    # Out:
+    rate_out: wp.array[wp.vec2d],
+) -> None:
+    pixel = wp.tid()
+    normal = normal2(random_bits(seed, rate_stream, wp.int64(0), pixel))
+    hot = uniform2(random_bits(seed, hot_stream, wp.int64(0), pixel))[0] < hot_fraction
+    shot = _spread_rate(shot_per_ns, decades, normal[0])
+    rate_out[pixel] = wp.vec2d(shot, wp.where(hot, hot_per_ns, _ZERO))
+
+
+@wp.kernel
+def _begin(
+    # Model:
+    model: _Model,
+    phase_stream: wp.uint32,
+    random_phase: wp.bool,
+    # In:
+    base: wp.array[wp.float32],
+    # Out:
+    memory_out: Memory,
+) -> None:
+    pixel = wp.tid()
+    value = wp.float64(base[pixel])
+    if memory_out.reference.shape[0] > 0:
+        memory_out.reference[pixel] = value
+    if memory_out.filtered.shape[0] > 0:
+        memory_out.filtered[pixel] = value
+    if memory_out.held_ns.shape[0] > 0:
+        memory_out.held_ns[pixel] = -_ONE
+    if memory_out.next_ns.shape[0] > 0:
+        state = _Pixel()
+        rate = model.rates[pixel][0] + model.rates[pixel][1]
+        memory_out.next_ns[pixel] = _wait_ns(rate, _spontaneous(model, pixel, state)[0])
+        memory_out.noise_count[pixel] = 0
+    if memory_out.voltage.shape[0] > 0:
+        voltage = _ZERO
+        if random_phase:
+            voltage = uniform2(random_bits(model.seed, phase_stream, wp.int64(0), pixel))[0]
+            if model.thresholds.shape[0] > 0:
+                voltage *= model.thresholds[pixel][0] / model.threshold_on
+        memory_out.voltage[pixel] = voltage
+
+
+def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
+    """Return the terms that a configuration asks for; none: the pixels are ideal."""
+    present = {
+        "spread": config.threshold_spread is not None,
+        "low_pass": config.low_pass is not None,
+        "refractory": config.refractory_s > 0.0,
+        "leak": config.leak is not None,
+        "spontaneous": config.shot_noise is not None or config.hot_pixels is not None,
+        "stochastic": config.stochastic is not None,
+    }
+    return tuple(term for term, asked in present.items() if asked)
+
+
+def _mix(seed: int, stamp_ns: int) -> int:
+    """Return a seed of 64 bits that differs for each stamp (finaliser of SplitMix64, Steele et al. 2014)."""
+    mixed = (seed + 0x9E3779B97F4A7C15 * (stamp_ns + 1)) % 2**64
+    mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
+    mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) % 2**64
+    return mixed ^ (mixed >> 31)
+
+
+class PixelNoise:
+    """The pixels of an event camera that are not ideal: what stays, what they remember, and their scan.
+
+    Args:
+        config: What they are like.
+        pixel_count: How many there are.
+        ring_size: How many states are kept.
+        seed: Seed of the run, 0 <= seed < 2^64.
+        sensor: Name of the camera; two of them with different names have independent noise.
+        device: Warp device.
+        terms: The terms to compile in; by default those that the configuration asks for.
+
+    Attributes:
+        terms: The terms that are compiled in.
+        thresholds: Thresholds upwards and downwards, device array of vec2d, shape [pixel]; empty without
+            mismatch.
+    """
+
+    def __init__(
+        self,
+        config: EventCameraConfig,
+        *,
+        pixel_count: int,
+        ring_size: int,
+        seed: int,
+        sensor: str,
+        device: Any,
+        terms: Sequence[str] | None = None,
+    ) -> None:
+        self.terms = tuple(terms_of(config) if terms is None else terms)
+        self._config = config
+        self._seed = seed
+        self._sensor = sensor
+        self._device = wp.get_device(device)
+        self._pixel_count = pixel_count
+        self._ring = [self._make_memory() for _ in range(ring_size)]
+        self._model = self._make_model()
+        self.thresholds = self._model.thresholds
+        self._reset_ns = 0
+        self.scan = make_scan(frozenset(self.terms))
+        wp.load_module(self.scan.module, device=self._device)
+
+    def reset(self, base: wp.array[wp.float32], stamp_ns: int) -> None:
+        """Begin anew in slot 0 of the ring, at what the pixels see at a stamp, shape [pixel]."""
+        self._reset_ns = stamp_ns
+        self._model.seed = _mix(self._seed, stamp_ns)
+        stochastic = self._config.stochastic
+        wp.launch(
+            _begin,
+            dim=self._pixel_count,
+            inputs=[
+                self._model,
+                self._stream("phase"),
+                stochastic is not None and stochastic.random_phase,
+                base,
+            ],
+            outputs=[self._ring[0]],
+            device=self._device,
+        )
+
+    def since_reset_ns(self, origin_ns: int) -> int:
+        """Return how long after the reset an origin of time lies [ns]."""
+        return origin_ns - self._reset_ns
+
+    def inputs(self) -> list[Any]:
+        """Return the first parameters of the scan."""
+        return [self._model]
+
+    def memory(self, slot: int) -> Any:
+        """Return the state in a slot of the ring."""
+        return self._ring[slot]
+
+    def _stream(self, use: str) -> int:
+        return stream_id(f"{self._sensor}/events/{use}")
+
+    def _has(self, *terms: str) -> bool:
+        return any(term in self.terms for term in terms)
+
+    def _array(self, dtype: Any, needed: bool) -> Any:
+        return wp.zeros(self._pixel_count if needed else 0, dtype=dtype, device=self._device)
+
+    def _make_memory(self) -> Any:
+        memory = Memory()
+        memory.reference = self._array(wp.float64, self._has("refractory", "spontaneous"))
+        memory.filtered = self._array(wp.float64, self._has("low_pass"))
+        memory.held_ns = self._array(wp.float64, self._has("refractory"))
+        memory.next_ns = self._array(wp.int64, self._has("spontaneous"))
+        memory.noise_count = self._array(wp.int32, self._has("spontaneous"))
+        memory.voltage = self._array(wp.float64, self._has("stochastic"))
+        return memory
+
+    def _make_model(self) -> Any:
+        config = self._config
+        model = _Model()
+        model.threshold_on = config.threshold_on
+        model.threshold_off = config.threshold_off
+        model.white_radiance = config.white_radiance
+        model.refractory_ns = 1e9 * config.refractory_s
+        if config.low_pass is not None:
+            model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz
+            model.dark_radiance = config.low_pass.dark_radiance
+        elif self._has("low_pass"):
+            model.corner_per_ns = 1e9
+        if config.shot_noise is not None:
+            model.bright_factor = config.shot_noise.bright_factor
+            model.shot_on_fraction = config.shot_noise.on_fraction
+        if config.hot_pixels is not None:
+            model.hot_on_fraction = config.hot_pixels.on_fraction
+        if config.stochastic is not None:
+            model.k1, model.k2 = config.stochastic.k1, config.stochastic.k2
+            model.k3, model.k6 = (k / math.sqrt(1e3) for k in (config.stochastic.k3, config.stochastic.k6))
+            model.k4, model.k5 = (k / 1e3 for k in (config.stochastic.k4, config.stochastic.k5))
+        model.spontaneous_stream = self._stream("noise")
+        model.step_stream = self._stream("voltage")
+        model.touch_stream = self._stream("passage")
+        model.thresholds = self._draw_thresholds()
+        model.leak = self._draw_leak()
+        model.rates = self._draw_rates()
+        return model
+
+    def _draw(self, kernel: Any, out: Any, *parameters: Any) -> Any:
+        if out.shape[0] > 0:
+            wp.launch(kernel, dim=out.shape[0], inputs=[*parameters], outputs=[out], device=self._device)
+        return out
+
+    def _draw_thresholds(self) -> Any:
+        config, spread = self._config, self._config.threshold_spread
+        return self._draw(
+            _draw_thresholds,
+            self._array(wp.vec2d, self._has("spread")),
+            wp.vec2d(config.threshold_on, config.threshold_off),
+            wp.vec2d(*((0.0, 0.0) if spread is None else (spread.on, spread.off))),
+            0.0 if spread is None else spread.minimum,
+            self._seed,
+            self._stream("threshold"),
+        )
+
+    def _draw_leak(self) -> Any:
+        leak = self._config.leak
+        return self._draw(
+            _draw_leak,
+            self._array(wp.vec2d, self._has("leak")),
+            0.0 if leak is None else 1e-9 * leak.rate_hz,
+            0.0 if leak is None else leak.spread_decades,
+            self._seed,
+            self._stream("leak"),
+            self._stream("leak_phase"),
+        )
+
+    def _draw_rates(self) -> Any:
+        shot, hot = self._config.shot_noise, self._config.hot_pixels
+        return self._draw(
+            _draw_rates,
+            self._array(wp.vec2d, self._has("spontaneous")),
+            0.0 if shot is None else 1e-9 * shot.rate_hz,
+            0.0 if shot is None else shot.spread_decades,
+            0.0 if hot is None else hot.fraction,
+            0.0 if hot is None else 1e-9 * hot.rate_hz,
+            self._seed,
+            self._stream("shot"),
+            self._stream("hot"),
+        )

@@ -1,0 +1,381 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
+# mypy: disable-error-code="call-overload,untyped-decorator,assignment"
+"""The arbiter that reads events out of the pixels: a queue with one server.
+
+`event`: events are read in the order in which they come, and the bus is busy for 1 / bandwidth with each. An
+event is stamped when its transfer begins, so an idle bus changes no stamp.
+
+`row`: rows wait in the order of their oldest event. The first is latched when the bus is free: all its events
+that have come until then get that stamp, and the bus is busy for row_s + n / bandwidth.
+
+At most `queue_length` events wait; one that finds the queue full is lost. A pixel does not wait for its event
+to be read: its refractory time begins at the crossing.
+
+It is a sequence by its nature, so one thread does it, on the CPU or the GPU, for events in the order of
+time to the nanosecond (then row, column, polarity). What is read depends only on what has come before, so not
+on when it is asked for.
+
+Reference: Boahen (2000), Point-to-point connectivity between neuromorphic chips using address events, for
+arbitrated queues; Finateu et al. (2020) for a readout by rows.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from neurosim_core.clock import NS_PER_US
+from neurosim_core.sensors.event_config import ReadoutConfig
+from neurosim_core.sensors.event_scan import SUB_BITS
+from neurosim_core.streams import HostCopy, Milestone
+
+wp.set_module_options({"enable_backward": False})
+
+_TICKS_PER_NS = 1024
+_TICK_BITS = wp.constant(wp.int64(10))
+_TICK_MASK = wp.constant(wp.int64(_TICKS_PER_NS - 1))
+_SUB_MASK = wp.constant(wp.int64(1023))
+_SUB_SHIFT = wp.constant(wp.int64(SUB_BITS - 1))
+_US = wp.constant(wp.int64(NS_PER_US))
+_ONE = wp.constant(wp.int64(1))
+
+# places in `counters`: events read, events that wait, events lost; first row that waits, rows that wait;
+# first free place for an event
+_READ = wp.constant(0)
+_WAITING = wp.constant(1)
+_DROPPED = wp.constant(2)
+_FIRST_ROW = wp.constant(3)
+_ROW_COUNT = wp.constant(4)
+_FREE_NODE = wp.constant(5)
+_COUNTERS = 6
+
+
+@wp.struct
+class _Bus:
+    """Parameters and what the arbiter remembers; times in 2^-10 ns since the reset."""
+
+    event_ticks: wp.int64
+    row_ticks: wp.int64
+    queue_length: wp.int32
+    row_shift: wp.int32
+    time_shift: wp.int32
+    free: wp.array[wp.int64]
+    """When the bus is free, shape [1]."""
+    # by rows only
+    place: wp.array[wp.int64]
+    """Row, column and polarity of events that wait, shape [queue_length]."""
+    following: wp.array[wp.int32]
+    """The next event of the same row, or the next free place."""
+    head: wp.array[wp.int32]
+    """First event of each row; -1: none."""
+    tail: wp.array[wp.int32]
+    asked: wp.array[wp.int64]
+    """When the first event of each row came."""
+    rows: wp.array[wp.int32]
+    """Rows in the order in which they are read, a ring."""
+
+
+@wp.func
+def _key_at(ticks: wp.int64, origin_ns: wp.int64, place: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return the key of an event read at a time; the origin is that of the keys, since the reset."""
+    down_ns = (ticks >> _TICK_BITS) - origin_ns
+    up_ns = down_ns
+    if (ticks & _TICK_MASK) != wp.int64(0):
+        up_ns += _ONE
+    time_us = down_ns // _US
+    return (time_us << wp.int64(time_shift)) | place | (up_ns - time_us * _US)
+
+
+@wp.kernel
+def _by_nanosecond(
+    # In:
+    keys: wp.array[wp.int64],
+    first: wp.int32,
+    time_shift: wp.int32,
+    # Out:
+    keys_out: wp.array[wp.int64],
+) -> None:
+    """Write keys that sort by the nanosecond: time [us] | nanoseconds | row | col | polarity."""
+    event = wp.tid()
+    key = keys[first + event]
+    low_bits = (_ONE << wp.int64(time_shift - 1)) - _ONE  # without `late`
+    place = (key & low_bits) >> _SUB_SHIFT
+    time = (key >> wp.int64(time_shift)) << wp.int64(time_shift)
+    keys_out[event] = time | ((key & _SUB_MASK) << (wp.int64(time_shift - 1) - _SUB_SHIFT)) | place
+
+
+@wp.func
+def _arrival_ns(key: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return the time of a key of `_by_nanosecond`, from the keys' origin."""
+    sub_ns = (key >> (wp.int64(time_shift - 1) - _SUB_SHIFT)) & _SUB_MASK
+    return (key >> wp.int64(time_shift)) * _US + sub_ns
+
+
+@wp.func
+def _place(key: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return row, column and polarity of a key of `_by_nanosecond`, where a key of an event has them."""
+    mask = (_ONE << (wp.int64(time_shift - 1) - _SUB_SHIFT)) - _ONE
+    return (key & mask) << _SUB_SHIFT
+
+
+@wp.kernel
+def _read_events(
+    # Model:
+    bus: _Bus,
+    # In:
+    arrivals: wp.array[wp.int64],
+    count: wp.int32,
+    origin_ns: wp.int64,
+    first_out: wp.int32,
+    # Out:
+    keys_out: wp.array[wp.int64],
+    dropped_ns_out: wp.array[wp.int64],
+    counters: wp.array[wp.int32],
+) -> None:
+    """Read events one by one; the time at which each will be read is known when it comes.
+
+    Args:
+        bus: Parameters and memory.
+        arrivals: Keys of `_by_nanosecond`, sorted.
+        count: How many.
+        origin_ns: Origin of the keys, since the reset [ns].
+        first_out: Where the keys of the events read go.
+        keys_out: Keys of events at the time when they are read.
+        dropped_ns_out: When lost events came, from the keys' origin [ns].
+        counters: Overwritten; see _READ and the others.
+    """
+    free = bus.free[0]
+    read = wp.int32(0)
+    dropped = wp.int32(0)
+    for event in range(count):
+        key = arrivals[event]
+        arrival_ns = _arrival_ns(key, bus.time_shift)
+        came = (arrival_ns + origin_ns) << _TICK_BITS
+        waiting = wp.int64(0)
+        if free > came:  # those that begin later, one every event_ticks, the last at free - event_ticks
+            waiting = (free - came + bus.event_ticks - _ONE) // bus.event_ticks - _ONE
+        if waiting >= wp.int64(bus.queue_length):
+            dropped_ns_out[dropped] = arrival_ns
+            dropped += 1
+        else:
+            begin = wp.max(free, came)
+            free = begin + bus.event_ticks
+            keys_out[first_out + read] = _key_at(
+                begin, origin_ns, _place(key, bus.time_shift), bus.time_shift
+            )
+            read += 1
+    bus.free[0] = free
+    counters[_READ] = read
+    counters[_DROPPED] = dropped
+
+
+@wp.func
+def _serve(
+    bus: _Bus,
+    before: wp.int64,
+    origin_ns: wp.int64,
+    first_out: wp.int32,
+    keys_out: wp.array[wp.int64],
+    counters: wp.array[wp.int32],
+) -> None:
+    """Latch the rows whose turn comes before a time."""
+    while counters[_ROW_COUNT] > 0:
+        row = bus.rows[counters[_FIRST_ROW]]
+        begin = wp.max(bus.free[0], bus.asked[row])
+        if begin >= before:
+            break
+        node = bus.head[row]
+        count = wp.int32(0)
+        while node >= 0:
+            keys_out[first_out + counters[_READ]] = _key_at(begin, origin_ns, bus.place[node], bus.time_shift)
+            counters[_READ] = counters[_READ] + 1
+            following = bus.following[node]
+            bus.following[node] = counters[_FREE_NODE]
+            counters[_FREE_NODE] = node
+            node = following
+            count += 1
+        bus.head[row] = -1
+        bus.free[0] = begin + bus.row_ticks + wp.int64(count) * bus.event_ticks
+        counters[_WAITING] = counters[_WAITING] - count
+        counters[_ROW_COUNT] = counters[_ROW_COUNT] - 1
+        counters[_FIRST_ROW] = (counters[_FIRST_ROW] + 1) % bus.rows.shape[0]
+
+
+@wp.kernel
+def _read_rows(
+    # Model:
+    bus: _Bus,
+    # In:
+    arrivals: wp.array[wp.int64],
+    count: wp.int32,
+    origin_ns: wp.int64,
+    now_ns: wp.int64,
+    first_out: wp.int32,
+    # Out:
+    keys_out: wp.array[wp.int64],
+    dropped_ns_out: wp.array[wp.int64],
+    counters: wp.array[wp.int32],
+) -> None:
+    """Read rows until a time, `now_ns` since the reset, after which nothing is known; see `_read_events`."""
+    counters[_READ] = 0
+    counters[_DROPPED] = 0
+    for event in range(count):
+        key = arrivals[event]
+        arrival_ns = _arrival_ns(key, bus.time_shift)
+        came = (arrival_ns + origin_ns) << _TICK_BITS
+        _serve(bus, came, origin_ns, first_out, keys_out, counters)
+        if counters[_WAITING] >= bus.queue_length:
+            dropped_ns_out[counters[_DROPPED]] = arrival_ns
+            counters[_DROPPED] = counters[_DROPPED] + 1
+        else:
+            place = _place(key, bus.time_shift)
+            row = wp.int32(place >> wp.int64(bus.row_shift))
+            node = counters[_FREE_NODE]
+            counters[_FREE_NODE] = bus.following[node]
+            counters[_WAITING] = counters[_WAITING] + 1
+            bus.place[node] = place
+            bus.following[node] = -1
+            if bus.head[row] < 0:
+                bus.head[row] = node
+                bus.asked[row] = came
+                row_count = bus.rows.shape[0]
+                bus.rows[(counters[_FIRST_ROW] + counters[_ROW_COUNT]) % row_count] = row
+                counters[_ROW_COUNT] = counters[_ROW_COUNT] + 1
+            else:
+                bus.following[bus.tail[row]] = node
+            bus.tail[row] = node
+    _serve(bus, (now_ns << _TICK_BITS) + _ONE, origin_ns, first_out, keys_out, counters)
+
+
+@wp.kernel
+def _begin(
+    # Out:
+    following_out: wp.array[wp.int32],
+) -> None:
+    node = wp.tid()
+    following_out[node] = wp.where(node + 1 < following_out.shape[0], node + 1, -1)
+
+
+class Readout:
+    """The arbiter of one event camera and the events that wait for it.
+
+    Args:
+        config: Its parameters.
+        height: Rows of the sensor [px].
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        device: Warp device.
+    """
+
+    def __init__(
+        self, config: ReadoutConfig, *, height: int, row_shift: int, time_shift: int, device: Any
+    ) -> None:
+        self._rowwise = config.kind == "row"
+        self._device = wp.get_device(device)
+        self._time_shift = time_shift
+        bus = _Bus()
+        bus.event_ticks = max(1, round(1e9 * _TICKS_PER_NS / config.bandwidth_hz))
+        bus.row_ticks = round(config.row_s * 1e9 * _TICKS_PER_NS)
+        bus.queue_length = config.queue_length
+        bus.row_shift = row_shift
+        bus.time_shift = time_shift
+        bus.free = wp.zeros(1, dtype=wp.int64, device=self._device)
+        places = config.queue_length if self._rowwise else 0
+        rows = height if self._rowwise else 0
+        bus.place = wp.empty(places, dtype=wp.int64, device=self._device)
+        bus.following = wp.empty(places, dtype=wp.int32, device=self._device)
+        bus.asked = wp.empty(rows, dtype=wp.int64, device=self._device)
+        bus.head, bus.tail, bus.rows = (wp.empty(rows, dtype=wp.int32, device=self._device) for _ in range(3))
+        self._bus = bus
+        self._counters = wp.zeros(_COUNTERS, dtype=wp.int32, device=self._device)
+        self._counters_on_host = HostCopy(self._counters)
+        self._done = Milestone(self._device)
+        self._make_drop_buffer(1024)
+        self._reset_ns = 0
+        self._dropped: list[tuple[int, int]] = []
+        self.waiting_count = 0
+        wp.load_module(_read_rows.module, device=self._device)
+
+    def reset(self, stamp_ns: int) -> None:
+        """Forget all events and be free from a stamp on [ns]."""
+        self._reset_ns = stamp_ns
+        self._bus.free.zero_()
+        self._counters.zero_()
+        self._bus.head.fill_(-1)
+        if self._rowwise:
+            following = self._bus.following
+            wp.launch(_begin, dim=following.shape[0], outputs=[following], device=self._device)
+        self._dropped = []
+        self.waiting_count = 0
+
+    def read(
+        self,
+        keys: wp.array[wp.int64],
+        *,
+        first: int,
+        count: int,
+        spare: wp.array[wp.int64],
+        order: wp.array[wp.int32],
+        origin_us: int,
+        now_ns: int,
+    ) -> int:
+        """Replace the keys of events that have happened by those of events that are read; return how many.
+
+        Args:
+            keys: Overwritten from `first` on; room for `count` + `waiting_count` keys is needed there.
+            first: Where they begin.
+            count: Events that have happened since the last call, in any order.
+            spare: Overwritten; at least `count` keys, on CUDA twice as many.
+            order: On CUDA overwritten, room like that of `spare`.
+            origin_us: Origin of the keys' time [us].
+            now_ns: All events until then have happened [ns].
+        """
+        wp.launch(
+            _by_nanosecond,
+            dim=count,
+            inputs=[keys, first, self._time_shift],
+            outputs=[spare],
+            device=self._device,
+        )
+        self._sort(spare, order, count)
+        if count > self._dropped_ns.shape[0]:
+            self._make_drop_buffer(1 << (count - 1).bit_length())
+        now = [now_ns - self._reset_ns] if self._rowwise else []
+        wp.launch(
+            _read_rows if self._rowwise else _read_events,
+            dim=1,
+            inputs=[self._bus, spare, count, origin_us * NS_PER_US - self._reset_ns, *now, first],
+            outputs=[keys, self._dropped_ns, self._counters],
+            device=self._device,
+        )
+        self._counters_on_host.fetch(0, _COUNTERS)
+        self._done.set()
+        self._done.wait()
+        read, self.waiting_count, dropped = (int(n) for n in self._counters_on_host.rows(0, 3))
+        if dropped > 0:
+            self._note_dropped(dropped, origin_us * NS_PER_US)
+        return read
+
+    def take_dropped(self) -> list[tuple[int, int]]:
+        """Return stamps [ns] and how many events were lost at each, since the last time."""
+        dropped, self._dropped = self._dropped, []
+        return dropped
+
+    def _make_drop_buffer(self, size: int) -> None:
+        self._dropped_ns = wp.empty(size, dtype=wp.int64, device=self._device)
+        self._dropped_on_host = HostCopy(self._dropped_ns)
+
+    def _note_dropped(self, count: int, origin_ns: int) -> None:
+        self._dropped_on_host.fetch(0, count)
+        self._done.set()
+        self._done.wait()
+        stamps, counts = np.unique(self._dropped_on_host.rows(0, count), return_counts=True)
+        self._dropped += [
+            (int(stamp) + origin_ns, int(lost)) for stamp, lost in zip(stamps, counts, strict=True)
+        ]
+
+    def _sort(self, keys: Any, order: Any, count: int) -> None:
+        if self._device.is_cpu:
+            keys.numpy()[:count].sort()
+        elif count > 0:
+            wp.utils.radix_sort_pairs(keys, order, count)
