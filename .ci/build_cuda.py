@@ -21,6 +21,7 @@ import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
 from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
+from neurosim_core.sensors.event_noise import TERMS, make_scan
 from neurosim_core.trajectory import HoverConfig, hover
 from neurosim_core.vehicle import Multirotor, preset
 
@@ -59,6 +60,8 @@ def make_kernels() -> None:
         everything._replace(finest_level=True, nearest_texel=True),
     ):
         raycast_kernel(OUTPUTS, terms)
+    for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
+        make_scan(frozenset(pixel))
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
         for mode in MODES:
