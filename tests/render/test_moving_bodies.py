@@ -113,7 +113,7 @@ def test_depth_and_size_of_a_sphere_over_time(device, traversal):
 
 
 def test_a_spinning_box_turns_as_far_as_it_should(device, traversal):
-    """Normals of its sides are at the angle w t, whichever side is in front; its edges are where they should."""
+    """Normals of its sides are at the angle w t, whichever is in front; edges are where they should be."""
     motion = MotionConfig(position_m=(2.0, 0.0, 0.0), spin_rad_s=(0.0, 0.0, 1.5))
     stamps_ns = [0, 210_000_000, 950_000_000, 1_400_000_000]
     config = UNSHADOWED.model_copy(update={"cpu_traversal": traversal})
