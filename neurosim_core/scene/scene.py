@@ -5,7 +5,9 @@ Metres, z up, linear light.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +16,23 @@ LinearRgb = tuple[float, float, float]
 """Linear-light red, green, blue (Rec. 709 primaries)."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Texture:
-    """A picture that is wrapped around a surface."""
+    """A picture that is wrapped around a surface; painted when it is first looked at, if ever."""
 
-    name: str
-    srgb: NDArray[np.uint8]
-    """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
+    def __init__(self, *, name: str, srgb: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]]) -> None:
+        """Take texels as `srgb` has them, or what paints them."""
+        self.name = name
+        self._source = srgb
+
+    @cached_property
+    def srgb(self) -> NDArray[np.uint8]:
+        """8-bit sRGB texels as stored in the file, shape [H, W, 3]; row 0 is v = 1 (top, as in a picture)."""
+        return self._source() if callable(self._source) else self._source
+
+    @property
+    def painted(self) -> bool:
+        """Whether there are texels already."""
+        return "srgb" in self.__dict__ or not callable(self._source)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

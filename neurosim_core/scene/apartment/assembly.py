@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,7 @@ class Assembly:
         if surface not in self._materials:
             key = surface.texture
             if key is not None and key not in self._textures:
-                self._textures[key] = Texture(name=key, srgb=self._paint(key))
+                self._textures[key] = Texture(name=key, srgb=partial(self._paint, key))
             self._materials[surface] = len(self._material_list)
             self._material_list.append(
                 Material(
