@@ -120,7 +120,7 @@ def test_counters_of_this_and_other_nodes(make_node):
     for value in range(10):
         publisher.publish(Number(0, value))
         subscriber.recv(1.0)
-    wait_for(lambda: len(two.nodes()) == 2)
+    wait_for(lambda: all(len(node.nodes()) == 2 for node in (one, two)))
     for asked in (one, two):
         sent = asked.ask_stats(one.id).publishers[0]
         assert (sent.topic, sent.source, sent.subscribers) == ("/numbers", publisher.source, 1)
