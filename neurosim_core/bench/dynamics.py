@@ -51,17 +51,21 @@ from neurosim_core.bench.dynamics_throughput import (
 )
 from neurosim_core.vehicle import preset
 
-__all__ = ["dynamics_chapter", "measure_dynamics"]
+__all__ = ["QUICK", "Extent", "dynamics_chapter", "measure_dynamics"]
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Extent:
+class Extent:
     """How much is measured."""
 
+    flights: tuple[str, ...] = tuple(SCENES)
+    """Which of `SCENES`; the chapter needs the last three."""
     steps_s: tuple[float, ...] = STEPS_S
+    """Divisors of `HOLD_NS`; 1 ms must be among them."""
     tolerances: tuple[float, ...] = TOLERANCES
+    """1e-6 must be among them."""
     repetitions: int = 5
     cross_checked: tuple[str, ...] = tuple(SCENES)
     """Flights whose reference is checked with Radau."""
@@ -71,6 +75,8 @@ class _Extent:
     time_constants_s: tuple[float, ...] = TIME_CONSTANTS_S
     stiff_peer_cpu_s: float = 5.0
     """CPU time that RotorPy gets for a stiff or extreme flight [s]."""
+    cases: tuple[str, ...] = tuple(case.name for case in CASES)
+    """Which extreme flights."""
     check_extremes: bool = True
     """Check the references of stiff and extreme flights with a second solver."""
     stamps_s: tuple[int, ...] = STAMPS_S
@@ -79,7 +85,7 @@ class _Extent:
     """Of one repetition of a throughput [s]."""
 
 
-_QUICK = _Extent(
+QUICK = Extent(
     steps_s=STEPS_S[:5],
     tolerances=(1e-4, 1e-6, 1e-8),
     repetitions=3,
@@ -95,14 +101,17 @@ _QUICK = _Extent(
 )
 
 
-def measure_dynamics(*, quick: bool = False, progress: Progress | None = None) -> DynamicsResult:
+def measure_dynamics(
+    *, quick: bool = False, progress: Progress | None = None, extent: Extent | None = None
+) -> DynamicsResult:
     """Measure everything that the chapter tells.
 
     Args:
         quick: A small version, in less than 40 s; figures of time are rough.
         progress: Told what is measured next.
+        extent: How much is measured, if it is neither the whole nor the small version.
     """
-    extent = _QUICK if quick else _Extent()
+    extent = extent or (QUICK if quick else Extent())
     say = progress or (lambda _: None)
     flights = _solve_flights(extent, say)
     samples = _sweep(extent, flights, say)
@@ -128,11 +137,11 @@ def measure_dynamics(*, quick: bool = False, progress: Progress | None = None) -
     )
 
 
-def _solve_flights(extent: _Extent, say: Progress) -> tuple[SolvedFlight, ...]:
+def _solve_flights(extent: Extent, say: Progress) -> tuple[SolvedFlight, ...]:
     solved = []
-    for name, make in SCENES.items():
+    for name in extent.flights:
         say(f"reference of {name}")
-        flight = make()
+        flight = SCENES[name]()
         solved.append(
             SolvedFlight(
                 flight=flight, reference=make_reference(flight, cross_check=name in extent.cross_checked)
@@ -141,7 +150,7 @@ def _solve_flights(extent: _Extent, say: Progress) -> tuple[SolvedFlight, ...]:
     return tuple(solved)
 
 
-def _sweep(extent: _Extent, flights: Sequence[SolvedFlight], say: Progress) -> tuple[Sample, ...]:
+def _sweep(extent: Extent, flights: Sequence[SolvedFlight], say: Progress) -> tuple[Sample, ...]:
     samples = []
     for f in flights:
         settings = [(method, step_s) for method in FIXED_STEP for step_s in extent.steps_s]
@@ -161,7 +170,7 @@ def _derivative_differences() -> dict[str, float]:
     return {name: rotorpy_peer.derivative_difference(preset(name)) for name in vehicles}
 
 
-def _peers(extent: _Extent, flights: Sequence[SolvedFlight], say: Progress) -> tuple[PeerSample, ...]:
+def _peers(extent: Extent, flights: Sequence[SolvedFlight], say: Progress) -> tuple[PeerSample, ...]:
     """Fly RotorPy, and one vehicle of ours that is called just as often."""
     peers = []
     for f in flights:
@@ -199,7 +208,7 @@ _STIFF_METHODS: tuple[tuple[Method, float], ...] = (
 """Methods of the stiff and the extreme flights, with step or tolerance."""
 
 
-def _motors(extent: _Extent, say: Progress) -> tuple[StiffMotor, ...]:
+def _motors(extent: Extent, say: Progress) -> tuple[StiffMotor, ...]:
     motors = []
     for time_constant_s in extent.time_constants_s:
         say(f"motor time constant {time_constant_s:g} s")
@@ -216,9 +225,11 @@ def _motors(extent: _Extent, say: Progress) -> tuple[StiffMotor, ...]:
     return tuple(motors)
 
 
-def _extremes(extent: _Extent, say: Progress) -> tuple[tuple[Extreme, ...], tuple[Refusal, ...]]:
+def _extremes(extent: Extent, say: Progress) -> tuple[tuple[Extreme, ...], tuple[Refusal, ...]]:
     extremes, refusals = [], []
     for case in CASES:
+        if case.name not in extent.cases:
+            continue
         say(case.name)
         flight = make_flight(case)
         if isinstance(flight, Refusal):
@@ -236,7 +247,7 @@ def _extremes(extent: _Extent, say: Progress) -> tuple[tuple[Extreme, ...], tupl
     return tuple(extremes), tuple(refusals)
 
 
-def _drifts(extent: _Extent, say: Progress) -> tuple[Drift, ...]:
+def _drifts(extent: Extent, say: Progress) -> tuple[Drift, ...]:
     drifts = []
     for method, setting in ((RKMK4, STEP_S), (DORMAND_PRINCE, 1e-6)):
         say(f"an hour of hover with {method.name}")
@@ -249,7 +260,7 @@ def _drifts(extent: _Extent, say: Progress) -> tuple[Drift, ...]:
     return (*drifts, *measure_formats(extent.formats_stamps_s))
 
 
-def _throughputs(extent: _Extent, say: Progress) -> tuple[Throughput, ...]:
+def _throughputs(extent: Extent, say: Progress) -> tuple[Throughput, ...]:
     throughputs = []
     for call, vehicles, steps_per_call in WAYS:
         say(f"{vehicles} vehicles, {steps_per_call} steps a call")
@@ -265,7 +276,7 @@ def _throughputs(extent: _Extent, say: Progress) -> tuple[Throughput, ...]:
     return tuple(throughputs)
 
 
-def _prunings(extent: _Extent, say: Progress) -> tuple[Pruning, ...]:
+def _prunings(extent: Extent, say: Progress) -> tuple[Pruning, ...]:
     say("terms left out")
     configs = {
         "hummingbird": preset("hummingbird"),

@@ -482,11 +482,12 @@ def _long(result: DynamicsResult) -> Table:
             }
             for d in result.drifts
         ],
-        note="Steps of 1 ms; Dormand-Prince in intervals of 0.1 s at rtol 1e-6 in hover and 1e-10 for the "
-        "top. *hover*: a hummingbird with all its terms. *free top*: moments 1 : 2 : 2.5 at 19 rad/s, "
-        "against Jacobi's elliptic functions; a dash: lost. *spin*: hover while turning at 29 rad/s, in "
-        "two formats of number by one RK4 kernel of the study; the product's kernels are float64 "
-        "throughout, and this is why.",
+        note="Steps of 1 ms; Dormand-Prince in intervals of 0.1 s, at rtol 1e-6 in hover and 1e-10 for the "
+        "top. *hover*: a hummingbird with all its terms at a fixed point, so that rounding is all there "
+        "is. *free top*: moments 1 : 2 : 2.5 at 19 rad/s, against Jacobi's elliptic functions; a dash: "
+        "lost. *spin*: hover while turning at 29 rad/s, in two formats of number by one RK4 kernel of the "
+        "study; most of what float32 drifts is a thrust that cannot be rounded to the weight. The "
+        "product's kernels are float64 throughout.",
     )
 
 

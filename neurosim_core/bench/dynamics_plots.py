@@ -38,6 +38,8 @@ _ROTORPY_MARKERS = {
     "RotorPy RK45, 10 ms": "P",
     "RotorPy explicit Euler, 1 ms": "X",
 }
+_PANELS = {"hover": "hover: all keep it to rounding"}
+"""Titles of panels that are not the name of the flight."""
 _ERROR_MIN = 1e-16  # errors below are drawn here
 
 
@@ -84,7 +86,7 @@ def _draw_work_precision(result: DynamicsResult, figure: Figure) -> None:
                     label=peer.method,
                 )
         _mark_reference(axes, solved.reference.uncertainty.position_m)
-        axes.set(xscale="log", yscale="log", ylim=(0.5 * _ERROR_MIN, 1e2), title=name)
+        axes.set(xscale="log", yscale="log", ylim=(0.5 * _ERROR_MIN, 1e2), title=_PANELS.get(name, name))
         axes.yaxis.set_major_locator(_decades(3))
     for axes in panels[::3]:
         axes.set_ylabel("position error [m]")
@@ -145,11 +147,10 @@ def _draw_steps(result: DynamicsResult, figure: Figure) -> None:
                 )
             axes.set(xscale="log", yscale="log", ylim=(1e-14, 1e2))
             axes.yaxis.set_major_locator(_decades(3))
-            for order, at in ((1, 1e-2), (2, 3e-6), (4, 1e-13)):
-                h_ms = np.array([0.1, 0.4])
-                axes.plot(
-                    h_ms, at * (h_ms / 0.1) ** order, color="0.45", linewidth=1.0, marker="", linestyle=":"
-                )
+            for order, from_ms, error in ((1, 0.1, 1e-1), (2, 0.1, 3e-5), (4, 2.5, 1e-13)):
+                h_ms = np.array([from_ms, 4.0 * from_ms])
+                guide = error * np.array([1.0, 4.0**order])
+                axes.plot(h_ms, guide, color="0.45", linewidth=1.0, marker="", linestyle=":")
         line[0].set_ylabel(label)
     for axes, flight in zip(panels[0], flights, strict=True):
         axes.set_title(flight)
