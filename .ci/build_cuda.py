@@ -21,6 +21,7 @@ import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
 from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
+from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import TERMS, make_scan
 from neurosim_core.trajectory import HoverConfig, hover
 from neurosim_core.vehicle import Multirotor, preset
@@ -58,8 +59,12 @@ def make_kernels() -> None:
         everything,
         everything._replace(finest_level=True),
         everything._replace(finest_level=True, nearest_texel=True),
+        everything._replace(bodies=True),
+        everything._replace(bodies=True, baked=False),
     ):
         raycast_kernel(OUTPUTS, terms)
+    for moving in (False, True):
+        rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
         make_scan(frozenset(pixel))
     for name in ("crazyflie", "hummingbird", "racer"):

@@ -1,5 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
 # mypy: disable-error-code="valid-type,call-overload,assignment,untyped-decorator"
+# ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """Adaptive sampling in time: which ticks of an event camera's clock have to be rendered.
 
 Between two renders log radiance is taken as linear in time, which is good as long as nothing moves far across
@@ -23,9 +24,13 @@ The points are what a coarse grid of rays hits, cast at t_last: one ray for each
 shifted from render to render by a low-discrepancy sequence, and the corners of the picture, where rotation
 and approach move fastest. A ray that hits nothing gives a point at infinity, which moves with rotation only.
 
-Limit: an object that no ray hits is not seen to move. It is narrower than the spacing, and it moves at most
-by f |t| / z px relative to the far background, for the translation t of the camera between two renders and
-its distance z. As the grid shifts, it is found sooner or later while it is in view.
+What a ray hits of a moving body is a point of the body, and moves with it: where the body will be is a
+function of time. The corners of the bounding boxes of bodies count as well, whether something hides them or
+not, if the box overlaps the picture and the corner is no further outside of it than the picture is large.
+
+Limit: an object of the scene that no ray hits is not seen to move. It is narrower than the spacing, and it
+moves at most by f |t| / z px relative to the far background, for the translation t of the camera between two
+renders and its distance z. As the grid shifts, it is found sooner or later while it is in view.
 
 Reference: Rebecq, Gehrig, Scaramuzza (2018), ESIM: an Open Event Camera Simulator, section 3.2 (adaptive
 sampling by the maximum displacement between two successive frames).
@@ -35,7 +40,8 @@ sampling by the maximum displacement between two successive frames).
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -45,6 +51,7 @@ from neurosim_core.frames import quaternion_exp
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.scene.bodies import bounding_points, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.streams import HostCopy, HostInput, Milestone
 
 PROBE_SPACING_PX = 16
@@ -85,6 +92,19 @@ class _Poses:
     q_WC: wp.array[wp.quatd]
     p_next_WC: wp.array[wp.vec3d]
     q_next_WC: wp.array[wp.quatd]
+
+
+@wp.struct
+class _Bodies:
+    """What moves by itself; empty if nothing does. Row 0: at the last render; a row more than in `_Poses`."""
+
+    mesh: wp.array[wp.uint64]
+    """Trees in the frames of the bodies, shape [B]."""
+    corners: wp.array2d[wp.vec3d]
+    """Of the bounding boxes, in the frames of the bodies [m], shape [B, 8]."""
+    p_WO: wp.array2d[wp.vec3d]
+    """Shape [row, B]."""
+    q_WO: wp.array2d[wp.quatd]
 
 
 @wp.kernel(enable_backward=False)
@@ -128,37 +148,6 @@ def _probe_pixel(
     return wp.vec2d(wp.float64(x), wp.float64(y))
 
 
-@wp.kernel(enable_backward=False)
-def _cast_probes(
-    first: int,
-    # Model:
-    mesh: wp.uint64,
-    lens: _Pinhole,
-    columns: int,
-    spacing: float,
-    # In:
-    first_row: int,
-    poses: _Poses,
-    shifts: wp.array[wp.vec2],
-    # Out:
-    points_out: wp.array2d[wp.vec4d],
-) -> None:
-    index = first + wp.tid()
-    count = points_out.shape[1]
-    row = first_row + index // count
-    probe = index % count
-    pixel = _probe_pixel(probe, columns, count, spacing, shifts[row], lens)
-    ray_C = wp.vec3d((pixel[0] - lens.cx) / lens.fx, (pixel[1] - lens.cy) / lens.fy, wp.float64(1.0))
-    ray = wp.quat_rotate(poses.q_WC[row], wp.normalize(ray_C))
-    origin = poses.p_WC[row]
-    query = wp.mesh_query_ray(mesh, wp.vec3(origin), wp.vec3(ray), _FAR_M)
-    if query.result:
-        point = origin + wp.float64(query.t) * ray
-        points_out[row, probe] = wp.vec4d(point[0], point[1], point[2], wp.float64(1.0))
-    else:
-        points_out[row, probe] = wp.vec4d(ray[0], ray[1], ray[2], wp.float64(0.0))
-
-
 @wp.func
 def _see(point: wp.vec4d, p_WC: wp.vec3d, q_WC: wp.quatd, lens: _Pinhole) -> wp.vec3d:
     """Return column and row [px] of a point (x, y, z, 1) or a direction (x, y, z, 0), and 1 if in front."""
@@ -180,17 +169,61 @@ def _in_picture(seen: wp.vec3d, lens: _Pinhole) -> bool:
 
 
 @wp.func
-def _displacement(before: wp.vec3d, after: wp.vec3d, lens: _Pinhole) -> float:
-    """Return how far a point moved in the picture [px]: 0 if it is in neither, inf if it went behind."""
-    if not (_in_picture(before, lens) or _in_picture(after, lens)):
-        return 0.0
+def _distance(before: wp.vec3d, after: wp.vec3d) -> float:
+    """Return how far a point moved in the picture [px]: inf to or from behind the camera."""
     if before[2] == wp.float64(0.0) or after[2] == wp.float64(0.0):
         return float(wp.inf)
     return float(wp.length(wp.vec2d(after[0] - before[0], after[1] - before[1])))
 
 
+@wp.func
+def _point_of(body: int, row: int, point: wp.vec4d, bodies: _Bodies) -> wp.vec4d:
+    """Return a point in W, given in W (body -1) or in the frame of a body."""
+    if body < 0:
+        return point
+    p_W = bodies.p_WO[row, body] + wp.quat_rotate(
+        bodies.q_WO[row, body], wp.vec3d(point[0], point[1], point[2])
+    )
+    return wp.vec4d(p_W[0], p_W[1], p_W[2], wp.float64(1.0))
+
+
+@wp.func
+def _near_picture(seen: wp.vec3d, lens: _Pinhole) -> bool:
+    """Whether a point is in the picture, or no further outside of it than the picture is large."""
+    return (
+        seen[2] > wp.float64(0.0)
+        and wp.abs(seen[0] - wp.float64(0.5) * lens.width) <= wp.float64(1.5) * lens.width
+        and wp.abs(seen[1] - wp.float64(0.5) * lens.height) <= wp.float64(1.5) * lens.height
+    )
+
+
+@wp.func
+def _box_in_picture(
+    body: int, row: int, p_WC: wp.vec3d, q_WC: wp.quatd, bodies: _Bodies, lens: _Pinhole
+) -> bool:
+    """Whether the box around the corners of a body overlaps the picture, or reaches behind the camera."""
+    low = wp.vec2d(wp.float64(wp.inf))
+    high = wp.vec2d(-wp.float64(wp.inf))
+    front = int(0)
+    for corner in range(8):
+        p_O = bodies.corners[body, corner]
+        point = wp.vec4d(p_O[0], p_O[1], p_O[2], wp.float64(1.0))
+        seen = _see(_point_of(body, row, point, bodies), p_WC, q_WC, lens)
+        if seen[2] > wp.float64(0.0):
+            front += 1
+            low = wp.min(low, wp.vec2d(seen[0], seen[1]))
+            high = wp.max(high, wp.vec2d(seen[0], seen[1]))
+    overlaps = (
+        low[0] <= lens.width
+        and high[0] >= wp.float64(0.0)
+        and low[1] <= lens.height
+        and high[1] >= wp.float64(0.0)
+    )
+    return overlaps or (front > 0 and front < 8)
+
+
 @wp.kernel(enable_backward=False)
-def _compare(
+def _compare_bodies(
     first: int,
     # Model:
     lens: _Pinhole,
@@ -198,27 +231,134 @@ def _compare(
     first_row: int,
     first_tick: int,
     tick_count: int,
-    chunk: int,
     poses: _Poses,
-    points: wp.array2d[wp.vec4d],
+    bodies: _Bodies,
     # In/out:
     moved: wp.array2d[float],
 ) -> None:
     index = first + wp.tid()
-    probes = points.shape[1]
-    chunks = (probes + chunk - 1) // chunk
-    begin = (index % chunks) * chunk
-    tick = first_tick + index // chunks % tick_count
-    row = first_row + index // chunks // tick_count
+    body = index % bodies.mesh.shape[0]
+    tick = first_tick + index // bodies.mesh.shape[0] % tick_count
+    row = first_row + index // bodies.mesh.shape[0] // tick_count
     if tick < row:
         return
-    most = float(0.0)  # noqa: UP018  (a literal would be a constant)
-    for probe in range(begin, wp.min(begin + chunk, probes)):
-        point = points[row, probe]
-        before = _see(point, poses.p_WC[row], poses.q_WC[row], lens)
-        after = _see(point, poses.p_next_WC[tick], poses.q_next_WC[tick], lens)
-        most = wp.max(most, _displacement(before, after, lens))
+    p_WC = poses.p_WC[row]
+    q_WC = poses.q_WC[row]
+    p_next_WC = poses.p_next_WC[tick]
+    q_next_WC = poses.q_next_WC[tick]
+    if not (
+        _box_in_picture(body, row, p_WC, q_WC, bodies, lens)
+        or _box_in_picture(body, tick + 1, p_next_WC, q_next_WC, bodies, lens)
+    ):
+        return
+    most = float(0.0)
+    for corner in range(8):
+        p_O = bodies.corners[body, corner]
+        point = wp.vec4d(p_O[0], p_O[1], p_O[2], wp.float64(1.0))
+        before = _see(_point_of(body, row, point, bodies), p_WC, q_WC, lens)
+        after = _see(_point_of(body, tick + 1, point, bodies), p_next_WC, q_next_WC, lens)
+        if _near_picture(before, lens) or _near_picture(after, lens):
+            most = wp.max(most, _distance(before, after))
     wp.atomic_max(moved, row, tick, most)
+
+
+class _Kernels(NamedTuple):
+    """The kernels for a scene with or without bodies."""
+
+    cast: Any
+    compare: Any
+
+
+@cache
+def rule_kernels(moving: bool) -> _Kernels:
+    """Return the kernels that cast probes and compare them, with or without moving bodies."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def cast_probes(
+        first: int,
+        # Model:
+        mesh: wp.uint64,
+        lens: _Pinhole,
+        columns: int,
+        spacing: float,
+        # In:
+        first_row: int,
+        poses: _Poses,
+        bodies: _Bodies,
+        shifts: wp.array[wp.vec2],
+        # Out:
+        points_out: wp.array2d[wp.vec4d],
+        owner_out: wp.array2d[int],
+    ) -> None:
+        index = first + wp.tid()
+        count = points_out.shape[1]
+        row = first_row + index // count
+        probe = index % count
+        pixel = _probe_pixel(probe, columns, count, spacing, shifts[row], lens)
+        ray_C = wp.vec3d((pixel[0] - lens.cx) / lens.fx, (pixel[1] - lens.cy) / lens.fy, wp.float64(1.0))
+        ray = wp.quat_rotate(poses.q_WC[row], wp.normalize(ray_C))
+        origin = poses.p_WC[row]
+        query = wp.mesh_query_ray(mesh, wp.vec3(origin), wp.vec3(ray), _FAR_M)
+        point = wp.vec4d(ray[0], ray[1], ray[2], wp.float64(0.0))
+        nearest = float(_FAR_M)
+        if query.result:
+            nearest = query.t
+            p_W = origin + wp.float64(nearest) * ray
+            point = wp.vec4d(p_W[0], p_W[1], p_W[2], wp.float64(1.0))
+        if wp.static(moving):
+            owner = int(-1)
+            for body in range(bodies.mesh.shape[0]):
+                q_WO = bodies.q_WO[row, body]
+                origin_O = wp.quat_rotate_inv(q_WO, origin - bodies.p_WO[row, body])
+                ray_O = wp.quat_rotate_inv(q_WO, ray)
+                hit = wp.mesh_query_ray(bodies.mesh[body], wp.vec3(origin_O), wp.vec3(ray_O), nearest)
+                if hit.result:
+                    nearest = hit.t
+                    p_O = origin_O + wp.float64(nearest) * ray_O
+                    point = wp.vec4d(p_O[0], p_O[1], p_O[2], wp.float64(1.0))
+                    owner = body
+            owner_out[row, probe] = owner
+        points_out[row, probe] = point
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def compare(
+        first: int,
+        # Model:
+        lens: _Pinhole,
+        # In:
+        first_row: int,
+        first_tick: int,
+        tick_count: int,
+        chunk: int,
+        poses: _Poses,
+        bodies: _Bodies,
+        points: wp.array2d[wp.vec4d],
+        owner: wp.array2d[int],
+        # In/out:
+        moved: wp.array2d[float],
+    ) -> None:
+        index = first + wp.tid()
+        probes = points.shape[1]
+        chunks = (probes + chunk - 1) // chunk
+        begin = (index % chunks) * chunk
+        tick = first_tick + index // chunks % tick_count
+        row = first_row + index // chunks // tick_count
+        if tick < row:
+            return
+        most = float(0.0)
+        for probe in range(begin, wp.min(begin + chunk, probes)):
+            point = points[row, probe]
+            later = point
+            if wp.static(moving):
+                later = _point_of(owner[row, probe], tick + 1, point, bodies)
+                point = _point_of(owner[row, probe], row, point, bodies)
+            before = _see(point, poses.p_WC[row], poses.q_WC[row], lens)
+            after = _see(later, poses.p_next_WC[tick], poses.q_next_WC[tick], lens)
+            if _in_picture(before, lens) or _in_picture(after, lens):
+                most = wp.max(most, _distance(before, after))
+        wp.atomic_max(moved, row, tick, most)
+
+    return _Kernels(cast_probes, compare)
 
 
 @wp.kernel(enable_backward=False)
@@ -228,9 +368,12 @@ def _carry_row(
     # In/out:
     poses: _Poses,
     points: wp.array2d[wp.vec4d],
+    owner: wp.array2d[int],
 ) -> None:
     probe = wp.tid()
     points[0, probe] = points[row, probe]
+    if owner.shape[0] > 0:
+        owner[0, probe] = owner[row, probe]
     if probe == 0:
         poses.p_WC[0] = poses.p_WC[row]
         poses.q_WC[0] = poses.q_WC[row]
@@ -291,6 +434,7 @@ class DisplacementRule:
         self._poses.p_WC, self._poses.p_next_WC = zeros(rows, wp.vec3d), zeros(rows, wp.vec3d)
         self._poses.q_WC, self._poses.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
         self._points = zeros((rows, self._probe_count), wp.vec4d)
+        self._make_bodies(arrays, rows)
         self._moved = zeros((rows, rows), float)
         self._moved_on_host = HostCopy(self._moved)
         self._slots, self._step_s = zeros(_BLOCK, int), zeros(_BLOCK, wp.float64)
@@ -298,7 +442,28 @@ class DisplacementRule:
         self._inputs = [HostInput(array) for array in (self._slots, self._step_s, self._shifts)]
         self._done = Milestone(device)
         self._started = False
+        self._last_ns = 0
         self._measured: dict[int, int] = {}
+
+    def _make_bodies(self, arrays: SceneArrays, rows: int) -> None:
+        """Take over the bodies of a scene, if it has any."""
+        moving = arrays.bodies
+        self._kernels = rule_kernels(moving is not None)
+        self._bodies = _Bodies()
+        self._body_count = 0
+        self._owner = wp.zeros(
+            (0, 0) if moving is None else self._points.shape, dtype=int, device=self._device
+        )
+        if moving is None:
+            return
+        self._body_count = len(moving.bodies)
+        self._motions = upload_motions({body.name: body.config for body in moving.bodies}, self._device)
+        self._body_poses = make_body_poses(rows + 1, self._body_count, self._device)
+        self._body_rows: Any = wp.array(np.arange(rows + 1, dtype=np.int32), dtype=int, device=self._device)
+        self._stamps = HostInput(wp.zeros((rows + 1, 1), dtype=wp.int64, device=self._device))
+        self._bodies.mesh = moving.mesh
+        self._bodies.corners = wp.array(bounding_points(moving.bodies), dtype=wp.vec3d, device=self._device)
+        self._bodies.p_WO, self._bodies.q_WO = self._body_poses.p_WO, self._body_poses.q_WO
 
     def choose(
         self,
@@ -323,7 +488,9 @@ class DisplacementRule:
         for begin in range(0, len(slots), _BLOCK):
             block = slice(begin, begin + _BLOCK)
             self._load(states, slots[block], stamps_ns[block], vehicle)
-            chosen += [begin + tick for tick in self._choose(forced[block])]
+            found = [begin + tick for tick in self._choose(forced[block])]
+            self._last_ns = stamps_ns[found[-1]] if found else self._last_ns
+            chosen += found
         return chosen
 
     def _choose(self, forced: Sequence[bool]) -> list[int]:
@@ -344,7 +511,7 @@ class DisplacementRule:
                 _carry_row,
                 dim=self._probe_count,
                 inputs=[last],
-                outputs=[self._poses, self._points],
+                outputs=[self._poses, self._points, self._owner],
                 device=self._device,
             )
         return chosen
@@ -367,6 +534,12 @@ class DisplacementRule:
             outputs=[self._poses],
             device=self._device,
         )
+        if self._body_count > 0:
+            self._stamps.rows[: count + 2, 0] = [self._last_ns, *stamps_ns, ends_ns[-1]]
+            self._stamps.upload()
+            pose_bodies(
+                self._motions, self._stamps.array, self._body_rows, count=count + 2, poses=self._body_poses
+            )
         self._moved.zero_()
         self._measured = {}
 
@@ -386,7 +559,7 @@ class DisplacementRule:
         """Cast the probes of some rows, compare those of some rows with some ticks, and wait."""
         if cast_count > 0:
             launch_split(
-                _cast_probes,
+                self._kernels.cast,
                 dim=cast_count * self._probe_count,
                 inputs=[
                     self._mesh,
@@ -395,19 +568,38 @@ class DisplacementRule:
                     self._spacing_px,
                     cast_row,
                     self._poses,
+                    self._bodies,
                     self._shifts,
                 ],
-                outputs=[self._points],
+                outputs=[self._points, self._owner],
                 device=self._device,
             )
         chunk = self._probe_count if self._on_cpu else _CHUNK_ON_CUDA
         launch_split(
-            _compare,
+            self._kernels.compare,
             dim=row_count * tick_count * -(-self._probe_count // chunk),
-            inputs=[self._lens, row, tick, tick_count, chunk, self._poses, self._points],
+            inputs=[
+                self._lens,
+                row,
+                tick,
+                tick_count,
+                chunk,
+                self._poses,
+                self._bodies,
+                self._points,
+                self._owner,
+            ],
             outputs=[self._moved],
             device=self._device,
         )
+        if self._body_count > 0:
+            launch_split(
+                _compare_bodies,
+                dim=row_count * tick_count * self._body_count,
+                inputs=[self._lens, row, tick, tick_count, self._poses, self._bodies],
+                outputs=[self._moved],
+                device=self._device,
+            )
         self._moved_on_host.fetch(row, row_count)
         self._done.set()
         self._done.wait()

@@ -17,6 +17,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.warp_renderer import SceneArrays, upload_scene
+from neurosim_core.scene.bodies import BodyConfig, make_bodies
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.sensors.displacement import DisplacementRule
 
@@ -179,6 +180,59 @@ def test_a_near_box_moves_more_than_the_wall():
     arrays = upload_scene(scene_of(trimesh.util.concatenate([wall(), near])), CONFIG, "cpu")
     gap = longest_gap(lambda t: LENS.fx * 0.7 * t / 0.5)
     assert choose(make_rule(arrays), flight(40, v_W=(0.7, 0.0, 0.0))) == list(range(0, 40, gap))
+
+
+def with_body(*, size_m, device: str = "cpu", **motion) -> SceneArrays:
+    """Return the wall and a box that moves before it."""
+    body = BodyConfig.model_validate({"shape": {"kind": "box", "size_m": size_m}, "motion": motion})
+    return upload_scene(scene_of(wall()), CONFIG, device, bodies=make_bodies({"box": body}))
+
+
+def test_a_body_between_the_probes_is_not_missed(device):
+    """Its picture is 1.2 px wide; its front is 1 cm before its middle."""
+    arrays = with_body(
+        size_m=(0.02, 0.02, 0.02), position_m=(-0.1, 0.0, 1.0), velocity_m_s=(0.5, 0.0, 0.0), device=device
+    )
+    gap = longest_gap(lambda t: LENS.fx * 0.5 * t / 0.99)
+    assert gap == 16
+    chosen = choose(make_rule(arrays), flight(300, device=device))
+    assert chosen == list(range(0, 300, gap))
+
+
+def test_a_body_that_fills_the_picture_moves_as_its_surface():
+    """Its corners are far outside, so that what the probes hit counts."""
+    arrays = with_body(size_m=(20.0, 20.0, 0.2), position_m=(0.0, 0.0, 1.1), velocity_m_s=(0.0, 0.6, 0.0))
+    gap = longest_gap(lambda t: LENS.fy * 0.6 * t / 1.0)
+    assert choose(make_rule(arrays), flight(200)) == list(range(0, 200, gap))
+
+
+def test_a_body_that_turns_moves_its_corners_along_a_circle():
+    arrays = with_body(size_m=(0.3, 0.3, 0.02), position_m=(0.0, 0.0, 1.01), spin_rad_s=(0.0, 0.0, 3.0))
+    corner_px = LENS.fx * 0.15 * math.sqrt(2.0) / 1.0
+    gap = longest_gap(lambda t: 2.0 * corner_px * math.sin(1.5 * t))
+    assert gap == 13
+    assert choose(make_rule(arrays), flight(200)) == list(range(0, 200, gap))
+
+
+@pytest.mark.parametrize("position_m", [(0.0, 0.0, -1.0), (9.0, 0.0, 1.0)], ids=["behind", "beside"])
+def test_a_body_out_of_sight_does_not_count(position_m):
+    arrays = with_body(size_m=(0.3, 0.3, 0.3), position_m=position_m, velocity_m_s=(0.0, 1.0, 0.0))
+    assert choose(make_rule(arrays), flight(200)) == [0]
+
+
+def test_a_body_that_comes_into_sight_is_looked_at():
+    """It comes from the right, 1 m away: its left edge, at the back, is at the border after 0.0995 s."""
+    start = 48.0 / 60.0 * 1.01 + 0.01 + 0.0995 * 2.0
+    arrays = with_body(size_m=(0.02, 0.02, 0.02), position_m=(start, 0.0, 1.0), velocity_m_s=(-2.0, 0.0, 0.0))
+    chosen = choose(make_rule(arrays), flight(150))
+    assert chosen[:2] == [0, 99]
+    assert np.diff(chosen[1:]).max() == longest_gap(lambda t: LENS.fx * 2.0 * t / 0.99)
+
+
+def test_bodies_that_do_not_move_change_nothing(arrays):
+    states = flight(200, v_W=(0.3, -0.2, 0.5), w_B=(0.2, 0.4, -0.9))
+    still = with_body(size_m=(0.5, 0.5, 0.1), position_m=(0.0, 0.0, WALL_M + 5.0))
+    assert choose(make_rule(still), states, cuts=[77, 90]) == choose(make_rule(arrays), states)
 
 
 @given(cuts=st.sets(st.integers(min_value=1, max_value=199), max_size=20))
