@@ -1,4 +1,4 @@
-"""The command `neurosim`: run | serve | fly | view | up | call | scene | bench."""
+"""The command `neurosim`: run | serve | fly | view | up | call | scene | convert | bench."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
+from neurosim_core.convert import command as convert
 from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.signals import handle_signals, leave_at_once
 
@@ -72,7 +73,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view, bench.add_parser):
+    parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
+    for add in (*parsers, convert.add_parser, bench.add_parser):
         add(commands)
     return parser
 

@@ -22,6 +22,7 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
+from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.sensors.rig import Cast
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.simulation import Model, State, load_scene, make_model, make_state, run_model
@@ -176,13 +177,18 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
         raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {flight}` makes one")
     with Flight(recorded) as source:
         header = source.header
-        config = load_config(yaml.safe_load(header.config_yaml))
-        logger = RerunLogger(
-            open_recording(save or made),
-            vehicles={next(iter(config.vehicles)): header.sensors},
-            scene=scene_shapes(load_scene(config.scene)),
-            links=bool(config.links),
-        )
+        settings = yaml.safe_load(header.config_yaml)
+        recording = open_recording(save or made)
+        if "conversion" in settings:  # of a video, which has neither vehicle nor scene
+            logger = RerunLogger(recording, vehicles={"video": header.sensors})
+        else:
+            config = load_config(settings)
+            logger = RerunLogger(
+                recording,
+                vehicles={next(iter(config.vehicles)): header.sensors},
+                scene=scene_shapes(load_scene(config.scene), make_bodies(config.bodies)),
+                links=bool(config.links),
+            )
         with logger:
             logger.log_path(header.path_position)
             for packet in source.packets():
@@ -215,7 +221,7 @@ def _sinks(
             logger = RerunLogger(
                 open_recording(folder / "flight.rrd"),
                 vehicles={next(iter(config.vehicles)): describe_sensors(config.sensors)},
-                scene=scene_shapes(model.scene),
+                scene=scene_shapes(model.scene, model.bodies),
             )
             logger.log_path(path_position)
             sinks.append(stack.enter_context(logger).log)

@@ -1,0 +1,234 @@
+"""The command `neurosim convert`: a video or a folder of pictures to events."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurosim_core.overrides import add_set_option, read_settings
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from neurosim_core.convert.convert import Conversion, ConversionConfig
+    from neurosim_core.convert.frames import Description
+
+_STEEP_SHARE_MAX = 0.2
+_OPTIONS = {
+    "preset": "pixel.preset",
+    "size": "size",
+    "crop": "crop",
+    "fit": "fit",
+    "fps": "fps",
+    "timestamps": "timestamps",
+    "time_unit": "time_unit",
+    "slow_motion": "slow_motion",
+    "transfer": "transfer",
+    "dark_floor": "dark_floor",
+    "seed": "seed",
+}
+"""Options, and the settings that they are."""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `convert` to the commands of `neurosim`."""
+    parser = commands.add_parser(
+        "convert",
+        help="turn a video or a folder of pictures into events",
+        description="Let a simulated event camera look at a video (needs neurosim[video]) or at the pictures "
+        "of a folder, and write its events as `neurosim run` does. Log radiance is taken as linear between "
+        "frames.",
+    )
+    parser.add_argument("source", type=Path, help="video file, or folder of pictures")
+    parser.add_argument("out", type=Path, help="HDF5 file to write")
+    parser.add_argument(
+        "--preset", metavar="NAME", help="pixels of a sensor: davis346, imx636, v2e_noisy, ..."
+    )
+    parser.add_argument(
+        "--size",
+        metavar="WxH",
+        help="resolution of the sensor; `preset`: that of the preset (default: as it is)",
+    )
+    parser.add_argument("--crop", metavar="WxH+X+Y", help="take this part of the picture")
+    parser.add_argument(
+        "--fit", choices=["crop", "stretch"], help="where --size has another shape (default: crop the middle)"
+    )
+    parser.add_argument(
+        "--fps", type=float, metavar="HZ", help="frames a second; needed for folders, else as the video says"
+    )
+    parser.add_argument(
+        "--timestamps", metavar="FILE", help="time of each frame, one a line, instead of --fps"
+    )
+    parser.add_argument(
+        "--time-unit", choices=["s", "ms", "us", "ns"], help="of --timestamps (default: seconds)"
+    )
+    parser.add_argument(
+        "--slow-motion",
+        type=float,
+        metavar="FACTOR",
+        help="how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
+    )
+    parser.add_argument(
+        "--transfer",
+        metavar="NAME",
+        help="how numbers become light: srgb, bt709, linear, pq, ... (default: auto)",
+    )
+    parser.add_argument(
+        "--dark-floor", type=float, metavar="L", help="added before the logarithm; white is 1 (default: auto)"
+    )
+    parser.add_argument("--seed", type=int, help="seed of the noise of the pixels")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
+    parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
+    add_set_option(parser, "any setting by its dotted key, such as pixel.threshold_on=0.15; may be repeated")
+    parser.set_defaults(command=_convert)
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    import threading
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from neurosim_core.convert.convert import convert_video
+    from neurosim_core.signals import stop_at_signals
+
+    config = read_config(arguments)
+    console = Console()
+    stop = threading.Event()
+    columns = [
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=32),
+        TextColumn("{task.fields[count]}"),
+        TimeRemainingColumn(),
+    ]
+    with stop_at_signals(stop), Progress(*columns, console=console) as progress:
+        task = progress.add_task("converting", total=None, count="")
+
+        def on_start(source: Description) -> None:
+            progress.update(task, total=source.frame_count)
+
+        def on_stack(frame_count: int, event_count: int, _end_ns: int) -> None:
+            progress.update(
+                task, completed=frame_count, count=f"{frame_count:,} frames, {event_count:,} events"
+            )
+
+        conversion = convert_video(
+            arguments.source,
+            arguments.out,
+            config,
+            overwrite=arguments.overwrite,
+            device=arguments.device,
+            on_start=on_start,
+            on_stack=on_stack,
+            stopped=stop.is_set,
+        )
+        progress.update(task, total=conversion.frame_count)
+    print_conversion(conversion, arguments.out, console)
+    return 0 if conversion.complete else 130
+
+
+def read_config(arguments: argparse.Namespace) -> ConversionConfig:
+    """Return the settings of a command line.
+
+    Raises:
+        ValueError: One is unknown or out of range; the message has one line for each.
+    """
+    from pydantic import ValidationError
+
+    from neurosim_core.convert.convert import ConversionConfig
+
+    given = {key: getattr(arguments, option) for option, key in _OPTIONS.items()}
+    settings = {key: value for key, value in given.items() if value is not None}
+    try:
+        return ConversionConfig.model_validate(_nested({**settings, **read_settings(arguments.settings)}))
+    except ValidationError as error:
+        lines = (_explain(item) for item in error.errors())
+        raise ValueError("; ".join(lines)) from None
+
+
+def _explain(item: Mapping[str, Any]) -> str:
+    key = ".".join(map(str, item["loc"]))
+    return f"{key}: {item['msg'].removeprefix('Value error, ')}, got {item['input']!r}"
+
+
+def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return {"a": {"b": value}} for the key "a.b"."""
+    nested: dict[str, Any] = {}
+    for key, value in settings.items():
+        *groups, last = key.split(".")
+        group = nested
+        for name in groups:
+            group = group.setdefault(name, {})
+            if not isinstance(group, dict):
+                raise ValueError(f"{key}: {name} is {group!r}, and has no keys")
+        group[last] = value
+    return nested
+
+
+def print_conversion(conversion: Conversion, out: Path, console: Console) -> None:
+    """Print what came of a video, and what to be aware of."""
+    from rich.table import Table
+
+    facts = Table(show_header=False, box=None, pad_edge=False)
+    facts.add_column(style="dim", min_width=10)
+    facts.add_column(overflow="fold")
+    for name, text in _facts(conversion):
+        facts.add_row(name, text)
+    console.print(facts, highlight=False)
+    for note in (*conversion.source.notes, *_warnings(conversion)):
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    if not conversion.complete:
+        console.print("interrupted; what was converted is kept", style="yellow")
+    console.print(f"{out}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _facts(c: Conversion) -> list[tuple[str, str]]:
+    source, duration_s = c.source, 1e-9 * c.duration_ns
+    whole = (c.crop.width, c.crop.height) == (source.width, source.height)
+    part = "" if whole else f", of which {c.crop}"
+    rate_hz = (c.frame_count - 1) / duration_s
+    longest_ms, shortest_ms = 1e-6 * c.interval_max_ns, 1e-6 * c.interval_min_ns
+    even = c.interval_max_ns - c.interval_min_ns <= 1_000_000
+    intervals = f"every {1e3 / rate_hz:.3g} ms" if even else f"every {shortest_ms:.3g} to {longest_ms:.3g} ms"
+    event_rate = c.event_count / duration_s / 1e6
+    on_share = c.on_count / c.event_count if c.event_count else 0.0
+    return [
+        ("source", f"{source.name}: {source.width}x{source.height}{part}; {source.light}"),
+        ("frames", f"{c.frame_count:,} in {duration_s:.3f} s, {intervals}"),
+        ("sensor", f"{c.width}x{c.height}, threshold {c.threshold:g}, dark floor {c.dark_floor:g}"),
+        (
+            "events",
+            f"{c.event_count:,} ({event_rate:.2f} M/s, {on_share:.0%} brighter), {c.dropped_count:,} dropped",
+        ),
+        ("time", f"{c.wall_s:.1f} s: real-time factor {c.real_time_factor:.2f}"),
+        (
+            "steepness",
+            f"{c.moving_share:.1%} of the pixels change by a threshold or more between two frames, "
+            f"{_share(c.steep_share)} of them by four or more; events between frames are interpolated",
+        ),
+    ]
+
+
+def _share(value: float) -> str:
+    return "none" if value != value else f"{value:.0%}"
+
+
+def _warnings(c: Conversion) -> list[str]:
+    notes = []
+    if c.steep_share > _STEEP_SHARE_MAX:
+        notes.append(
+            f"the motion is fast for this frame rate: {c.steep_share:.0%} of the pixels that change do so by "
+            "four thresholds or more from one frame to the next. Times within an interval are those of a "
+            "cross-fade: film faster, or convert a part where less moves."
+        )
+    if c.code_step > c.threshold:
+        notes.append(
+            f"one step of the stored numbers changes log radiance by up to {c.code_step:.2g} in the dark, "
+            f"more than the threshold {c.threshold:g}: noise of one step makes events there. A larger "
+            f"--dark-floor helps, now {c.dark_floor:g}."
+        )
+    if c.dropped_count:
+        notes.append("dropped events were more than the readout or event_count_max lets through")
+    return notes

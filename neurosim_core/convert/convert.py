@@ -1,0 +1,448 @@
+"""Frames of light to events: the pixels of a simulated event camera look at a video.
+
+    frames -> crop, area averages (linear light) -> log(luminance + dark floor) -> EventCamera -> HDF5
+
+Between two frames log radiance is linear in time, as everywhere in Neurosim. So a video must be fast enough:
+what moves by more than about a pixel between two frames makes the events of a cross-fade, not of a motion.
+What the frames themselves say about that is counted (`Conversion.steep_share`). Memory is bounded: frames are
+read a few at a time, one stack ahead of the events.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import warp as wp
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from neurosim_core import __version__
+from neurosim_core.clock import NS_PER_S, NS_PER_US
+from neurosim_core.convert.frames import Description, Frame, Source, open_source, read_stamps
+from neurosim_core.convert.geometry import Crop, Reducer, largest_crop, read_crop, read_size
+from neurosim_core.convert.light import TRANSFERS
+from neurosim_core.packets import Events
+from neurosim_core.record import FlightHeader, FlightWriter, SensorDescription
+from neurosim_core.render.config import RenderConfig
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_presets import PRESETS
+from neurosim_core.sensors.events import EventCamera
+from neurosim_core.settings import Settings
+
+SENSOR = "events"
+"""Name of the camera in the file."""
+STEEP_STEPS = 4.0
+"""A change between two frames is steep if it is at least this many thresholds."""
+
+_STACK_BYTES = 64_000_000
+_STACK_FRAMES_MAX = 32
+_CODE_STEP_MAX = 0.5
+"""Largest change of log radiance by one step of the stored numbers, in thresholds."""
+
+
+class ConversionConfig(Settings):
+    """How a video becomes events."""
+
+    pixel: EventCameraConfig = EventCameraConfig()
+    """The law of the pixels."""
+    size: str | None = None
+    """Width and height of the sensor, such as 346x260: pictures are averaged to it, in linear light.
+    "preset": those of the sensor that `pixel.preset` names. null: those of the video."""
+    crop: str | None = None
+    """Part of the picture that is taken, WIDTHxHEIGHT+X+Y in pixels; null: all of it."""
+    fit: Literal["crop", "stretch"] = "crop"
+    """Where `size` has another shape than the picture: take the middle of the picture, or distort it."""
+    fps: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
+    """Frames a second [Hz]; null: the times that are in the video."""
+    timestamps: str | None = None
+    """File with the time of each frame, one a line."""
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    """What the numbers in `timestamps` are in."""
+    slow_motion: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
+    """How much slower than the world the video runs: all times are divided by it. A video filmed at 240 Hz
+    that plays at 30 Hz has 8; one sped up has less than 1."""
+    transfer: str = "auto"
+    """How numbers become light: srgb, bt709, linear, gamma22, gamma28, smpte240m, log100, log316, pq, hlg; or
+    auto: as the file says, else sRGB."""
+    dark_floor: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    """Luminance that is added before the logarithm, white is 1. null: 0.001, as rendered scenes have, or as
+    much more as it takes for one step of the stored numbers to be at most half a threshold."""
+    seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 0
+    """Seed of the noise of the pixels."""
+
+    @field_validator("transfer")
+    @classmethod
+    def _transfer_is_known(cls, name: str) -> str:
+        if name not in ("auto", *TRANSFERS):
+            raise ValueError(f"transfer must be one of auto, {', '.join(TRANSFERS)}")
+        return name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conversion:
+    """What came of a video."""
+
+    source: Description
+    width: int
+    """Of the sensor [px]."""
+    height: int
+    """Of the sensor [px]."""
+    crop: Crop
+    """What was taken of the pictures."""
+    dark_floor: float
+    code_step: float
+    """Largest change of log radiance by one step of the stored numbers."""
+    threshold: float
+    """The smaller of the two thresholds, in log radiance."""
+    frame_count: int
+    duration_ns: int
+    """From the first frame to the last."""
+    interval_min_ns: int
+    """Shortest time between two frames."""
+    interval_max_ns: int
+    """Longest time between two frames."""
+    event_count: int
+    on_count: int
+    """Events of polarity 1."""
+    dropped_count: int
+    moving_share: float
+    """Share of pixels whose log radiance changes by a threshold or more from one frame to the next."""
+    steep_share: float
+    """Share of these that change by `STEEP_STEPS` thresholds or more; nan if there are none."""
+    wall_s: float
+    """Time that it took [s]."""
+    complete: bool
+    """Whether it came to the end of the video."""
+
+    @property
+    def real_time_factor(self) -> float:
+        """Time of the video over time that it took."""
+        return self.duration_ns / NS_PER_S / self.wall_s
+
+
+class _Stack(NamedTuple):
+    log_radiance: NDArray[np.float32]
+    """Shape [K, H, W]."""
+    stamps_ns: NDArray[np.int64]
+    """From the first frame, shape [K]."""
+    moving_count: int
+    steep_count: int
+    """Pixels that changed since the frame before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """What is decided before the first frame."""
+
+    crop: Crop
+    width: int
+    height: int
+    dark_floor: float
+    code_step: float
+    threshold: float
+    slow_motion: Fraction
+    stack_length: int
+
+
+def convert_video(
+    path: str | Path,
+    out: str | Path,
+    config: ConversionConfig | None = None,
+    *,
+    overwrite: bool = False,
+    device: str = "auto",
+    stack_length: int | None = None,
+    on_start: Callable[[Description], None] | None = None,
+    on_stack: Callable[[int, int, int], None] | None = None,
+    stopped: Callable[[], bool] | None = None,
+) -> Conversion:
+    """Write the events of a video or a folder of pictures as the HDF5 file that `neurosim run` writes.
+
+    Times count from the first frame. There is one packet of events for each interval between two frames.
+    What was converted stays in the file if there is an error or `stopped` says so, marked as not complete.
+
+    Args:
+        path: A video of any kind that FFmpeg reads, or a folder of pictures.
+        out: The file to write.
+        config: How; None: the defaults.
+        overwrite: Replace a file that is there.
+        device: Where the pixels are; auto: a GPU if there is one.
+        stack_length: Frames that are in memory at a time; None: as many as take 64 MB, at most 32. The
+            events do not depend on it.
+        on_start: Told about the source, once it is open.
+        on_stack: Told how many frames and events there are so far, and the time of the last frame [ns].
+        stopped: Asked after each stack whether to end here.
+
+    Raises:
+        FileNotFoundError: There is no such video or folder.
+        FileExistsError: `out` is there, and may not be replaced.
+        ValueError: A frame cannot be read or has another size, there is only one, or their times do not
+            increase by 1 us at least; the crop or the size does not fit.
+        ImportError: PyAV or h5py is not installed.
+    """
+    config = config or ConversionConfig()
+    out = Path(out)
+    if out.exists() and (not overwrite or out.is_dir()):
+        raise FileExistsError(f"{out} is already there: add --overwrite, or name another file")
+    begin = time.perf_counter()
+    source = _open(Path(path), config)
+    plan = _make_plan(source, config, stack_length)
+    if on_start is not None:
+        on_start(source.description)
+    camera = EventCamera(
+        config.pixel,
+        width=plan.width,
+        height=plan.height,
+        device=("cuda:0" if wp.get_cuda_device_count() else "cpu") if device == "auto" else device,
+        sensor=SENSOR,
+        seed=config.seed,
+        on_host=True,
+    )
+    stacks = _ahead(_stacks(source, plan))
+    first = next(stacks)
+    tally = _Tally(plan.width, plan.height)
+    writer = FlightWriter(out, _header(source.description, config, plan, first))
+    complete = False
+    try:
+        for stack in itertools.chain([first], stacks):
+            packets = _see(camera, stack)
+            for events in packets:
+                writer.write(events)
+            tally.add(stack, packets)
+            if on_stack is not None:
+                on_stack(tally.frame_count, tally.event_count, tally.end_ns)
+            if stopped is not None and stopped():
+                break
+        else:
+            complete = True
+    finally:
+        stacks.close()
+        writer.close(complete=complete)
+    return tally.conversion(source.description, plan, time.perf_counter() - begin, complete)
+
+
+def _open(path: Path, config: ConversionConfig) -> Source:
+    stamps_ns = None
+    if config.timestamps is not None:
+        stamps_ns = read_stamps(Path(config.timestamps), unit=config.time_unit)
+    return open_source(path, fps=config.fps, stamps_ns=stamps_ns, transfer=config.transfer)
+
+
+def _make_plan(source: Source, config: ConversionConfig, stack_length: int | None) -> _Plan:
+    known = source.description
+    crop = Crop(known.width, known.height) if config.crop is None else read_crop(config.crop)
+    size = _wanted_size(config, crop)
+    if config.fit == "crop":
+        crop = largest_crop(crop, size)
+    threshold = _threshold(config.pixel)
+    floor = config.dark_floor
+    if floor is None:
+        floor = find_floor(known.codes, _CODE_STEP_MAX * threshold, least=RenderConfig().dark_floor)
+    length = max(1, min(_STACK_FRAMES_MAX, _STACK_BYTES // (4 * size[0] * size[1])))
+    return _Plan(
+        crop=crop,
+        width=size[0],
+        height=size[1],
+        dark_floor=floor,
+        code_step=code_step(known.codes, floor),
+        threshold=threshold,
+        slow_motion=Fraction(str(config.slow_motion)),
+        stack_length=length if stack_length is None else max(1, stack_length),
+    )
+
+
+def _wanted_size(config: ConversionConfig, crop: Crop) -> tuple[int, int]:
+    if config.size is None:
+        return crop.width, crop.height
+    if config.size != "preset":
+        return read_size(config.size)
+    if config.pixel.preset is None:
+        raise ValueError("size preset needs a preset: --preset davis346, or another")
+    sensor = PRESETS[config.pixel.preset]
+    return sensor.width, sensor.height
+
+
+def _threshold(pixel: EventCameraConfig) -> float:
+    """Return the smaller of the two thresholds, in log radiance."""
+    if pixel.stochastic is not None:
+        return 1.0 / pixel.stochastic.k1
+    return min(pixel.threshold_on, pixel.threshold_off)
+
+
+def code_step(codes: NDArray[np.float64], floor: float) -> float:
+    """Return the largest change of log(luminance + floor) by one step of the stored numbers.
+
+    Args:
+        codes: Luminance of all numbers in their order, none if light is stored itself.
+        floor: Dark floor.
+    """
+    return float(np.diff(np.log(codes + floor)).max()) if len(codes) > 1 else 0.0
+
+
+def find_floor(codes: NDArray[np.float64], step_max: float, *, least: float) -> float:
+    """Return the smallest dark floor, at least `least`, with which `code_step` is at most `step_max`.
+
+    It is rounded up to two digits; 1 if that is not enough.
+    """
+    low, high = least, 1.0
+    if code_step(codes, low) <= step_max:
+        return low
+    while high / low > 1.001:
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if code_step(codes, middle) <= step_max else (middle, high)
+    digit = 10.0 ** np.floor(np.log10(high) - 1.0)
+    return float(min(1.0, round(np.ceil(high / digit) * digit, 12)))
+
+
+def _ahead(stacks: Iterator[_Stack]) -> Generator[_Stack, None, None]:
+    """Yield what an iterator yields, while a thread already works on the next."""
+    with ThreadPoolExecutor(1, thread_name_prefix="frames") as pool:
+        coming = pool.submit(next, stacks, None)
+        while (stack := coming.result()) is not None:
+            coming = pool.submit(next, stacks, None)
+            yield stack
+
+
+def _stacks(source: Source, plan: _Plan) -> Iterator[_Stack]:
+    """Yield the frames of a source as stacks of log radiance; the first has two frames at least."""
+    known = source.description
+    reducer = Reducer((known.width, known.height), plan.crop, (plan.width, plan.height))
+    frames = _in_order(source, plan.slow_motion)
+    before: NDArray[np.float32] | None = None
+    while rows := list(
+        itertools.islice(frames, max(plan.stack_length, 2) if before is None else plan.stack_length)
+    ):
+        if before is None and len(rows) == 1:
+            raise ValueError(f"{known.name} has one frame only; events need two or more")
+        log = np.empty((len(rows), plan.height, plan.width), dtype=np.float32)
+        moving = steep = 0
+        for row, frame in zip(log, rows, strict=True):
+            np.log(reducer.reduce(frame.luminance) + np.float32(plan.dark_floor), out=row)
+            if before is not None:
+                change = np.abs(row - before)
+                moving += int(np.count_nonzero(change >= plan.threshold))
+                steep += int(np.count_nonzero(change >= STEEP_STEPS * plan.threshold))
+            before = row
+        yield _Stack(log, np.array([frame.stamp_ns for frame in rows], dtype=np.int64), moving, steep)
+
+
+def _in_order(source: Source, slow_motion: Fraction) -> Iterator[Frame]:
+    """Yield frames with times in the world from the first, and see that these increase."""
+    origin_ns = last_ns = 0
+    for number, frame in enumerate(source.frames()):
+        if number == 0:
+            origin_ns = frame.stamp_ns
+        stamp_ns = round((frame.stamp_ns - origin_ns) / slow_motion)
+        if number > 0 and stamp_ns - last_ns < NS_PER_US:
+            here_s, before_s = stamp_ns / NS_PER_S, last_ns / NS_PER_S
+            raise ValueError(
+                f"times must increase by at least 1 us from frame to frame: frame {number} of"
+                f" {source.description.name} is at {here_s:.9g} s, after {before_s:.9g} s;"
+                " --fps gives other times"
+            )
+        last_ns = stamp_ns
+        yield Frame(stamp_ns, frame.luminance)
+
+
+def _see(camera: EventCamera, stack: _Stack) -> list[Events]:
+    """Return the events of a stack, a packet for each interval between two frames."""
+    log, ends = stack.log_radiance, [int(stamp) for stamp in stack.stamps_ns]
+    if ends[0] == 0:
+        camera.reset(log[0], 0)
+        log, ends = log[1:], ends[1:]
+    camera.feed_device(wp.array(log, dtype=wp.float32, device=camera.device, copy=False), ends)
+    return camera.collect_windows(ends)
+
+
+class _Tally:
+    """Counts what goes by."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._pixel_count = width * height
+        self._moving_count = 0
+        self._steep_count = 0
+        self._intervals_ns = (1 << 62, 0)
+        self.frame_count = 0
+        self.end_ns = 0
+        self.event_count = 0
+        self.on_count = 0
+        self.dropped_count = 0
+
+    def add(self, stack: _Stack, packets: list[Events]) -> None:
+        stamps = stack.stamps_ns if self.frame_count == 0 else np.append(self.end_ns, stack.stamps_ns)
+        intervals = np.diff(stamps)
+        low, high = self._intervals_ns
+        self._intervals_ns = min(low, int(intervals.min())), max(high, int(intervals.max()))
+        self.frame_count += len(stack.stamps_ns)
+        self.end_ns = int(stamps[-1])
+        self._moving_count += stack.moving_count
+        self._steep_count += stack.steep_count
+        for events in packets:
+            self.event_count += len(events)
+            self.on_count += int(np.count_nonzero(events.numpy().polarity))
+            self.dropped_count += events.dropped_count
+
+    def conversion(self, source: Description, plan: _Plan, wall_s: float, complete: bool) -> Conversion:
+        moving = self._moving_count
+        return Conversion(
+            source=source,
+            width=plan.width,
+            height=plan.height,
+            crop=plan.crop,
+            dark_floor=plan.dark_floor,
+            code_step=plan.code_step,
+            threshold=plan.threshold,
+            frame_count=self.frame_count,
+            duration_ns=self.end_ns,
+            interval_min_ns=self._intervals_ns[0],
+            interval_max_ns=self._intervals_ns[1],
+            event_count=self.event_count,
+            on_count=self.on_count,
+            dropped_count=self.dropped_count,
+            moving_share=moving / (self._pixel_count * (self.frame_count - 1)),
+            steep_share=self._steep_count / moving if moving else float("nan"),
+            wall_s=wall_s,
+            complete=complete,
+        )
+
+
+def _header(source: Description, config: ConversionConfig, plan: _Plan, first: _Stack) -> FlightHeader:
+    """Return what goes with the events: what was converted, and how."""
+    seen = {
+        "source": source.name,
+        "light": source.light,
+        "width": source.width,
+        "height": source.height,
+        "crop": str(plan.crop),
+        "dark_floor": plan.dark_floor,
+    }
+    settings = {"kind": "event_camera", "pixel": config.pixel.model_dump(mode="json")}
+    rate_hz = (len(first.stamps_ns) - 1) * NS_PER_S / int(first.stamps_ns[-1])
+    return FlightHeader(
+        config_yaml=yaml.safe_dump(
+            {"conversion": {**seen, **config.model_dump(mode="json")}}, sort_keys=False
+        ),
+        seed=config.seed,
+        version=__version__,
+        scene=source.name,
+        sensors=(
+            SensorDescription(
+                name=SENSOR,
+                kind="event_camera",
+                rate_hz=rate_hz,
+                position=np.zeros(3),
+                orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+                settings=json.dumps(settings),
+            ),
+        ),
+    )

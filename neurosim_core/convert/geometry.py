@@ -1,0 +1,110 @@
+"""Which part of a picture is taken, and how it is made smaller: averages of light over areas."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+_SIZE = re.compile(r"(\d+)x(\d+)")
+_CROP = re.compile(r"(\d+)x(\d+)\+(\d+)\+(\d+)")
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A rectangle of a picture."""
+
+    width: int
+    """[px]."""
+    height: int
+    """[px]."""
+    x: int = 0
+    """First column [px]."""
+    y: int = 0
+    """First row [px]."""
+
+    def __str__(self) -> str:
+        """Return it as `WxH+X+Y`."""
+        return f"{self.width}x{self.height}+{self.x}+{self.y}"
+
+
+def read_size(text: str) -> tuple[int, int]:
+    """Return width and height of a text such as 346x260 [px].
+
+    Raises:
+        ValueError: It is not of this form, or a number is 0.
+    """
+    match = _SIZE.fullmatch(text)
+    if match is None or "0" in match.groups():
+        raise ValueError(f"size must be WIDTHxHEIGHT in pixels, such as 346x260, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def read_crop(text: str) -> Crop:
+    """Return the rectangle of a text such as 640x480+10+0: width, height, first column, first row [px].
+
+    Raises:
+        ValueError: It is not of this form, or a width or height is 0.
+    """
+    match = _CROP.fullmatch(text)
+    if match is None or "0" in match.groups()[:2]:
+        raise ValueError(f"crop must be WIDTHxHEIGHT+X+Y in pixels, such as 640x480+10+0, got {text!r}")
+    return Crop(*map(int, match.groups()))
+
+
+def largest_crop(crop: Crop, size: tuple[int, int]) -> Crop:
+    """Return the largest rectangle in the middle of `crop` that has the shape of `size`, to the pixel."""
+    width = min(crop.width, max(size[0], round(crop.height * size[0] / size[1])))
+    height = min(crop.height, max(size[1], round(crop.width * size[1] / size[0])))
+    return Crop(width, height, crop.x + (crop.width - width) // 2, crop.y + (crop.height - height) // 2)
+
+
+class Reducer:
+    """Takes a rectangle of a picture and averages it over the areas of larger pixels, exactly.
+
+    A source pixel that lies in two pixels counts in each by the share of its area, so the mean is kept.
+
+    Args:
+        source: Width and height of the pictures [px].
+        crop: What of them is taken.
+        size: Width and height of the result [px].
+
+    Raises:
+        ValueError: The rectangle is not inside the picture, or the result would be larger than it.
+    """
+
+    def __init__(self, source: tuple[int, int], crop: Crop, size: tuple[int, int]) -> None:
+        if crop.x + crop.width > source[0] or crop.y + crop.height > source[1]:
+            raise ValueError(f"crop must lie inside the {source[0]}x{source[1]} pixels there are, got {crop}")
+        if size[0] > crop.width or size[1] > crop.height:
+            raise ValueError(
+                f"size must be at most the {crop.width}x{crop.height} pixels there are (pictures are made"
+                f" smaller, never larger), got {size[0]}x{size[1]}"
+            )
+        self._span = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
+        self._rows = _averages(crop.height, size[1])
+        self._columns = _averages(crop.width, size[0])
+
+    def reduce(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the averages, shape [height, width], of a picture of light."""
+        part = picture[self._span]
+        if self._rows is not None:
+            part = self._rows @ part
+        if self._columns is not None:
+            part = (self._columns @ part.T).T
+        return np.ascontiguousarray(part)
+
+
+def _averages(count: int, wanted: int) -> sparse.csr_array | None:
+    """Return the matrix that averages `count` numbers to `wanted`; None: they are as many already."""
+    if wanted == count:
+        return None
+    edges = np.arange(wanted + 1) * (count / wanted)
+    cells = np.arange(count + 1)
+    low = np.maximum(edges[:-1, None], cells[None, :-1])
+    high = np.minimum(edges[1:, None], cells[None, 1:])
+    share = np.maximum(high - low, 0.0)
+    return sparse.csr_array((share / share.sum(axis=1, keepdims=True)).astype(np.float32))
