@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from neurosim_core.config import SimulationConfig
+from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.simulation import load_scene
 from neurosim_core.view.rerun_shapes import SceneShapes, scene_shapes
 
@@ -34,9 +35,9 @@ class SceneLoader:
     def load(self, config: SimulationConfig) -> None:
         """Begin to load a scene, unless it is the one that is there."""
         with self._lock:
-            if config.scene == self._settings:
+            if _what(config) == self._settings:
                 return
-            self._settings, self._shapes = config.scene, None
+            self._settings, self._shapes = _what(config), None
         thread = threading.Thread(target=self._load, args=(config,), name="load scene", daemon=True)
         self._threads = [other for other in self._threads if other.is_alive()] + [thread]
         thread.start()
@@ -48,10 +49,14 @@ class SceneLoader:
 
     def _load(self, config: SimulationConfig) -> None:
         try:
-            shapes = scene_shapes(load_scene(config.scene))
+            shapes = scene_shapes(load_scene(config.scene), make_bodies(config.bodies))
         except (ValueError, OSError) as error:
             self._say(f"warning: shown without the scene: {error}")
             return
         with self._lock:
-            if config.scene == self._settings:
+            if _what(config) == self._settings:
                 self._shapes = shapes
+
+
+def _what(config: SimulationConfig) -> tuple[Any, Any]:
+    return config.scene, config.bodies

@@ -4,6 +4,7 @@ Rerun gets what eyes need: pictures as JPEG, depth in whole millimetres, events 
 Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. Entities:
 
     world/scene/{room,ceiling}/<n>          the scene, one mesh per material; the ceiling is hidden
+    world/bodies/<body>                     where it is, whenever the first vehicle says where that one is
     world/vehicles/<vehicle>                its pose; below it one entity per camera, with frustum and picture
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
@@ -28,10 +29,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record.header import SensorDescription
+from neurosim_core.scene.bodies import BodyConfig, body_poses
 from neurosim_core.view.event_picture import EventWindow
 from neurosim_core.view.rerun_layout import make_blueprint
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
-from neurosim_core.view.rerun_shapes import SceneShapes, encode_events, encode_image, event_colors
+from neurosim_core.view.rerun_shapes import (
+    SceneShapes,
+    body_entity,
+    encode_events,
+    encode_image,
+    event_colors,
+)
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -126,6 +134,7 @@ class RerunLogger:
         self._tables: dict[str, _Table] = {}
         self._trail_end: dict[str, NDArray[np.float64]] = {}
         self._pose_of: dict[str, str] = {}
+        self._bodies: Mapping[str, BodyConfig] = {}
         self._log_of: dict[type[Packet], Callable[[str, Any], None]] = {
             Events: self._log_events,
             Image: self._log_image,
@@ -261,8 +270,10 @@ class RerunLogger:
         self.close()
 
     def _log_meshes(self, scene: SceneShapes | None) -> None:
-        for entity, mesh in () if scene is None else scene.meshes:
-            self._recording.log(entity, mesh, static=True)
+        if scene is not None:
+            self._bodies = scene.bodies
+            for entity, mesh in scene.meshes:
+                self._recording.log(entity, mesh, static=True)
 
     def _send_blueprint(self, scene: SceneShapes | None) -> None:
         bounds_m = None if scene is None else scene.bounds_m
@@ -343,11 +354,21 @@ class RerunLogger:
         times = rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
         columns = rr.Transform3D.columns(translation=translation, quaternion=quaternion)
         self._recording.send_columns(entity, indexes=[times], columns=columns)
+        if vehicle == self._first:
+            self._send_bodies(stamp_ns)
         stroke = np.concatenate([self._trail_end.get(vehicle, translation[:1]), translation])
         self._trail_end[vehicle] = translation[-1:]
         self._set_time(int(stamp_ns[-1]))
         line = rr.LineStrips3D([stroke], colors=[self._color(vehicle)], radii=rr.Radius.ui_points(3.0))
         self._recording.log(f"world/trails/{vehicle}", line)
+
+    def _send_bodies(self, stamp_ns: NDArray[np.int64]) -> None:
+        rr = self._rr
+        times = rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
+        position, orientation = body_poses(self._bodies, stamp_ns)
+        for index, name in enumerate(self._bodies):
+            columns = rr.Transform3D.columns(translation=position[:, index], quaternion=orientation[:, index])
+            self._recording.send_columns(body_entity(name), indexes=[times], columns=columns)
 
     def _color(self, vehicle: str) -> tuple[int, int, int]:
         return self._colors.get(vehicle, _VEHICLE_COLORS[0])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from neurosim_core.packets import EventArrays, Image
+from neurosim_core.scene.bodies import Body, BodyConfig
+from neurosim_core.scene.body_shapes import Solid
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.source import linear_to_srgb8
 from neurosim_core.view.event_picture import PALETTE, event_classes
@@ -86,35 +89,52 @@ class SceneShapes:
     """One mesh for each material, with its entity path."""
     bounds_m: NDArray[np.float64]
     """Lowest and highest corner of all vertices [m], shape [2, 3]."""
+    bodies: dict[str, BodyConfig] = field(default_factory=dict)
+    """What moves, by name: its meshes are below `world/bodies/<name>`."""
 
 
-def scene_shapes(scene: Scene) -> SceneShapes:
-    """Return the shapes of a scene: one mesh per material.
+def scene_shapes(scene: Scene, bodies: Sequence[Body] = ()) -> SceneShapes:
+    """Return the shapes of a scene and of the bodies in it: one mesh per material.
 
     Faces that lie wholly in the highest 15 % go below `world/scene/ceiling`, so that they can be hidden.
     Textures are reduced to 256 pixels.
     """
-    rr = import_rerun()
     low_m, high_m = scene.bounds_m[:, 2]
     top = scene.vertices[scene.faces, 2].min(axis=1) > low_m + 0.85 * (high_m - low_m)
     meshes = []
     for part, chosen in (("room", ~top), ("ceiling", top)):
         for index, material in enumerate(scene.materials):
             faces = scene.faces[chosen & (scene.face_material == index)]
-            if not len(faces):
-                continue
-            used, triangles = np.unique(faces, return_inverse=True)
-            texture = _texture(material)
-            mesh = rr.Mesh3D(
-                vertex_positions=scene.vertices[used],
-                vertex_normals=scene.normals[used],
-                triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
-                vertex_texcoords=None if texture is None else _image_coordinates(scene.uv[used]),
-                albedo_texture=texture,
-                albedo_factor=[*linear_to_srgb8(_albedo(material)), 255],
-            )
-            meshes.append((f"world/scene/{part}/{index}", mesh))
-    return SceneShapes(meshes=tuple(meshes), bounds_m=np.array(scene.bounds_m, dtype=np.float64))
+            if len(faces):
+                meshes.append((f"world/scene/{part}/{index}", _mesh(scene, faces, material)))
+    for body in bodies:
+        for index, material in enumerate(body.solid.materials):
+            faces = body.solid.faces[body.solid.face_material == index]
+            if len(faces):
+                meshes.append((f"{body_entity(body.name)}/{index}", _mesh(body.solid, faces, material)))
+    return SceneShapes(
+        meshes=tuple(meshes),
+        bounds_m=np.array(scene.bounds_m, dtype=np.float64),
+        bodies={body.name: body.config for body in bodies},
+    )
+
+
+def body_entity(name: str) -> str:
+    """Return the entity of a body's frame."""
+    return f"world/bodies/{name}"
+
+
+def _mesh(source: Scene | Solid, faces: NDArray[np.int32], material: Material) -> Any:
+    used, triangles = np.unique(faces, return_inverse=True)
+    texture = _texture(material)
+    return import_rerun().Mesh3D(
+        vertex_positions=source.vertices[used],
+        vertex_normals=source.normals[used],
+        triangle_indices=triangles.reshape(-1, 3).astype(np.uint32),
+        vertex_texcoords=None if texture is None else _image_coordinates(source.uv[used]),
+        albedo_texture=texture,
+        albedo_factor=[*linear_to_srgb8(_albedo(material)), 255],
+    )
 
 
 def _albedo(material: Material) -> NDArray[np.float64]:

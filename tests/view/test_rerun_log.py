@@ -20,6 +20,8 @@ from test_plan import make_scene
 
 from neurosim_core.packets import Collision, Delivery, EventArrays, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record import Intrinsics, SensorDescription
+from neurosim_core.scene.bodies import BodyConfig, MotionConfig, make_bodies
+from neurosim_core.scene.body_shapes import CheckerSurface, SphereShape
 from neurosim_core.scene.scene import Material, Texture
 from neurosim_core.view.event_picture import event_picture
 from neurosim_core.view.rerun_log import RerunLogger
@@ -336,6 +338,27 @@ def test_scene_is_split_by_material_and_ceiling():
     assert room.vertex_texcoords.as_arrow_array().to_pylist() == [[0.25, 0.25]] * 8
     assert room.albedo_texture_format.as_arrow_array().to_pylist()[0]["width"] == 256
     assert room.albedo_factor.as_arrow_array().to_pylist() == [0xFF0000FF]
+
+
+def test_bodies_move_with_the_stamps_of_the_first_vehicle(tmp_path):
+    """A mesh once, in the frame of the body; a pose at each stamp of odometry, its function of time."""
+    motion = MotionConfig(
+        position_m=(1.0, 2.0, 3.0), velocity_m_s=(0.5, 0.0, 0.0), spin_rad_s=(0.0, 0.0, 2.0)
+    )
+    ball = BodyConfig(shape=SphereShape(radius_m=0.5), surface=CheckerSurface(), motion=motion)
+    shapes = scene_shapes(make_scene(trimesh.creation.box((4, 4, 4))), make_bodies({"ball": ball}))
+    rows = record(tmp_path / "f.rrd", [make_odometry(k) for k in range(50)], scene=shapes)
+    mesh = [values for t, values in rows["/world/bodies/ball/0"] if t is None]
+    assert len(mesh) == 1
+    assert np.linalg.norm(mesh[0]["vertex_positions"], axis=1) == pytest.approx(0.5, rel=1e-6)
+    assert "albedo_texture_buffer" in mesh[0]
+    poses = rows["/world/bodies/ball"]
+    assert [t for t, _ in poses] == [k * 5 * MS + 1 for k in range(50)]
+    for t, values in poses:
+        assert values["translation"][0] == pytest.approx([1.0 + 0.5e-9 * t, 2.0, 3.0], rel=1e-6)  # float32
+        assert values["quaternion"][0] == pytest.approx(
+            [0.0, 0.0, np.sin(1e-9 * t), np.cos(1e-9 * t)], abs=1e-6
+        )
 
 
 def test_memory_is_bounded(tmp_path):
