@@ -40,7 +40,9 @@ class VehicleConfig(Settings):
     preset: str = "hummingbird"
     """Name of the airframe: crazyflie, hummingbird or racer."""
     parameters: dict[str, Any] = Field(default_factory=dict)
-    """Parameters of the airframe to change, by name (see `MultirotorConfig`), such as {mass_kg: 0.6}."""
+    """Parameters to change, by name (see `MultirotorConfig`), of the airframe, such as {mass_kg: 0.6}, and of
+    what it flies in: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5}],
+    turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}."""
     max_step_s: Annotated[float, Field(gt=0.0, le=0.1)] = 0.001
     """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
     integrator: Integrator = "rkmk4"
@@ -57,9 +59,8 @@ class VehicleConfig(Settings):
         try:
             self.airframe()
         except ValidationError as error:
-            known = ", ".join(MultirotorConfig.model_fields)
             reasons = [
-                f"unknown parameter, known: {known}"
+                f"unknown parameter, known: {_known_beside(item['loc'])}"
                 if item["type"] == "extra_forbidden"
                 else f"{item['msg'].removeprefix('Value error, ')}, got {_shorten(item['input'])}"
                 for item in error.errors()
@@ -129,7 +130,7 @@ class SimulationConfig(Settings):
     duration_s: Annotated[float, Field(gt=0.0, le=1e6)] = 4.0
     """Simulated time [s]. Both ends are sampled: 4 s at 20 Hz give 81 pictures."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of all sensor noise."""
+    """Seed of all sensor noise, and of turbulence."""
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
     """Where to compute: auto (the first CUDA device, else the CPU), cpu, cuda:0, ..."""
     instants_per_launch: Annotated[int, Field(ge=1, le=1024)] = 16
@@ -397,6 +398,12 @@ def _model_at(
         keys.append(str(part))
     members = list(_models_in(annotation))
     return (members[0] if len(members) == 1 else None), keys
+
+
+def _known_beside(loc: tuple[int | str, ...]) -> str:
+    """Return the parameters that a vehicle has where an unknown one was found."""
+    model, _ = _model_at(MultirotorConfig, loc[:-1])
+    return ", ".join(model.model_fields) if model is not None else "none"
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

@@ -350,7 +350,7 @@ def make_state(
             launch returns when it has finished. It changes no packet.
         flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
         borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`.
-        seed: Seed of the sensor noise; None: as configured.
+        seed: Seed of the sensor noise and of turbulence; None: as configured.
         start: Where the vehicle starts; None: as configured.
 
     Raises:
@@ -365,6 +365,7 @@ def make_state(
         device=device,
         max_step_ns=to_ns(config.vehicle.max_step_s),
         integrator=config.vehicle.integrator,
+        seed=config.seed if seed is None else seed,
     )
     begin = model.path.evaluate([0])
     half_yaw = 0.5 * begin.yaw[0]

@@ -46,8 +46,8 @@ def allocation_matrix(vehicle: MultirotorConfig) -> NDArray[np.float64]:
     wrench = quadratic_weights(
         np.array(vehicle.rotor_position_m),
         np.array(vehicle.rotor_direction, dtype=np.float64),
-        thrust=vehicle.thrust_coefficient_n_s2,
-        torque=vehicle.torque_coefficient_n_m_s2,
+        thrust=vehicle.thrust_coefficients_n_s2,
+        torque=vehicle.torque_coefficients_n_m_s2,
     ).T
     scale = np.abs(wrench).max(
         axis=1, keepdims=True

@@ -123,9 +123,7 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
-    thrust = (
-        len(airframe.rotor_position_m) * airframe.thrust_coefficient_n_s2 * airframe.rotor_speed_max_rad_s**2
-    )
+    thrust = airframe.thrust_coefficients_n_s2.sum() * airframe.rotor_speed_max_rad_s**2
     weight = airframe.mass_kg * airframe.gravity_m_s2
     if limits.thrust_to_weight_max * weight > thrust:
         raise PlanningError(

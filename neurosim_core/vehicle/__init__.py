@@ -1,5 +1,6 @@
 """Multirotor dynamics: `Multirotor(preset("hummingbird"))` is a vehicle to fly."""
 
+from neurosim_core.vehicle.ground import GroundConfig
 from neurosim_core.vehicle.multirotor import (
     TERMS,
     Acceleration,
@@ -12,16 +13,20 @@ from neurosim_core.vehicle.multirotor import (
     MultirotorState,
 )
 from neurosim_core.vehicle.presets import preset
+from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig
 
 __all__ = [
     "TERMS",
     "Acceleration",
     "DynamicsError",
     "Effort",
+    "GroundConfig",
+    "GustConfig",
     "Integrator",
     "Multirotor",
     "MultirotorArrays",
     "MultirotorConfig",
     "MultirotorState",
+    "TurbulenceConfig",
     "preset",
 ]

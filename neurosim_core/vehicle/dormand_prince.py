@@ -16,10 +16,13 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.frames import quaternion_exp
-from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
+from neurosim_core.vehicle.aerodynamics import Airframe
 from neurosim_core.vehicle.chart import chart_rate
 from neurosim_core.vehicle.equations import Equations
+from neurosim_core.vehicle.rotors import RotorSums
 from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_OK, STATUS_VELOCITY
+from neurosim_core.vehicle.surroundings import Surroundings
+from neurosim_core.vehicle.wind import time_to_tick
 
 _PROPORTIONAL = wp.constant(wp.float64(0.2 - 0.75 * 0.04))
 _INTEGRAL = wp.constant(wp.float64(0.04))
@@ -30,18 +33,6 @@ _STEP_MIN = wp.constant(wp.float64(1e-14))  # as a share of the duration
 _ROTATION_MAX_RAD = wp.constant(wp.float64(2.0))  # in one step; the chart ends at 2 pi
 
 _vec12d = wp.types.vector(length=12, dtype=wp.float64)
-
-
-@wp.struct
-class RotorSums:
-    """Sums over the rotors as functions of time: constant, decaying, and decaying twice as fast."""
-
-    quadratic_cc: wp.vec4d  # of `aerodynamics.quadratic_weights` times Omega^2 = c^2 + 2 c d + d^2
-    quadratic_cd: wp.vec4d
-    quadratic_dd: wp.vec4d
-    linear_c: vec10d  # of `aerodynamics.linear_weights` times Omega = c + d
-    linear_d: vec10d
-    lag_rate: wp.float64  # 1 / time constant [1/s]
 
 
 @wp.func
@@ -85,47 +76,63 @@ def _scaled_error(
     return wp.length(_part(error, first)) / (atol + rtol * size)
 
 
-def make_dormand_prince(terms: frozenset[str], equations: Equations, *, air_terms: bool, wind: bool) -> Any:
+def make_dormand_prince(equations: Equations) -> Any:
     """Return the device function that moves one vehicle by a duration.
 
-    Its arguments: the airframe; the sums over the rotors; duration and first trial step [s]; relative and
-    absolute tolerance, the latter in [m, m/s, rad, rad/s]; the most evaluations of the right-hand side;
-    position [m] and velocity [m/s] in W, attitude, body rate [rad/s].
-    It returns the last four, the number of evaluations, and why it failed or STATUS_OK.
+    Its arguments: the airframe; what surrounds it; the sums over the rotors; index of the vehicle and time at
+    the beginning [ns]; duration and first trial step [s]; relative and absolute tolerance, the latter in [m,
+    m/s, rad, rad/s]; the most evaluations of the right-hand side; position [m] and velocity [m/s] in W,
+    attitude, body rate [rad/s]. It returns the last four, the number of evaluations, and why it failed or
+    STATUS_OK.
     """
-    motor_lag = "motor_lag" in terms
-    rates = equations.rates
+    air_terms, wind, changing_wind = equations.air_terms, equations.wind, equations.changing_wind
+    turbulence = equations.turbulence and air_terms
+    near_ground = equations.ground or equations.ground_effect
+    rates, lift, wind_at, sums_at = equations.rates, equations.lift, equations.wind_at, equations.rotors.at
 
     @wp.func
     def derivative(
         airframe: Airframe,
-        rotors: RotorSums,
+        around: Surroundings,
+        sums: RotorSums,
+        vehicle: wp.int32,
+        start_ns: wp.int64,
         t: wp.float64,
+        height_0: wp.float64,
         q: wp.quatd,
         y: _vec12d,
     ):
         """d/dt of displacement, velocity, rotation vector, body rate; q is the attitude at u = 0."""
-        quadratic = rotors.quadratic_cc
-        linear = rotors.linear_c
-        if wp.static(motor_lag):
-            left = wp.exp(-rotors.lag_rate * t)
-            quadratic = quadratic + left * rotors.quadratic_cd + left * left * rotors.quadratic_dd
-            if wp.static(air_terms):
-                linear = linear + left * rotors.linear_d
+        quadratic, linear = sums_at(airframe, sums, around.rotors, vehicle, t)
         v = _part(y, 3)
         u = _part(y, 6)
         w = _part(y, 9)
         air = v
-        if wp.static(wind):
-            air -= airframe.wind
-        force_0, spin = rates(airframe, quadratic, linear, u, wp.quat_rotate_inv(q, air), w)
+        if wp.static(changing_wind):
+            air = v - wind_at(airframe, around.wind, vehicle, start_ns, t)
+        elif wp.static(wind):
+            air = v - airframe.wind
+        air_0 = wp.quat_rotate_inv(q, air)
+        velocity_0 = air_0
+        up_0 = air_0
+        height = height_0 + y[2] - around.ground.height
+        if wp.static(near_ground):
+            velocity_0 = wp.quat_rotate_inv(q, v)
+            up_0 = wp.quat_rotate_inv(q, wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)))
+            quadratic = lift(around.ground, height, quadratic)
+        force_0, spin = rates(
+            airframe, around.ground, quadratic, linear, u, air_0, velocity_0, up_0, height, w
+        )
         a = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity) + wp.quat_rotate(q, force_0)
         return _joined(v, a, chart_rate(u, w), spin)
 
     @wp.func
     def fly_adaptive(
         airframe: Airframe,
-        rotors: RotorSums,
+        around: Surroundings,
+        sums: RotorSums,
+        vehicle: wp.int32,
+        start_ns: wp.int64,
         duration_s: wp.float64,
         first_step_s: wp.float64,
         rtol: wp.float64,
@@ -145,30 +152,40 @@ def make_dormand_prince(terms: frozenset[str], equations: Equations, *, air_term
         error_before = wp.float64(1e-4)
         growth = _GROWTH
         failure = STATUS_OK
-        k1 = derivative(airframe, rotors, t, q, y)
+        k1 = derivative(airframe, around, sums, vehicle, start_ns, t, x[2], q, y)
         evaluation_count = wp.int32(1)
         while t < duration_s:
             h = wp.min(h, _ROTATION_MAX_RAD / (wp.length(_part(y, 9)) + wp.float64(1e-9)))
+            if wp.static(turbulence):
+                h = wp.min(h, time_to_tick(around.wind, start_ns, t))
             last = bool(t + wp.float64(1.01) * h >= duration_s)
             if last:
                 h = duration_s - t
             y2 = y + h * wp.static(wp.float64(1 / 5)) * k1
-            k2 = derivative(airframe, rotors, t + wp.static(wp.float64(1 / 5)) * h, q, y2)
+            k2 = derivative(
+                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(1 / 5)) * h, x[2], q, y2
+            )
             y3 = y + h * (wp.static(wp.float64(3 / 40)) * k1 + wp.static(wp.float64(9 / 40)) * k2)
-            k3 = derivative(airframe, rotors, t + wp.static(wp.float64(3 / 10)) * h, q, y3)
+            k3 = derivative(
+                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(3 / 10)) * h, x[2], q, y3
+            )
             y4 = y + h * (
                 wp.static(wp.float64(44 / 45)) * k1
                 - wp.static(wp.float64(56 / 15)) * k2
                 + wp.static(wp.float64(32 / 9)) * k3
             )
-            k4 = derivative(airframe, rotors, t + wp.static(wp.float64(4 / 5)) * h, q, y4)
+            k4 = derivative(
+                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(4 / 5)) * h, x[2], q, y4
+            )
             y5 = y + h * (
                 wp.static(wp.float64(19372 / 6561)) * k1
                 - wp.static(wp.float64(25360 / 2187)) * k2
                 + wp.static(wp.float64(64448 / 6561)) * k3
                 - wp.static(wp.float64(212 / 729)) * k4
             )
-            k5 = derivative(airframe, rotors, t + wp.static(wp.float64(8 / 9)) * h, q, y5)
+            k5 = derivative(
+                airframe, around, sums, vehicle, start_ns, t + wp.static(wp.float64(8 / 9)) * h, x[2], q, y5
+            )
             y6 = y + h * (
                 wp.static(wp.float64(9017 / 3168)) * k1
                 - wp.static(wp.float64(355 / 33)) * k2
@@ -176,7 +193,7 @@ def make_dormand_prince(terms: frozenset[str], equations: Equations, *, air_term
                 + wp.static(wp.float64(49 / 176)) * k4
                 - wp.static(wp.float64(5103 / 18656)) * k5
             )
-            k6 = derivative(airframe, rotors, t + h, q, y6)
+            k6 = derivative(airframe, around, sums, vehicle, start_ns, t + h, x[2], q, y6)
             y7 = y + h * (
                 wp.static(wp.float64(35 / 384)) * k1
                 + wp.static(wp.float64(500 / 1113)) * k3
@@ -184,7 +201,7 @@ def make_dormand_prince(terms: frozenset[str], equations: Equations, *, air_term
                 - wp.static(wp.float64(2187 / 6784)) * k5
                 + wp.static(wp.float64(11 / 84)) * k6
             )
-            k7 = derivative(airframe, rotors, t + h, q, y7)
+            k7 = derivative(airframe, around, sums, vehicle, start_ns, t + h, x[2], q, y7)
             evaluation_count += 6
             difference = h * (
                 wp.static(wp.float64(71 / 57600)) * k1

@@ -6,33 +6,54 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.chart import rotation_series
+from neurosim_core.vehicle.ground import Ground, contact_wrench, lifted
+from neurosim_core.vehicle.rotors import RotorFunctions, make_rotor_functions
+from neurosim_core.vehicle.wind import WindFunctions, make_wind_functions
 
 
 class Equations(NamedTuple):
-    """Device functions of one set of terms."""
+    """Device functions of one set of terms, and which of them there are."""
 
-    wrench: Any
-    """(airframe, quadratic, linear, air, w) -> force and torque in B; see `aerodynamics.make_wrench`."""
+    motor_lag: bool
+    rotor_lags: bool
+    air_terms: bool
+    """Something depends on the air speed."""
+    wind: bool
+    """The air speed is not the velocity."""
+    changing_wind: bool
+    """The wind depends on time."""
+    turbulence: bool
+    ground: bool
+    ground_effect: bool
+    rotor_wrench: Any
+    """(airframe, quadratic, linear, air, w) -> force and torque in B that are linear in the sums over the
+    rotors."""
     solve_inertia: Any
     """(airframe, torque) -> J^-1 torque."""
-    angular_acceleration: Any
-    """(airframe, torque, w) -> dw/dt in B."""
+    forces: Any
+    """(airframe, ground, quadratic, linear, air, velocity, up, height, w) -> force [N], dw/dt [rad/s^2], all
+    in B. The arguments: sums over the rotors, air speed and velocity [m/s], direction of world z, height of
+    the centre of mass above ground [m], body rate [rad/s]."""
     rates: Any
-    """(airframe, quadratic, linear, u, air_0, w) -> specific force in B0 and dw/dt in B, B being B0 turned by
-    exp(u), and air_0 the air speed in B0."""
+    """(airframe, ground, quadratic, linear, u, air_0, velocity_0, up_0, height, w) -> specific force in B0,
+    dw/dt in B, B being B0 turned by exp(u); what ends in 0 is in B0."""
+    lift: Any
+    """(ground, height, quadratic) -> the sums over the rotors with the ground effect."""
+    rotors: RotorFunctions
+    wind_at: Any
+    """See `WindFunctions.at`."""
 
 
-def make_equations(terms: frozenset[str], *, air_terms: bool) -> Equations:
-    """Return the equations with the given terms (see `multirotor.TERMS`).
-
-    Args:
-        terms: What is computed.
-        air_terms: Some of it depends on the air speed.
-    """
+def make_equations(terms: frozenset[str]) -> Equations:
+    """Return the equations with the given terms (see `multirotor.TERMS`)."""
+    air_terms = any(term in terms for term in AIR_TERMS)
     full_inertia = "full_inertia" in terms
+    ground_contact = "ground" in terms
+    ground_effect = "ground_effect" in terms
     wrench = make_wrench(terms)
+    winds: WindFunctions = make_wind_functions(terms)
 
     @wp.func
     def solve_inertia(airframe: Airframe, torque: wp.vec3d) -> wp.vec3d:
@@ -49,17 +70,75 @@ def make_equations(terms: frozenset[str], *, air_terms: bool) -> Equations:
         return solve_inertia(airframe, torque - wp.cross(w, momentum))
 
     @wp.func
+    def forces(
+        airframe: Airframe,
+        ground: Ground,
+        quadratic: wp.vec4d,
+        linear: vec10d,
+        air: wp.vec3d,
+        velocity: wp.vec3d,
+        up: wp.vec3d,
+        height: wp.float64,
+        w: wp.vec3d,
+    ):
+        force, torque = wrench(airframe, quadratic, linear, air, w)
+        if wp.static(ground_contact):
+            push, twist = contact_wrench(ground, height, up, velocity, w)
+            force += push
+            torque += twist
+        return force, angular_acceleration(airframe, torque, w)
+
+    @wp.func
     def rates(
-        airframe: Airframe, quadratic: wp.vec4d, linear: vec10d, u: wp.vec3d, air_0: wp.vec3d, w: wp.vec3d
+        airframe: Airframe,
+        ground: Ground,
+        quadratic: wp.vec4d,
+        linear: vec10d,
+        u: wp.vec3d,
+        air_0: wp.vec3d,
+        velocity_0: wp.vec3d,
+        up_0: wp.vec3d,
+        height: wp.float64,
+        w: wp.vec3d,
     ):
         series = rotation_series(u)
         air = air_0
+        velocity = velocity_0
+        up = up_0
         if wp.static(air_terms):
             turn = wp.cross(u, air_0)
             air = air_0 - series[0] * turn + series[1] * wp.cross(u, turn)
-        force, torque = wrench(airframe, quadratic, linear, air, w)
+        if wp.static(ground_contact):
+            swept = wp.cross(u, velocity_0)
+            velocity = velocity_0 - series[0] * swept + series[1] * wp.cross(u, swept)
+            tilt = wp.cross(u, up_0)
+            up = up_0 - series[0] * tilt + series[1] * wp.cross(u, tilt)
+        force, spin = forces(airframe, ground, quadratic, linear, air, velocity, up, height, w)
         swing = wp.cross(u, force)
         force_0 = force + series[0] * swing + series[1] * wp.cross(u, swing)
-        return airframe.mass_inverse * force_0, angular_acceleration(airframe, torque, w)
+        return airframe.mass_inverse * force_0, spin
 
-    return Equations(wrench, solve_inertia, angular_acceleration, rates)
+    @wp.func
+    def lift(ground: Ground, height: wp.float64, quadratic: wp.vec4d):
+        if wp.static(ground_effect):
+            return lifted(ground, height, quadratic)
+        else:
+            return quadratic
+
+    return Equations(
+        motor_lag="motor_lag" in terms,
+        rotor_lags="rotor_lags" in terms,
+        air_terms=air_terms,
+        wind=air_terms and (winds.changes or "wind" in terms),
+        changing_wind=air_terms and winds.changes,
+        turbulence="turbulence" in terms,
+        ground=ground_contact,
+        ground_effect=ground_effect,
+        rotor_wrench=make_wrench(terms & {"rotor_drag", "flapping"}),
+        solve_inertia=solve_inertia,
+        forces=forces,
+        rates=rates,
+        lift=lift,
+        rotors=make_rotor_functions(terms, air_terms=air_terms),
+        wind_at=winds.at,
+    )

@@ -7,11 +7,48 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, vec10d
-from neurosim_core.vehicle.dormand_prince import RotorSums, make_dormand_prince
+from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
+from neurosim_core.vehicle.dormand_prince import make_dormand_prince
 from neurosim_core.vehicle.equations import make_equations
 from neurosim_core.vehicle.rkmk4 import make_rkmk4
+from neurosim_core.vehicle.rotors import RotorSums, held_command
 from neurosim_core.vehicle.status import STATUS_COMMAND, STATUS_OK
+from neurosim_core.vehicle.surroundings import Surroundings
+from neurosim_core.vehicle.wind import draw_turbulence, start_turbulence
+
+
+@wp.struct
+class Interval:
+    """What a batch is moved by. One parameter: on a CPU each costs a quarter of a microsecond a launch."""
+
+    duration_ns: wp.int64
+    step_s: wp.float64
+    step_count: wp.int32
+    speed_nodes: wp.vec3d  # see `motor.LagConstants`
+    square_nodes: wp.vec3d
+    decay: wp.float64
+    lag_rate: wp.float64
+    rtol: wp.float64  # of adaptive steps
+    atol: wp.float64
+    evaluation_count_max: wp.int32
+
+
+@wp.struct
+class Batch:
+    """The arrays of a batch, as in `multirotor.MultirotorArrays`."""
+
+    position: wp.array(dtype=wp.vec3d)
+    velocity: wp.array(dtype=wp.vec3d)
+    orientation: wp.array(dtype=wp.quatd)
+    body_rate: wp.array(dtype=wp.vec3d)
+    rotor_speed: wp.array2d(dtype=wp.float64)
+    rotor_speed_command: wp.array2d(dtype=wp.float64)
+    acceleration: wp.array(dtype=wp.vec3d)
+    angular_acceleration: wp.array(dtype=wp.vec3d)
+    stamp_ns: wp.array(dtype=wp.int64)
+    status: wp.array(dtype=wp.int32)
+    redone_count: wp.array(dtype=wp.int64)
+    evaluation_count: wp.array(dtype=wp.int64)
 
 
 class Kernels(NamedTuple):
@@ -21,6 +58,8 @@ class Kernels(NamedTuple):
     """Moves every vehicle by a duration."""
     accelerate: Any
     """Evaluates linear and angular acceleration at the current state."""
+    begin: Any
+    """Draws the turbulence at time 0; None without."""
 
 
 @functools.cache
@@ -31,13 +70,13 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
         terms: What is computed.
         adaptive: Take no fixed steps.
     """
-    motor_lag = "motor_lag" in terms
-    air_terms = any(term in terms for term in AIR_TERMS)
-    wind = air_terms and "wind" in terms
-    equations = make_equations(terms, air_terms=air_terms)
-    wrench, angular_acceleration = equations.wrench, equations.angular_acceleration
-    fly_fixed = make_rkmk4(terms, equations, air_terms=air_terms, wind=wind)
-    fly_adaptive = make_dormand_prince(terms, equations, air_terms=air_terms, wind=wind)
+    equations = make_equations(terms)
+    motor_lag, rotor_lags, air_terms = equations.motor_lag, equations.rotor_lags, equations.air_terms
+    wind, changing_wind, turbulence = equations.wind, equations.changing_wind, equations.turbulence
+    near_ground = equations.ground or equations.ground_effect
+    forces, lift, wind_at = equations.forces, equations.lift, equations.wind_at
+    fly_fixed = make_rkmk4(equations)
+    fly_adaptive = make_dormand_prince(equations)
     name = "_".join(sorted(terms)) or "rigid"
     module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}" + (".adaptive" if adaptive else ""))
 
@@ -45,38 +84,18 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     def advance(
         # Model:
         airframe: Airframe,
-        quadratic_weight: wp.array[wp.vec4d],
-        linear_weight: wp.array[vec10d],
-        speed_nodes: wp.vec3d,
-        square_nodes: wp.vec3d,
-        decay: wp.float64,
-        step_s: wp.float64,
-        step_count: wp.int32,
-        duration_ns: wp.int64,
-        lag_rate: wp.float64,
-        rtol: wp.float64,
-        atol: wp.float64,
-        evaluation_count_max: wp.int32,
-        # In:
-        rotor_speed_command: wp.array2d[wp.float64],
+        around: Surroundings,
+        interval: Interval,
         # In/out:
-        position: wp.array[wp.vec3d],
-        velocity: wp.array[wp.vec3d],
-        orientation: wp.array[wp.quatd],
-        body_rate: wp.array[wp.vec3d],
-        rotor_speed: wp.array2d[wp.float64],
-        stamp_ns: wp.array[wp.int64],
-        status: wp.array[wp.int32],
-        redone_count: wp.array[wp.int64],
-        evaluation_count: wp.array[wp.int64],
+        batch: Batch,
     ):
         vehicle = wp.tid()
-        if status[vehicle] != STATUS_OK:
+        if batch.status[vehicle] != STATUS_OK:
             return
-        rotor_count = rotor_speed_command.shape[1]
+        rotor_count = batch.rotor_speed_command.shape[1]
         for rotor in range(rotor_count):
-            if not wp.isfinite(rotor_speed_command[vehicle, rotor]):
-                status[vehicle] = STATUS_COMMAND
+            if not wp.isfinite(batch.rotor_speed_command[vehicle, rotor]):
+                batch.status[vehicle] = STATUS_COMMAND
                 return
 
         # sums over the rotors of Omega^2 = c^2 + 2 c d + d^2 and Omega = c + d, where d = Omega_0 - c decays
@@ -86,99 +105,118 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
         linear_c = vec10d()
         linear_d = vec10d()
         for rotor in range(rotor_count):
-            c = wp.clamp(
-                rotor_speed_command[vehicle, rotor], airframe.rotor_speed_min, airframe.rotor_speed_max
-            )
-            d = rotor_speed[vehicle, rotor] - c
-            quadratic_cc += c * c * quadratic_weight[rotor]
-            if wp.static(motor_lag):
-                quadratic_cd += wp.float64(2.0) * c * d * quadratic_weight[rotor]
-                quadratic_dd += d * d * quadratic_weight[rotor]
+            c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
+            d = batch.rotor_speed[vehicle, rotor] - c
+            quadratic_cc += c * c * around.rotors.quadratic_weight[rotor]
+            if wp.static(motor_lag and not rotor_lags):
+                quadratic_cd += wp.float64(2.0) * c * d * around.rotors.quadratic_weight[rotor]
+                quadratic_dd += d * d * around.rotors.quadratic_weight[rotor]
             if wp.static(air_terms):
-                linear_c += c * linear_weight[rotor]
-                if wp.static(motor_lag):
-                    linear_d += d * linear_weight[rotor]
+                linear_c += c * around.rotors.linear_weight[rotor]
+                if wp.static(motor_lag and not rotor_lags):
+                    linear_d += d * around.rotors.linear_weight[rotor]
 
-        x = position[vehicle]
-        v = velocity[vehicle]
-        q = orientation[vehicle]
-        w = body_rate[vehicle]
+        x = batch.position[vehicle]
+        v = batch.velocity[vehicle]
+        q = batch.orientation[vehicle]
+        w = batch.body_rate[vehicle]
+        start_ns = batch.stamp_ns[vehicle]
+        if wp.static(turbulence):
+            draw_turbulence(around.wind, airframe, vehicle, start_ns + interval.duration_ns, x, v)
         remaining = wp.float64(0.0)
         redo = wp.bool(True)
         if wp.static(not adaptive):
             x, v, q, w, remaining, redo = fly_fixed(
-                airframe, quadratic_cc, quadratic_cd, quadratic_dd, linear_c, linear_d,
-                speed_nodes, square_nodes, decay, step_s, step_count, x, v, q, w,
+                airframe, around, vehicle, start_ns,
+                quadratic_cc, quadratic_cd, quadratic_dd, linear_c, linear_d,
+                interval.speed_nodes, interval.square_nodes, interval.decay,
+                interval.step_s, interval.step_count, x, v, q, w,
             )  # fmt: skip
         if redo:
-            rotors = RotorSums()
-            rotors.quadratic_cc = quadratic_cc
-            rotors.quadratic_cd = quadratic_cd
-            rotors.quadratic_dd = quadratic_dd
-            rotors.linear_c = linear_c
-            rotors.linear_d = linear_d
-            rotors.lag_rate = lag_rate
-            duration_s = wp.float64(step_count) * step_s
+            sums = RotorSums()
+            sums.quadratic_cc = quadratic_cc
+            sums.quadratic_cd = quadratic_cd
+            sums.quadratic_dd = quadratic_dd
+            sums.linear_c = linear_c
+            sums.linear_d = linear_d
+            sums.rate = interval.lag_rate
+            duration_s = wp.float64(interval.step_count) * interval.step_s
             x, v, q, w, used, failure = fly_adaptive(
-                airframe, rotors, duration_s, step_s, rtol, atol, evaluation_count_max,
-                position[vehicle], velocity[vehicle], orientation[vehicle], body_rate[vehicle],
+                airframe, around, sums, vehicle, start_ns,
+                duration_s, interval.step_s, interval.rtol, interval.atol, interval.evaluation_count_max,
+                batch.position[vehicle], batch.velocity[vehicle],
+                batch.orientation[vehicle], batch.body_rate[vehicle],
             )  # fmt: skip
-            evaluation_count[vehicle] += wp.int64(used)
+            batch.evaluation_count[vehicle] += wp.int64(used)
             if wp.static(not adaptive):
-                redone_count[vehicle] += wp.int64(1)
+                batch.redone_count[vehicle] += wp.int64(1)
             if failure != STATUS_OK:
-                status[vehicle] = failure
+                batch.status[vehicle] = failure
                 return
             if wp.static(motor_lag):
-                remaining = wp.exp(-lag_rate * duration_s)
+                remaining = wp.exp(-interval.lag_rate * duration_s)
 
-        position[vehicle] = x
-        velocity[vehicle] = v
-        orientation[vehicle] = q
-        body_rate[vehicle] = w
+        batch.position[vehicle] = x
+        batch.velocity[vehicle] = v
+        batch.orientation[vehicle] = q
+        batch.body_rate[vehicle] = w
         for rotor in range(rotor_count):
-            c = wp.clamp(
-                rotor_speed_command[vehicle, rotor], airframe.rotor_speed_min, airframe.rotor_speed_max
-            )
+            c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
+            if wp.static(rotor_lags):
+                remaining = wp.exp(
+                    -around.rotors.lags[rotor].rate * wp.float64(interval.step_count) * interval.step_s
+                )
             if wp.static(motor_lag):
-                rotor_speed[vehicle, rotor] = c + remaining * (rotor_speed[vehicle, rotor] - c)
+                batch.rotor_speed[vehicle, rotor] = c + remaining * (batch.rotor_speed[vehicle, rotor] - c)
             else:
-                rotor_speed[vehicle, rotor] = c
-        stamp_ns[vehicle] += duration_ns
+                batch.rotor_speed[vehicle, rotor] = c
+        batch.stamp_ns[vehicle] += interval.duration_ns
 
     @wp.kernel(module=module, enable_backward=False)
     def accelerate(
         # Model:
         airframe: Airframe,
-        quadratic_weight: wp.array[wp.vec4d],
-        linear_weight: wp.array[vec10d],
-        # In:
-        velocity: wp.array[wp.vec3d],
-        orientation: wp.array[wp.quatd],
-        body_rate: wp.array[wp.vec3d],
-        rotor_speed: wp.array2d[wp.float64],
-        # Out:
-        acceleration_out: wp.array[wp.vec3d],
-        angular_acceleration_out: wp.array[wp.vec3d],
+        around: Surroundings,
+        # In/out:
+        batch: Batch,
     ):
         vehicle = wp.tid()
         quadratic = wp.vec4d()
         linear = vec10d()
-        for rotor in range(rotor_speed.shape[1]):
-            speed = rotor_speed[vehicle, rotor]
-            quadratic += speed * speed * quadratic_weight[rotor]
+        for rotor in range(batch.rotor_speed.shape[1]):
+            speed = batch.rotor_speed[vehicle, rotor]
+            quadratic += speed * speed * around.rotors.quadratic_weight[rotor]
             if wp.static(air_terms):
-                linear += speed * linear_weight[rotor]
-        q = orientation[vehicle]
-        w = body_rate[vehicle]
-        air = velocity[vehicle]
+                linear += speed * around.rotors.linear_weight[rotor]
+        q = batch.orientation[vehicle]
+        w = batch.body_rate[vehicle]
+        v = batch.velocity[vehicle]
+        air = v
         if wp.static(air_terms):
-            if wp.static(wind):
+            if wp.static(changing_wind):
+                air -= wind_at(airframe, around.wind, vehicle, batch.stamp_ns[vehicle], wp.float64(0.0))
+            elif wp.static(wind):
                 air -= airframe.wind
             air = wp.quat_rotate_inv(q, air)
-        force, torque = wrench(airframe, quadratic, linear, air, w)
+        up = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+        height = batch.position[vehicle][2] - around.ground.height
+        if wp.static(near_ground):
+            v = wp.quat_rotate_inv(q, v)
+            up = wp.quat_rotate_inv(q, up)
+            quadratic = lift(around.ground, height, quadratic)
+        force, spin = forces(airframe, around.ground, quadratic, linear, air, v, up, height, w)
         down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
-        acceleration_out[vehicle] = down + airframe.mass_inverse * wp.quat_rotate(q, force)
-        angular_acceleration_out[vehicle] = angular_acceleration(airframe, torque, w)
+        batch.acceleration[vehicle] = down + airframe.mass_inverse * wp.quat_rotate(q, force)
+        batch.angular_acceleration[vehicle] = spin
 
-    return Kernels(advance, accelerate)
+    @wp.kernel(module=module, enable_backward=False)
+    def begin(
+        # Model:
+        around: Surroundings,
+        # In:
+        position: wp.array[wp.vec3d],
+    ):
+        vehicle = wp.tid()
+        start_turbulence(around.wind, vehicle, position[vehicle])
+
+    return Kernels(advance, accelerate, begin if turbulence else None)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
@@ -23,11 +23,25 @@ from neurosim_core.vehicle.aerodynamics import (
     vec8d,
     vec10d,
 )
-from neurosim_core.vehicle.integrator import make_kernels
-from neurosim_core.vehicle.motor import lag_constants
+from neurosim_core.vehicle.ground import GroundConfig, make_ground
+from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
+from neurosim_core.vehicle.motor import LagConstants, lag_constants
+from neurosim_core.vehicle.rotors import RotorLag, Rotors
 from neurosim_core.vehicle.status import STATUS_TERMS
+from neurosim_core.vehicle.surroundings import Surroundings
+from neurosim_core.vehicle.wind import INTERVAL_TICKS_MAX, GustConfig, TurbulenceConfig, make_wind
 
-TERMS = ("motor_lag", *AIR_TERMS, "wind", "full_inertia")
+TERMS = (
+    "motor_lag",
+    "rotor_lags",
+    *AIR_TERMS,
+    "wind",
+    "gusts",
+    "turbulence",
+    "ground",
+    "ground_effect",
+    "full_inertia",
+)
 """Terms of the equations of motion that a vehicle may do without."""
 
 Integrator = Literal["rkmk4", "dormand_prince"]
@@ -54,6 +68,11 @@ class MultirotorConfig(Settings):
     """Thrust of a rotor per squared speed [N/(rad/s)^2]."""
     torque_coefficient_n_m_s2: NonNegative
     """Reaction torque of a rotor per squared speed [N m/(rad/s)^2]."""
+    rotor_thrust_scale: tuple[NonNegative, ...] = ()
+    """For each rotor, its thrust coefficient as a multiple of the common one, where they are not alike; 0: a
+    rotor that is lost."""
+    rotor_torque_scale: tuple[NonNegative, ...] = ()
+    """For each rotor, its torque coefficient as a multiple of the common one, where they are not alike."""
     rotor_drag_kg: NonNegative = 0.0
     """Drag of a rotor in its plane, per rotor speed and air speed [N/(rad/s)/(m/s)]."""
     rotor_inflow_kg: NonNegative = 0.0
@@ -66,6 +85,8 @@ class MultirotorConfig(Settings):
     """Drag of the frame along body x, y, z per squared air speed [N/(m/s)^2]."""
     motor_time_constant_s: NonNegative = 0.0
     """Time to close 63 % of a step in commanded rotor speed [s]; 0 means at once."""
+    motor_time_constant_scale: tuple[NonNegative, ...] = ()
+    """For each rotor, its time constant as a multiple of the common one, where they are not alike."""
     rotor_speed_min_rad_s: NonNegative = 0.0
     """Slowest speed of a rotor [rad/s]; commands below saturate there, as in the motor controller."""
     rotor_speed_max_rad_s: Annotated[float, Field(gt=0.0)]
@@ -74,6 +95,12 @@ class MultirotorConfig(Settings):
     """Gravity along world -z [m/s^2]."""
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     """Velocity of the air in W [m/s]."""
+    gusts: tuple[GustConfig, ...] = ()
+    """Discrete gusts, which add up."""
+    turbulence: TurbulenceConfig | None = None
+    """Random wind; null: none."""
+    ground: GroundConfig | None = None
+    """A horizontal plane to land on; null: the vehicle falls for ever."""
 
     @model_validator(mode="after")
     def _is_a_body(self) -> MultirotorConfig:
@@ -96,6 +123,12 @@ class MultirotorConfig(Settings):
                 "rotor_position_m and rotor_direction must have one entry for each rotor, "
                 f"got {len(self.rotor_position_m)} and {len(self.rotor_direction)}"
             )
+        for name in ("rotor_thrust_scale", "rotor_torque_scale", "motor_time_constant_scale"):
+            if len(scale := getattr(self, name)) not in (0, self.rotor_count):
+                raise ValueError(
+                    f"{name} must have one entry for each of {self.rotor_count} rotors, or none, "
+                    f"got {len(scale)}"
+                )
         if not self.rotor_speed_min_rad_s < self.rotor_speed_max_rad_s:
             raise ValueError(
                 "rotor_speed_min_rad_s must be below "
@@ -109,24 +142,48 @@ class MultirotorConfig(Settings):
         return len(self.rotor_position_m)
 
     @property
+    def thrust_coefficients_n_s2(self) -> NDArray[np.float64]:
+        """Thrust of each rotor per squared speed [N/(rad/s)^2], shape [R]."""
+        return self._of_each(self.thrust_coefficient_n_s2, self.rotor_thrust_scale)
+
+    @property
+    def torque_coefficients_n_m_s2(self) -> NDArray[np.float64]:
+        """Reaction torque of each rotor per squared speed [N m/(rad/s)^2], shape [R]."""
+        return self._of_each(self.torque_coefficient_n_m_s2, self.rotor_torque_scale)
+
+    @property
+    def motor_time_constants_s(self) -> NDArray[np.float64]:
+        """Time constant of each rotor [s], shape [R]."""
+        return self._of_each(self.motor_time_constant_s, self.motor_time_constant_scale)
+
+    @property
     def hover_rotor_speed_rad_s(self) -> float:
         """Speed at which equal rotors carry the weight in still air [rad/s]; within their range."""
-        thrust = self.rotor_count * self.thrust_coefficient_n_s2
+        thrust = self.thrust_coefficients_n_s2.sum()
         speed = np.sqrt(self.mass_kg * self.gravity_m_s2 / thrust) if thrust > 0.0 else 0.0
         return float(np.clip(speed, self.rotor_speed_min_rad_s, self.rotor_speed_max_rad_s))
+
+    def _of_each(self, common: float, scale: tuple[float, ...]) -> NDArray[np.float64]:
+        return common * np.array(scale or self.rotor_count * (1.0,))
 
     def terms(self) -> tuple[str, ...]:
         """Return the terms (of `TERMS`) that these parameters need."""
         inertia = np.array(self.inertia_kg_m2)
         needed = {
-            "motor_lag": self.motor_time_constant_s > 0.0,
+            "motor_lag": bool(self.motor_time_constants_s.any()),
+            "rotor_lags": bool(np.ptp(self.motor_time_constants_s) > 0.0),
             "rotor_drag": self.rotor_drag_kg > 0.0 or self.rotor_inflow_kg > 0.0,
             "translational_lift": self.translational_lift_kg_m > 0.0,
             "flapping": self.flapping_kg_m > 0.0,
             "parasitic_drag": any(self.parasitic_drag_kg_m),
+            "ground": self.ground is not None,
+            "ground_effect": self.ground is not None and self.ground.rotor_radius_m > 0.0,
             "full_inertia": bool(np.any(inertia - np.diag(np.diag(inertia)))),
         }
-        needed["wind"] = any(self.wind_m_s) and any(needed[term] for term in AIR_TERMS)
+        felt = any(needed[term] for term in AIR_TERMS)
+        needed["wind"] = felt and any(self.wind_m_s)
+        needed["gusts"] = felt and bool(self.gusts)
+        needed["turbulence"] = felt and self.turbulence is not None
         return tuple(term for term in TERMS if needed[term])
 
 
@@ -251,6 +308,7 @@ class Multirotor:
             velocity and of body rate.
         atol: What is added to that [m, m/s, rad, rad/s].
         evaluation_count_max: The most evaluations of the right-hand side for one interval of one vehicle.
+        seed: Of the turbulence, 0 <= seed < 2^64; each vehicle of the batch has its own, by its index.
 
     Raises:
         ValueError: An argument is out of range, or there is no such device.
@@ -268,6 +326,7 @@ class Multirotor:
         rtol: float = 1e-6,
         atol: float = 1e-8,
         evaluation_count_max: int = 100_000,
+        seed: int = 0,
     ) -> None:
         if count < 1:
             raise ValueError(f"count must be >= 1, got {count}")
@@ -286,6 +345,8 @@ class Multirotor:
             raise ValueError(f"atol must be > 0 and finite, got {atol}")
         if not 7 <= evaluation_count_max < 2**31 - 7:
             raise ValueError(f"evaluation_count_max must be in [7, 2^31 - 7), got {evaluation_count_max}")
+        if not 0 <= seed < 2**64:
+            raise ValueError(f"seed must be in [0, 2^64), got {seed}")
         self.config = config
         self.count = count
         self.device = wp.get_device(device)
@@ -314,7 +375,21 @@ class Multirotor:
         self._kernels = make_kernels(frozenset(self.terms), adaptive=integrator == "dormand_prince")
         self._adaptive = (rtol, atol, evaluation_count_max)
         self._model = make_airframe(config, self.device)
-        self._launches: dict[int, wp.Launch] = {}
+        self._wind = make_wind(
+            config.gusts if "gusts" in self.terms else (),
+            config.turbulence,
+            turbulent="turbulence" in self.terms,
+            wind_m_s=config.wind_m_s,
+            seed=seed,
+            count=count,
+            device=self.device,
+        )
+        self._ground = make_ground(config.ground, config.rotor_position_m, self.device)
+        self._batch = _struct(Batch, **vars(self.arrays))
+        self._begin: wp.Launch | None = None
+        if self._kernels.begin is not None:
+            self._begin = self._record(self._kernels.begin, self._surroundings(), self.arrays.position)
+        self._launches: dict[int, tuple[wp.Launch, ...]] = {}
         self._acceleration_launch: wp.Launch | None = None
         self.reset()
 
@@ -364,6 +439,8 @@ class Multirotor:
             array.assign(value)
         for counter in (arrays.stamp_ns, arrays.status, arrays.redone_count, arrays.evaluation_count):
             counter.zero_()
+        if self._begin is not None:
+            self._begin.launch()
         self._stamp_ns = 0
 
     def step(self, rotor_speed_command: ArrayLike, duration_ns: int) -> None:
@@ -403,24 +480,18 @@ class Multirotor:
         """
         if not isinstance(duration_ns, (int, np.integer)):
             raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
-        launch = self._launches.get(duration_ns)
-        if launch is None:
-            launch = self._record_advance(duration_ns)
-        launch.launch()
+        launches = self._launches.get(duration_ns)
+        if launches is None:
+            launches = self._record_advance(duration_ns)
+        for launch in launches:
+            launch.launch()
         self._stamp_ns += duration_ns
 
     def accelerate(self) -> None:
         """Evaluate `arrays.acceleration` and `.angular_acceleration` at the current state; device form."""
         if self._acceleration_launch is None:
-            a = self.arrays
-            self._acceleration_launch = wp.launch(
-                self._kernels.accelerate,
-                dim=self.count,
-                inputs=[*self._model, a.velocity, a.orientation, a.body_rate, a.rotor_speed],
-                outputs=[a.acceleration, a.angular_acceleration],
-                device=self.device,
-                block_dim=_BLOCK_DIM,
-                record_cmd=True,
+            self._acceleration_launch = self._record(
+                self._kernels.accelerate, self._model.airframe, self._surroundings(), self._batch
             )
         self._acceleration_launch.launch()
 
@@ -475,41 +546,83 @@ class Multirotor:
     def _rows(self, value: ArrayLike, name: str, width: int) -> NDArray[np.float64]:
         return as_rows(value, name=name, count=self.count, width=width)
 
-    def _record_advance(self, duration_ns: int) -> wp.Launch:
-        """Prepare the launch for one duration, and keep it."""
-        if duration_ns <= 0:
-            raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
-        step_count = -(-duration_ns // self.max_step_ns)
-        step_s = duration_ns / step_count * 1e-9
-        lag = lag_constants(step_s, self.config.motor_time_constant_s)
-        a = self.arrays
+    def _record(self, kernel: Any, *parameters: Any) -> wp.Launch:
         launch: wp.Launch = wp.launch(
-            self._kernels.advance,
+            kernel,
             dim=self.count,
-            inputs=[
-                *self._model,
-                wp.vec3d(*lag.speed_nodes),
-                wp.vec3d(*lag.square_nodes),
-                lag.decay,
-                step_s,
-                step_count,
-                duration_ns,
-                lag.rate_1_s,
-                *self._adaptive,
-                a.rotor_speed_command,
-            ],
-            outputs=[
-                a.position, a.velocity, a.orientation, a.body_rate, a.rotor_speed, a.stamp_ns, a.status,
-                a.redone_count, a.evaluation_count,
-            ],
+            inputs=parameters,
             device=self.device,
             block_dim=_BLOCK_DIM,
             record_cmd=True,
-        )  # fmt: skip
+        )
+        return launch
+
+    def _record_advance(self, duration_ns: int) -> tuple[wp.Launch, ...]:
+        """Prepare the launches for one duration, and keep them."""
+        if duration_ns <= 0:
+            raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
+        longest_ns = duration_ns
+        if "turbulence" in self.terms:
+            longest_ns = INTERVAL_TICKS_MAX * int(self._wind.tick_ns)
+        parts_ns = [min(longest_ns, duration_ns - begin) for begin in range(0, duration_ns, longest_ns)]
+        recorded = {part_ns: self._record_interval(part_ns) for part_ns in set(parts_ns)}
+        launches = tuple(recorded[part_ns] for part_ns in parts_ns)
         if len(self._launches) >= _LAUNCH_COUNT_MAX:
             del self._launches[next(iter(self._launches))]
-        self._launches[duration_ns] = launch
-        return launch
+        self._launches[duration_ns] = launches
+        return launches
+
+    def _record_interval(self, duration_ns: int) -> wp.Launch:
+        step_count = -(-duration_ns // self.max_step_ns)
+        step_s = duration_ns / step_count * 1e-9
+        lags = [lag_constants(step_s, float(tau_s)) for tau_s in self.config.motor_time_constants_s]
+        rtol, atol, evaluation_count_max = self._adaptive
+        interval = _struct(
+            Interval,
+            duration_ns=duration_ns,
+            step_s=step_s,
+            step_count=step_count,
+            speed_nodes=wp.vec3d(*lags[0].speed_nodes),
+            square_nodes=wp.vec3d(*lags[0].square_nodes),
+            decay=lags[0].decay,
+            lag_rate=lags[0].rate_1_s,
+            rtol=rtol,
+            atol=atol,
+            evaluation_count_max=evaluation_count_max,
+        )
+        return self._record(
+            self._kernels.advance, self._model.airframe, self._surroundings(lags), interval, self._batch
+        )
+
+    def _surroundings(self, lags: Sequence[LagConstants] = ()) -> Surroundings:
+        """Return all but the airframe; of the rotors, lags only where they are not equal."""
+        rotors = _struct(
+            Rotors,
+            quadratic_weight=self._model.quadratic_weight,
+            linear_weight=self._model.linear_weight,
+            command=self.arrays.rotor_speed_command,
+            speed=self.arrays.rotor_speed,
+        )
+        if lags and "rotor_lags" in self.terms:
+            rows = [
+                _struct(
+                    RotorLag,
+                    speed_nodes=wp.vec3d(*lag.speed_nodes),
+                    square_nodes=wp.vec3d(*lag.square_nodes),
+                    rate=lag.rate_1_s,
+                )
+                for lag in lags
+            ]
+            rotors.lags = wp.array(rows, dtype=RotorLag, device=self.device)
+        return _struct(Surroundings, wind=self._wind, ground=self._ground, rotors=rotors)
+
+
+def _struct(kind: Any, **values: Any) -> Any:
+    """Return a struct of the kernels with its members set."""
+    filled = kind()
+    for name, value in values.items():
+        setattr(filled, name, value)
+    return filled
 
 
 class AirframeArrays(NamedTuple):
@@ -533,8 +646,8 @@ def make_airframe(config: MultirotorConfig, device: Any) -> AirframeArrays:
     quadratic = quadratic_weights(
         position,
         np.array(config.rotor_direction, dtype=np.float64),
-        thrust=config.thrust_coefficient_n_s2,
-        torque=config.torque_coefficient_n_m_s2,
+        thrust=config.thrust_coefficients_n_s2,
+        torque=config.torque_coefficients_n_m_s2,
     )
     return AirframeArrays(
         _airframe(config, position, drag),

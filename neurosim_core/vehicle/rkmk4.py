@@ -16,9 +16,11 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.frames import quaternion_exp
-from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
 from neurosim_core.vehicle.chart import chart_rate_4
 from neurosim_core.vehicle.equations import Equations
+from neurosim_core.vehicle.ground import touches
+from neurosim_core.vehicle.surroundings import Surroundings
 
 GUARD_ABSOLUTE = 1e-3
 """Guard: largest embedded error estimate of one step at rest [m/s, rad/s]."""
@@ -26,22 +28,32 @@ GUARD_RELATIVE = 1e-2
 """Guard: largest embedded error estimate of one step as a share of speed and body rate."""
 
 
-def make_rkmk4(terms: frozenset[str], equations: Equations, *, air_terms: bool, wind: bool) -> Any:
+GUARD_CONTACT = 1e3
+"""How many times tighter the guard is while a foot is in the ground: forces have kinks there."""
+
+
+def make_rkmk4(equations: Equations) -> Any:
     """Return the device function that moves one vehicle by a number of equal steps.
 
-    Its arguments: the airframe; of the sums over the rotors (`aerodynamics.quadratic_weights`) the parts that
-    are constant, decay, and decay twice as fast; of those of `aerodynamics.linear_weights` the first two;
-    `LagConstants`; length [s] and number of steps; position [m] and velocity [m/s] in W, attitude, body rate
-    [rad/s]. It returns the last four, what is left of the decaying part, and whether the guard tripped; then
-    the others mean nothing.
+    Its arguments: the airframe; what surrounds it; index of the vehicle and time at the beginning [ns]; of
+    the sums over the rotors (`rotors.RotorSums`) the five parts; `LagConstants`; length [s] and number of
+    steps; position [m] and velocity [m/s] in W, attitude, body rate [rad/s]. It returns the last four, what
+    is left of the decaying part, and whether the guard tripped; then the others mean nothing.
     """
-    motor_lag = "motor_lag" in terms
-    rotor_wrench = make_wrench(terms & {"rotor_drag", "flapping"})  # linear in the sums over the rotors
-    wrench, solve_inertia, angular_acceleration, rates = equations
+    motor_lag, rotor_lags, air_terms = equations.motor_lag, equations.rotor_lags, equations.air_terms
+    wind, changing_wind = equations.wind, equations.changing_wind
+    near_ground = equations.ground or equations.ground_effect
+    contact = equations.ground
+    forces, rates, rotor_wrench = equations.forces, equations.rates, equations.rotor_wrench
+    solve_inertia, lift, wind_at = equations.solve_inertia, equations.lift, equations.wind_at
+    rotor_nodes = equations.rotors.nodes
 
     @wp.func
     def fly_fixed(
         airframe: Airframe,
+        around: Surroundings,
+        vehicle: wp.int32,
+        start_ns: wp.int64,
         quadratic_cc: wp.vec4d,
         quadratic_cd_0: wp.vec4d,
         quadratic_dd_0: wp.vec4d,
@@ -75,14 +87,24 @@ def make_rkmk4(terms: frozenset[str], equations: Equations, *, air_terms: bool, 
 
         remaining = wp.float64(1.0)
         tripped = wp.bool(False)
-        for _step in range(step_count):
+        for step in range(step_count):
+            t = wp.float64(step) * h
             quadratic_1 = quadratic_cc
             quadratic_2 = quadratic_cc
             quadratic_4 = quadratic_cc
             linear_1 = linear_c
             linear_2 = linear_c
             linear_4 = linear_c
-            if wp.static(motor_lag):
+            if wp.static(rotor_lags):
+                lag_1, lag_2, lag_4, slow_1, slow_2, slow_4 = rotor_nodes(airframe, around.rotors, vehicle, t)
+                quadratic_1 += lag_1
+                quadratic_2 += lag_2
+                quadratic_4 += lag_4
+                if wp.static(air_terms):
+                    linear_1 += slow_1
+                    linear_2 += slow_2
+                    linear_4 += slow_4
+            elif wp.static(motor_lag):
                 quadratic_1 += speed_nodes[0] * quadratic_cd + square_nodes[0] * quadratic_dd
                 quadratic_2 += speed_nodes[1] * quadratic_cd + square_nodes[1] * quadratic_dd
                 quadratic_4 += speed_nodes[2] * quadratic_cd + square_nodes[2] * quadratic_dd
@@ -94,29 +116,82 @@ def make_rkmk4(terms: frozenset[str], equations: Equations, *, air_terms: bool, 
             air_0 = v
             down_0 = down
             if wp.static(air_terms):
-                if wp.static(wind):
+                if wp.static(changing_wind):
+                    air_0 = wp.quat_rotate_inv(q, v - wind_at(airframe, around.wind, vehicle, start_ns, t))
+                elif wp.static(wind):
                     air_0 = wp.quat_rotate_inv(q, v - airframe.wind)
                 else:
                     air_0 = wp.quat_rotate_inv(q, v)
                 down_0 = wp.quat_rotate_inv(q, down)
+            velocity_0 = v
+            up_0 = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+            z_1 = x[2] - around.ground.height
+            if wp.static(near_ground):
+                down_0 = wp.quat_rotate_inv(q, down)
+                velocity_0 = wp.quat_rotate_inv(q, v)
+                up_0 = wp.quat_rotate_inv(q, up_0)
+                quadratic_1 = lift(around.ground, z_1, quadratic_1)
 
-            force_1, torque_1 = wrench(airframe, quadratic_1, linear_1, air_0, w)
+            force_1, w_1 = forces(
+                airframe, around.ground, quadratic_1, linear_1, air_0, velocity_0, up_0, z_1, w
+            )
             a_1 = airframe.mass_inverse * force_1
-            w_1 = angular_acceleration(airframe, torque_1, w)
 
             u_2 = half * w
             rate_2 = w + half * w_1
-            a_2, w_2 = rates(airframe, quadratic_2, linear_2, u_2, air_0 + half * (a_1 + down_0), rate_2)
+            air_2 = air_0 + half * (a_1 + down_0)
+            velocity_2 = velocity_0 + half * (a_1 + down_0)
+            lifted_2 = quadratic_2
+            z_2 = z_1
+            if wp.static(near_ground):
+                z_2 = z_1 + half * wp.dot(up_0, velocity_0)
+                lifted_2 = lift(around.ground, z_2, quadratic_2)
+            gust_2 = wp.vec3d()
+            gust_4 = wp.vec3d()
+            if wp.static(changing_wind):
+                gust_2 = (
+                    wp.quat_rotate_inv(q, v - wind_at(airframe, around.wind, vehicle, start_ns, t + half))
+                    - air_0
+                )
+                gust_4 = (
+                    wp.quat_rotate_inv(q, v - wind_at(airframe, around.wind, vehicle, start_ns, t + h))
+                    - air_0
+                )
+                air_2 += gust_2
+            a_2, w_2 = rates(
+                airframe, around.ground, lifted_2, linear_2, u_2, air_2, velocity_2, up_0, z_2, rate_2
+            )
             u_rate_2 = chart_rate_4(u_2, rate_2)
 
             u_3 = half * u_rate_2
             rate_3 = w + half * w_2
-            a_3, w_3 = rates(airframe, quadratic_2, linear_2, u_3, air_0 + half * (a_2 + down_0), rate_3)
+            air_3 = air_0 + half * (a_2 + down_0)
+            velocity_3 = velocity_0 + half * (a_2 + down_0)
+            lifted_3 = quadratic_2
+            z_3 = z_1
+            if wp.static(near_ground):
+                z_3 = z_1 + half * wp.dot(up_0, velocity_2)
+                lifted_3 = lift(around.ground, z_3, quadratic_2)
+            if wp.static(changing_wind):
+                air_3 += gust_2
+            a_3, w_3 = rates(
+                airframe, around.ground, lifted_3, linear_2, u_3, air_3, velocity_3, up_0, z_3, rate_3
+            )
             u_rate_3 = chart_rate_4(u_3, rate_3)
 
             u_4 = h * u_rate_3
             rate_4 = w + h * w_3
-            a_4, w_4 = rates(airframe, quadratic_4, linear_4, u_4, air_0 + h * (a_3 + down_0), rate_4)
+            air_4 = air_0 + h * (a_3 + down_0)
+            velocity_4 = velocity_0 + h * (a_3 + down_0)
+            z_4 = z_1
+            if wp.static(near_ground):
+                z_4 = z_1 + h * wp.dot(up_0, velocity_3)
+                quadratic_4 = lift(around.ground, z_4, quadratic_4)
+            if wp.static(changing_wind):
+                air_4 += gust_4
+            a_4, w_4 = rates(
+                airframe, around.ground, quadratic_4, linear_4, u_4, air_4, velocity_4, up_0, z_4, rate_4
+            )
             u_rate_4 = chart_rate_4(u_4, rate_4)
 
             v_next = v + h * down + wp.quat_rotate(q, sixth * (a_1 + two * (a_2 + a_3) + a_4))
@@ -129,13 +204,17 @@ def make_rkmk4(terms: frozenset[str], equations: Equations, *, air_terms: bool, 
             if wp.static(motor_lag):
                 lag_force, lag_torque = rotor_wrench(
                     airframe,
-                    quadratic_1 - two * quadratic_2 + quadratic_4,
+                    quadratic_1 - two * lifted_2 + quadratic_4,
                     linear_1 - two * linear_2 + linear_4,
                     air_0,
                     w,
                 )
                 a_error -= airframe.mass_inverse * lag_force
                 w_error -= solve_inertia(airframe, lag_torque)
+            if wp.static(contact):  # noqa: SIM102
+                if touches(around.ground, z_1, up_0) or touches(around.ground, z_4, up_0):
+                    a_error *= wp.static(wp.float64(GUARD_CONTACT))
+                    w_error *= wp.static(wp.float64(GUARD_CONTACT))
             # written so that a NaN trips it
             if not (sixth * sixth * wp.length_sq(a_error) <= absolute2 + relative2 * wp.length_sq(v_next)):
                 tripped = True
@@ -150,7 +229,7 @@ def make_rkmk4(terms: frozenset[str], equations: Equations, *, air_terms: bool, 
             q = q * quaternion_exp(u)
             # one Newton step towards unit length: exact to rounding this close to it
             q = (wp.float64(1.5) - wp.float64(0.5) * wp.dot(q, q)) * q
-            if wp.static(motor_lag):
+            if wp.static(motor_lag and not rotor_lags):
                 remaining *= decay
                 quadratic_cd = decay * quadratic_cd
                 quadratic_dd = decay * decay * quadratic_dd

@@ -79,7 +79,9 @@ def test_derivatives_of_an_odd_airframe(device):
     states = random_states(config, 20)
     vehicle = Multirotor(config, count=20, device=device)
     vehicle.reset(*states)
-    assert vehicle.terms == TERMS
+    assert set(TERMS) - set(vehicle.terms) == {
+        "rotor_lags", "gusts", "turbulence", "ground", "ground_effect",
+    }  # fmt: skip
     rates = np.array([derivative(config, np.concatenate([*s[:4]]), s[4]) for s in zip(*states, strict=True)])
     assert relative(vehicle.acceleration.linear, rates[:, 3:6]) < 1e-12
     assert relative(vehicle.acceleration.angular, rates[:, 10:13]) < 1e-12
@@ -423,7 +425,7 @@ def test_unknown_airframe_lists_the_known():
         ({"count": 0}, "count must be >= 1"),
         ({"max_step_ns": 0}, "max_step_ns must be >= 1"),
         ({"terms": ("motor_lag",)}, "terms must hold"),
-        ({"terms": (*TERMS, "ground")}, "terms must hold"),
+        ({"terms": (*TERMS, "moon")}, "terms must hold"),
     ],
 )
 def test_constructor_refuses(arguments, message):
