@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import rich.table
 from rich.console import Console
 from rich.markdown import Markdown
+from rich.measure import Measurement
 from rich.text import Text
 
 if TYPE_CHECKING:
@@ -174,21 +175,22 @@ def print_chapter(chapter: Chapter, console: Console) -> None:
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Print a table with its title and note."""
+    """Print a table with its title and note; wider than the terminal rather than with broken words."""
     numeric = numeric_columns(table)
     grid = rich.table.Table(box=None, pad_edge=False, header_style="bold")
     rows = cells(table)
     for column, (key, heading) in enumerate(table.columns.items()):
-        width = max((len(row[column]) for row in rows), default=0)
+        texts = [row[column] for row in rows]
+        words = heading.split() if key in numeric else [w for text in (heading, *texts) for w in text.split()]
         grid.add_column(
             Text(heading),
             justify="right" if key in numeric else "left",
-            min_width=width if key in numeric else None,  # headings may be broken, numbers not
-            overflow="fold",
+            min_width=max(map(len, [*words, *(texts if key in numeric else [])]), default=0),
         )
     for row in rows:
         grid.add_row(*map(Text, row))
     console.print(Text(table.title, style="bold"), soft_wrap=True)
-    console.print(grid, highlight=False)
+    narrowest = Measurement.get(console, console.options.update(max_width=10_000), grid).minimum
+    console.print(grid, highlight=False, width=max(narrowest, console.width), crop=False, soft_wrap=True)
     if table.note:
         console.print(Markdown(table.note), style="dim")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.bench.event_matching import match_events, take
-from neurosim_core.bench.figures import COLORS
+from neurosim_core.bench.figures import COLORS, plain_ticks
 from neurosim_core.bench.report import Bar, Chapter, Plot, Table
 from neurosim_core.packets import EventArrays
 from neurosim_core.render.camera import PinholeConfig
@@ -32,6 +32,7 @@ from neurosim_core.scene.scene import Ambient, Material, Scene, Texture
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FALSE_EVENTS_BAR = 10.0
@@ -44,6 +45,7 @@ _TEXELS_PER_CHECK = 16
 _FLOOR_M = 80.0
 _HEIGHT_M = 1.5
 _PITCH_RAD = math.radians(40.0)
+_PLAIN = RenderConfig(lighting=LightingConfig(mode="unshadowed"), exposure=1.0)  # nothing to prepare
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,11 +226,10 @@ def checkerboard_floor(check_m: float) -> Scene:
 
 def _checkerboard(quick: bool, lens: PinholeConfig, device: str) -> tuple[SceneArrays, Poses]:
     """Return a floor whose squares are 3 pixels wide at the lower border, and smaller further away."""
-    config = RenderConfig(lighting=LightingConfig(mode="unshadowed"), exposure=1.0)
     steepest_rad = _PITCH_RAD + math.atan(0.5 * lens.height / lens.intrinsics().fy)
     check_m = _CHECK_PX / lens.intrinsics().fy * _HEIGHT_M / math.sin(steepest_rad)
     yaws = (0.1,) if quick else (0.1, 0.4, 0.8)
-    return upload_scene(checkerboard_floor(check_m), config, device), _poses(
+    return upload_scene(checkerboard_floor(check_m), _PLAIN, device), _poses(
         [((0.013, 0.007, _HEIGHT_M), looking(yaw, _PITCH_RAD)) for yaw in yaws]
     )
 
@@ -242,7 +243,9 @@ def _apartment(quick: bool, lens: PinholeConfig, device: str) -> tuple[SceneArra
     points = rng.uniform([*low[:2], 0.8], [*high[:2], 1.8], (4000, 3))
     roomy = points[space.clearance(points) > 0.6]
     views = zip(roomy[: 2 if quick else 6], rng.uniform(-np.pi, np.pi, (6, 1)), strict=False)
-    config = RenderConfig(lighting=LightingConfig(ambient_ray_count=4, shadow_ray_count=1))
+    config = (
+        _PLAIN if quick else RenderConfig(lighting=LightingConfig(ambient_ray_count=4, shadow_ray_count=1))
+    )
     return upload_scene(scene, config, device), _poses(
         [(point, looking(yaw.item(), math.radians(10.0))) for point, yaw in views]
     )
@@ -287,6 +290,15 @@ class _Pictures:
         self._renderer.render(position, orientation, self._slots, instant_count=len(poses[0]))
         wp.synchronize_device(self._device)
         return self._renderer.log_radiance, time.perf_counter() - begin
+
+
+def first_pictures(scene: Scene) -> NDArray[np.float32]:
+    """Return log radiance above a floor on the CPU, without shadows; shape [1, H, W]."""
+    lens = _lens(96, 72)
+    _, poses = _checkerboard(True, lens, "cpu")
+    return np.asarray(
+        _Pictures(upload_scene(scene, _PLAIN, "cpu"), lens, DEFAULT, 1).render(poses)[0].numpy()
+    )
 
 
 def _compare(
@@ -458,8 +470,8 @@ def _of(result: RenderResult, sampling: Sampling) -> PanEvents:
 def _summary(result: RenderResult) -> str:
     point, default = _of(result, POINT), _of(result, DEFAULT)
     lines = [
-        f"Reference: {_REFERENCE_SAMPLES} samples per pixel. Its own error is {result.reference_rms:.3f} (root "
-        f"mean square of log radiance, on the checkerboard, against {16 * _REFERENCE_SAMPLES} samples); an "
+        f"Reference: {_REFERENCE_SAMPLES} samples per pixel. Its own error is {result.reference_rms:.3f} "
+        f"(root mean square of log radiance, checkerboard, against {16 * _REFERENCE_SAMPLES} samples); an "
         f"event is {EventCameraConfig().threshold_on:g}. Pictures are {result.width}x{result.height}, on "
         f"{result.device}.",
         "",
@@ -485,8 +497,8 @@ def _summary(result: RenderResult) -> str:
 def _false_events_bar(result: RenderResult) -> Bar:
     point, default = _of(result, POINT).false_count, _of(result, DEFAULT).false_count
     return Bar(
-        text=f"with defaults at least {FALSE_EVENTS_BAR:g} times fewer false events than with point sampling, "
-        "on a slow pan over a fine checkerboard",
+        text=f"with defaults at least {FALSE_EVENTS_BAR:g} times fewer false events than with point "
+        "sampling, on a slow pan over a fine checkerboard",
         measured=f"{point / max(default, 1):,.0f} times fewer: {default:,} against {point:,}",
         met=point >= FALSE_EVENTS_BAR * max(default, 1),
     )
@@ -544,9 +556,9 @@ def _pan_table(result: RenderResult) -> Table:
             for row in result.pan
         ],
         note=f"{result.pan_width}x{result.pan_height} px, {result.pan_s:g} s at {result.pan_speed_px_s:g} "
-        f"px/s, rendered at {result.pan_rate_hz:g} Hz. Two events are the same if pixel and polarity are, and "
-        f"times differ by at most {1e3 * result.tolerance_s:g} ms (half a pixel). False: no such event in the "
-        "reference; wrong polarity: one of the other polarity is there.",
+        f"px/s, rendered at {result.pan_rate_hz:g} Hz. Two events are the same if pixel and polarity are, "
+        f"and times differ by at most {1e3 * result.tolerance_s:g} ms (half a pixel). False: no such event "
+        "in the reference; wrong polarity: one of the other polarity is there.",
     )
 
 
@@ -564,6 +576,8 @@ def _draw_error(result: RenderResult, figure: Figure) -> None:
             axes.loglog([1e3 * row.picture_s for row in line], [row.rms for row in line], label=name)
         axes.axhline(EventCameraConfig().threshold_on, color="0.5", ls="--", lw=1.0, marker="")
         axes.set(xlabel="time of a picture [ms]", title=scene)
+        plain_ticks(axes.xaxis)
+    plain_ticks(panels[0].yaxis)
     panels[0].set_ylabel("RMS error of log radiance (dashed: one event)")
     samples = sorted({row.sampling.samples_per_pixel for row in result.pictures})
     panels[-1].legend(title=f"left to right: {', '.join(map(str, samples))} samples", title_fontsize=8)
@@ -571,34 +585,38 @@ def _draw_error(result: RenderResult, figure: Figure) -> None:
 
 def _draw_aliasing(result: RenderResult, figure: Figure) -> None:
     """Draw what the camera sees, where events are false, and how many."""
-    figure.set_size_inches(8.0, 8.4)
-    rows = figure.add_gridspec(3, 3, height_ratios=(1.0, 1.0, 1.5))
+    from matplotlib.colors import SymLogNorm
+
+    figure.set_size_inches(8.0, 8.0)
+    upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 0.75))
+    panels = upper.subplots(2, 3)
     names = ("point sampling", "default", f"{_REFERENCE_SAMPLES} samples")
-    for column, (name, view) in enumerate(zip(names, result.views, strict=True)):
-        axes = figure.add_subplot(rows[0, column])
-        low, high = result.views.min(), result.views.max()
-        axes.imshow(view, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+    for axes, name, view in zip(panels[0], names, result.views, strict=True):
+        axes.imshow(
+            view, cmap="gray", vmin=result.views.min(), vmax=result.views.max(), interpolation="nearest"
+        )
         axes.set_title(f"log radiance, {name}")
-        axes.axis("off")
-    most = max(int(result.false_per_pixel.max()), 1)
-    for column, (name, count) in enumerate(zip(names[:2], result.false_per_pixel, strict=True)):
-        axes = figure.add_subplot(rows[1, column])
-        shown = axes.imshow(count, cmap="magma", vmin=0, vmax=most, interpolation="nearest")
+    most = max(int(result.false_per_pixel.max()), 2)
+    for axes, name, count in zip(panels[1], names[:2], result.false_per_pixel, strict=False):
+        shown = axes.imshow(
+            count, cmap="magma", norm=SymLogNorm(1.0, vmin=0, vmax=most), interpolation="nearest"
+        )
         axes.set_title(f"false events, {name}")
+    for axes in panels.flat:
         axes.axis("off")
-    scale = figure.add_subplot(rows[1, 2])
-    scale.axis("off")
-    figure.colorbar(shown, ax=scale, location="left", label="false events per pixel")
-    axes = figure.add_subplot(rows[2, :])
+    upper.colorbar(shown, ax=panels[1, 2], location="left", fraction=0.6, aspect=8, label="per pixel")
+    _draw_counts(result, lower.subplots())
+
+
+def _draw_counts(result: RenderResult, axes: Axes) -> None:
+    """Draw how many events are false, and how many are missing."""
     places = np.arange(len(result.pan))
-    kinds = (
-        ("false", [row.false_count for row in result.pan]),
-        ("missing", [r.missing_count for r in result.pan]),
-    )
-    for offset, (kind, counts) in zip((-0.2, 0.2), kinds, strict=True):
-        axes.barh(places + offset, counts, height=0.4, label=kind, color=COLORS[1 if kind == "false" else 5])
+    false, missing = ([getattr(row, name) for row in result.pan] for name in ("false_count", "missing_count"))
+    axes.barh(places - 0.2, false, height=0.4, label="false", color=COLORS[1])
+    axes.barh(places + 0.2, missing, height=0.4, label="missing", color=COLORS[5])
     axes.axvline(result.pan[0].true_count, color="0.3", ls="--", lw=1.0, label="true events")
     axes.set_yticks(places, [str(row.sampling) for row in result.pan])
     axes.set(xscale="log", xlabel="events")
+    axes.grid(visible=False, axis="y")
     axes.invert_yaxis()
     axes.legend()
