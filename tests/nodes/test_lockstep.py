@@ -46,6 +46,13 @@ SETTINGS: dict[str, Any] = {
     "device": "cpu",
     "seed": 11,
     "scene": {"kind": "apartment", "rooms": 2},
+    "bodies": {
+        "ball": {
+            "shape": {"kind": "sphere", "radius_m": 0.1},
+            "surface": {"kind": "checker"},
+            "motion": {"position_m": [-0.6, 0.0, 1.4], "orbit": {"rate_hz": 3.0}, "spin_rad_s": [0, 0, 9]},
+        }
+    },
     "render": {"lighting": {"mode": "unshadowed"}},
     "vehicle": {"on_collision": "report"},
     "path": {"kind": "circle", "ramp_s": 0.3, "speed_max_m_s": 3.0},
