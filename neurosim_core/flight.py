@@ -285,7 +285,8 @@ def _print_plan(console: Console, model: Model) -> None:
         f"[bold]{scene.name}[/]: {size} m, {len(scene.faces):,} triangles, {len(scene.lights)} lights",
         highlight=False,
     )
-    for note in (*scene.notes, *model.free_space.notes):
+    notes = [f"{body.name}: {note}" for body in model.bodies for note in body.solid.notes]
+    for note in (*scene.notes, *notes, *model.free_space.notes):
         console.print(f"  {note}", style="dim", highlight=False)
     beyond_s = (model.path.end_ns - model.duration_ns) / NS_PER_S
     rest = f"; the whole path takes {beyond_s:.1f} s more" if beyond_s > 0.0 else ""

@@ -106,7 +106,7 @@ class Trace:
     def __init__(self, *, capacity: int, vehicle_count: int, rotor_count: int, device: str) -> None:
         self.states = wp.zeros((capacity, vehicle_count, 13 + rotor_count), dtype=wp.float64, device=device)
         self.status = wp.zeros((capacity, vehicle_count), dtype=wp.int32, device=device)
-        self.stamps = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
+        self.stamps: Any = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
         self.redone = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
         self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
         self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance, self.redone)]

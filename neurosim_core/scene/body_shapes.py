@@ -121,6 +121,8 @@ class Solid:
     face_material: NDArray[np.int32]
     """Index into `materials`, shape [F]."""
     materials: tuple[Material, ...]
+    notes: tuple[str, ...] = ()
+    """What was assumed while a file was loaded, one sentence each; shown to the user."""
 
 
 def make_solid(shape: ShapeConfig, surface: SurfaceConfig | None, *, name: str) -> Solid:
@@ -258,4 +260,5 @@ def _mesh(shape: MeshShape, surface: SurfaceConfig | None, name: str) -> Solid:
         faces=scene.faces,
         face_material=np.zeros_like(scene.face_material) if plain else scene.face_material,
         materials=scene.materials if surface is None else (Material(name=name, base_color=surface.color),),
+        notes=scene.notes[:-1],  # the last is about lights, which a body does not bring
     )

@@ -203,6 +203,8 @@ def test_mesh_file(tmp_path):
     np.testing.assert_allclose(brick.center_m, [1.0, 0.0, 0.0], atol=1e-7)
     assert brick.radius_m == pytest.approx(math.sqrt(0.05**2 + 0.15**2 + 0.1**2))
     assert brick.solid.materials[brick.solid.face_material[0]].base_color == (1.0, 0.0, 0.0)
+    assert [note.split(":")[0] for note in brick.solid.notes[:2]] == ["Unit", "Up axis"]  # none on lights
+    assert not any("light" in note for note in brick.solid.notes)
     assert painted.solid.materials[painted.solid.face_material[0]].base_color == (0.6, 0.6, 0.6)
     with pytest.raises(SceneError, match="body 'brick': a mesh wears the surface of its file"):
         make_bodies({"brick": BodyConfig(shape=shape, surface=CheckerSurface())})
