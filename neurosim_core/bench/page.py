@@ -21,7 +21,7 @@ _STYLE = """
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--wash); color: var(--ink);
        font: 16px/1.6 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", sans-serif; }
-main { max-width: 62rem; margin: 0 auto; padding: 2.5rem 1.25rem 5rem; }
+main { max-width: 70rem; margin: 0 auto; padding: 2.5rem 1.25rem 5rem; }
 h1 { font-size: 2.1rem; line-height: 1.2; margin: 0 0 .3rem; letter-spacing: -.01em; }
 h2 { font-size: 1.45rem; line-height: 1.25; margin: 0 0 .6rem; letter-spacing: -.005em; }
 h3 { font-size: 1rem; margin: 2rem 0 .5rem; }
@@ -44,7 +44,8 @@ th, td { text-align: left; padding: .4rem .7rem .4rem 0; border-bottom: 1px soli
          vertical-align: top; }
 thead th { font-weight: 600; color: var(--soft); vertical-align: bottom; border-bottom-width: 2px; }
 tbody tr:hover { background: var(--wash); }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.number { text-align: right; font-variant-numeric: tabular-nums; padding-left: .5rem; }
+td.number { white-space: nowrap; }
 .bars th { font-weight: 600; padding-top: 1.1rem; }
 .bars td p { margin: 0; }
 .bars td:first-child { width: 10rem; white-space: nowrap; }
