@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from neurosim_core.convert.convert import Conversion, ConversionConfig
     from neurosim_core.convert.frames import Description
 
-_STEEP_SHARE_MAX = 0.2
+_HALVED_LOSS_MAX = 0.15
 _OPTIONS = {
     "preset": "pixel.preset",
     "size": "size",
@@ -204,24 +205,20 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
         ),
         ("time", f"{c.wall_s:.1f} s: real-time factor {c.real_time_factor:.2f}"),
         (
-            "steepness",
-            f"{c.moving_share:.1%} of the pixels change by a threshold or more between two frames, "
-            f"{_share(c.steep_share)} of them by four or more; events between frames are interpolated",
+            "sampling",
+            "events between frames are interpolated; with every second frame left out there would be "
+            + ("none" if math.isnan(c.halved_loss) else f"{c.halved_loss:.0%} fewer"),
         ),
     ]
 
 
-def _share(value: float) -> str:
-    return "none" if value != value else f"{value:.0%}"
-
-
 def _warnings(c: Conversion) -> list[str]:
     notes = []
-    if c.steep_share > _STEEP_SHARE_MAX:
+    if c.halved_loss > _HALVED_LOSS_MAX:
         notes.append(
-            f"the motion is fast for this frame rate: {c.steep_share:.0%} of the pixels that change do so by "
-            "four thresholds or more from one frame to the next. Times within an interval are those of a "
-            "cross-fade: film faster, or convert a part where less moves."
+            f"the motion is fast for this frame rate: without every second frame {c.halved_loss:.0%} of the "
+            "events would be missing, so as many or more are missing now, and times within an interval are "
+            "those of a cross-fade. Film faster, or take a part where less moves."
         )
     if c.code_step > c.threshold:
         notes.append(

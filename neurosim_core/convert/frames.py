@@ -25,6 +25,7 @@ TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 """Units of a file of time stamps, and the power of ten that makes nanoseconds of them."""
 
 _GRAY_MODES = ("1", "L", "I;16", "I;16B", "I;16L", "F")
+_CONVERTED_MODES = ("P", "PA", "LA", "RGBA", "RGBX", "CMYK", "YCbCr")
 _FULL_RANGE = 2
 _LIMITED_RANGE = 1
 
@@ -239,7 +240,9 @@ def _read_picture(file: Path) -> NDArray[Any]:
     except (OSError, SyntaxError) as error:
         raise ValueError(f"{file} is not a readable picture: {error}") from None
     if picture.mode not in (*_GRAY_MODES, "RGB"):
-        if picture.has_transparency_data and picture.convert("RGBA").getextrema()[3][0] < 255:
+        if picture.mode not in _CONVERTED_MODES:
+            raise ValueError(f"{file} has pixels of mode {picture.mode}, which cannot be read")
+        if picture.has_transparency_data and np.asarray(picture.convert("RGBA"))[..., 3].min() < 255:
             raise ValueError(f"{file} has transparent pixels; pictures must be opaque")
         picture = picture.convert("L" if picture.mode == "LA" else "RGB")
     if picture.mode == "1":
@@ -254,7 +257,8 @@ def _read_picture(file: Path) -> NDArray[Any]:
 
 def _refuse_deep_colour(file: Path, picture: Image.Image) -> None:
     """Refuse colours of 16 bits, of which Pillow would drop half without a word."""
-    layout = str(picture.tile[0][3]) if picture.tile else ""
+    tiles = getattr(picture, "tile", [])  # how the file stores its parts
+    layout = str(tiles[0][3]) if tiles else ""
     if ";16" in layout and not picture.mode.startswith("I;16"):
         raise ValueError(
             f"{file} has colours of 16 bits, which can be read from a video only: make one without loss,"

@@ -62,6 +62,26 @@ def largest_crop(crop: Crop, size: tuple[int, int]) -> Crop:
     return Crop(width, height, crop.x + (crop.width - width) // 2, crop.y + (crop.height - height) // 2)
 
 
+def require_inside(source: tuple[int, int], crop: Crop, size: tuple[int, int]) -> None:
+    """Refuse a rectangle that is not inside the picture, and a result that would be larger than it.
+
+    Args:
+        source: Width and height of the pictures [px].
+        crop: What of them is taken.
+        size: Width and height of the result [px].
+
+    Raises:
+        ValueError: Its message says what is there.
+    """
+    if crop.x + crop.width > source[0] or crop.y + crop.height > source[1]:
+        raise ValueError(f"crop must lie inside the {source[0]}x{source[1]} pixels there are, got {crop}")
+    if size[0] > crop.width or size[1] > crop.height:
+        raise ValueError(
+            f"size must be at most the {crop.width}x{crop.height} pixels there are (pictures are made"
+            f" smaller, never larger), got {size[0]}x{size[1]}"
+        )
+
+
 class Reducer:
     """Takes a rectangle of a picture and averages it over the areas of larger pixels, exactly.
 
@@ -77,13 +97,7 @@ class Reducer:
     """
 
     def __init__(self, source: tuple[int, int], crop: Crop, size: tuple[int, int]) -> None:
-        if crop.x + crop.width > source[0] or crop.y + crop.height > source[1]:
-            raise ValueError(f"crop must lie inside the {source[0]}x{source[1]} pixels there are, got {crop}")
-        if size[0] > crop.width or size[1] > crop.height:
-            raise ValueError(
-                f"size must be at most the {crop.width}x{crop.height} pixels there are (pictures are made"
-                f" smaller, never larger), got {size[0]}x{size[1]}"
-            )
+        require_inside(source, crop, size)
         self._span = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
         self._rows = _averages(crop.height, size[1])
         self._columns = _averages(crop.width, size[0])

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
-# mypy: disable-error-code="call-overload,untyped-decorator,assignment"
+# mypy: disable-error-code="call-overload,untyped-decorator,assignment,var-annotated,type-var,valid-type"
 """From a picture as it is stored to linear luminance.
 
 Greys and RGB are looked up in tables. Videos store luma and two colour differences instead. FFmpeg's own way
