@@ -138,7 +138,7 @@ class Bridge:
         self._ros_publishers: Shared[RosPublisher] = Shared()
         self._cortex_publishers: Shared[Publisher[Any]] = Shared()
         self._vehicles: dict[str, Whereabouts] = {}
-        self._static = StaticTransforms(convert.static_transforms, self._frames)
+        self._static = StaticTransforms(self._frames)
         self._resources = contextlib.ExitStack()
         self._static_publisher: RosPublisher | None = None
         self._diagnostics = self._ros_publishers.take(
@@ -147,11 +147,16 @@ class Bridge:
             lambda: backend.publisher(diagnostics.TOPIC, diagnostics.TYPE, QOS["default"]),
         )
         self._diagnosed_s = time.monotonic()
+        self._failed_s: float | None = None
+        self._failure = ""
 
     def run(self, stop: threading.Event) -> None:
-        """Work until told to stop."""
+        """Work until told to stop; what goes wrong with one look is said, and the next one may go well."""
         while not stop.is_set():
-            self.update()
+            try:
+                self.update()
+            except Exception as error:  # streams and commands of others must not end with one mistake
+                self._tell_failure(error)
             stop.wait(LOOK_INTERVAL_S)
 
     def update(self) -> None:
@@ -270,7 +275,8 @@ class Bridge:
         feed = self._feed(route.cortex_topic, route.cortex_type, stack)
         if route.ros_topic == TF_STATIC:
             tally = Tally(str(route))
-            self._tap(feed, lambda message: self._take_transform(message, tally), lambda: True, stack)
+            source = route.cortex_topic
+            self._tap(feed, lambda message: self._take_transform(source, message, tally), lambda: True, stack)
             return tally, lambda: publisher.subscriber_count
         kind = CORTEX_TYPES[route.cortex_type]
         output = Outgoing(
@@ -372,43 +378,60 @@ class Bridge:
                 )
             if clock is not None:
                 self._tap(self._feed(clock, "cortex/Clock", stack), whereabouts.take_clock, wants, stack)
-        tf_static = {vehicle_of(r.cortex_topic) for r in self.routes() if r.ros_topic == TF_STATIC}
-        moving = {vehicle_of(r.cortex_topic) for r in self.routes() if r.ros_topic == "/tf"}
-        self._static.keep(tf_static, moving)
+
+    def _keep_static(self) -> None:
+        """Forget the transforms of routes that are closed."""
+        routes = self.routes()
+        sources = {r.cortex_topic for r in routes if r.ros_topic == TF_STATIC}
+        self._static.keep(sources, {vehicle_of(r.cortex_topic) for r in routes if r.ros_topic == "/tf"})
 
     def _commands_come_for(self, vehicle: str) -> Callable[[], bool]:
         whereabouts = self._vehicles[vehicle]
         return lambda: any(i.heard for i in self._incoming.values() if i.whereabouts is whereabouts)
 
-    def _take_transform(self, transform: Any, tally: Tally) -> None:
+    def _take_transform(self, source: str, transform: Any, tally: Tally) -> None:
         tally.receive()
-        self._static.add(transform)
-        tally.send()
+        try:
+            self._static.add(source, transform)
+        except convert.ConvertError as error:
+            tally.refuse(str(error))
+        else:
+            tally.send()
 
     def _publish_static(self) -> None:
         """Publish all transforms that do not change, if there is a new one."""
+        self._keep_static()
         if not self._static.changed:
             return
-        if self._static_publisher is None:
-            self._static_publisher = self._ros_publishers.take(
-                self._resources,
-                TF_STATIC,
-                lambda: self._backend.publisher(TF_STATIC, "tf2_msgs/msg/TFMessage", QOS["latched"]),
-            )
         try:
+            if self._static_publisher is None:
+                self._static_publisher = self._ros_publishers.take(
+                    self._resources,
+                    TF_STATIC,
+                    lambda: self._backend.publisher(TF_STATIC, "tf2_msgs/msg/TFMessage", QOS["latched"]),
+                )
             self._static_publisher.publish(self._static.message())
         except BackendError as error:
             logger.warning("%s: %s", TF_STATIC, error)
+
+    def _tell_failure(self, error: Exception) -> None:
+        """Say a mistake once a second at most, and on /diagnostics."""
+        now_s = time.monotonic()
+        if self._failed_s is None or now_s - self._failed_s >= DIAGNOSTICS_INTERVAL_S:
+            logger.exception("the bridge goes on, but could not look after everything")
+            self._failed_s = now_s
+        self._failure = f"{type(error).__name__}: {error}"
 
     # Diagnostics
 
     def _diagnose(self, elapsed_s: float) -> None:
         """Publish how everything is doing."""
+        failure, self._failure = self._failure, ""
         statuses = [
             diagnostics.Status(
                 name="bridge",
-                level=diagnostics.WARN if self.problems else diagnostics.OK,
-                message="; ".join(self.problems) or f"{len(self._links)} routes",
+                level=diagnostics.ERROR if failure else diagnostics.WARN if self.problems else diagnostics.OK,
+                message="; ".join([failure][: len(failure)] + self.problems) or f"{len(self._links)} routes",
                 values=(
                     ("backend", self._backend.name),
                     ("distro", self._backend.distro),

@@ -97,7 +97,7 @@ def _config(options: argparse.Namespace) -> BridgeConfig:
         if (value := getattr(options, name)) is not None
     }
     if options.namespace is not None:
-        changes["namespace"] = check_namespace(options.namespace) if options.namespace.strip("/") else ""
+        changes["namespace"] = check_namespace(options.namespace)
     if changes.get("domain", 0) < 0:
         raise ConfigError(f"domain must be >= 0, got {changes['domain']}")
     return dataclasses.replace(config, **changes)

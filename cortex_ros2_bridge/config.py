@@ -108,7 +108,9 @@ def check_namespace(value: object) -> str:
     Raises:
         ConfigError: ROS allows no such name.
     """
-    text = _text("namespace", value).strip("/")
+    if not isinstance(value, str):
+        raise ConfigError(f"namespace must be a text, got {value!r:.80}")
+    text = value.strip("/")
     return _ros_name("namespace", f"/{text}") if text else ""
 
 

@@ -167,6 +167,11 @@ def static_transforms(
     return _transforms(roots + [_transform_of(each, names) for each in transforms])
 
 
+def check_transform(message: messages.Transform, names: FrameNames) -> None:
+    """Raise `ConvertError` unless a transform is one: finite, with a rotation, between two frames."""
+    _transform_of(message, names)
+
+
 def image(message: messages.Image, context: Context) -> Buffer:
     """Convert to sensor_msgs/Image; encodings are called the same."""
     data = np.ascontiguousarray(message.data)
@@ -787,6 +792,8 @@ def _transform_of(message: messages.Transform, names: FrameNames) -> Any:
     _finite(what, message.translation, message.rotation)
     if not message.child or not message.parent:
         raise ConvertError(f"a transform from {message.parent!r} to {message.child!r}")
+    if names.ros(message.parent) == names.ros(message.child):
+        raise ConvertError(f"{what}: its parent is itself, which tf2 refuses")
     if not np.any(message.rotation):
         raise ConvertError(f"{what}: its rotation is zero")
     return _transform(

@@ -362,8 +362,11 @@ def _to_array(name: str, base: str, value: Any) -> array.array[Any]:
     """Return a sequence of numbers as an array; without a Python loop where it is one already."""
     code = TYPE_CODES[base]
     flat: array.array[Any] = array.array(code)
+    assert np.ndim(value) == 1 or not isinstance(value, np.ndarray), (
+        f"The '{name}' field must have one dimension, got a numpy.ndarray() with {np.ndim(value)}"
+    )
     if isinstance(value, np.ndarray) and value.dtype == np.dtype("uint8" if base == "char" else base):
-        flat.frombytes(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+        flat.frombytes(np.ascontiguousarray(value).view(np.uint8).data)
         return flat
     if code == "B" and isinstance(value, bytes | bytearray):
         flat.frombytes(value)

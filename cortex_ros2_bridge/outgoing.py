@@ -12,7 +12,8 @@ from typing import Any
 from cortex import Node, Subscriber, keep_last
 from cortex.messages import CameraInfo, Clock, Events, Image, Odometry, PointCloud, Transform
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
-from cortex_ros2_bridge.convert import Context
+from cortex_ros2_bridge.convert import Context, check_transform, static_transforms
+from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.routes import Route
 from cortex_ros2_bridge.tally import Tally
 
@@ -136,38 +137,43 @@ class Outgoing:
 class StaticTransforms:
     """All transforms that do not change, in one message: /tf_static keeps one for whoever comes later."""
 
-    def __init__(
-        self, join: Callable[[Iterable[Transform], Iterable[str], Any], Buffer], frames: Any
-    ) -> None:
+    def __init__(self, frames: FrameNames) -> None:
         """Begin without any.
 
         Args:
-            join: Makes the message of transforms and the names of vehicles.
             frames: Names of frames.
         """
-        self._join = join
         self._frames = frames
-        self._transforms: dict[str, Transform] = {}
+        self._transforms: dict[str, tuple[str, Transform]] = {}
         self._vehicles: tuple[str, ...] = ()
         self._lock = threading.Lock()
         self.changed = False
 
-    def add(self, transform: Transform) -> None:
-        """Take in a transform, or a newer one of the same child."""
-        with self._lock:
-            self._transforms[transform.child] = transform
-            self.changed = True
-
-    def keep(self, parents: Iterable[str], vehicles: Iterable[str]) -> None:
-        """Say which vehicles there are; transforms of others are forgotten.
+    def add(self, source: str, transform: Transform) -> None:
+        """Take in a transform, or a newer one of the same child.
 
         Args:
-            parents: Vehicles that have transforms.
+            source: Cortex topic that it came on.
+            transform: The transform.
+
+        Raises:
+            ConvertError: It is none: the one before stays.
+        """
+        check_transform(transform, self._frames)
+        with self._lock:
+            self._transforms[transform.child] = source, transform
+            self.changed = True
+
+    def keep(self, sources: Iterable[str], vehicles: Iterable[str]) -> None:
+        """Say what there is; transforms that came from elsewhere are forgotten.
+
+        Args:
+            sources: Cortex topics of transforms.
             vehicles: Vehicles that move.
         """
-        there = set(parents)
+        there = set(sources)
         with self._lock:
-            kept = {child: t for child, t in self._transforms.items() if child.rpartition("/")[0] in there}
+            kept = {child: held for child, held in self._transforms.items() if held[0] in there}
             names = tuple(sorted(set(vehicles)))
             if len(kept) < len(self._transforms) or names != self._vehicles:
                 self._transforms, self._vehicles, self.changed = kept, names, True
@@ -176,7 +182,8 @@ class StaticTransforms:
         """Return the message with all of them."""
         with self._lock:
             self.changed = False
-            return self._join(list(self._transforms.values()), self._vehicles, self._frames)
+            transforms = [transform for _, transform in self._transforms.values()]
+            return static_transforms(transforms, self._vehicles, self._frames)
 
 
 class Feed:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import re
+import socket
 from collections.abc import Mapping
+from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, DISTROS
@@ -19,6 +23,11 @@ _TUNING = (
     "<Internal><WriterLingerDuration>50 ms</WriterLingerDuration>"
     '<SocketReceiveBufferSize min="default" max="4MB"/></Internal>'
 )
+_BEST = '<NetworkInterface autodetermine="true"/>'
+_LOOPBACK = '<NetworkInterface address="127.0.0.1"/>'
+_ELSEWHERE = "192.0.2.1"
+"""An address of no host (RFC 5737)."""
+
 # As ROS does it: unicast discovery on a host works only between processes with numbers.
 _INDEX = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
 
@@ -57,7 +66,9 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
     """Return the configuration of a domain, in the form of CYCLONEDDS_URI, whose settings win.
 
     ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS and ROS_LOCALHOST_ONLY mean what they mean to
-    `rmw_cyclonedds_cpp`: Humble keeps to the interface 127.0.0.1, later ones search on this host only.
+    `rmw_cyclonedds_cpp`: Humble keeps to the interface 127.0.0.1, later ones search on this host only. For
+    these the interface 127.0.0.1 is added to the one that Cyclone DDS chooses: nodes on Fast DDS that start
+    later look for others there only, nodes on Cyclone DDS on the chosen one only.
 
     Raises:
         ValueError: A variable has a value that ROS does not know.
@@ -69,16 +80,18 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
             f"got {environment['ROS_AUTOMATIC_DISCOVERY_RANGE']!r}"
         )
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
+    theirs = environment.get("CYCLONEDDS_URI", "")
     general, discovery = "", _INDEX
     if _localhost_only(environment):
-        if distro in (None, "humble"):
-            general = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
+        if distro == "humble":
+            general = f"<Interfaces>{_LOOPBACK}</Interfaces>"
             area, peers = "SYSTEM_DEFAULT", ["localhost"]
         else:
             area, peers = "LOCALHOST", []
     if area in ("LOCALHOST", "OFF"):
         general = "<AllowMulticast>false</AllowMulticast>"
     if area == "LOCALHOST":
+        general = ("" if _names_interfaces(theirs) else _both_interfaces()) + general
         peers = ["localhost", *peers]
     elif area == "OFF":
         discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
@@ -90,8 +103,31 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
         f"<Discovery>{discovery}</Discovery>{_TUNING}"
         "</Domain></CycloneDDS>"
     )
-    theirs = environment.get("CYCLONEDDS_URI", "")
     return f"{ours},{theirs}" if theirs else ours
+
+
+def _both_interfaces() -> str:
+    """Choose the best interface and 127.0.0.1; "" where that is the best one, or there is none.
+
+    Cyclone DDS refuses to begin with the same interface twice.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((_ELSEWHERE, 9))  # sends nothing; the kernel says from where it would
+        except OSError:
+            return ""
+        if probe.getsockname()[0].startswith("127."):
+            return ""
+    return f"<Interfaces>{_BEST}{_LOOPBACK}</Interfaces>"
+
+
+def _names_interfaces(uri: str) -> bool:
+    """Return whether settings of CYCLONEDDS_URI choose interfaces: ours would be added to them."""
+    texts = [uri]
+    for path in re.findall(r"file://([^,]+)", uri):
+        with contextlib.suppress(OSError, UnicodeDecodeError):  # Cyclone DDS says what is wrong with the file
+            texts.append(Path(path).read_text(encoding="utf-8"))
+    return any("networkinterface" in text.lower() for text in texts)
 
 
 def _localhost_only(environment: Mapping[str, str]) -> bool:

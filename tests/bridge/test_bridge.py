@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import logging
 import threading
@@ -185,6 +186,71 @@ def test_frames_hang_together():
     assert (moved.transform.translation.x, moved.transform.translation.z) == (1.0, 3.0)
     assert static.qos.durability == "transient_local"
     assert static.qos.depth == 1
+
+
+BAD_TRANSFORMS = {
+    "not finite": {"translation": np.array([np.nan, 0.0, 0.0])},
+    "its rotation is zero": {"rotation": np.zeros(4)},
+    "a transform from": {"parent": ""},
+    "its parent is itself": {"parent": "drone/imu"},
+    "seconds have 32 bits": {"stamp_ns": 2**62},
+}
+
+
+@pytest.mark.parametrize("reason", BAD_TRANSFORMS)
+def test_a_transform_that_is_none_is_refused_and_the_old_one_stays(reason, caplog):
+    """It must not end the bridge: the next bridge would get it too, as it is latched."""
+    with rig_of() as rig:
+        mount = rig.simulator.publisher("/drone/imu/transform", msg.Transform, latch=True)
+        mount.publish(transform("imu", x=0.5))
+        (static,) = rig.opens("/tf_static")
+        rig.update_until(lambda: static.sent)
+        mount.publish(dataclasses.replace(transform("imu"), **BAD_TRANSFORMS[reason]))
+        rig.update_until(lambda: rig.tally("/drone/imu/transform -> /tf_static").refused == 1)
+        rig.updates_during()
+        (kept,) = static.messages()[-1].transforms
+        assert kept.transform.translation.x == 0.5
+        assert rig.tally("/drone/imu/transform -> /tf_static").sent == 1
+    assert reason in caplog.text
+
+
+def test_static_transforms_stay_as_long_as_their_topic(monkeypatch):
+    """Also those of frames that are not named after a vehicle, as a real sensor's; then nobody gets them."""
+    monkeypatch.setattr(bridge_module, "GONE_S", 0.1)
+    with rig_of() as rig, Node("sensor") as sensor:
+        mount = sensor.publisher("/robot/cam/transform", msg.Transform, latch=True)
+        mount.publish(dataclasses.replace(transform("x"), parent="base_link", child="cam_link"))
+        (static,) = rig.opens("/tf_static")
+        rig.update_until(lambda: static.sent)
+        rig.simulator.publisher("/robot/imu", msg.Imu)
+        rig.opens("/robot/imu")
+        rig.updates_during()
+        assert [t.child_frame_id for t in static.messages()[-1].transforms] == ["cam_link"]
+        sensor.close()
+        rig.update_until(lambda: static.closed or static.messages()[-1].transforms == [])
+
+
+def test_a_mistake_in_the_bridge_is_said_and_does_not_end_it(monkeypatch, caplog):
+    with rig_of() as rig:
+        stop, looks = threading.Event(), []
+
+        def look() -> None:
+            looks.append(1)
+            if len(looks) == 3:
+                stop.set()
+            raise ZeroDivisionError("it cannot be")
+
+        monkeypatch.setattr(rig.bridge, "update", look)
+        rig.bridge.run(stop)
+        assert len(looks) == 3
+        assert caplog.text.count("ZeroDivisionError: it cannot be") == 1
+        monkeypatch.undo()
+        monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.02)
+        with rig.backend.listening("/diagnostics") as (diagnostics,):
+            rig.update_until(lambda: len(diagnostics.sent) > 1)
+        then, now = (message.status[0] for message in diagnostics.messages()[:2])
+        assert (then.level, now.level) == (b"\2", b"\0")
+        assert "ZeroDivisionError: it cannot be" in then.message
 
 
 def test_the_transform_of_a_sensor_that_moved_replaces_the_old_one():

@@ -61,6 +61,15 @@ def test_printed_settings_make_the_same_routes():
     assert "!!" not in text
 
 
+def test_printed_defaults_are_read_back(capsys, monkeypatch, tmp_path):
+    """As `cortex-ros2-bridge --help` shows it: print, edit, use."""
+    monkeypatch.setattr(cli, "LIST_S", 0.1)
+    assert cli.main(["--print-config"]) == 0
+    path = tmp_path / "bridge.yaml"
+    path.write_text(capsys.readouterr().out)
+    assert load(path) == load(None)
+
+
 def test_list(simulator, capsys):
     """A line for each route: from where, to where, as what."""
     assert cli.main(["--list", "--namespace", "sim"]) == 0

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from foreigners import Foreigner
 from processes import wait_for
 
+from cortex_ros2_bridge.backend import environment
 from cortex_ros2_bridge.backend.base import Qos, TopicInfo, Trigger
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
@@ -216,7 +218,7 @@ def settings(distro: str | None = None, **environment: str) -> dict[str, Any]:
 INDEX = {"Discovery/ParticipantIndex": "auto", "Discovery/MaxAutoParticipantIndex": "32"}
 
 
-def test_environment_of_ros_becomes_configuration() -> None:
+def test_environment_of_ros_becomes_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     """As rmw_cyclonedds of Humble and of Jazzy reads it."""
     assert settings() == settings("jazzy", ROS_AUTOMATIC_DISCOVERY_RANGE="subnet") == INDEX
     assert settings(ROS_STATIC_PEERS="10.0.0.1;host") == {
@@ -224,14 +226,16 @@ def test_environment_of_ros_becomes_configuration() -> None:
         "Discovery/Peers/Peer": ["10.0.0.1", "host"],
     }
     local = {**INDEX, "General/AllowMulticast": "false", "Discovery/Peers/Peer": ["localhost"]}
+    monkeypatch.setattr(environment, "_both_interfaces", lambda: "")
     assert settings(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST") == local
-    assert settings("jazzy", ROS_LOCALHOST_ONLY="1", ROS_STATIC_PEERS="host") == local
+    for distro in ("jazzy", None):
+        assert settings(distro, ROS_LOCALHOST_ONLY="1", ROS_STATIC_PEERS="host") == local
     only = {
         **INDEX,
         "General/Interfaces/NetworkInterface": ["127.0.0.1"],
         "Discovery/Peers/Peer": ["localhost"],
     }
-    assert settings("humble", ROS_LOCALHOST_ONLY="1") == settings(None, ROS_LOCALHOST_ONLY="1") == only
+    assert settings("humble", ROS_LOCALHOST_ONLY="1") == only
     assert settings("humble", ROS_LOCALHOST_ONLY="0") == INDEX
     off = settings(ROS_AUTOMATIC_DISCOVERY_RANGE="OFF", ROS_STATIC_PEERS="host")
     assert off.pop("Discovery/Tag").startswith("ros_discovery_off_")
@@ -242,6 +246,46 @@ def test_environment_of_ros_becomes_configuration() -> None:
         cyclone_config(None, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "HOUSE"})
     with pytest.raises(ValueError, match="ROS_LOCALHOST_ONLY must be 0 or 1, got 'yes'"):
         cyclone_config(None, {"ROS_LOCALHOST_ONLY": "yes"})
+
+
+def test_cyclone_accepts_both_interfaces_or_the_only_one() -> None:
+    """Where 127.0.0.1 is the only one, naming it as well would be refused."""
+    chosen = environment._both_interfaces()
+    both = '<NetworkInterface autodetermine="true"/><NetworkInterface address="127.0.0.1"/>'
+    assert chosen in ("", f"<Interfaces>{both}</Interfaces>")
+
+
+def test_interfaces_of_the_user_are_the_only_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(environment, "_both_interfaces", lambda: "<Interfaces>both</Interfaces>")
+    path = tmp_path / "cyclone.xml"
+    path.write_text("<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>")
+    local = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    for uri in (f"file://{path}", f"<CycloneDDS/>,file://{path}", path.read_text()):
+        assert "both" not in cyclone_config(None, {**local, "CYCLONEDDS_URI": uri})
+    for uri in ("", "file:///etc/no_such_file.xml", "<CycloneDDS><Domain/></CycloneDDS>"):
+        assert "both" in cyclone_config(None, {**local, "CYCLONEDDS_URI": uri})
+
+
+@pytest.mark.parametrize(
+    "peer",
+    [
+        "<AllowMulticast>false</AllowMulticast>",
+        "<Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>",
+    ],
+    ids=["as rmw_cyclonedds of Jazzy", "as that of Humble"],
+)
+def test_on_this_host_only_nodes_that_start_later_are_found(
+    make: Any, foreigner: Start, monkeypatch: pytest.MonkeyPatch, peer: str
+) -> None:
+    """Both of those that search on this host only, and those that keep to 127.0.0.1."""
+    discovery = "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='localhost'/></Peers>"
+    monkeypatch.delenv("CYCLONEDDS_URI")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    words = make(distro="jazzy").publisher("/words", STRING, Qos())
+    uri = f"<Domain><General>{peer}</General><Discovery>{discovery}</Discovery></Domain>"
+    other = foreigner(CYCLONEDDS_URI=f"<CycloneDDS>{uri}</CycloneDDS>")
+    assert other.do("subscribe", topic="rt/words", kind="String") == 1
+    wait_for(lambda: words.subscriber_count == 1)
 
 
 def test_domain_number() -> None:

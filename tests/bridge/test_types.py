@@ -46,6 +46,8 @@ from cortex_ros2_bridge.typestore import (
     typestore,
 )
 
+WRONG = (AssertionError, TypeError)
+"""What the classes raise with and without ROS_PYTHON_CHECK_FIELDS=1; ours always check."""
 ROUTED = sorted({name for _, name in OUT} | {name for name, _ in IN})
 HASHES = Path(__file__).with_name("golden") / "type_hashes.txt"
 REAL_HASHES = {
@@ -227,9 +229,10 @@ def test_values_of_a_wrong_type_or_range_are_refused(change, reason):
 
 def test_arrays_are_those_of_rclpy_whatever_they_are_made_of():
     pixels = np.arange(12, dtype=np.uint8).reshape(2, 6)
-    for data in (pixels, pixels.tobytes(), bytearray(pixels), list(range(12)), array.array("B", range(12))):
+    flat = pixels.reshape(-1)
+    for data in (flat, pixels.tobytes(), bytearray(pixels), list(range(12)), array.array("B", range(12))):
         assert Image(data=data).data == array.array("B", range(12))
-    assert Image(data=pixels[:, ::2]).data.tolist() == [0, 2, 4, 6, 8, 10]
+    assert Image(data=flat[::2]).data.tolist() == [0, 2, 4, 6, 8, 10]
     assert Actuators(velocity=[1, 2]).velocity == array.array("d", [1.0, 2.0])
     imu = Imu(orientation_covariance=[0, 1, 2, 3, 4, 5, 6, 7, 8])
     assert imu.orientation_covariance.dtype == np.float64
@@ -240,6 +243,16 @@ def test_arrays_are_those_of_rclpy_whatever_they_are_made_of():
     message = Actuators()
     message.velocity.extend([3.0, 4.0])
     assert message.velocity.tolist() == [3.0, 4.0]
+
+
+def test_an_array_of_more_dimensions_is_refused_as_rclpy_does():
+    """Else what was written without ROS would fail where ROS is."""
+    picture = np.zeros((2, 6), np.uint8)
+    with pytest.raises(WRONG):
+        Image(data=picture)
+    message = Image()
+    with pytest.raises(WRONG):
+        message.data = picture
 
 
 def test_equality():
