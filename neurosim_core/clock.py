@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -47,23 +48,23 @@ class Rate:
         return (NS_PER_S / Fraction(str(self.rate_hz))).as_integer_ratio()
 
     def stamp_ns(self, tick: int) -> int:
-        """Return the stamp of a tick [ns]."""
+        """Return the stamp of a tick [ns]; TypeError if it is no integer."""
         numerator, denominator = self._period
-        return tick * numerator // denominator
+        return operator.index(tick) * numerator // denominator
 
     def first_tick(self, stamp_ns: int) -> int:
-        """Return the first tick at or after a stamp."""
+        """Return the first tick at or after a stamp; TypeError if it is no integer."""
         # floor(k p) >= s  <=>  k p >= s  for integer s
         numerator, denominator = self._period
-        return -(-stamp_ns * denominator // numerator)
+        return -(-operator.index(stamp_ns) * denominator // numerator)
 
     def has_tick(self, stamp_ns: int) -> bool:
         """Return whether a tick is at this stamp."""
         return self.stamp_ns(self.first_tick(stamp_ns)) == stamp_ns
 
     def stamps(self, start_ns: int, end_ns: int) -> Iterator[int]:
-        """Yield the stamps of all ticks in [start_ns, end_ns)."""
-        tick = self.first_tick(start_ns)
+        """Yield the stamps of all ticks in [start_ns, end_ns); TypeError if they are no integers."""
+        tick, end_ns = self.first_tick(start_ns), operator.index(end_ns)
         while (stamp := self.stamp_ns(tick)) < end_ns:
             yield stamp
             tick += 1

@@ -23,6 +23,9 @@ Vector3 = tuple[float, float, float]
 Q_FORWARD_OPTICAL = (-0.5, 0.5, -0.5, 0.5)
 """Quaternion that takes optical coordinates to those of a forward, left, up frame that looks the same way."""
 
+UNIT_TOLERANCE = 1e-3
+"""How far the length of a quaternion that is given as a rotation may be from 1."""
+
 
 class Mount(Settings):
     """Where a sensor sits on the body: exactly T_BS, no hidden lift or lever arm."""
@@ -67,8 +70,14 @@ def heading_rad(q_WB: ArrayLike) -> float:
 
     Args:
         q_WB: Unit quaternion, xyzw, shape [4].
+
+    Raises:
+        ValueError: It is no unit quaternion, by more than rounding in single precision.
     """
-    x, y, z, w = np.asarray(q_WB, dtype=np.float64).tolist()
+    q = np.asarray(q_WB, dtype=np.float64)
+    if q.shape != (4,) or not abs(math.hypot(*q.tolist()) - 1.0) < UNIT_TOLERANCE:
+        raise ValueError(f"q_WB must be a unit quaternion, got {q.tolist()}")
+    x, y, z, w = q.tolist()
     return math.atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (x * x + z * z))
 
 

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
+import operator
 from typing import Any, Literal, get_args
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.control.modes import make_controller
+from neurosim_core.control.modes import Controller, make_controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
@@ -80,23 +81,39 @@ class PathFollower:
             rotor_speed: Speed of each rotor [rad/s], shape [R].
 
         Raises:
-            ValueError: A shape does not fit.
+            TypeError: The stamp is no integer.
+            ValueError: A shape does not fit, or what the command is made of is not finite.
         """
+        if self.mode == "position":
+            return self._position(self._cursor.at(stamp_ns))
         if self._controller is None:
-            point = self._cursor.at(stamp_ns)
-            return (
-                self._position(point)
-                if self.mode == "position"
-                else self._velocity(point, position, orientation)
+            command = self._velocity(self._cursor.at(stamp_ns), position, orientation)
+        else:
+            command = self._motor_speeds(
+                self._controller, stamp_ns, position, velocity, orientation, body_rate, rotor_speed
             )
+        if not math.isfinite(sum(command.tolist())):
+            raise ValueError(f"no finite command follows from the state at {stamp_ns} ns: it is not finite")
+        return command
+
+    def _motor_speeds(
+        self,
+        controller: Controller,
+        stamp_ns: int,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        orientation: ArrayLike,
+        body_rate: ArrayLike,
+        rotor_speed: ArrayLike,
+    ) -> NDArray[np.float64]:
         state = self._feedback
         state.host_position[0] = position
         state.host_velocity[0] = velocity
         state.host_orientation[0] = orientation
         state.host_body_rate[0] = body_rate
         state.host_rotor_speed[0] = rotor_speed
-        state.host_stamp_ns[0] = stamp_ns
-        self._controller.update(state)
+        state.host_stamp_ns[0] = operator.index(stamp_ns)
+        controller.update(state)
         return np.array(state.host_rotor_speed_command[0])
 
     def error_m(self, stamp_ns: int, position: ArrayLike) -> float:

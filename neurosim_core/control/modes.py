@@ -16,6 +16,7 @@ sin yaw, 0). A mode is compiled when it is first used, and only then.
 """
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -40,7 +41,7 @@ from neurosim_core.control.se3 import (
     shorten,
     velocity_wrench,
 )
-from neurosim_core.frames import as_rows
+from neurosim_core.frames import UNIT_TOLERANCE, as_rows
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
 from neurosim_core.vehicle.multirotor import MultirotorConfig
@@ -258,7 +259,12 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
     Args:
         mode: Name of the mode.
         terms: Aerodynamic terms to compensate, of `vehicle.aerodynamics.AIR_TERMS`.
+
+    Raises:
+        ValueError: There is no such mode.
     """
+    if mode not in MODES:
+        raise ValueError(f"unknown command mode {mode!r}, known: {sorted(MODES)}")
     return MODES[mode].make_kernel(terms)
 
 
@@ -336,9 +342,11 @@ class Controller:
             stamp_ns: Time at which a path is evaluated [ns].
 
         Raises:
-            ValueError: If a shape does not fit or an element is not finite; the message names the mode and
-                its layout.
+            TypeError: If the stamp is no integer.
+            ValueError: If a shape does not fit, an element is not finite, an orientation is no unit
+                quaternion, or numbers are so large that there is no finite command.
         """
+        stamp_ns = _checked_stamp(stamp_ns)
         if setpoint is not None:
             self.set(setpoint)
         if self._host is None:
@@ -352,10 +360,16 @@ class Controller:
             (arrays.body_rate, "body_rate", body_rate, 3),
             (arrays.rotor_speed, "rotor_speed", rotor_speed, self.rotor_count),
         ):
-            array.assign(as_rows(value, name=name, count=self.count, width=width))
+            rows = as_rows(value, name=name, count=self.count, width=width)
+            if name == "orientation" and (abs(np.linalg.norm(rows, axis=1) - 1.0) > UNIT_TOLERANCE).any():
+                raise ValueError(f"orientation must be unit quaternions, got {rows.tolist()}")
+            array.assign(rows)
         arrays.stamp_ns.fill_(stamp_ns)
         launch.launch()
-        return np.array(arrays.rotor_speed_command.numpy())
+        command = np.array(arrays.rotor_speed_command.numpy())
+        if not np.isfinite(command).all():
+            raise ValueError("state or setpoint is too large: no finite command follows from it")
+        return command
 
     def set(self, setpoint: ArrayLike) -> None:
         """Write all setpoints from the host.
@@ -376,7 +390,7 @@ class Controller:
             raise ValueError(
                 f"mode {self.mode!r} takes rows of ({', '.join(self.layout)}): {error}"
             ) from None
-        if self.mode == "attitude" and not (np.linalg.norm(rows[:, 1:], axis=1) > 1e-6).all():
+        if self.mode == "attitude" and not (np.abs(rows[:, 1:]).max(axis=1) > 1e-6).all():
             raise ValueError(f"mode 'attitude' takes unit quaternions, got {rows[:, 1:].tolist()}")
         return rows
 
@@ -399,6 +413,13 @@ class Controller:
             device=self.device,
             record_cmd=True,
         )
+
+
+def _checked_stamp(stamp_ns: int) -> int:
+    stamp_ns = operator.index(stamp_ns)
+    if not -(2**63) <= stamp_ns < 2**63:
+        raise ValueError(f"stamp_ns must fit 64 bits, got {stamp_ns}")
+    return stamp_ns
 
 
 class _HostArrays:
@@ -434,12 +455,13 @@ def make_controller(
         paths: For mode `path`, and only there: one for all, or one for each vehicle.
 
     Raises:
+        TypeError: If the count is no integer.
         ValueError: If the mode is unknown, paths are missing, superfluous or of the wrong number, or the
             rotors cannot produce every torque.
     """
     if mode not in MODES:
         raise ValueError(f"unknown command mode {mode!r}, known: {sorted(MODES)}")
-    if count < 1:
+    if operator.index(count) < 1:
         raise ValueError(f"count must be >= 1, got {count}")
     given = [] if paths is None else [paths] if isinstance(paths, Path) else list(paths)
     if mode == "path" and len(given) not in (1, count):

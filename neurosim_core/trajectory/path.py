@@ -8,6 +8,7 @@ metres, radians.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -175,7 +176,11 @@ class Path:
         knots_ns = knots_ns.astype(np.int64)
         if not (np.diff(knots_ns) > 0).all():
             raise ValueError(f"knots_ns must increase, got {knots_ns.tolist()}")
-        if coefficients.ndim != 3 or coefficients.shape[:2] != (len(knots_ns) - 1, 4):
+        if (
+            coefficients.ndim != 3
+            or coefficients.shape[:2] != (len(knots_ns) - 1, 4)
+            or coefficients.shape[2] < 1
+        ):
             raise ValueError(
                 f"coefficients must have shape [{len(knots_ns) - 1}, 4, degree + 1], "
                 f"got {list(coefficients.shape)}"
@@ -221,10 +226,11 @@ class Path:
             device: Where to compute.
 
         Raises:
-            TypeError: If the stamps are not integers.
+            TypeError: If the stamps are not integers of at most 64 bits.
         """
         stamps = np.atleast_1d(np.asarray(stamps_ns))
-        if stamps.ndim != 1 or not np.issubdtype(stamps.dtype, np.integer):
+        integer = np.issubdtype(stamps.dtype, np.integer) and np.can_cast(stamps.dtype, np.int64)
+        if stamps.ndim != 1 or not integer:
             raise TypeError(
                 f"stamps_ns must be integers of shape [n], got {stamps.dtype} {list(stamps.shape)}"
             )
@@ -247,8 +253,14 @@ class Path:
 
         Args:
             parts: How many parts each piece is cut into, integers >= 1, shape [S] or one for all.
+
+        Raises:
+            ValueError: If they are not.
         """
-        counts = np.broadcast_to(np.asarray(parts, dtype=np.int64), (len(self.coefficients),))
+        given = np.asarray(parts)
+        if not np.issubdtype(given.dtype, np.integer) or not (given >= 1).all():
+            raise ValueError(f"parts must be integers >= 1, got {given.tolist()}")
+        counts = np.broadcast_to(given.astype(np.int64), (len(self.coefficients),))
         knots: list[NDArray[np.int64]] = []
         pieces: list[NDArray[np.float64]] = []
         for start_ns, end_ns, count, piece in zip(
@@ -265,7 +277,15 @@ class Path:
 
         Args:
             coefficients: Yaw in rising powers of normalised time [rad], shape [S, any degree + 1].
+
+        Raises:
+            ValueError: If the shape does not fit.
         """
+        if coefficients.ndim != 2 or len(coefficients) != len(self.coefficients):
+            raise ValueError(
+                f"coefficients must have shape [{len(self.coefficients)}, degree + 1], "
+                f"got {list(coefficients.shape)}"
+            )
         return Path(self.knots_ns, join_axes(self.coefficients[:, :3], coefficients[:, None, :]))
 
 
@@ -286,8 +306,13 @@ class PathCursor:
         self._stamp_ns, self._point = stamps_ns.numpy(), points.numpy()
 
     def at(self, stamp_ns: int) -> np.void:
-        """Return a record with the fields of `PathPoint`, shape []; the next call overwrites it."""
-        self._stamp_ns[0] = stamp_ns
+        """Return a record with the fields of `PathPoint`, shape []; the next call overwrites it.
+
+        Raises:
+            TypeError: The stamp is no integer.
+            OverflowError: It does not fit 64 bits.
+        """
+        self._stamp_ns[0] = operator.index(stamp_ns)
         self._launch.launch()
         point: np.void = self._point[0]
         return point

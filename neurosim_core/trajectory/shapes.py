@@ -29,6 +29,9 @@ Cycles = Annotated[int, Field(ge=1, le=16)]
 
 _ORDER = 5
 """Values given at each knot: position to snap."""
+_PIECES_MAX = 1_000_000
+_LARGEST = 1e6
+"""Of lengths [m], speeds [m/s], times [s] and laps."""
 _RAMP = Polynomial([0.0] * 5 + [126.0, -420.0, 540.0, -315.0, 70.0])
 """Rises from 0 to 1 on [0, 1] with four derivatives zero at both ends."""
 
@@ -58,7 +61,7 @@ class LineConfig(ShapeConfig):
     """Where it begins [m]."""
     end_m: Vector3
     """Where it ends [m]."""
-    speed_max_m_s: float = Field(default=2.0, gt=0.0)
+    speed_max_m_s: float = Field(default=2.0, gt=0.0, le=_LARGEST)
     """Speed half-way [m/s]."""
 
     @model_validator(mode="after")
@@ -73,11 +76,11 @@ class PeriodicConfig(ShapeConfig):
 
     center_m: Vector3 | None = None
     """Centre of the curve [m]; null: the middle of free space."""
-    speed_max_m_s: float = Field(default=2.0, gt=0.0)
+    speed_max_m_s: float = Field(default=2.0, gt=0.0, le=_LARGEST)
     """Largest speed [m/s]."""
-    laps: float = Field(default=2.0, gt=0.0)
+    laps: float = Field(default=2.0, gt=0.0, le=_LARGEST)
     """How often the curve is flown, the parts in which speed rises and falls included."""
-    ramp_s: float = Field(default=2.0, gt=0.0)
+    ramp_s: float = Field(default=2.0, gt=0.0, le=_LARGEST)
     """Time from rest to full speed, and back [s]; shortened if the laps take less."""
 
 
@@ -85,7 +88,7 @@ class CircleConfig(PeriodicConfig):
     """A level circle, counter-clockwise from its easternmost point."""
 
     kind: Literal["circle"] = "circle"
-    radius_m: float = Field(default=1.0, gt=0.0)
+    radius_m: float = Field(default=1.0, gt=0.0, le=_LARGEST)
     """Radius [m]."""
 
 
@@ -93,9 +96,9 @@ class FigureEightConfig(PeriodicConfig):
     """A level figure eight, x = length/2 sin(theta), y = width/2 sin(2 theta); fastest in the middle."""
 
     kind: Literal["figure_eight"] = "figure_eight"
-    length_m: float = Field(default=3.0, gt=0.0)
+    length_m: float = Field(default=3.0, gt=0.0, le=_LARGEST)
     """Size along x [m]."""
-    width_m: float = Field(default=1.5, gt=0.0)
+    width_m: float = Field(default=1.5, gt=0.0, le=_LARGEST)
     """Size along y [m]."""
 
 
@@ -112,8 +115,10 @@ class LissajousConfig(PeriodicConfig):
 
     @model_validator(mode="after")
     def _moves(self) -> LissajousConfig:
-        if not any(self.amplitude_m):
-            raise ValueError("amplitude_m must not be all zero")
+        if not 0.0 < max(map(abs, self.amplitude_m)) <= _LARGEST:
+            raise ValueError(
+                f"amplitude_m must not be all zero, and at most {_LARGEST:g} m, got {self.amplitude_m}"
+            )
         return self
 
 
@@ -154,6 +159,8 @@ def _periodic(
 ) -> Path:
     size, rate, shift = np.array(amplitude), np.array(cycles, dtype=np.float64), np.array(phase)
     middle = center if config.center_m is None else np.array(config.center_m)
+    if not np.isfinite(middle).all():
+        raise ValueError(f"the centre must be finite, got {middle.tolist()}")
     theta = np.linspace(0.0, 2.0 * math.pi, 20_001)  # finds the largest speed to 1e-5 at 16 cycles
     tangent = size * rate * np.cos(theta[:, None] * rate + shift)
     omega = config.speed_max_m_s / float(np.linalg.norm(tangent, axis=1).max())
@@ -164,6 +171,11 @@ def _periodic(
 
     fastest = omega * float(rate[size != 0.0].max())
     spacing_ns = min(to_ns(0.4 / fastest), ramp_ns // 16)
+    if spacing_ns < 1 or end_ns // spacing_ns > _PIECES_MAX:
+        raise ValueError(
+            f"{config.laps:g} laps at {config.speed_max_m_s:g} m/s with ramps of {config.ramp_s:g} s take "
+            f"{end_ns / NS_PER_S:.3g} s, {fastest:.3g} rad/s and more than {_PIECES_MAX:,} pieces of path"
+        )
     marks = sorted({0, ramp_ns, end_ns - ramp_ns, end_ns})
     knots = [np.zeros(1, dtype=np.int64)]
     for a, b in itertools.pairwise(marks):
