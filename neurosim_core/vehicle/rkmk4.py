@@ -28,7 +28,7 @@ GUARD_RELATIVE = 1e-2
 """Guard: largest embedded error estimate of one step as a share of speed and body rate."""
 
 
-GUARD_CONTACT = 1e3
+GUARD_CONTACT = 1e4
 """How many times tighter the guard is while a foot is in the ground: forces have kinks there."""
 
 
@@ -211,8 +211,9 @@ def make_rkmk4(equations: Equations) -> Any:
                 )
                 a_error -= airframe.mass_inverse * lag_force
                 w_error -= solve_inertia(airframe, lag_torque)
-            if wp.static(contact):  # noqa: SIM102
-                if touches(around.ground, z_1, up_0) or touches(around.ground, z_4, up_0):
+            if wp.static(contact):
+                up_4 = up_0 - wp.cross(u_4, up_0)  # turned by exp(-u), nearly
+                if touches(around.ground, z_1, up_0) or touches(around.ground, z_4, up_4):
                     a_error *= wp.static(wp.float64(GUARD_CONTACT))
                     w_error *= wp.static(wp.float64(GUARD_CONTACT))
             # written so that a NaN trips it
