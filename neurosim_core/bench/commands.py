@@ -9,10 +9,10 @@ import argparse
 import signal
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.signals import handle_signals
@@ -33,8 +33,10 @@ class Study:
     name: str
     help: str
     description: str
-    chapter: Callable[[bool, Progress], Chapter]
-    """Measures, quickly if the first argument says so, and returns the answer."""
+    chapter: Callable[[Mapping[str, Any], Progress], Chapter]
+    """Measures under options, such as quick, and returns the answer."""
+    options: frozenset[str] = frozenset()
+    """What it takes besides `quick`, some of scene, device, width and height."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -53,6 +55,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _add_study(parser: argparse.ArgumentParser, study: Study) -> None:
     _add_out(parser, study.name)
     _add_quick(parser)
+    _add_options(parser, study.options)
     parser.set_defaults(command=lambda arguments: _bench_study(study, arguments))
 
 
@@ -63,6 +66,7 @@ def _add_all(parser: argparse.ArgumentParser) -> None:
     )
     _add_out(parser, "report")
     _add_quick(parser)
+    _add_options(parser, frozenset().union(*(study.options for study in STUDIES)))
     parser.set_defaults(command=_bench_all)
 
 
@@ -70,6 +74,21 @@ def _add_quick(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick", action="store_true", help="a small version, to see what it looks like; figures are rough"
     )
+
+
+def _add_options(parser: argparse.ArgumentParser, options: frozenset[str]) -> None:
+    """What may be chosen; what is not given is up to the study."""
+    if "scene" in options:
+        parser.add_argument(
+            "--scene", type=Path, metavar="FILE", help="mesh file; default: a generated scene"
+        )
+    if "device" in options:
+        parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    for name, side in (("width", "columns"), ("height", "rows")):
+        if name in options:
+            parser.add_argument(
+                f"--{name}", type=int, metavar="PX", help=f"{side} of the camera (default: as the device can)"
+            )
 
 
 def _add_step(parser: argparse.ArgumentParser) -> None:
@@ -190,34 +209,34 @@ def _numbers(text: str) -> list[float]:
         raise argparse.ArgumentTypeError(f"takes numbers with commas between them, got {text!r}") from None
 
 
-def _dynamics(quick: bool, progress: Progress) -> Chapter:
+def _dynamics(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.dynamics import dynamics_chapter, measure_dynamics
 
-    return dynamics_chapter(measure_dynamics(quick=quick))
+    return dynamics_chapter(measure_dynamics(**options, progress=progress))
 
 
-def _events(quick: bool, progress: Progress) -> Chapter:
+def _events(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.events import events_chapter, measure_events
 
-    return events_chapter(measure_events(quick=quick))
+    return events_chapter(measure_events(**options, progress=progress))
 
 
-def _pixel(quick: bool, progress: Progress) -> Chapter:
+def _pixel(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.pixel import measure_pixel, pixel_chapter
 
-    return pixel_chapter(measure_pixel(quick=quick))
+    return pixel_chapter(measure_pixel(**options, progress=progress))
 
 
-def _render(quick: bool, progress: Progress) -> Chapter:
+def _render(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.render import measure_render, render_chapter
 
-    return render_chapter(measure_render(quick=quick, progress=progress))
+    return render_chapter(measure_render(**options, progress=progress))
 
 
-def _leave_out(quick: bool, progress: Progress) -> Chapter:
+def _leave_out(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.leave_out import leave_out_chapter, measure_leave_out
 
-    return leave_out_chapter(measure_leave_out(quick=quick, progress=progress))
+    return leave_out_chapter(measure_leave_out(**options, progress=progress))
 
 
 STUDIES: Sequence[Study] = (
@@ -234,6 +253,7 @@ STUDIES: Sequence[Study] = (
         description="Render a flight at fixed rates and as often as its motion asks for, and compare the "
         "events with those of a far higher rate.",
         chapter=_events,
+        options=frozenset({"scene", "device", "width", "height"}),
     ),
     Study(
         name="pixel",
@@ -248,6 +268,7 @@ STUDIES: Sequence[Study] = (
         description="Render with several settings of sampling and filtering, against many samples a pixel; "
         "then pan slowly over a fine checkerboard and count false events.",
         chapter=_render,
+        options=frozenset({"device"}),
     ),
     Study(
         name="leave-out",
@@ -264,7 +285,7 @@ def _bench_study(study: Study, arguments: argparse.Namespace) -> int:
 
     console = Console()
     with handle_signals(signal.default_int_handler):
-        _write([_measure(study, console, quick=arguments.quick)], arguments.out, console)
+        _write([_measure(study, arguments, console)], arguments.out, console)
     return 0
 
 
@@ -279,7 +300,7 @@ def _bench_all(arguments: argparse.Namespace) -> int:
             for number, study in enumerate(STUDIES, 1):
                 prefix = f"({number} of {len(STUDIES)}) "
                 try:
-                    chapter = _measure(study, console, quick=arguments.quick, prefix=prefix)
+                    chapter = _measure(study, arguments, console, prefix=prefix)
                 except Exception as error:  # whatever it is, it is told, and the other studies go on
                     chapter, status = _failed(study, error, console, quick=arguments.quick), 1
                 chapters.append(chapter)
@@ -290,16 +311,24 @@ def _bench_all(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _measure(study: Study, console: Console, *, quick: bool, prefix: str = "") -> Chapter:
+def _measure(study: Study, arguments: argparse.Namespace, console: Console, *, prefix: str = "") -> Chapter:
     """Measure one thing and print it."""
     from neurosim_core.bench.report import print_chapter
 
     begin = time.perf_counter()
     with console.status(f"{prefix}{study.name}") as status:
-        chapter = study.chapter(quick, lambda what: status.update(f"{prefix}{study.name}: {what}"))
+        chapter = study.chapter(
+            _options(study, arguments), lambda what: status.update(f"{prefix}{study.name}: {what}")
+        )
     print_chapter(chapter, console)
     console.print(f"{study.name} took {time.perf_counter() - begin:.0f} s\n", style="dim", highlight=False)
     return chapter
+
+
+def _options(study: Study, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what a study is told: whether to be quick, and what was given of what it takes."""
+    given = {name: getattr(arguments, name) for name in study.options}
+    return {"quick": arguments.quick, **{name: value for name, value in given.items() if value is not None}}
 
 
 def _failed(study: Study, error: Exception, console: Console, *, quick: bool) -> Chapter:
