@@ -58,7 +58,8 @@ class Events(Packet):
     start_ns: int = 0
     """Start of the window, not part of it [ns]."""
     dropped_count: int = 0
-    """Events of this window that did not fit into the buffer and are lost."""
+    """Events of this window that are lost: they did not fit into the buffer, or the readout's queue was
+    full."""
 
     def __len__(self) -> int:
         return int(self.t.shape[0])

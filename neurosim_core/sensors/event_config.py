@@ -6,6 +6,7 @@ Every group is optional. What is left out is not compiled and allocates nothing;
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -22,9 +23,9 @@ Decades = Annotated[float, Field(ge=0.0, le=2.0)]
 class ThresholdSpreadConfig(Settings):
     """Mismatch: the thresholds of a pixel differ from the nominal ones by normal numbers that stay."""
 
-    on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     """Standard deviation of the threshold upwards, in log radiance."""
-    off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     """Standard deviation of the threshold downwards, in log radiance."""
     minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
     """Smaller thresholds are raised to this one."""
@@ -46,7 +47,7 @@ class LowPassConfig(Settings):
 class LeakConfig(Settings):
     """Leak of the reset switch: the reference falls, so that a still pixel fires ON events steadily."""
 
-    rate_hz: Rate = 0.1
+    rate_hz: Annotated[float, Field(ge=0.0, le=1e4)] = 0.1
     """Events a second and pixel in a still scene [Hz]."""
     spread_decades: Decades = 0.1
     """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
@@ -79,7 +80,7 @@ class HotPixelConfig(Settings):
 class StochasticConfig(Settings):
     """DVS-Voltmeter: the voltage of a pixel is a Brownian motion with drift, events are first passages.
 
-    With L the radiance in units of white_radiance / 255, the voltage moves with
+    With L the radiance in units of white_radiance / 255, at most 1000 times white, the voltage moves with
 
         mean rate  k1 d/dt ln(L + k2) + k4 + k5 L,    standard deviation  k3 sqrt(L) / (L + k2) + k6,
 
@@ -99,12 +100,22 @@ class StochasticConfig(Settings):
     """Photon noise."""
     k4: Annotated[float, Field(ge=0.0, le=1.0)]
     """Leak in the dark [1/us]."""
-    k5: Annotated[float, Field(ge=0.0, le=1.0)]
+    k5: Annotated[float, Field(ge=0.0, le=1e-3)]
     """Leak by parasitic photocurrent, for each unit of light [1/us]."""
     k6: Annotated[float, Field(ge=0.0, le=1.0)]
     """Noise that does not depend on light [1/sqrt(us)]."""
     random_phase: bool = True
     """Begin at voltages drawn from 0 ... 1, as a camera that has been running; false: at 0, as published."""
+
+    @model_validator(mode="after")
+    def _noise_is_bounded(self) -> StochasticConfig:
+        photons = 0.5 * self.k3 / math.sqrt(max(self.k2, 1e-300))
+        if photons + self.k6 > 1.0:
+            raise ValueError(
+                f"k3 / (2 sqrt(k2)) + k6, the largest noise, must be at most 1 per root microsecond, "
+                f"got k2 = {self.k2:g}, k3 = {self.k3:g}, k6 = {self.k6:g}"
+            )
+        return self
 
 
 class ReadoutConfig(Settings):
@@ -122,7 +133,16 @@ class ReadoutConfig(Settings):
     """`row`: time to reach a row, before its events are read [s]."""
     queue_length: Annotated[int, Field(ge=1, le=1 << 26)] = 65_536
     """Most events that wait; those that come while so many do are lost, and counted in
-    `Events.dropped_count`."""
+    `Events.dropped_count`. To read them must take 60 s at most."""
+
+    @model_validator(mode="after")
+    def _queue_is_read_in_time(self) -> ReadoutConfig:
+        if self.queue_length > 60.0 * self.bandwidth_hz:
+            raise ValueError(
+                f"queue_length must be at most 60 s of bandwidth_hz = {self.bandwidth_hz:g}, "
+                f"got {self.queue_length}"
+            )
+        return self
 
 
 class EventCameraConfig(Settings):
@@ -142,8 +162,8 @@ class EventCameraConfig(Settings):
     white_radiance: float = Field(default=1.0, gt=0.0, le=1e30)
     """Radiance that `low_pass`, `shot_noise` and `stochastic` take for white, the brightest of a picture."""
     threshold_spread: ThresholdSpreadConfig | None = None
-    """Thresholds that differ from pixel to pixel, and stay: {on: 0.03, off: 0.03, minimum: 0.01}, standard
-    deviations in log radiance; null: none."""
+    """Thresholds that differ from pixel to pixel, and stay: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01},
+    standard deviations in log radiance; null: none."""
     low_pass: LowPassConfig | None = None
     """Finite bandwidth of the photoreceptor, falling with light: {cutoff_hz: 3000, dark_radiance: 0.08};
     null: infinitely fast."""

@@ -71,7 +71,12 @@ _NEVER = wp.constant(wp.int64(2**62))
 _PIECE = wp.constant(wp.float64(0.125))
 """Change of log radiance over which tau is held constant."""
 _PIECE_COUNT_MAX = wp.constant(1024)
+_DARKEST = wp.constant(wp.float64(1e-9))
+"""Least share of the photoreceptor's bandwidth, so that it has a time constant without light."""
 _FULL_SCALE = wp.constant(wp.float64(255.0))
+_FAINTEST = wp.constant(wp.float64(1e-12))
+_BRIGHTEST = wp.constant(wp.float64(255e3))
+"""Most light that a voltage is driven by, 1000 times white."""
 _DRAW_BITS = wp.constant(wp.int64(12))
 _NEWTON_STEPS_MAX = wp.constant(64)
 _NEWTON_NS = wp.constant(wp.float64(1e-4))
@@ -280,7 +285,7 @@ def _inverse_gaussian(
 
 @wp.func
 def _touch(near: wp.float64, far: wp.float64, variance: wp.float64) -> wp.float64:
-    """Return the probability that a Brownian bridge touches a threshold.
+    """Return the probability that a Brownian bridge touches a threshold; 0 below 4e-18.
 
     Args:
         near: Distance of its begin to the threshold, > 0.
@@ -289,13 +294,17 @@ def _touch(near: wp.float64, far: wp.float64, variance: wp.float64) -> wp.float6
     """
     if far <= _ZERO:
         return _ONE
-    if variance <= _ZERO:
+    exponent = _TWO * near * far
+    if exponent >= wp.float64(40.0) * variance:
         return _ZERO
-    return wp.exp(-_TWO * near * far / variance)
+    return wp.exp(-exponent / variance)
 
 
 @wp.func
 def _first_passage(
+    model: _Model,
+    pixel: wp.int32,
+    step: wp.int64,
     voltage: wp.float64,
     on: wp.float64,
     off: wp.float64,
@@ -303,12 +312,13 @@ def _first_passage(
     deviation: wp.float64,
     now: wp.float64,
     end: wp.float64,
-    step: wp.vec2d,
-    touch: wp.vec2d,
 ) -> _Crossing:
     """Move the voltage from now to the end, or to where it first touches +on or -off.
 
     Args:
+        model: Parameters.
+        pixel: Address of random numbers, with `step`.
+        step: A number that no other piece has.
         voltage: Between -off and on.
         on: Threshold upwards.
         off: Threshold downwards.
@@ -316,17 +326,19 @@ def _first_passage(
         deviation: Per root ns.
         now: Begin [ns].
         end: End [ns].
-        step: Two normal numbers.
-        touch: Two uniform numbers.
     """
     span_ns = end - now
     variance = deviation * deviation * span_ns
-    arrival = voltage + drift * span_ns + wp.sqrt(variance) * step[0]
+    normal = normal2(random_bits(model.seed, model.step_stream, step, pixel))
+    arrival = voltage + drift * span_ns + wp.sqrt(variance) * normal[0]
     touch_on = _touch(on - voltage, on - arrival, variance)
     touch_off = _touch(voltage + off, arrival + off, variance)
     crossing = _Crossing()
     crossing.polarity = -1
     crossing.voltage = arrival
+    touch = wp.vec2d(_ONE, _ONE)
+    if touch_on + touch_off > _ZERO:
+        touch = uniform2(random_bits(model.seed, model.touch_stream, step, pixel))
     if arrival >= on:
         crossing.polarity = wp.where(touch[0] < touch_off, 0, 1)
     elif arrival <= -off:
@@ -340,10 +352,17 @@ def _first_passage(
         far = wp.abs(wp.where(crossing.polarity == 1, on - arrival, arrival + off))
         ratio = near / wp.max(far, wp.float64(1e-12) * near)
         if variance > _ZERO:
-            ratio = _inverse_gaussian(ratio, near * near / variance, step[1], touch[1])
+            ratio = _inverse_gaussian(ratio, near * near / variance, normal[1], touch[1])
         crossing.time_ns = wp.clamp(now + span_ns * (ratio / (_ONE + ratio)), now, end)
         crossing.voltage = _ZERO
     return crossing
+
+
+@wp.func
+def _digital(model: _Model, sample: wp.float32) -> wp.float64:
+    """Return light in units of white / 255."""
+    light = _FULL_SCALE / model.white_radiance * wp.exp(wp.float64(sample))
+    return wp.clamp(light, _FAINTEST, _BRIGHTEST)
 
 
 @wp.func
@@ -466,15 +485,7 @@ def make_scan(terms: frozenset[str]) -> Any:
                 step = (since_ns << _DRAW_BITS) + draw
                 draw += wp.int64(1)
                 crossing = _first_passage(
-                    state.voltage,
-                    state.on,
-                    state.off,
-                    drift,
-                    deviation,
-                    now,
-                    end,
-                    normal2(random_bits(model.seed, model.step_stream, step, pixel)),
-                    uniform2(random_bits(model.seed, model.touch_stream, step, pixel)),
+                    model, pixel, step, state.voltage, state.on, state.off, drift, deviation, now, end
                 )
                 state.voltage = crossing.voltage
             else:
@@ -576,6 +587,9 @@ def make_scan(terms: frozenset[str]) -> Any:
             if wp.static(low_pass):
                 filtered = before.filtered[pixel]
             sample_before = last[pixel]
+            dn_end = _ZERO
+            if wp.static(stochastic):
+                dn_end = _digital(model, sample_before)
             invalid_count = wp.int32(0)
             invalid_first = wp.int32(0)
             quiet = range_of(state)
@@ -600,9 +614,8 @@ def make_scan(terms: frozenset[str]) -> Any:
                     drift = _ZERO
                     deviation = _ZERO
                     if wp.static(stochastic):
-                        scale = _FULL_SCALE / model.white_radiance
-                        dn_begin = scale * wp.exp(light)
-                        dn_end = scale * wp.exp(wp.float64(sample))
+                        dn_begin = dn_end
+                        dn_end = _digital(model, sample)
                         dn = (dn_begin + dn_end) / _TWO
                         drift = model.k1 * wp.log((dn_end + model.k2) / (dn_begin + model.k2)) / span_ns
                         drift += model.k4 + model.k5 * dn
@@ -624,14 +637,21 @@ def make_scan(terms: frozenset[str]) -> Any:
                             share = (wp.exp(middle) + model.dark_radiance) / (
                                 model.white_radiance + model.dark_radiance
                             )
-                            signal.tau = _ONE / (model.corner_per_ns * wp.min(share, _ONE))
+                            signal.tau = _ONE / (model.corner_per_ns * wp.clamp(share, _DARKEST, _ONE))
                             decay = filtered - light_begin + light_slope * signal.tau
                             gain = wp.exp(-length_ns / signal.tau) - _ONE
                             signal.start = filtered + leaked + leak_slope * signal.begin
                             signal.slope = light_slope + leak_slope
                             signal.decay = decay
-                            filtered = filtered + light_slope * length_ns + decay * gain
+                            filtered += light_slope * length_ns + decay * gain
                             signal.last = filtered + leaked + leak_slope * signal.end
+                            steepness = signal.slope - decay / signal.tau
+                            turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
+                            busy = turns or _reached(signal.last, quiet) >= 0
+                            if wp.static(refractory):
+                                busy = busy or state.held_ns >= _ZERO
+                            if wp.static(spontaneous):
+                                busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
                         elif wp.static(not stochastic):
                             signal.start = light + leaked
                             signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
@@ -942,7 +962,7 @@ class PixelNoise:
             _draw_thresholds,
             self._array(wp.vec2d, self._has("spread")),
             wp.vec2d(config.threshold_on, config.threshold_off),
-            wp.vec2d(*((0.0, 0.0) if spread is None else (spread.on, spread.off))),
+            wp.vec2d(*((0.0, 0.0) if spread is None else (spread.sigma_on, spread.sigma_off))),
             0.0 if spread is None else spread.minimum,
             self._seed,
             self._stream("threshold"),

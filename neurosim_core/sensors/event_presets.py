@@ -41,7 +41,7 @@ _DVS128 = Preset(
     pixel={
         "threshold_on": _contrast(0.17),
         "threshold_off": _contrast(0.17),
-        "threshold_spread": {"on": 0.021, "off": 0.021},
+        "threshold_spread": {"sigma_on": 0.021, "sigma_off": 0.021},
         "low_pass": {"cutoff_hz": 3000.0},
         "leak": {"rate_hz": 0.05},
         "readout": {"kind": "event", "bandwidth_hz": 1e6},
@@ -58,7 +58,7 @@ _DAVIS240C = Preset(
     pixel={
         "threshold_on": _contrast(0.11),
         "threshold_off": _contrast(0.11),
-        "threshold_spread": {"on": 0.035, "off": 0.035},
+        "threshold_spread": {"sigma_on": 0.035, "sigma_off": 0.035},
         "leak": {"rate_hz": 0.1},
         "readout": {"kind": "event", "bandwidth_hz": 12e6},
     },
@@ -74,7 +74,7 @@ _DAVIS346 = Preset(
     pixel={
         "threshold_on": _contrast(0.143),
         "threshold_off": _contrast(0.225),
-        "threshold_spread": {"on": 0.03, "off": 0.03},
+        "threshold_spread": {"sigma_on": 0.03, "sigma_off": 0.03},
         "leak": {"rate_hz": 0.1, "spread_decades": 0.1},
         "readout": {"kind": "event", "bandwidth_hz": 12e6},
     },
@@ -124,7 +124,7 @@ _V2E_CLEAN = Preset(
     title="v2e, clean",
     width=346,
     height=260,
-    pixel={"threshold_spread": {"on": 0.02, "off": 0.02}},
+    pixel={"threshold_spread": {"sigma_on": 0.02, "sigma_off": 0.02}},
     sources="Hu, Liu, Delbruck (2021), v2e; its published code, option clean: thresholds 0.2, mismatch 0.02.",
 )
 
@@ -133,7 +133,7 @@ _V2E_NOISY = Preset(
     width=346,
     height=260,
     pixel={
-        "threshold_spread": {"on": 0.05, "off": 0.05},
+        "threshold_spread": {"sigma_on": 0.05, "sigma_off": 0.05},
         "low_pass": {"cutoff_hz": 30.0, "dark_radiance": round(20 / 255, 4)},
         "refractory_s": 0.01,
         "leak": {"rate_hz": 0.1, "spread_decades": 0.1},

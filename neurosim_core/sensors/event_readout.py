@@ -19,10 +19,12 @@ Reference: Boahen (2000), Point-to-point connectivity between neuromorphic chips
 arbitrated queues; Finateu et al. (2020) for a readout by rows.
 """
 
+from collections import deque
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors.event_config import ReadoutConfig
@@ -292,7 +294,7 @@ class Readout:
         self._done = Milestone(self._device)
         self._make_drop_buffer(1024)
         self._reset_ns = 0
-        self._dropped: list[tuple[int, int]] = []
+        self._dropped: deque[NDArray[np.int64]] = deque()
         self.waiting_count = 0
         wp.load_module(_read_rows.module, device=self._device)
 
@@ -305,7 +307,7 @@ class Readout:
         if self._rowwise:
             following = self._bus.following
             wp.launch(_begin, dim=following.shape[0], outputs=[following], device=self._device)
-        self._dropped = []
+        self._dropped.clear()
         self.waiting_count = 0
 
     def read(
@@ -356,10 +358,17 @@ class Readout:
             self._note_dropped(dropped, origin_us * NS_PER_US)
         return read
 
-    def take_dropped(self) -> list[tuple[int, int]]:
-        """Return stamps [ns] and how many events were lost at each, since the last time."""
-        dropped, self._dropped = self._dropped, []
-        return dropped
+    def take_dropped(self, until_ns: int) -> int:
+        """Return how many events were lost until a time [ns], since the one before."""
+        count = 0
+        while self._dropped and self._dropped[0][0] <= until_ns:
+            stamps = self._dropped.popleft()
+            lost = int(np.searchsorted(stamps, until_ns, side="right"))
+            count += lost
+            if lost < len(stamps):
+                self._dropped.appendleft(stamps[lost:])
+                break
+        return count
 
     def _make_drop_buffer(self, size: int) -> None:
         self._dropped_ns = wp.empty(size, dtype=wp.int64, device=self._device)
@@ -369,10 +378,7 @@ class Readout:
         self._dropped_on_host.fetch(0, count)
         self._done.set()
         self._done.wait()
-        stamps, counts = np.unique(self._dropped_on_host.rows(0, count), return_counts=True)
-        self._dropped += [
-            (int(stamp) + origin_ns, int(lost)) for stamp, lost in zip(stamps, counts, strict=True)
-        ]
+        self._dropped.append(self._dropped_on_host.rows(0, count) + origin_ns)
 
     def _sort(self, keys: Any, order: Any, count: int) -> None:
         if self._device.is_cpu:

@@ -604,6 +604,8 @@ class EventCamera:
             return
         span_us = self._require_reset() // NS_PER_US - self._origin_us
         end_bit = self._time_shift + span_us.bit_length()
+        if self._readout is not None:
+            end_bit = 63  # events may be read later than now
         wp.utils.radix_sort_pairs(
             self._keys, self._order, self._key_count, begin_bit=SUB_BITS - 1, end_bit=end_bit
         )
@@ -619,6 +621,8 @@ class EventCamera:
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
             dropped = sum(lost for stamp_ns, lost in self._dropped if stamp_ns <= end_ns)
             self._dropped = [(stamp_ns, lost) for stamp_ns, lost in self._dropped if stamp_ns > end_ns]
+            if self._readout is not None:
+                dropped += self._readout.take_dropped(end_ns)
             t, x, y, polarity = (
                 [column[start:cut] for column in columns] if cut > start else self._no_events()
             )
@@ -645,6 +649,8 @@ class EventCamera:
     def _read_out(self, readout: Readout) -> None:
         """Put the events that the arbiter reads until now in place of those that have happened."""
         first, count = self._read_count, self._key_count - self._read_count
+        if count == 0 and readout.waiting_count == 0:
+            return
         self._key_count += readout.waiting_count
         self._reserve_keys(kept=first + count)
         read = readout.read(
@@ -657,7 +663,6 @@ class EventCamera:
             now_ns=self._require_reset(),
         )
         self._key_count = first + read
-        self._dropped += readout.take_dropped()
 
     def _decode(self, ends: list[int]) -> tuple[list[Any], list[int]]:
         """Sort the keys and return them as columns, and the index of the first key after each window."""
