@@ -40,9 +40,9 @@ def _field(description: Any, distro: str) -> Any:
         base, bound = detail
         if base == "string":
             return types.bounded_str[bound] if bound else str
-        if base not in _SCALARS:
+        if base not in (*_SCALARS, "bool"):
             raise ValueError(f"fields of type {base} are not supported")
-        return getattr(types, _SCALARS[base]) if base != "bool" else bool
+        return bool if base == "bool" else getattr(types, _SCALARS[base])
     if kind == Nodetype.NAME:
         return idl_struct(detail, distro)
     element, count = detail
@@ -56,8 +56,8 @@ _SCALARS = {
     **{name: name for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")},
     "float32": "float32",
     "float64": "float64",
-    "byte": "uint8",
-    "char": "uint8",
-    "octet": "uint8",
-    "bool": "bool",
+    "byte": "byte",
+    "octet": "byte",
+    "char": "uint8",  # so rosidl has it
 }
+"""Types in .msg files, and what rosidl makes of them in IDL: nodes that compare types accept no other."""

@@ -29,7 +29,7 @@ from cyclonedds.topic import Topic
 SOON_S = 15.0
 
 
-def _struct(name: str, **fields: Any) -> Any:
+def _struct(name: str, /, **fields: Any) -> Any:
     return make_idl_struct(name.rpartition(".")[2], name, fields)
 
 
@@ -56,7 +56,59 @@ TriggerRequest = _struct(
 TriggerReply = _struct(
     "std_srvs.srv.dds_.Trigger_Response_", guid=types.uint64, seq=types.int64, success=bool, message=str
 )
-KINDS = {"Image": Image, "String": String, "Impostor": Impostor}
+# As `idlc` makes them of the IDL that rosidl makes of each .msg file.
+PRIMITIVES = {
+    "Bool": bool,
+    "Byte": types.byte,  # octet
+    "Char": types.uint8,
+    "Float32": types.float32,
+    "Float64": types.float64,
+    "Int8": types.int8,
+    "Int16": types.int16,
+    "Int32": types.int32,
+    "Int64": types.int64,
+    "UInt8": types.uint8,
+    "UInt16": types.uint16,
+    "UInt32": types.uint32,
+    "UInt64": types.uint64,
+}
+KeyValue = _struct("diagnostic_msgs.msg.dds_.KeyValue_", key=str, value=str)
+DiagnosticStatus = _struct(
+    "diagnostic_msgs.msg.dds_.DiagnosticStatus_",
+    level=types.byte,
+    name=str,
+    message=str,
+    hardware_id=str,
+    values=types.sequence[KeyValue],
+)
+Point = _struct("geometry_msgs.msg.dds_.Point_", x=types.float64, y=types.float64, z=types.float64)
+Quaternion = _struct(
+    "geometry_msgs.msg.dds_.Quaternion_",
+    x=types.float64,
+    y=types.float64,
+    z=types.float64,
+    w=types.float64,
+)
+Pose = _struct("geometry_msgs.msg.dds_.Pose_", position=Point, orientation=Quaternion)
+PoseWithCovariance = _struct(
+    "geometry_msgs.msg.dds_.PoseWithCovariance_", pose=Pose, covariance=types.array[types.float64, 36]
+)
+Actuators = _struct(
+    "actuator_msgs.msg.dds_.Actuators_",
+    header=Header,
+    position=types.sequence[types.float64],
+    velocity=types.sequence[types.float64],
+    normalized=types.sequence[types.float64],
+)
+KINDS = {
+    "Image": Image,
+    "String": String,
+    "Impostor": Impostor,
+    "DiagnosticStatus": DiagnosticStatus,
+    "PoseWithCovariance": PoseWithCovariance,
+    "Actuators": Actuators,
+    **{name: _struct(f"std_msgs.msg.dds_.{name}_", data=kind) for name, kind in PRIMITIVES.items()},
+}
 
 
 def _graph_types(gid_bytes: int) -> Any:

@@ -20,6 +20,10 @@ from cortex_ros2_bridge.backend.cyclone import Fast, Public, Refused, choose_tra
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.typestore import typestore
 
+PRIMITIVES = (
+    *("Bool", "Byte", "Char", "Float32", "Float64"),
+    *("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64"),
+)
 IMAGE = "sensor_msgs/msg/Image"
 STRING = "std_msgs/msg/String"
 SOME = np.arange(1001, dtype=np.uint32).astype(np.uint8)  # odd: CDR is padded
@@ -224,6 +228,35 @@ def test_every_type_of_the_distributions_can_be_published(backend: DdsBackend) -
                 backend._site().writer(f"rt/{distro}{number}", idl_struct(type_name, distro), Qos(), b"")
             else:
                 idl_struct(type_name, distro)
+
+
+PACKAGES = {
+    "DiagnosticStatus": "diagnostic_msgs",
+    "PoseWithCovariance": "geometry_msgs",
+    "Actuators": "actuator_msgs",
+    "Image": "sensor_msgs",
+}
+
+
+def test_each_kind_of_field_is_that_of_hand_written_types(backend: DdsBackend, foreigner: Start) -> None:
+    """A node that compares the types does not hear what is declared otherwise: a byte is an octet."""
+    publishers = {}
+    for kind in [*PRIMITIVES, "String", *PACKAGES]:
+        type_name = f"{PACKAGES.get(kind, 'std_msgs')}/msg/{kind}"
+        publishers[kind] = backend.publisher(f"/kinds/{kind}", type_name, Qos())
+    other = foreigner()
+    for kind in publishers:
+        other.do("subscribe", topic=f"rt/kinds/{kind}", kind=kind, matched=False)
+    silent = set(publishers)
+
+    def all_match() -> bool:
+        silent.intersection_update(kind for kind, one in publishers.items() if not one.subscriber_count)
+        return not silent
+
+    try:
+        wait_for(all_match)
+    finally:
+        assert not silent
 
 
 def test_reliable_messages_all_arrive_in_order(backend: DdsBackend, foreigner: Start) -> None:
