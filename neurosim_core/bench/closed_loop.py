@@ -7,19 +7,17 @@ time passes at the pace of the wall clock, as long as the machine keeps up with 
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import rich.table
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from neurosim_core.bench.loop_trace import (
     LoopTrace,
@@ -32,8 +30,12 @@ from neurosim_core.bench.loop_trace import (
 )
 from neurosim_core.bench.machine import describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
+from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.nodes.probe import ProbeError, answer_images
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LoopMode = Literal["lockstep", "streaming"]
 
@@ -241,7 +243,7 @@ def sweep(
 
 def print_sweep(results: Sequence[LoopResult], console: Console) -> None:
     """Print a sweep as a table, and what its transport is to be judged by."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = rich.table.Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("mode")
     for name in (
         "requested\n[Hz]",
@@ -280,29 +282,21 @@ def _ms(seconds: float) -> str:
     return f"{1e3 * seconds:.3f} ms"
 
 
-def save_csv(results: Sequence[LoopResult], file: Path) -> None:
-    """Write one row for each rate and mode; times in seconds."""
-    with file.open("w", newline="", encoding="utf-8") as out:
-        writer = csv.DictWriter(out, [field.name for field in dataclasses.fields(LoopResult)])
-        writer.writeheader()
-        writer.writerows(dataclasses.asdict(result) for result in results)
+def _table(results: Sequence[LoopResult]) -> Table:
+    """Return one row for each rate and mode; times in seconds."""
+    names = [field.name for field in dataclasses.fields(LoopResult)]
+    return Table(
+        name="closed-loop",
+        title="closed loop",
+        columns={name: name for name in names},
+        rows=[dataclasses.asdict(result) for result in results],
+    )
 
 
-def save_plot(results: Sequence[LoopResult], file: Path, *, title: str, notes: Sequence[str]) -> None:
-    """Draw latency against rate, and received against requested rate.
-
-    Args:
-        results: What was measured.
-        file: Where to.
-        title: What was flown.
-        notes: Lines on machine and versions, below the panels.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 5))
+def _draw(results: Sequence[LoopResult], figure: Figure) -> None:
+    """Draw latency against rate, and received against requested rate."""
+    figure.set_size_inches(11.0, 5.0)
+    left, right = figure.subplots(1, 2)
     rates = np.array(sorted({r.requested_hz for r in results}))
     for mode, marker in (("lockstep", "o"), ("streaming", "s")):
         chosen = [r for r in results if r.mode == mode]
@@ -310,30 +304,20 @@ def save_plot(results: Sequence[LoopResult], file: Path, *, title: str, notes: S
             continue
         x = [r.requested_hz for r in chosen]
         median, p99 = ([1e3 * t for t in times] for times in zip(*_latencies(chosen), strict=True))
+        transport = [1e3 * r.transport_median_s for r in chosen]
         (line,) = left.plot(x, median, marker=marker, label=f"command to image, {mode}")
-        left.plot(x, p99, ":", color=line.get_color(), label="its 99th percentile")
-        left.plot(
-            x,
-            [1e3 * r.transport_median_s for r in chosen],
-            "--",
-            color=line.get_color(),
-            label="of which transport",
-        )
+        style: dict[str, Any] = {"color": line.get_color(), "marker": ""}
+        left.plot(x, p99, ":", label="its 99th percentile", **style)
+        left.plot(x, transport, "--", label="of which transport", **style)
         right.plot(x, [r.received_hz for r in chosen], marker=marker, label=mode)
-    left.plot(rates, 1e3 / rates, color="0.7", label="one period")
-    right.plot(rates, rates, color="0.7", label="as requested")
+    left.plot(rates, 1e3 / rates, color="0.7", marker="", label="one period")
+    right.plot(rates, rates, color="0.7", marker="", label="as requested")
     left.set(xlabel="controller and image rate [Hz]", ylabel="wall-clock time [ms]", title="(i) latency")
     right.set(xlabel="requested [Hz]", ylabel="images received a second", title="(ii) rate")
     for axes in (left, right):
         axes.set(xscale="log", yscale="log")
-        axes.grid(which="both", alpha=0.3)
-        axes.legend(fontsize=7)
+        axes.legend()
     left.set_ylim(top=8.0 * left.get_ylim()[1])  # room for the legend
-    figure.suptitle(title, fontsize=10)
-    figure.text(0.01, 0.01, "\n".join(notes), fontsize=6, va="bottom", family="monospace")
-    figure.tight_layout(rect=(0.0, 0.03 + 0.02 * len(notes), 1.0, 1.0))
-    figure.savefig(file, dpi=150)
-    pyplot.close(figure)
 
 
 def _latencies(results: Sequence[LoopResult]) -> list[tuple[float, float]]:
@@ -369,12 +353,6 @@ def bench_closed_loop(
         )
     console.print("\n".join([title, *notes]), highlight=False, soft_wrap=True)
     print_sweep(results, console)
-    save_csv(results, out / "closed-loop.csv")
-    made = [out / "closed-loop.csv"]
-    if importlib.util.find_spec("matplotlib") is None:
-        console.print("[yellow]closed-loop.png is left out: pip install 'neurosim\\[view]'[/]")
-    else:
-        save_plot(results, out / "closed-loop.png", title=title, notes=notes)
-        made.append(out / "closed-loop.png")
-    console.print(f"left in {', '.join(map(str, made))}", highlight=False, soft_wrap=True)
+    plot = Plot(name="closed-loop", title=title, draw=lambda figure: _draw(results, figure))
+    save_files(out, console, tables=[_table(results)], plots=[plot], notes=notes)
     return results

@@ -8,19 +8,19 @@ far the true positions are from the path.
 
 from __future__ import annotations
 
-import csv
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rich.table
 from rich.console import Console
-from rich.table import Table
 
 from neurosim_core.bench.machine import describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
+from neurosim_core.bench.report import Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.record import Flight
 
@@ -111,20 +111,26 @@ def bench_delay(
                 results.append(
                     _compare(config, scratch / f"{len(results)}", tour, delay_s, mode, real_time_factor)
                 )
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "delay.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(asdict(results[0])))
-        writer.writeheader()
-        writer.writerows(asdict(result) for result in results)
     print_delays(results, console, mode=mode)
     for text in describe_machine("cpu"):
         console.print(text, style="dim", highlight=False)
+    save_files(folder, console, tables=[_table(results)])
     return results
+
+
+def _table(results: Sequence[DelayResult]) -> Table:
+    """Return one row for each tour and delay."""
+    return Table(
+        name="delay",
+        title="distance from the path under a delay",
+        columns={field.name: field.name for field in fields(DelayResult)},
+        rows=[asdict(result) for result in results],
+    )
 
 
 def print_delays(results: Sequence[DelayResult], console: Console, *, mode: str) -> None:
     """Print a row for each tour and delay, and what they come to."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
+    table = rich.table.Table(box=None, pad_edge=False, header_style="dim")
     for name in ("tour", "delay", "predicted", "measured", "ratio", "commands every", "in lockstep"):
         table.add_column(name, justify="right")
     for result in results:

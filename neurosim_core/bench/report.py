@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neurosim_core.bench.chapter import (
     Bar,
@@ -17,14 +18,17 @@ from neurosim_core.bench.chapter import (
     print_chapter,
     save_table,
 )
-from neurosim_core.bench.figures import can_draw, draw_plot
+from neurosim_core.bench.figures import can_draw, draw_plot, save_plot
 from neurosim_core.bench.machine import accelerators, command_line, hardware, now, versions
 from neurosim_core.bench.page import html_page
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _SPECIAL = re.compile(r"(?=\||<[A-Za-z/!?])")
 """Places in a cell that need a backslash: a bar, and what begins a tag."""
 
-__all__ = ["Bar", "Chapter", "Plot", "Table", "print_chapter", "write_report"]
+__all__ = ["Bar", "Chapter", "Plot", "Table", "print_chapter", "save_files", "write_report"]
 
 
 def write_report(chapters: Sequence[Chapter], folder: Path, *, title: str = "Neurosim: the numbers") -> Path:
@@ -61,6 +65,34 @@ def write_report(chapters: Sequence[Chapter], folder: Path, *, title: str = "Neu
     page = folder / "report.html"
     page.write_text(html_page(chapters, pictures, title=title, facts=facts), encoding="utf-8")
     return page
+
+
+def save_files(
+    folder: Path,
+    console: Console,
+    *,
+    tables: Sequence[Table],
+    plots: Sequence[Plot] = (),
+    notes: Sequence[str] = (),
+) -> None:
+    """Leave tables and plots without a report around them, and say so.
+
+    Args:
+        folder: Where to; made if need be, files of these names are replaced.
+        console: Where to say it.
+        tables: What becomes `<name>.csv`.
+        plots: What becomes `<name>.png`, where matplotlib is installed.
+        notes: Lines on machine and versions, below each plot.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [save_table(table, folder) for table in tables]
+    for plot in plots:
+        if can_draw():
+            made.append(save_plot(plot, folder, notes=notes))
+        else:
+            missing = f"{plot.name}.png is left out: pip install 'neurosim[view]'"
+            console.print(missing, style="yellow", markup=False)
+    console.print(f"left in {', '.join(map(str, made))}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _check_unique(kind: str, names: Sequence[str]) -> None:

@@ -6,24 +6,26 @@ camera is rendered is chosen by what the machine can do, which is measured first
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import rich.table
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from neurosim_core.bench.machine import describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
+from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.bench.step import measure_steps
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.nodes.probe import ProbeError, StreamProbe, StreamTrace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 JITTER_BAR_S = 1e-3
 """What the 99th percentile of the jitter is to stay under [s]."""
@@ -245,7 +247,7 @@ def print_stream(result: StreamResult, console: Console) -> None:
     """Print the figures as a table, with their bars."""
     r = result
     lost = r.imu_lost_count + r.packet_lost_count + r.event_dropped_count + r.frame_dropped_count
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = rich.table.Table(box=None, pad_edge=False, header_style="bold")
     for name in ("", "measured", "bar"):
         table.add_column(name)
     table.add_row("real-time factor", f"{r.real_time_factor:.5f} over {r.seconds:.1f} s")
@@ -286,8 +288,8 @@ def _ms(seconds: float) -> str:
     return f"{1e3 * seconds:.3f} ms"
 
 
-def save_csv(result: StreamResult, calibration: Calibration, file: Path) -> None:
-    """Write one row for each figure: name, value, unit."""
+def stream_table(result: StreamResult, calibration: Calibration) -> Table:
+    """Return one row for each figure: name, value, unit."""
     rows: list[tuple[str, Any, str]] = [
         ("renders_hz", calibration.renders_hz, "Hz"),
         ("sampling_rate_hz", calibration.sampling_rate_hz, "Hz"),
@@ -297,49 +299,47 @@ def save_csv(result: StreamResult, calibration: Calibration, file: Path) -> None
             unit = "s" if field.name.endswith(("_s", "seconds")) else ""
             rows.append((field.name, getattr(result, field.name), unit))
     rows += [(f"{name}_grown_bytes", grown, "B") for name, grown in result.grown_bytes.items()]
-    with file.open("w", newline="", encoding="utf-8") as out:
-        writer = csv.writer(out)
-        writer.writerow(("name", "value", "unit"))
-        writer.writerows(rows)
+    return Table(
+        name="streaming",
+        title="streaming",
+        columns={"name": "name", "value": "value", "unit": "unit"},
+        rows=[{"name": name, "value": value, "unit": unit} for name, value, unit in rows],
+    )
 
 
-def save_plot(trace: StreamTrace, file: Path, *, title: str, notes: Sequence[str]) -> None:
-    """Draw how late each sample of the IMU came, how often how much, and the memory.
+def _arrivals(trace: StreamTrace) -> Table:
+    """Return when each sample of the IMU was taken and received [ns]."""
+    received_ns = trace.imu_received_ns - trace.imu_received_ns[0]
+    return Table(
+        name="arrivals",
+        title="samples of the IMU",
+        columns={"stamp_ns": "stamp [ns]", "received_ns": "received [ns]"},
+        rows=[
+            {"stamp_ns": stamp, "received_ns": received}
+            for stamp, received in zip(trace.imu_stamp_ns.tolist(), received_ns.tolist(), strict=True)
+        ],
+    )
 
-    Args:
-        trace: What was seen.
-        file: Where to.
-        title: What was flown.
-        notes: Lines on machine and versions, below the panels.
-    """
-    import matplotlib
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (left, middle, right) = pyplot.subplots(1, 3, figsize=(14, 5))
+def _draw(trace: StreamTrace, figure: Figure) -> None:
+    """Draw how late each sample of the IMU came, how often how much, and the memory."""
+    figure.set_size_inches(14.0, 5.0)
+    left, middle, right = figure.subplots(1, 3)
     late_ms = 1e3 * lateness_s(trace)
     since_s = 1e-9 * (trace.imu_received_ns - trace.imu_received_ns[0])
-    left.plot(since_s, late_ms, ",")
+    left.plot(since_s, late_ms, ls="", marker=",")
     left.set(xlabel="wall-clock time [s]", ylabel="lateness [ms]", title="(i) each sample of the IMU")
     jitter_ms = np.sort(np.abs(late_ms))[::-1]
-    middle.plot(jitter_ms, (np.arange(len(jitter_ms)) + 1) / len(jitter_ms))
+    middle.plot(jitter_ms, (np.arange(len(jitter_ms)) + 1) / len(jitter_ms), marker="")
     middle.axvline(1e3 * JITTER_BAR_S, color="0.7", label="bar of the 99th percentile")
     middle.axhline(0.01, color="0.7", ls=":")
     middle.set(xscale="log", yscale="log", xlabel="jitter [ms]", ylabel="share above", title="(ii) jitter")
     middle.set_xlim(left=1e-3)
-    middle.legend(fontsize=7)
+    middle.legend()
     for name, resident in zip(_WATCHED, trace.resident_bytes.T, strict=True):
-        right.plot(trace.resident_s, resident / 2**20, label=name)
+        right.plot(trace.resident_s, resident / 2**20, label=name, marker="")
     right.set(xlabel="wall-clock time [s]", ylabel="resident [MiB]", title="(iii) memory", ylim=(0, None))
-    right.legend(fontsize=7)
-    for axes in (left, middle, right):
-        axes.grid(which="both", alpha=0.3)
-    figure.suptitle(title, fontsize=10)
-    figure.text(0.01, 0.01, "\n".join(notes), fontsize=6, va="bottom", family="monospace")
-    figure.tight_layout(rect=(0.0, 0.03 + 0.02 * len(notes), 1.0, 1.0))
-    figure.savefig(file, dpi=150)
-    pyplot.close(figure)
+    right.legend()
 
 
 def bench_streaming(
@@ -388,20 +388,7 @@ def bench_streaming(
     )
     console.print("\n".join([title, *notes]), highlight=False, soft_wrap=True)
     print_stream(result, console)
-    save_csv(result, calibration, out / "streaming.csv")
-    np.savetxt(
-        out / "arrivals.csv",
-        np.stack([trace.imu_stamp_ns, trace.imu_received_ns - trace.imu_received_ns[0]], axis=1),
-        fmt="%d",
-        delimiter=",",
-        header="stamp_ns,received_ns",
-        comments="",
-    )
-    made = [out / "streaming.csv", out / "arrivals.csv"]
-    if importlib.util.find_spec("matplotlib") is None:
-        console.print("[yellow]streaming.png is left out: pip install 'neurosim\\[view]'[/]")
-    else:
-        save_plot(trace, out / "streaming.png", title=title, notes=notes)
-        made.append(out / "streaming.png")
-    console.print(f"left in {', '.join(map(str, made))}", highlight=False, soft_wrap=True)
+    plot = Plot(name="streaming", title=title, draw=lambda figure: _draw(trace, figure))
+    tables = [stream_table(result, calibration), _arrivals(trace)]
+    save_files(out, console, tables=tables, plots=[plot], notes=notes)
     return result

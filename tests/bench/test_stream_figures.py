@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from neurosim_core.bench import streaming
+from neurosim_core.bench.chapter import save_table
 from neurosim_core.nodes.probe import StreamTrace
 
 MS = 1_000_000
@@ -130,8 +131,7 @@ def test_the_camera_is_sized_to_the_machine(monkeypatch, renders_hz, chosen):
 def test_the_csv_has_every_figure(tmp_path):
     result = streaming.summarise(heard(np.zeros(2000)))
     calibration = streaming.Calibration(renders_hz=200.0, sampling_rate_hz=50.0)
-    streaming.save_csv(result, calibration, tmp_path / "figures.csv")
-    with (tmp_path / "figures.csv").open(newline="") as file:
+    with save_table(streaming.stream_table(result, calibration), tmp_path).open(newline="") as file:
         rows = {row["name"]: (row["value"], row["unit"]) for row in csv.DictReader(file)}
     names = {f.name for f in dataclasses.fields(result)} - {"grown_bytes"}
     assert set(rows) == names | {
