@@ -274,6 +274,7 @@ def test_emission_and_colour_of_bodies(device):
     seen, _ = look(scene, bodies, [FORWARD], [0], device=device)
     for instance, linear in ((0, (0.0, 0.0, 0.7)), (1, (0.5, 0.0, 0.0)), (2, (0.0, 0.25, 0.0))):
         shown = np.exp(seen["log_radiance"][seen["instance"] == instance]) - UNSHADOWED.dark_floor
+        assert len(shown) > 200
         np.testing.assert_allclose(shown, LUMA @ linear, rtol=1e-4)
 
 
