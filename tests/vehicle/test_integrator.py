@@ -71,6 +71,38 @@ def test_figure_eight_at_9_m_s(device):
     assert max(angle(f.orientation, e.orientation) for f, e in zip(flown, exact, strict=True)) < 1e-7
 
 
+def test_flip_at_700_deg_s(device):
+    """A crazyflie rolls over: up to speed, on, and down again, with motors that lag 72 ms."""
+    config = preset("crazyflie")
+    vehicle = Multirotor(config, device=device)
+    start = one(vehicle.state)
+    hover = config.hover_rotor_speed_rad_s
+    roll = np.array([1.0, -1.0, -1.0, 1.0])  # more lift on the left
+    swing = np.concatenate([np.full(25, 0.08), np.zeros(20), np.full(30, -0.08)])
+    commands = hover * (1.0 + swing[:, None] * roll)
+    flown = fly(vehicle, commands)
+    exact = solve(config, start, commands, 0.01)
+    assert max(abs(s.body_rate[0]) for s in flown) > np.radians(700.0)
+    assert max(np.linalg.norm(f.position - e.position) for f, e in zip(flown, exact, strict=True)) < 1e-10
+    assert max(angle(f.orientation, e.orientation) for f, e in zip(flown, exact, strict=True)) < 1e-9
+    assert vehicle.effort.redone_count.tolist() == [0]
+
+
+def test_tumble_at_20_rad_s(device):
+    """About all three axes for 2 s, rotors running at random."""
+    config = preset("hummingbird")
+    vehicle = Multirotor(config, device=device)
+    vehicle.reset(body_rate=20.0 / np.sqrt(3.0) * np.array([1.0, -1.0, 1.0]))
+    start = one(vehicle.state)
+    spread = np.random.default_rng(11).uniform(-0.05, 0.05, (200, 4))
+    commands = config.hover_rotor_speed_rad_s * (1.0 + spread)
+    flown = fly(vehicle, commands)
+    exact = solve(config, start, commands, 0.01)
+    assert max(np.linalg.norm(f.position - e.position) for f, e in zip(flown, exact, strict=True)) < 1e-8
+    assert max(angle(f.orientation, e.orientation) for f, e in zip(flown, exact, strict=True)) < 1e-8
+    assert vehicle.effort.redone_count.tolist() == [0]
+
+
 @pytest.mark.parametrize("tau_s", [1e-1, 1e-2, 5e-3, 1e-3, 5e-4, 3e-4, 1e-4, 1e-5, 1e-6, 0.0])
 def test_any_motor_time_constant(tau_s, device):
     """0.2 s of random commands: no blow-up, no stiffness, and order 4 is not lost to a boundary layer."""
