@@ -1,4 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,arg-type"
+# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,arg-type,operator,untyped-decorator"
 """Which events of one stream are those of another: same pixel, same polarity, nearly the same time."""
 
 from __future__ import annotations

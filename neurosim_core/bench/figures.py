@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neurosim_core.bench.chapter import Plot
 
@@ -85,7 +85,7 @@ def draw_plot(plot: Plot, *, notes: Sequence[str] = ()) -> bytes:
         plot.draw(figure)
         if notes:
             height = 1.3 * _NOTE_PT / 72.0 * len(notes) / figure.get_figheight()
-            figure.get_layout_engine().set(rect=(0.0, height + 0.01, 1.0, 0.99 - height))  # type: ignore[union-attr]
+            figure.set_layout_engine("constrained", rect=(0.0, height + 0.01, 1.0, 0.99 - height))
             figure.text(0.01, 0.01, "\n".join(notes), size=_NOTE_PT, va="bottom", family="monospace")
         data = io.BytesIO()
         figure.savefig(data, format="png", dpi=_DPI)
@@ -98,7 +98,8 @@ def _look() -> Iterator[None]:
     from cycler import cycler
 
     cycle = cycler(color=COLORS) + cycler(marker=MARKERS)
-    with matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE, "axes.prop_cycle": cycle}):
+    settings: dict[Any, Any] = {**matplotlib.rcParamsDefault, **_STYLE, "axes.prop_cycle": cycle}
+    with matplotlib.rc_context(settings):
         yield
 
 

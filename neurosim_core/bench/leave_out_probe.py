@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+# mypy: disable-error-code="attr-defined,no-untyped-call,method-assign"
 """What one run launches, allocates and imports, counted in a process of its own.
 
 `python -m neurosim_core.bench.leave_out_probe` reads a request as JSON from its standard input, flies, and

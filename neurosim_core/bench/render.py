@@ -283,8 +283,8 @@ class _Pictures:
     def render(self, poses: Poses) -> tuple[Any, float]:
         """Return log radiance, shape [K, H, W], overwritten by the next call, and the time it took [s]."""
         self._arrays.data.mip_bias = self._bias
-        position = wp.array(poses[0], dtype=wp.vec3, device=self._device)
-        orientation = wp.array(poses[1], dtype=wp.quat, device=self._device)
+        position: Any = wp.array(poses[0], dtype=wp.vec3, device=self._device)
+        orientation: Any = wp.array(poses[1], dtype=wp.quat, device=self._device)
         wp.synchronize_device(self._device)
         begin = time.perf_counter()
         self._renderer.render(position, orientation, self._slots, instant_count=len(poses[0]))
@@ -588,7 +588,8 @@ def _draw_aliasing(result: RenderResult, figure: Figure) -> None:
     from matplotlib.colors import SymLogNorm
 
     figure.set_size_inches(8.0, 8.0)
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.0, 0.75))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(1.0, 0.75))
+    upper, lower = parts
     panels = upper.subplots(2, 3)
     names = ("point sampling", "default", f"{_REFERENCE_SAMPLES} samples")
     for axes, name, view in zip(panels[0], names, result.views, strict=True):
