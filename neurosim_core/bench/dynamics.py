@@ -262,10 +262,11 @@ def _drifts(extent: Extent, say: Progress) -> tuple[Drift, ...]:
 
 def _throughputs(extent: Extent, say: Progress) -> tuple[Throughput, ...]:
     throughputs = []
-    for call, vehicles, steps_per_call in WAYS:
-        say(f"{vehicles} vehicles, {steps_per_call} steps a call")
+    for load, call, vehicles, steps_per_call in WAYS:
+        say(f"{vehicles} vehicles, {steps_per_call} steps a call, {load}")
         throughputs.append(
             measure_throughput(
+                load=load,
                 vehicles=vehicles,
                 steps_per_call=steps_per_call,
                 call=call,

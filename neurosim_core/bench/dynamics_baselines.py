@@ -20,7 +20,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
+
+KNOWN_TERMS = frozenset({"motor_lag", *AIR_TERMS, "wind", "full_inertia"})
+"""Terms of the product that the baselines have too."""
 
 _ITERATION_COUNT_MAX = wp.constant(100)
 """Fixed-point iterations of one step; where they contract at all, a dozen reach rounding."""
@@ -65,7 +68,13 @@ def _moved(s: Motion, rate: Motion, h: wp.float64) -> Motion:
 
 @functools.cache
 def make_baselines(terms: frozenset[str]) -> Baselines:
-    """Return the baselines with the given terms (of `multirotor.TERMS`) in them."""
+    """Return the baselines with the given terms in them.
+
+    Raises:
+        ValueError: There are terms that the baselines do not have.
+    """
+    if unknown := terms - KNOWN_TERMS:
+        raise ValueError(f"the baselines have the terms {sorted(KNOWN_TERMS)}, got {sorted(unknown)} as well")
     motor_lag = "motor_lag" in terms
     full_inertia = "full_inertia" in terms
     wrench = make_wrench(terms)

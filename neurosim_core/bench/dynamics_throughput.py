@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +23,10 @@ class Throughput:
     """`step` (checked, from the host's arrays) or `advance` (one launch)."""
     vehicles: int
     steps_per_call: int
-    terms: str
-    """Which terms are compiled in."""
+    load: str
+    """Key of `LOADS`: what acts on the vehicles."""
+    terms: tuple[str, ...]
+    """The terms that this takes; no others are compiled in."""
     steps_per_s: float
     """Steps of vehicles per second of CPU time; the best of the repetitions."""
 
@@ -49,32 +51,47 @@ class Pruning:
         return self.reduced_per_s / self.full_per_s
 
 
-def everything() -> MultirotorConfig:
+def in_wind(**more: object) -> MultirotorConfig:
     """Return a hummingbird that needs every aerodynamic term, wind, motor lag and its full inertia."""
     inertia = ((3.65e-3, 2e-5, -1e-5), (2e-5, 3.68e-3, 1e-5), (-1e-5, 1e-5, 7.03e-3))
-    return preset("hummingbird", flapping_kg_m=1e-5, wind_m_s=(2.0, -1.0, 0.5), inertia_kg_m2=inertia)
+    return preset("hummingbird", flapping_kg_m=1e-5, wind_m_s=(2.0, -1.0, 0.5), inertia_kg_m2=inertia, **more)
+
+
+def everything() -> MultirotorConfig:
+    """Return the same with gusts, turbulence, a ground far below, and motors that are not alike."""
+    return in_wind(
+        gusts=({"velocity_m_s": (3.0, 0.0, 0.0), "start_s": 1.0, "rise_s": 2.0},),
+        turbulence={"wind_20ft_m_s": 7.7},
+        ground={"height_m": -1e6, "rotor_radius_m": 0.1},
+        motor_time_constant_scale=(1.0, 1.05, 0.95, 1.0),
+    )
+
+
+LOADS: dict[str, Callable[[], MultirotorConfig]] = {"air and wind": in_wind, "everything": everything}
+"""What may act on the vehicles."""
 
 
 def measure_throughput(
-    *, vehicles: int, steps_per_call: int, call: str, repetitions: int, cpu_s: float
+    *, load: str, vehicles: int, steps_per_call: int, call: str, repetitions: int, cpu_s: float
 ) -> Throughput:
-    """Time one way of calling, with all terms in use.
+    """Time one way of calling.
 
     Args:
+        load: Key of `LOADS`.
         vehicles: How many fly.
         steps_per_call: Steps of 1 ms that one call makes.
         call: `step` or `advance`.
         repetitions: How often.
         cpu_s: About how long each repetition takes [s].
     """
-    config = everything()
-    vehicle = Multirotor(config, count=vehicles, max_step_ns=STEP_NS)
+    vehicle = Multirotor(LOADS[load](), count=vehicles, max_step_ns=STEP_NS)
     rate = _best_rate(vehicle, steps_per_call, call, repetitions=repetitions, cpu_s=cpu_s)
     return Throughput(
         call=call,
         vehicles=vehicles,
         steps_per_call=steps_per_call,
-        terms=f"{len(vehicle.terms)} in use",
+        load=load,
+        terms=vehicle.terms,
         steps_per_s=rate,
     )
 
@@ -115,10 +132,10 @@ def _best_rate(
 ) -> float:
     """Return the steps of vehicles per second of CPU time, the best of the repetitions."""
     duration_ns = steps_per_call * STEP_NS
-    command = np.tile(vehicle.config.hover_rotor_speed_rad_s, (vehicle.count, vehicle.config.rotor_count))
-    vehicle.reset()
+    command = np.full((vehicle.count, vehicle.config.rotor_count), vehicle.config.hover_rotor_speed_rad_s)
 
     def spend(calls: int) -> float:
+        vehicle.reset()
         begin = time.thread_time_ns()
         if call == "step":
             for _ in range(calls):
@@ -135,15 +152,17 @@ def _best_rate(
     return calls * steps_per_call * vehicle.count / best_s
 
 
-WAYS: Sequence[tuple[str, int, int]] = (
-    ("step", 1, 1),
-    ("step", 1, 100),
-    ("advance", 1, 1),
-    ("advance", 1, 10),
-    ("advance", 1, 100),
-    ("advance", 1, 1000),
-    ("advance", 4096, 1),
-    ("advance", 4096, 10),
-    ("advance", 4096, 100),
+WAYS: Sequence[tuple[str, str, int, int]] = (
+    ("air and wind", "step", 1, 1),
+    ("air and wind", "step", 1, 100),
+    ("air and wind", "advance", 1, 1),
+    ("air and wind", "advance", 1, 10),
+    ("air and wind", "advance", 1, 100),
+    ("air and wind", "advance", 1, 1000),
+    ("air and wind", "advance", 4096, 1),
+    ("air and wind", "advance", 4096, 10),
+    ("air and wind", "advance", 4096, 100),
+    ("everything", "advance", 1, 100),
+    ("everything", "advance", 4096, 10),
 )
-"""Call, number of vehicles and steps per call of each figure."""
+"""Load, call, number of vehicles and steps per call of each figure."""

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from neurosim_core.bench.dynamics_baselines import KNOWN_TERMS
 from neurosim_core.bench.dynamics_methods import Flown
 from neurosim_core.bench.dynamics_reference import Derivative
 from neurosim_core.bench.dynamics_scenes import HOLD_NS, Flight, stacked
@@ -49,6 +50,10 @@ def quad_params(config: MultirotorConfig) -> dict[str, Any]:
     """
     if config.motor_time_constant_s == 0.0 or config.gravity_m_s2 != 9.81:
         raise ValueError("RotorPy divides by the motor time constant and knows one gravity, 9.81 m/s^2")
+    if unknown := set(config.terms()) - KNOWN_TERMS:
+        raise ValueError(f"RotorPy flies without {sorted(unknown)} here")
+    if config.rotor_thrust_scale or config.rotor_torque_scale:
+        raise ValueError("RotorPy's rotors are all alike")
     inertia = np.array(config.inertia_kg_m2)
     return {
         "mass": config.mass_kg,

@@ -39,9 +39,9 @@ from neurosim_core.bench.dynamics_scenes import (
     random_commands,
     stacked,
 )
-from neurosim_core.bench.dynamics_throughput import everything
+from neurosim_core.bench.dynamics_throughput import everything, in_wind
 from neurosim_core.bench.rotorpy_peer import fly_rotorpy, quad_params
-from neurosim_core.vehicle import Multirotor, MultirotorState, preset
+from neurosim_core.vehicle import TERMS, Multirotor, MultirotorState, preset
 from neurosim_core.vehicle.aerodynamics import AIR_TERMS
 
 NOTHING = Errors(position_m=0.0, attitude_rad=0.0, body_rate_rad_s=0.0)
@@ -49,7 +49,7 @@ NOTHING = Errors(position_m=0.0, attitude_rad=0.0, body_rate_rad_s=0.0)
 
 def windy() -> Flight:
     """Return 30 ms of a hummingbird that uses every term, at some speed and spin."""
-    config = everything()
+    config = in_wind()
     start = at_rest(config, velocity=(3.0, -2.0, 1.0), body_rate=(2.0, -3.0, 1.0))
     return Flight(
         name="windy", config=config, start=start, commands=random_commands(config, 3, share=0.2, seed=1)
@@ -64,7 +64,7 @@ def pack(state: MultirotorState) -> np.ndarray:
 
 
 def test_the_right_hand_side_is_that_of_the_rotors_one_by_one():
-    config = everything()
+    config = in_wind()
     assert {"motor_lag", "wind", "full_inertia", *AIR_TERMS} <= set(config.terms())  # nothing is left out
     ours, rng = Derivative(config), np.random.default_rng(2)
     for _ in range(20):
@@ -180,6 +180,15 @@ def test_baselines_are_for_four_rotors():
     )
     with pytest.raises(ValueError, match="4 rotors, got 6"):
         EULER.make(config, 1, 1e-3)
+
+
+def test_baselines_refuse_terms_that_they_do_not_have():
+    config = everything()
+    assert set(config.terms()) == set(TERMS)
+    with pytest.raises(ValueError, match=r"got \['ground', .*'turbulence'\] as well"):
+        EULER.make(config, 1, 1e-3)
+    with pytest.raises(ValueError, match="as well"):
+        Derivative(config)
 
 
 # The free top
@@ -352,7 +361,7 @@ def test_single_precision_is_what_is_lost():
 
 def test_rotorpy_gets_our_vehicle():
     pytest.importorskip("rotorpy")
-    table = quad_params(everything())
+    table = quad_params(in_wind())
     assert table["mass"] == 0.5
     assert (table["Ixx"], table["Ixy"], table["Iyz"]) == (3.65e-3, 2e-5, 1e-5)
     assert table["c_Dz"] == 1e-2
@@ -376,7 +385,10 @@ def test_rotorpy_is_stopped_when_it_takes_too_long():
     assert np.isnan(flown.states.position[1:]).all()
 
 
-def test_rotorpy_cannot_do_without_a_motor():
-    config = preset("hummingbird", motor_time_constant_s=0.0)
+def test_rotorpy_is_not_asked_for_what_it_cannot_do():
     with pytest.raises(ValueError, match="motor time constant"):
-        quad_params(config)
+        quad_params(preset("hummingbird", motor_time_constant_s=0.0))
+    with pytest.raises(ValueError, match="turbulence"):
+        quad_params(everything())
+    with pytest.raises(ValueError, match="all alike"):
+        quad_params(preset("hummingbird", rotor_thrust_scale=(1.0, 0.9, 1.0, 1.0)))
