@@ -7,6 +7,7 @@ import csv
 import io
 import math
 import re
+import subprocess
 from html.parser import HTMLParser
 
 import numpy as np
@@ -16,7 +17,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from neurosim_core.bench import report
+import neurosim_core
+from neurosim_core.bench import machine, report
 from neurosim_core.bench.chapter import cell, print_table, save_table
 from neurosim_core.bench.figures import draw_plot
 from neurosim_core.bench.report import Bar, Chapter, Plot, Table, print_chapter, write_report
@@ -267,3 +269,29 @@ def test_names_must_differ(tmp_path):
     with pytest.raises(ValueError, match="two plots have the name 'one-plot'"):
         write_report([chapter(), chapter("two", plots=chapter().plots)], tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_commit_is_that_of_the_checkout(tmp_path, monkeypatch):
+    """With a note if files differ from it; nothing where the package is in no checkout."""
+    package = tmp_path / "neurosim_core" / "__init__.py"
+    package.parent.mkdir()
+    package.write_text("")
+    monkeypatch.setattr(neurosim_core, "__file__", str(package))
+    assert machine.commit() == ""
+
+    def git(*arguments):
+        identity = ["-c", "user.name=n", "-c", "user.email=e@example.org"]
+        done = subprocess.run(
+            ["git", "-C", str(tmp_path), *identity, *arguments], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-q", "-m", "first")
+    name = git("rev-parse", "HEAD")[:10]
+    assert machine.commit() == name
+    package.write_text("changed = True")
+    assert machine.commit() == f"{name} with changes"
+    monkeypatch.setenv("PATH", str(tmp_path))  # no git
+    assert machine.commit() == ""
