@@ -58,6 +58,16 @@ from neurosim_core.sensors.event_scan import (
     quiet_range,
     write_key,
 )
+from neurosim_core.sensors.event_signal import (
+    Crossing,
+    Signal,
+    curve_at,
+    curve_crossing,
+    first_passage,
+    line_at,
+    line_crossing,
+    reached,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -78,8 +88,6 @@ _FAINTEST = wp.constant(wp.float64(1e-12))
 _BRIGHTEST = wp.constant(wp.float64(255e3))
 """Most light that a voltage is driven by, 1000 times white."""
 _DRAW_BITS = wp.constant(wp.int64(12))
-_NEWTON_STEPS_MAX = wp.constant(64)
-_NEWTON_NS = wp.constant(wp.float64(1e-4))
 
 
 @wp.struct
@@ -146,218 +154,6 @@ class _Pixel:
     voltage: wp.float64
 
 
-@wp.struct
-class _Signal:
-    """start + slope (t - begin) + decay (exp(-(t - begin) / tau) - 1), for t in (begin, end]."""
-
-    begin: wp.float64
-    end: wp.float64
-    start: wp.float64
-    slope: wp.float64
-    decay: wp.float64
-    tau: wp.float64
-    last: wp.float64
-    """Value at the end."""
-
-
-@wp.struct
-class _Crossing:
-    time_ns: wp.float64
-    polarity: wp.int32
-    """-1: none."""
-    voltage: wp.float64
-
-
-@wp.func
-def _line_at(signal: _Signal, time_ns: wp.float64) -> wp.float64:
-    if time_ns >= signal.end:
-        return signal.last
-    share = (time_ns - signal.begin) / (signal.end - signal.begin)
-    return signal.start + (signal.last - signal.start) * share
-
-
-@wp.func
-def _curve_at(signal: _Signal, time_ns: wp.float64) -> wp.float64:
-    if time_ns >= signal.end:
-        return signal.last
-    elapsed = time_ns - signal.begin
-    return signal.start + signal.slope * elapsed + signal.decay * (wp.exp(-elapsed / signal.tau) - _ONE)
-
-
-@wp.func
-def _reached(value: wp.float64, quiet: wp.vec2) -> wp.int32:
-    """Return the polarity of the event of a signal that came to a value; -1: none."""
-    if value >= wp.float64(quiet[1]):
-        return 1
-    if value <= wp.float64(quiet[0]):
-        return 0
-    return -1
-
-
-@wp.func
-def _line_crossing(
-    signal: _Signal, now: wp.float64, end: wp.float64, quiet: wp.vec2, lower: wp.float64, upper: wp.float64
-) -> _Crossing:
-    """Find the first level that a line reaches in (now, end]."""
-    crossing = _Crossing()
-    crossing.polarity = _reached(_line_at(signal, end), quiet)
-    if crossing.polarity >= 0:
-        level = wp.where(crossing.polarity == 1, upper, lower)
-        rise = signal.last - signal.start
-        time_ns = now
-        if rise != _ZERO:
-            # the same operations as for an ideal pixel, whose events are these to the bit
-            fraction = wp.min((level - signal.start) / rise, _ONE)
-            time_ns = signal.begin + (signal.end - signal.begin) * fraction
-        crossing.time_ns = wp.clamp(time_ns, now, end)
-    return crossing
-
-
-@wp.func
-def _curve_root(signal: _Signal, begin: wp.float64, end: wp.float64, level: wp.float64) -> wp.float64:
-    """Return when the signal, monotone in (begin, end], reaches a level; the end if that is by rounding.
-
-    Newton's method from the end where the curve lies on the side of its bend, from where it cannot overshoot.
-    """
-    at_begin = _curve_at(signal, begin) - level
-    at_end = _curve_at(signal, end) - level
-    if at_begin == _ZERO or at_begin * at_end > _ZERO:
-        return wp.where(at_begin == _ZERO, begin, end)
-    time_ns = wp.where(at_end * signal.decay > _ZERO, end, begin)
-    value = wp.where(at_end * signal.decay > _ZERO, at_end, at_begin)
-    if signal.decay == _ZERO:
-        value = at_begin
-        time_ns = begin
-    for _step in range(_NEWTON_STEPS_MAX):
-        steepness = signal.slope - signal.decay / signal.tau * wp.exp(-(time_ns - signal.begin) / signal.tau)
-        if steepness == _ZERO:
-            break
-        before = time_ns
-        time_ns = wp.clamp(time_ns - value / steepness, begin, end)
-        elapsed = time_ns - signal.begin
-        value = signal.start + signal.slope * elapsed - level
-        value += signal.decay * (wp.exp(-elapsed / signal.tau) - _ONE)
-        if wp.abs(time_ns - before) <= _NEWTON_NS:
-            break
-    return time_ns
-
-
-@wp.func
-def _curve_crossing(
-    signal: _Signal, now: wp.float64, end: wp.float64, quiet: wp.vec2, lower: wp.float64, upper: wp.float64
-) -> _Crossing:
-    """Find the first level that the photoreceptor's output reaches in (now, end].
-
-    It turns at most once, where its derivative is zero; before and after that it is monotone.
-    """
-    crossing = _Crossing()
-    crossing.polarity = -1
-    middle = now
-    if signal.slope * signal.decay > _ZERO:
-        ratio = signal.decay / (signal.tau * signal.slope)
-        if ratio > _ONE:
-            turn = signal.begin + signal.tau * wp.log(ratio)
-            if turn > now and turn < end:
-                middle = turn
-    if middle > now:
-        crossing.polarity = _reached(_curve_at(signal, middle), quiet)
-        if crossing.polarity >= 0:
-            level = wp.where(crossing.polarity == 1, upper, lower)
-            crossing.time_ns = _curve_root(signal, now, middle, level)
-            return crossing
-    crossing.polarity = _reached(_curve_at(signal, end), quiet)
-    if crossing.polarity >= 0:
-        level = wp.where(crossing.polarity == 1, upper, lower)
-        crossing.time_ns = _curve_root(signal, middle, end, level)
-    return crossing
-
-
-@wp.func
-def _inverse_gaussian(
-    mean: wp.float64, shape: wp.float64, normal: wp.float64, uniform: wp.float64
-) -> wp.float64:
-    """Return an inverse Gaussian number made of a normal and a uniform one (Michael, Schucany, Haas)."""
-    a = mean * normal * normal / (_TWO * shape)
-    factor = _ONE + a + wp.sqrt(a * (a + _TWO))
-    small = mean / factor
-    return wp.where(uniform * (mean + small) <= mean, small, mean * factor)
-
-
-@wp.func
-def _touch(near: wp.float64, far: wp.float64, variance: wp.float64) -> wp.float64:
-    """Return the probability that a Brownian bridge touches a threshold; 0 below 4e-18.
-
-    Args:
-        near: Distance of its begin to the threshold, > 0.
-        far: Distance of its end; <= 0: beyond.
-        variance: Of a free motion of this length.
-    """
-    if far <= _ZERO:
-        return _ONE
-    exponent = _TWO * near * far
-    if exponent >= wp.float64(40.0) * variance:
-        return _ZERO
-    return wp.exp(-exponent / variance)
-
-
-@wp.func
-def _first_passage(
-    model: _Model,
-    pixel: wp.int32,
-    step: wp.int64,
-    voltage: wp.float64,
-    on: wp.float64,
-    off: wp.float64,
-    drift: wp.float64,
-    deviation: wp.float64,
-    now: wp.float64,
-    end: wp.float64,
-) -> _Crossing:
-    """Move the voltage from now to the end, or to where it first touches +on or -off.
-
-    Args:
-        model: Parameters.
-        pixel: Address of random numbers, with `step`.
-        step: A number that no other piece has.
-        voltage: Between -off and on.
-        on: Threshold upwards.
-        off: Threshold downwards.
-        drift: Per ns.
-        deviation: Per root ns.
-        now: Begin [ns].
-        end: End [ns].
-    """
-    span_ns = end - now
-    variance = deviation * deviation * span_ns
-    normal = normal2(random_bits(model.seed, model.step_stream, step, pixel))
-    arrival = voltage + drift * span_ns + wp.sqrt(variance) * normal[0]
-    touch_on = _touch(on - voltage, on - arrival, variance)
-    touch_off = _touch(voltage + off, arrival + off, variance)
-    crossing = _Crossing()
-    crossing.polarity = -1
-    crossing.voltage = arrival
-    touch = wp.vec2d(_ONE, _ONE)
-    if touch_on + touch_off > _ZERO:
-        touch = uniform2(random_bits(model.seed, model.touch_stream, step, pixel))
-    if arrival >= on:
-        crossing.polarity = wp.where(touch[0] < touch_off, 0, 1)
-    elif arrival <= -off:
-        crossing.polarity = wp.where(touch[0] < touch_on, 1, 0)
-    elif touch[0] < touch_on:
-        crossing.polarity = 1
-    elif touch[0] < touch_on + touch_off:
-        crossing.polarity = 0
-    if crossing.polarity >= 0:
-        near = wp.where(crossing.polarity == 1, on - voltage, voltage + off)
-        far = wp.abs(wp.where(crossing.polarity == 1, on - arrival, arrival + off))
-        ratio = near / wp.max(far, wp.float64(1e-12) * near)
-        if variance > _ZERO:
-            ratio = _inverse_gaussian(ratio, near * near / variance, normal[1], touch[1])
-        crossing.time_ns = wp.clamp(now + span_ns * (ratio / (_ONE + ratio)), now, end)
-        crossing.voltage = _ZERO
-    return crossing
-
-
 @wp.func
 def _digital(model: _Model, sample: wp.float32) -> wp.float64:
     """Return light in units of white / 255."""
@@ -405,8 +201,8 @@ def make_scan(terms: frozenset[str]) -> Any:
     spontaneous = "spontaneous" in terms
     stochastic = "stochastic" in terms
     resets = refractory or spontaneous
-    value_at = _curve_at if low_pass else _line_at
-    find_crossing = _curve_crossing if low_pass else _line_crossing
+    value_at = curve_at if low_pass else line_at
+    find_crossing = curve_crossing if low_pass else line_crossing
 
     @wp.func
     def range_of(state: _Pixel) -> wp.vec2:
@@ -420,7 +216,7 @@ def make_scan(terms: frozenset[str]) -> Any:
         return state
 
     @wp.func
-    def release(signal: _Signal, time_ns: wp.float64, state: _Pixel) -> _Pixel:
+    def release(signal: Signal, time_ns: wp.float64, state: _Pixel) -> _Pixel:
         """Let the reference be the signal at a time."""
         if wp.static(stochastic):
             state.voltage = _ZERO
@@ -438,7 +234,7 @@ def make_scan(terms: frozenset[str]) -> Any:
         row: wp.int32,
         place: wp.int64,
         time_shift: wp.int32,
-        signal: _Signal,
+        signal: Signal,
         drift: wp.float64,
         deviation: wp.float64,
         first_light: wp.float64,
@@ -475,7 +271,7 @@ def make_scan(terms: frozenset[str]) -> Any:
                     end = noise_ns
                     noisy = wp.bool(True)
 
-            crossing = _Crossing()
+            crossing = Crossing()
             if wp.static(stochastic):
                 ratio = wp.min(state.on, state.off) / wp.max(deviation, wp.float64(1e-30))
                 longest_ns = ratio * ratio / wp.float64(16.0)
@@ -484,8 +280,19 @@ def make_scan(terms: frozenset[str]) -> Any:
                     noisy = wp.bool(False)
                 step = (since_ns << _DRAW_BITS) + draw
                 draw += wp.int64(1)
-                crossing = _first_passage(
-                    model, pixel, step, state.voltage, state.on, state.off, drift, deviation, now, end
+                crossing = first_passage(
+                    model.seed,
+                    model.step_stream,
+                    model.touch_stream,
+                    step,
+                    pixel,
+                    state.voltage,
+                    state.on,
+                    state.off,
+                    drift,
+                    deviation,
+                    now,
+                    end,
                 )
                 state.voltage = crossing.voltage
             else:
@@ -626,7 +433,7 @@ def make_scan(terms: frozenset[str]) -> Any:
                         rise = wp.abs(wp.float64(sample) - light)
                         pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
                     for piece in range(pieces):
-                        signal = _Signal()
+                        signal = Signal()
                         signal.begin = span_ns * (wp.float64(piece) / wp.float64(pieces))
                         signal.end = span_ns * (wp.float64(piece + 1) / wp.float64(pieces))
                         busy = wp.bool(True)
@@ -647,7 +454,7 @@ def make_scan(terms: frozenset[str]) -> Any:
                             signal.last = filtered + leaked + leak_slope * signal.end
                             steepness = signal.slope - decay / signal.tau
                             turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
-                            busy = turns or _reached(signal.last, quiet) >= 0
+                            busy = turns or reached(signal.last, quiet) >= 0
                             if wp.static(refractory):
                                 busy = busy or state.held_ns >= _ZERO
                             if wp.static(spontaneous):
@@ -655,7 +462,7 @@ def make_scan(terms: frozenset[str]) -> Any:
                         elif wp.static(not stochastic):
                             signal.start = light + leaked
                             signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
-                            busy = _reached(signal.last, quiet) >= 0
+                            busy = reached(signal.last, quiet) >= 0
                             if wp.static(refractory):
                                 busy = busy or state.held_ns >= _ZERO
                             if wp.static(spontaneous):
