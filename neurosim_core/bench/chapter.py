@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -149,11 +150,17 @@ def cells(table: Table) -> list[list[str]]:
 def save_table(table: Table, folder: Path) -> Path:
     """Write `<name>.csv`: the keys, then all digits of the values; return its path."""
     file = folder / f"{table.name}.csv"
-    with file.open("w", newline="", encoding="utf-8") as out:
-        writer = csv.DictWriter(out, list(table.columns))
-        writer.writeheader()
-        writer.writerows({key: _plain(value) for key, value in row.items()} for row in table.rows)
+    file.write_bytes(to_csv(table).encode("utf-8"))
     return file
+
+
+def to_csv(table: Table) -> str:
+    """Return a table as the text of a CSV file."""
+    out = io.StringIO(newline="")
+    writer = csv.DictWriter(out, list(table.columns))
+    writer.writeheader()
+    writer.writerows({key: _plain(value) for key, value in row.items()} for row in table.rows)
+    return out.getvalue()
 
 
 def _plain(value: object) -> Any:

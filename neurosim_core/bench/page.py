@@ -8,7 +8,7 @@ from html import escape
 
 from markdown_it import MarkdownIt
 
-from neurosim_core.bench.chapter import Bar, Chapter, Table, cells, numeric_columns
+from neurosim_core.bench.chapter import Bar, Chapter, Table, cells, numeric_columns, to_csv
 
 _LONG = 24  # rows, from which on a table is folded
 _CLASSES = {True: "met", False: "missed", None: "open"}
@@ -56,6 +56,7 @@ figure { margin: 1.5rem 0; }
 img { display: block; width: 100%; height: auto; }
 .command { color: var(--soft); font-size: .875rem; margin: 0 0 1rem; }
 .note, .note p { color: var(--soft); font-size: .875rem; }
+.file { font-size: .75rem; font-weight: 400; margin-left: .4rem; }
 summary { cursor: pointer; color: #0b5cad; font-size: .875rem; }
 @media (max-width: 40rem) { section { padding: 1.25rem 1rem; } .bars td:first-child { width: auto; } }
 @media print { body { background: none; } section { border: 0; padding: 0; break-inside: avoid-page; }
@@ -162,7 +163,9 @@ def _table(table: Table) -> str:
     if len(table.rows) > _LONG:
         grid = f"<details><summary>{len(table.rows)} rows</summary>{grid}</details>"
     note = f'<div class="note">{_MARKDOWN.render(table.note)}</div>' if table.note else ""
-    return f"<h3>{escape(table.title)}</h3>{grid}{note}"
+    data = base64.b64encode(to_csv(table).encode("utf-8")).decode("ascii")
+    link = f'<a class="file" download="{table.name}.csv" href="data:text/csv;base64,{data}">CSV</a>'
+    return f"<h3>{escape(table.title)} {link}</h3>{grid}{note}"
 
 
 def _inline(text: str) -> str:

@@ -104,13 +104,15 @@ def test_the_page_needs_no_other_file(written):
     assert all(link.startswith(("data:", "#")) for link in links)
     assert "url(" not in reader.text("style")
     pictures = [a["src"] for tag, a in reader.tags if tag == "img"]
+    files = [a["href"] for _, a in reader.tags if a.get("download") == "one-table.csv"]
+    assert base64.b64decode(files[0].partition(",")[2]) == (folder / "one-table.csv").read_bytes()
     assert base64.b64decode(pictures[0].partition(",")[2]) == (folder / "one-plot.png").read_bytes()
 
 
 def test_text_is_shown_as_it_was_written(written):
     """Wherever it stands: titles, summaries, bars and cells."""
     _, _, reader = written
-    for tag, text in (("h2", f"Chapter {NASTY}"), ("h3", f"Table of {NASTY}"), ("td", NASTY)):
+    for tag, text in (("h2", f"Chapter {NASTY}"), ("h3", f"Table of {NASTY} "), ("td", NASTY)):
         assert text in [data for t, data in reader.texts if t == tag], tag
     assert '<script>alert("x")</script>' in reader.text("p")
     assert "fast" in [data for t, data in reader.texts if t == "strong"]
@@ -125,7 +127,7 @@ def test_the_page_sums_up_what_was_promised(written):
     verdicts = [a["class"] for tag, a in reader.tags if tag == "td" and "verdict" in a.get("class", "")]
     assert verdicts == ["verdict met", "verdict missed", "verdict open"]
     ids = {a["id"] for _, a in reader.tags if "id" in a}
-    assert {a["href"][1:] for tag, a in reader.tags if tag == "a"} <= ids
+    assert {a["href"][1:] for tag, a in reader.tags if tag == "a" and "download" not in a} <= ids
 
 
 def test_the_page_says_on_what_it_was_measured(written):
