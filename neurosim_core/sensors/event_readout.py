@@ -11,9 +11,9 @@ that have come until then get that stamp, and the bus is busy for row_s + n / ba
 At most `queue_length` events wait; one that finds the queue full is lost. A pixel does not wait for its event
 to be read: its refractory time begins at the crossing.
 
-It is a sequence by its nature, so one thread does it, on the CPU or the GPU, for events in the order of
-time to the nanosecond (then row, column, polarity). What is read depends only on what has come before, so not
-on when it is asked for.
+It is a sequence by its nature, so one thread of the CPU does it, also for a camera on a GPU, where one thread
+takes half a microsecond for each event: keys come sorted by time to the nanosecond, then row, column and
+polarity, and go back. What is read depends only on what has come before, so not on when it is asked for.
 
 Reference: Boahen (2000), Point-to-point connectivity between neuromorphic chips using address events, for
 arbitrated queues; Finateu et al. (2020) for a readout by rows.
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors.event_config import ReadoutConfig
 from neurosim_core.sensors.event_scan import SUB_BITS
-from neurosim_core.streams import HostCopy, Milestone
+from neurosim_core.streams import Milestone
 
 wp.set_module_options({"enable_backward": False})
 
@@ -249,15 +249,6 @@ def _read_rows(
     _serve(bus, (now_ns << _TICK_BITS) + _ONE, origin_ns, first_out, keys_out, counters)
 
 
-@wp.kernel
-def _begin(
-    # Out:
-    following_out: wp.array[wp.int32],
-) -> None:
-    node = wp.tid()
-    following_out[node] = wp.where(node + 1 < following_out.shape[0], node + 1, -1)
-
-
 class Readout:
     """The arbiter of one event camera and the events that wait for it.
 
@@ -266,7 +257,10 @@ class Readout:
         height: Rows of the sensor [px].
         row_shift: Bits of a key below its row.
         time_shift: Bits of a key below its microseconds.
-        device: Warp device.
+        device: Where the keys are.
+
+    Attributes:
+        waiting_count: Events that wait now.
     """
 
     def __init__(
@@ -281,22 +275,22 @@ class Readout:
         bus.queue_length = config.queue_length
         bus.row_shift = row_shift
         bus.time_shift = time_shift
-        bus.free = wp.zeros(1, dtype=wp.int64, device=self._device)
+        bus.free = wp.zeros(1, dtype=wp.int64, device="cpu")
         places = config.queue_length if self._rowwise else 0
         rows = height if self._rowwise else 0
-        bus.place = wp.empty(places, dtype=wp.int64, device=self._device)
-        bus.following = wp.empty(places, dtype=wp.int32, device=self._device)
-        bus.asked = wp.empty(rows, dtype=wp.int64, device=self._device)
-        bus.head, bus.tail, bus.rows = (wp.empty(rows, dtype=wp.int32, device=self._device) for _ in range(3))
+        bus.place = wp.empty(places, dtype=wp.int64, device="cpu")
+        bus.following = wp.empty(places, dtype=wp.int32, device="cpu")
+        bus.asked = wp.empty(rows, dtype=wp.int64, device="cpu")
+        bus.head, bus.tail, bus.rows = (wp.empty(rows, dtype=wp.int32, device="cpu") for _ in range(3))
         self._bus = bus
-        self._counters = wp.zeros(_COUNTERS, dtype=wp.int32, device=self._device)
-        self._counters_on_host = HostCopy(self._counters)
-        self._done = Milestone(self._device)
-        self._make_drop_buffer(1024)
+        self._counters = wp.zeros(_COUNTERS, dtype=wp.int32, device="cpu")
+        self._arrived = Milestone(self._device)
+        self._make_buffers(0)
         self._reset_ns = 0
         self._dropped: deque[NDArray[np.int64]] = deque()
         self.waiting_count = 0
         wp.load_module(_read_rows.module, device=self._device)
+        wp.load_module(_read_rows.module, device="cpu")
 
     def reset(self, stamp_ns: int) -> None:
         """Forget all events and be free from a stamp on [ns]."""
@@ -305,8 +299,9 @@ class Readout:
         self._counters.zero_()
         self._bus.head.fill_(-1)
         if self._rowwise:
-            following = self._bus.following
-            wp.launch(_begin, dim=following.shape[0], outputs=[following], device=self._device)
+            following = self._bus.following.numpy()
+            following[:] = np.arange(1, len(following) + 1)
+            following[-1] = -1
         self._dropped.clear()
         self.waiting_count = 0
 
@@ -340,22 +335,20 @@ class Readout:
             device=self._device,
         )
         self._sort(spare, order, count)
-        if count > self._dropped_ns.shape[0]:
-            self._make_drop_buffer(1 << (count - 1).bit_length())
+        arrivals, out, first_out = self._on_cpu(spare, keys, first, count)
         now = [now_ns - self._reset_ns] if self._rowwise else []
         wp.launch(
             _read_rows if self._rowwise else _read_events,
             dim=1,
-            inputs=[self._bus, spare, count, origin_us * NS_PER_US - self._reset_ns, *now, first],
-            outputs=[keys, self._dropped_ns, self._counters],
-            device=self._device,
+            inputs=[self._bus, arrivals, count, origin_us * NS_PER_US - self._reset_ns, *now, first_out],
+            outputs=[out, self._dropped_ns, self._counters],
+            device="cpu",
         )
-        self._counters_on_host.fetch(0, _COUNTERS)
-        self._done.set()
-        self._done.wait()
-        read, self.waiting_count, dropped = (int(n) for n in self._counters_on_host.rows(0, 3))
+        read, self.waiting_count, dropped = (int(n) for n in self._counters.numpy()[:3])
+        if out is not keys and read > 0:
+            wp.copy(keys, out, dest_offset=first, count=read)
         if dropped > 0:
-            self._note_dropped(dropped, origin_us * NS_PER_US)
+            self._dropped.append(self._dropped_ns.numpy()[:dropped] + origin_us * NS_PER_US)
         return read
 
     def take_dropped(self, until_ns: int) -> int:
@@ -370,15 +363,26 @@ class Readout:
                 break
         return count
 
-    def _make_drop_buffer(self, size: int) -> None:
-        self._dropped_ns = wp.empty(size, dtype=wp.int64, device=self._device)
-        self._dropped_on_host = HostCopy(self._dropped_ns)
+    def _make_buffers(self, size: int) -> None:
+        """Allocate for so many events at a time; keys are only copied where they are on a GPU."""
+        copied = size if self._device.is_cuda else 0
+        self._dropped_ns = wp.empty(size, dtype=wp.int64, device="cpu")
+        self._keys_in, self._keys_out = (
+            wp.empty(copied, dtype=wp.int64, device="cpu", pinned=copied > 0) for _ in range(2)
+        )
 
-    def _note_dropped(self, count: int, origin_ns: int) -> None:
-        self._dropped_on_host.fetch(0, count)
-        self._done.set()
-        self._done.wait()
-        self._dropped.append(self._dropped_on_host.rows(0, count) + origin_ns)
+    def _on_cpu(self, arrivals: Any, keys: Any, first: int, count: int) -> tuple[Any, Any, int]:
+        """Return where the CPU finds arrivals and puts keys, and the place of the first of these."""
+        room = count + self.waiting_count
+        if room > self._dropped_ns.shape[0]:
+            self._make_buffers(1 << (room - 1).bit_length())
+        if self._device.is_cpu:
+            return arrivals, keys, first
+        if count > 0:
+            wp.copy(self._keys_in, arrivals, count=count)
+        self._arrived.set()
+        self._arrived.wait()
+        return self._keys_in, self._keys_out, 0
 
     def _sort(self, keys: Any, order: Any, count: int) -> None:
         if self._device.is_cpu:
