@@ -580,6 +580,31 @@ def test_adaptive_cameras_in_another_thread_yield_the_same(settings):
     assert sum(len(packet.t) for packet in of(got, "events")) > 50
 
 
+def test_an_adaptive_camera_that_comes_back_sees_the_first_tick(settings):
+    """Also if its content has hardly moved since; and a batch that is skipped makes a window longer."""
+    model = simulation.make_model(ns.load_config({**settings, "sensors": ADAPTIVE}))
+    command = 1.05 * hover(model)
+    state = simulation.make_state(model, flight_lane_count=32)
+    for _ in range(10):
+        simulation.step(model, state, command)
+    simulation.want(model, state, ())
+    simulation.step(model, state, command)
+    away_until_ns = state.stamp_ns
+    simulation.want(model, state, ["events"])
+    later = of([p for _ in range(6) for p in simulation.step(model, state, command)], "events")
+    assert later[0].start_ns == away_until_ns + 500_000
+    packets: list[Packet] = []
+    for period in range(16):
+        for batch in simulation.fly_period(model, state, command)[1]:
+            looks = simulation.skip if 4 <= period < 8 else simulation.see
+            found = looks(model, state, batch)
+            packets += found if isinstance(found, list) else []
+    windows = of(packets, "events")
+    assert windows[0].start_ns == later[-1].stamp_ns
+    assert all(a.stamp_ns == b.start_ns for a, b in itertools.pairwise(windows))
+    assert {w.stamp_ns - w.start_ns for w in windows} == {10_000_000, 30_000_000}
+
+
 def test_an_adaptive_camera_needs_a_renderer_that_knows_where_things_are(settings):
     model = simulation.make_model(ns.load_config({**settings, "sensors": ADAPTIVE, "renderer": "synthetic"}))
     with pytest.raises(ValueError, match="needs the renderer 'warp'"):
