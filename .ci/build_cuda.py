@@ -24,7 +24,9 @@ from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import TERMS, make_scan
 from neurosim_core.trajectory import HoverConfig, hover
+from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
+from neurosim_core.vehicle.integrator import make_kernels as make_flight
 
 ARCHITECTURES = (80, 90)
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
@@ -67,6 +69,8 @@ def make_kernels() -> None:
         rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
         make_scan(frozenset(pixel))
+    for adaptive in (False, True):
+        make_flight(frozenset(VEHICLE_TERMS), adaptive=adaptive)
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
         for mode in MODES:

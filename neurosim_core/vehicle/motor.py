@@ -30,7 +30,15 @@ class LagConstants(NamedTuple):
 
 
 def lag_constants(step_s: float, time_constant_s: float) -> LagConstants:
-    """Return the constants of one step; a time constant of 0 means that the speed follows at once."""
+    """Return the constants of one step; a time constant of 0 means that the speed follows at once.
+
+    Raises:
+        ValueError: The step is not positive, the time constant negative, or one of them not finite.
+    """
+    if not 0.0 < step_s < math.inf:
+        raise ValueError(f"step_s must be > 0 and finite, got {step_s}")
+    if not 0.0 <= time_constant_s < math.inf:
+        raise ValueError(f"time_constant_s must be >= 0 and finite, got {time_constant_s}")
     z = step_s / time_constant_s if time_constant_s > 0.0 else math.inf
     rate_1_s = min(z / step_s, _RATE_MAX_1_S)
     return LagConstants(_projected_exponential(z), _projected_exponential(2.0 * z), math.exp(-z), rate_1_s)

@@ -47,6 +47,7 @@ TERMS = (
 Integrator = Literal["rkmk4", "dormand_prince"]
 """How a vehicle is integrated: see `Multirotor`."""
 
+_STEP_MAX_NS = 10**12
 _BLOCK_DIM = 32  # threads per CUDA block: a few thousand vehicles then reach every multiprocessor
 _LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
 
@@ -311,6 +312,7 @@ class Multirotor:
         seed: Of the turbulence, 0 <= seed < 2^64; each vehicle of the batch has its own, by its index.
 
     Raises:
+        TypeError: What counts is not an integer.
         ValueError: An argument is out of range, or there is no such device.
     """
 
@@ -328,10 +330,10 @@ class Multirotor:
         evaluation_count_max: int = 100_000,
         seed: int = 0,
     ) -> None:
-        if count < 1:
-            raise ValueError(f"count must be >= 1, got {count}")
-        if max_step_ns < 1:
-            raise ValueError(f"max_step_ns must be >= 1, got {max_step_ns}")
+        _check_integer("count", count, 1, 2**31 - 1)
+        _check_integer("max_step_ns", max_step_ns, 1, _STEP_MAX_NS)
+        _check_integer("evaluation_count_max", evaluation_count_max, 7, 2**31 - 8)
+        _check_integer("seed", seed, 0, 2**64 - 1)
         chosen = set(config.terms() if terms is None else terms)
         if not set(config.terms()) <= chosen <= set(TERMS):
             raise ValueError(
@@ -343,10 +345,6 @@ class Multirotor:
             raise ValueError(f"rtol must be in [1e-14, 0.1], got {rtol}")
         if not 0.0 < atol < np.inf:
             raise ValueError(f"atol must be > 0 and finite, got {atol}")
-        if not 7 <= evaluation_count_max < 2**31 - 7:
-            raise ValueError(f"evaluation_count_max must be in [7, 2^31 - 7), got {evaluation_count_max}")
-        if not 0 <= seed < 2**64:
-            raise ValueError(f"seed must be in [0, 2^64), got {seed}")
         self.config = config
         self.count = count
         self.device = wp.get_device(device)
@@ -416,9 +414,10 @@ class Multirotor:
         """
         config, arrays = self.config, self.arrays
         q = self._rows((0.0, 0.0, 0.0, 1.0) if orientation is None else orientation, "orientation", 4)
-        norm = np.linalg.norm(q, axis=1, keepdims=True)
-        if not (norm > 1e-6).all():
-            raise ValueError(f"orientation must not be 0, got {q.tolist()}")
+        with np.errstate(over="ignore"):
+            norm = np.linalg.norm(q, axis=1, keepdims=True)
+        if not ((norm > 1e-6) & (norm < np.inf)).all():
+            raise ValueError(f"orientation must not be 0, nor too large to be normalised, got {q.tolist()}")
         rotors = config.rotor_count
         hover = np.full(rotors, config.hover_rotor_speed_rad_s)
         speed = self._rows(hover if rotor_speed is None else rotor_speed, "rotor_speed", rotors)
@@ -561,6 +560,8 @@ class Multirotor:
         """Prepare the launches for one duration, and keep them."""
         if duration_ns <= 0:
             raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
+        if duration_ns > (longest_ns := (2**31 - 1) * self.max_step_ns):
+            raise ValueError(f"duration_ns must be at most 2^31 steps, {longest_ns}, got {duration_ns}")
         longest_ns = duration_ns
         if "turbulence" in self.terms:
             longest_ns = INTERVAL_TICKS_MAX * int(self._wind.tick_ns)
@@ -614,7 +615,15 @@ class Multirotor:
                 for lag in lags
             ]
             rotors.lags = wp.array(rows, dtype=RotorLag, device=self.device)
-        return _struct(Surroundings, wind=self._wind, ground=self._ground, rotors=rotors)
+        around: Surroundings = _struct(Surroundings, wind=self._wind, ground=self._ground, rotors=rotors)
+        return around
+
+
+def _check_integer(name: str, value: Any, low: int, high: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name} must be an integer, got {value!r}")
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be in [{low}, {high}], got {value}")
 
 
 def _struct(kind: Any, **values: Any) -> Any:

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-call"
 """Why a vehicle is held: the codes in `MultirotorArrays.status`."""
 
 import warp as wp

@@ -10,9 +10,11 @@ from pydantic import ValidationError
 from scipy import stats
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from neurosim_core import load_config, simulation
 from neurosim_core.vehicle import GustConfig, Multirotor, MultirotorState, TurbulenceConfig, preset, wind
 
 MS = 1_000_000
+HUMMINGBIRD = preset("hummingbird")
 FOOT_M = 0.3048
 DRAG = {"rotor_drag_kg": 1e-12, "rotor_inflow_kg": 1e-12}
 VANE = {
@@ -340,6 +342,25 @@ def test_redone_intervals_meet_the_same_wind(device):
         ends.append(vehicle.state.position[0])
         assert (vehicle.effort.redone_count[0] > 0) == (integrator == "rkmk4")
     assert ends[0] == pytest.approx(ends[1], rel=1e-4)
+
+
+def test_a_run_has_the_wind_of_its_seed():
+    settings = {
+        "device": "cpu",
+        "scene": {"kind": "apartment", "rooms": 1},
+        "vehicle": {"parameters": {"turbulence": {"wind_20ft_m_s": 5.0}}},
+        "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
+        "path": {"kind": "hover"},
+    }
+    model = simulation.make_model(load_config({**settings, "seed": 3}))
+    ends = []
+    for seed in (None, 3, 4):
+        state = simulation.make_state(model, seed=seed)
+        for _ in range(4):
+            simulation.step(model, state, np.full(4, HUMMINGBIRD.hover_rotor_speed_rad_s))
+        ends.append(np.concatenate(state.vehicle.state, axis=1))
+    assert np.array_equal(ends[0], ends[1])
+    assert not np.isclose(ends[0][0, :3], ends[2][0, :3], rtol=1e-9, atol=0.0).any()
 
 
 def test_what_nothing_feels_is_left_out(device):
