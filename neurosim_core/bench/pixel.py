@@ -113,8 +113,8 @@ def _ramp_bars(result: PixelResult) -> list[Bar]:
             met=threshold <= 1e-3,
         ),
         Bar(
-            text="ramp: rates are 1 / (t_ref + C / slope) with a refractory time, slope / C and the leak add up, "
-            "to 0.1 %",
+            text="ramp: rates are 1 / (t_ref + C / slope) with a refractory time, and slope / C and the leak "
+            "add up, to 0.1 %",
             measured=f"to {rate:.2g}",
             met=rate <= 1e-3,
         ),

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,7 @@ def measure_ramp(bench: TestBench) -> tuple[list[Curve], Curve]:
                 f"refractory {1e3 * dead_s:g} ms",
                 make_pixel(refractory_s=dead_s),
                 slopes,
-                lambda s, dead_s=dead_s: 1.0 / (dead_s + THRESHOLD / s),  # type: ignore[misc]
+                partial(_dead_rate_hz, dead_s),
             )
         )
     leak_hz = 10.0
@@ -147,27 +148,25 @@ def measure_ramp(bench: TestBench) -> tuple[list[Curve], Curve]:
         )
     )
     recovered = Curve(
-        name="threshold", x=slopes, measured=slopes / ideal.measured, expected=np.full_like(slopes, THRESHOLD)
+        name="threshold", x=slopes, measured=slopes / ideal.measured, law=lambda s: np.full_like(s, THRESHOLD)
     )
     return curves, recovered
 
 
+def _dead_rate_hz(dead_s: float, slope: Floats) -> Floats:
+    return 1.0 / (dead_s + THRESHOLD / slope)
+
+
 def _ramp_curve(
-    bench: TestBench,
-    name: str,
-    config: EventCameraConfig,
-    slopes: Floats,
-    rate: Callable[[float], float],
+    bench: TestBench, name: str, config: EventCameraConfig, slopes: Floats, rate: Callable[[Floats], Floats]
 ) -> Curve:
     """Show each slope for as long as about 100 events take, but no more than the camera takes of light."""
     measured = []
-    for slope in slopes:
-        duration_s = min(100.5 / rate(slope), 900.0 / slope)
+    for slope, rate_hz in zip(slopes, rate(slopes), strict=True):
+        duration_s = min(100.5 / rate_hz, 900.0 / slope)
         log = np.array([0.0, slope * duration_s]).reshape(2, 1, 1)
         measured.append(_rates_hz(bench.expose(config, log, [0.0, duration_s]), 1, 1)[0])
-    return Curve(
-        name=name, x=slopes, measured=np.array(measured), expected=np.array([rate(s) for s in slopes])
-    )
+    return Curve(name=name, x=slopes, measured=np.array(measured), law=rate)
 
 
 # ---- step ------------------------------------------------------------------------------------------------
@@ -181,8 +180,9 @@ def measure_staircase(bench: TestBench) -> list[Curve]:
         log = np.stack([np.zeros_like(heights), sign * heights])[:, :, None]
         events = bench.expose(make_pixel(), log, [0.0, 1e-9 * _STEP_NS])
         counts = _per_pixel(events, 1, len(heights))
-        expected = np.floor(heights / THRESHOLD)
-        curves.append(Curve(name=name, x=heights, measured=counts.astype(float), expected=expected))
+        curves.append(
+            Curve(name=name, x=heights, measured=counts.astype(float), law=lambda h: np.floor(h / THRESHOLD))
+        )
     return curves
 
 
@@ -209,13 +209,14 @@ def measure_s_curves(bench: TestBench) -> tuple[list[Curve], float]:
             log[1] = sign * height
             events = bench.expose(config, log, [0.0, 1e-9 * _STEP_NS])
             shares.append(float((_per_pixel(events, side, side * side) > 0).mean()))
-        expected = stats.norm.cdf((heights - mean) / sigma)
+        law = stats.norm(mean, sigma).cdf
+        expected = law(heights)
         deviation = np.sqrt(expected * (1.0 - expected)) / side
         curve = Curve(
             name=f"{name}: C = {mean:.3f}, sigma = {sigma:g}",
             x=heights,
             measured=np.array(shares),
-            expected=expected,
+            law=law,
             deviation=deviation,
         )
         curves.append(curve)
@@ -235,22 +236,23 @@ def measure_latency(bench: TestBench) -> list[Curve]:
     for preset in PHOTORECEPTORS:
         low_pass = make_preset(preset).low_pass
         assert low_pass is not None
-        tau_s = 1.0 / (2.0 * math.pi * corner_hz(make_preset(preset), radiance))
+        law = partial(_latency_s, make_preset(preset), height)
         for name, sign in (("ON", 1.0), ("OFF", -1.0)):
             after = np.log(radiance)
             log = np.stack([after - sign * height, after, after])[:, :, None]
-            last_s = 20.0 * float(tau_s.max())
+            last_s = 20.0 * float(law(radiance).max())
             events = bench.expose(make_pixel(low_pass=low_pass), log, [0.0, 1e-9 * _STEP_NS, last_s])
             first_us = np.full(len(radiance), np.nan)
             rows, first = np.unique(events.y, return_index=True)
             first_us[rows] = events.t[first]
-            expected_s = -tau_s * math.log(1.0 - THRESHOLD / height)
             # half the rise time passes before the middle of the step, and stamps are floored to 1 us
             measured_s = 1e-6 * (first_us + 0.5) - 0.5e-9 * _STEP_NS
-            curves.append(
-                Curve(name=f"{preset}, {name}", x=radiance, measured=measured_s, expected=expected_s)
-            )
+            curves.append(Curve(name=f"{preset}, {name}", x=radiance, measured=measured_s, law=law))
     return curves
+
+
+def _latency_s(config: EventCameraConfig, height: float, radiance: Floats) -> Floats:
+    return -math.log(1.0 - THRESHOLD / height) / (2.0 * math.pi * corner_hz(config, radiance))
 
 
 # ---- sine ------------------------------------------------------------------------------------------------
@@ -282,16 +284,19 @@ def measure_gain(bench: TestBench) -> tuple[list[Curve], list[Curve]]:
         found = []
         for light, at in zip(radiance, corner, strict=True):
             gain = np.array([_sine_gain(bench, fine, light, at, ratio) for ratio in ratios])
-            expected = 1.0 / np.sqrt(1.0 + ratios**2)
-            gains.append(
-                Curve(name=f"{preset}, radiance {light:.2g}", x=ratios * at, measured=gain, expected=expected)
-            )
+            name = f"{preset}, radiance {light:.2g}"
+            gains.append(Curve(name=name, x=ratios * at, measured=gain, law=partial(_first_order, at)))
             # 1 / gain^2 - 1 = (f / fc)^2 at every frequency
             squares = 1.0 / gain**2 - 1.0
             usable = (ratios > 0.4) & (ratios < 4.0)
             found.append(at * float(np.exp(np.mean(np.log(ratios[usable] / np.sqrt(squares[usable]))))))
-        corners.append(Curve(name=preset, x=radiance, measured=np.array(found), expected=corner))
+        law = partial(corner_hz, config)
+        corners.append(Curve(name=preset, x=radiance, measured=np.array(found), law=law))
     return gains, corners
+
+
+def _first_order(corner: float, frequency_hz: Floats) -> Floats:
+    return np.asarray(1.0 / np.sqrt(1.0 + (frequency_hz / corner) ** 2))
 
 
 def _sine_gain(
@@ -348,7 +353,7 @@ def measure_bar(bench: TestBench) -> tuple[list[BarTimes], list[Jitter]]:
     times, jitters = [], []
     for name, config, delay_s, jitter_s in models:
         late_s = _edge_times(bench, config, width, rows) - THRESHOLD / slope
-        times.append(BarTimes(name=name, column=np.arange(width, dtype=float), late_s=late_s[0]))
+        times.append(BarTimes(name=name, column=np.arange(width, dtype=float), late_s=late_s))
         jitters.append(
             Jitter(
                 name=name,
@@ -395,7 +400,6 @@ def measure_dark(bench: TestBench) -> list[Curve]:
     radiance = np.logspace(-3.0, 0.0, bench.pick(10, 4))
     shot = make_preset("v2e_noisy").shot_noise
     assert shot is not None
-    shot_hz = shot.rate_hz * (1.0 + (shot.bright_factor - 1.0) * radiance)
     leak_hz, decades = 0.1, 0.1
     leak = make_pixel(leak={"rate_hz": leak_hz, "spread_decades": decades})
     spread = math.log(10.0) * decades
@@ -404,16 +408,16 @@ def measure_dark(bench: TestBench) -> list[Curve]:
     seconds = bench.pick(40, 10)
     pixel_s = side * side * seconds
     curves = []
-    on_hz = shot_hz * shot.on_fraction
     found = _dark_rates(bench, make_pixel(shot_noise=shot), radiance, side, seconds)
-    for polarity, expected in ((1, on_hz), (0, shot_hz - on_hz)):
+    for polarity, name, share in ((1, "ON", shot.on_fraction), (0, "OFF", 1.0 - shot.on_fraction)):
+        law = partial(_shot_hz, share * shot.rate_hz, shot.bright_factor)
         curves.append(
             Curve(
-                name=f"shot noise, {'ON' if polarity else 'OFF'}",
+                name=f"shot noise, {name}",
                 x=radiance,
                 measured=found[polarity],
-                expected=expected,
-                deviation=np.sqrt(expected / pixel_s),
+                law=law,
+                deviation=np.sqrt(law(radiance) / pixel_s),
             )
         )
     found = _dark_rates(bench, leak, radiance, side, seconds)
@@ -425,11 +429,15 @@ def measure_dark(bench: TestBench) -> list[Curve]:
             name="leak, ON",
             x=radiance,
             measured=found[1],
-            expected=np.full_like(radiance, mean_leak_hz),
+            law=lambda light: np.full_like(light, mean_leak_hz),
             deviation=np.full_like(radiance, math.sqrt(variance) / side),
         )
     )
     return [*curves, _dark_passages(bench, radiance, side, seconds)]
+
+
+def _shot_hz(dark_hz: float, bright_factor: float, radiance: Floats) -> Floats:
+    return dark_hz * (1.0 + (bright_factor - 1.0) * radiance)
 
 
 def _dark_passages(bench: TestBench, radiance: Floats, side: int, seconds: float) -> Curve:
@@ -440,7 +448,7 @@ def _dark_passages(bench: TestBench, radiance: Floats, side: int, seconds: float
         name="DVS-Voltmeter, ON",
         x=radiance,
         measured=found[1],
-        expected=np.array([_passage_rates(config, light)[0] for light in radiance]),
+        law=lambda radiance: np.array([_passage_rates(config, light)[0] for light in radiance]),
         # drift outweighs diffusion: the counts of a pixel differ by one, by the phase at which it begins
         deviation=np.full_like(radiance, 0.5 / (side * seconds)),
     )
@@ -456,7 +464,7 @@ def _dark_rates(
         events = bench.expose(config, log, [0.0, float(seconds)], seed=number)
         on = int(events.polarity.sum())
         rates.append([len(events.t) - on, on])
-    return np.array(rates, dtype=float).T / (side * side * seconds)
+    return np.asarray(np.array(rates, dtype=float).T / (side * side * seconds))
 
 
 def measure_survival(bench: TestBench) -> tuple[Curve, float]:
@@ -478,7 +486,7 @@ def measure_survival(bench: TestBench) -> tuple[Curve, float]:
         name="shot noise",
         x=time_s,
         measured=measured,
-        expected=expected,
+        law=lambda time_s: np.exp(-rate_hz * time_s),
         deviation=np.sqrt(np.maximum(expected * (1.0 - expected), 1e-12) / len(interval_s)),
     )
     return curve, float(distance * math.sqrt(len(interval_s)))
@@ -503,12 +511,11 @@ def measure_competition(bench: TestBench) -> Curve:
         leaked = (events.polarity == 1) & (events.t > 1e6 * begin_s)
         late = EventArrays(*(column[leaked] for column in events))
         rates.append(_per_pixel(late, side, side * side) / (seconds - begin_s))
-    share = np.exp(-noise_hz / leak_hz)
     return Curve(
         name="leak among shot noise",
         x=noise_hz,
         measured=np.array([rate.mean() for rate in rates]),
-        expected=noise_hz * share / (1.0 - share),
+        law=lambda noise_hz: noise_hz / np.expm1(noise_hz / leak_hz),
         deviation=np.array([max(float(rate.std()), 0.1 / seconds) / side for rate in rates]),
     )
 
@@ -516,7 +523,7 @@ def measure_competition(bench: TestBench) -> Curve:
 def measure_hot(bench: TestBench) -> Curve:
     """Return the share of pixels that are found hot: those with more than a quarter of the rate."""
     side = bench.pick(256, 64)
-    fractions = np.array([1e-3, 1e-2])
+    fractions = np.array([3e-4, 1e-3, 3e-3, 1e-2])
     shares = []
     for fraction in fractions:
         config = make_pixel(hot_pixels={"fraction": fraction, "rate_hz": 100.0})
@@ -524,7 +531,7 @@ def measure_hot(bench: TestBench) -> Curve:
         shares.append(float((_per_pixel(events, side, side * side) > 25).mean()))
     deviation = np.sqrt(fractions * (1.0 - fractions)) / side
     return Curve(
-        name="hot pixels", x=fractions, measured=np.array(shares), expected=fractions, deviation=deviation
+        name="hot pixels", x=fractions, measured=np.array(shares), law=lambda f: f, deviation=deviation
     )
 
 
@@ -555,7 +562,7 @@ def measure_throughput(bench: TestBench) -> list[Curve]:
                 name=name,
                 x=loads * bandwidth_hz,
                 measured=np.array(rates),
-                expected=np.minimum(loads, 1.0) * bandwidth_hz,
+                law=lambda rate_hz: np.minimum(rate_hz, bandwidth_hz),
                 deviation=deviation,
             )
         )
@@ -590,12 +597,11 @@ def measure_batch(bench: TestBench) -> Curve:
         parts = [part.mean() for part in np.array_split(size, 10)]
         sizes.append(size.mean())
         deviations.append(np.std(parts, ddof=1) / math.sqrt(len(parts)))
-    rate = loads * bandwidth_hz
     return Curve(
         name="events per row",
-        x=rate,
+        x=loads * bandwidth_hz,
         measured=np.array(sizes),
-        expected=rate * row_s / (1.0 - loads),
+        law=lambda rate_hz: rate_hz * row_s / (1.0 - rate_hz / bandwidth_hz),
         deviation=np.array(deviations),
     )
 
@@ -626,7 +632,7 @@ def measure_wait(bench: TestBench) -> Curve:
         name="wait",
         x=loads,
         measured=np.array(waits),
-        expected=loads / (2.0 * bandwidth_hz * (1.0 - loads)),
+        law=lambda load: load / (2.0 * bandwidth_hz * (1.0 - load)),
         deviation=np.array(deviations),
     )
 
@@ -678,7 +684,7 @@ def _preset_threshold(bench: TestBench, config: EventCameraConfig, sign: float) 
     log = np.zeros((2, side, side))
     log[1 if sign > 0.0 else 0] = slope * seconds
     if config.stochastic is not None:  # its law is linear in ln(light + k2), its white is 255
-        seconds, k2 = 0.01, config.stochastic.k2  # fast against its leak
+        seconds, k2 = 0.002, config.stochastic.k2  # fast against its leak
         dim = 0.02
         log[1 if sign > 0.0 else 0] = 0.0
         log[0 if sign > 0.0 else 1] = math.log(dim)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurosim_core.bench.figures import COLORS, MARKERS
+from neurosim_core.bench.figures import COLORS, MARKERS, plain_ticks
 from neurosim_core.bench.pixel_result import Curve, PixelResult
 from neurosim_core.bench.report import Plot
 
@@ -28,11 +28,15 @@ def pixel_plots(result: PixelResult) -> list[Plot]:
     ]
 
 
-def _draw_curves(axes: Axes, curves: Sequence[Curve], *, names: Sequence[str] | None = None) -> None:
+def _draw_curves(
+    axes: Axes, curves: Sequence[Curve], *, names: Sequence[str] | None = None, log: bool = True
+) -> None:
     """Draw marks for what was measured, with bars of a standard deviation, on lines of what is expected."""
     for index, curve in enumerate(curves):
         color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
-        axes.plot(curve.x, curve.expected, color=color, marker="", lw=1.2)
+        ends = float(curve.x.min()), float(curve.x.max())
+        fine = np.geomspace(*ends, 500) if log else np.linspace(*ends, 500)
+        axes.plot(fine, curve.law(fine), color=color, marker="", lw=1.2)
         axes.errorbar(
             curve.x,
             curve.measured,
@@ -75,7 +79,7 @@ def _draw_step(result: PixelResult, figure: Figure) -> None:
     (stairs, share), (latency, late) = figure.subplots(2, 2)
     for curve, color, marker, sign in zip(result.staircase, COLORS, MARKERS, (1.0, -1.0), strict=False):
         fine = np.linspace(0.0, curve.x.max(), 1000)
-        stairs.plot(sign * fine, sign * np.floor(fine / 0.2 + 1e-9), color=color, marker="", lw=1.0)
+        stairs.plot(sign * fine, sign * curve.law(fine), color=color, marker="", lw=1.0)
         stairs.plot(
             sign * curve.x, sign * curve.measured, color=color, marker=marker, ms=3.5, ls="", mfc="none",
             label=curve.name,
@@ -84,13 +88,14 @@ def _draw_step(result: PixelResult, figure: Figure) -> None:
         xlabel="step of log radiance", ylabel="events (OFF downwards)", title="events: floor(step / C)"
     )
     stairs.legend()
-    _draw_curves(share, result.s_curve)
+    _draw_curves(share, result.s_curve, log=False)
     share.set(
         xlabel="height of the step",
         ylabel="share of pixels that fire",
         title="S-curves: Phi((step - C) / sigma)",
     )
-    share.legend(fontsize=7)
+    share.legend(fontsize=7, loc="upper left")
+    share.set_ylim(-0.03, 1.3)
     _draw_curves(latency, result.latency)
     latency.set(
         xscale="log",
@@ -111,36 +116,31 @@ def _draw_step(result: PixelResult, figure: Figure) -> None:
 
 
 def _draw_sine(result: PixelResult, figure: Figure) -> None:
-    gain, corner = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
-    _draw_curves(gain, result.gain)
-    gain.axhline(0.5**0.5, color="0.4", ls="--", lw=1.0, marker="")
-    gain.annotate(
-        "-3 dB", (gain.get_xlim()[0], 0.5**0.5), textcoords="offset points", xytext=(4, 3), fontsize=7
-    )
-    gain.set(
-        xscale="log",
-        yscale="log",
-        xlabel="frequency [Hz]",
-        ylabel="gain, from the number of events a cycle",
-        title="gain: 1 / sqrt(1 + (f / f_c)^2)",
-    )
-    gain.legend(fontsize=6, ncols=2, loc="lower left")
-    _draw_curves(corner, result.corner)
-    corner.set(
+    panels = figure.subplots(1, len(result.corner) + 1, width_ratios=[*([1.0] * len(result.corner)), 0.9])
+    for axes, corner in zip(panels, result.corner, strict=False):
+        curves = [curve for curve in result.gain if curve.name.startswith(corner.name)]
+        _draw_curves(axes, curves, names=[curve.name.split("radiance ")[1] for curve in curves])
+        axes.axhline(0.5**0.5, color="0.4", ls="--", lw=1.0, marker="")
+        axes.set(xscale="log", yscale="log", xlabel="frequency [Hz]", title=f"photoreceptor of {corner.name}")
+        plain_ticks(axes.yaxis)
+        axes.legend(title="radiance", fontsize=7, title_fontsize=7, loc="lower left")
+    panels[0].set_ylabel("gain, from the number of events a cycle (dashed: -3 dB)")
+    _draw_curves(panels[-1], result.corner)
+    panels[-1].set(
         xscale="log",
         yscale="log",
         xlabel="radiance [white = 1]",
         ylabel="3 dB frequency [Hz]",
-        title="f_c = f_w (I + I_d) / (I_w + I_d)",
+        title="3 dB over light",
     )
-    corner.legend()
+    panels[-1].legend()
 
 
 def _draw_bar(result: PixelResult, figure: Figure) -> None:
     along, spread = figure.subplots(1, 2, width_ratios=(2.2, 1.0), sharey=True)
     for times, row, color, marker in zip(result.bar, result.jitter, COLORS, MARKERS, strict=False):
         late_us = 1e6 * times.late_s
-        along.plot(times.column, late_us, color=color, marker=marker, ms=3.0, ls="", label=times.name)
+        along.plot(times.column, late_us[0], color=color, marker=marker, ms=3.0, ls="", label=times.name)
         along.axhline(1e6 * row.delay_expected_s, color=color, lw=1.0, marker="")
         if row.jitter_expected_s > 0.0:
             place = np.linspace(-4.0, 4.0, 200)
@@ -150,7 +150,7 @@ def _draw_bar(result: PixelResult, figure: Figure) -> None:
             )
             edges = np.linspace(-4.0, 4.0, 33)
             found, _ = np.histogram(
-                (times.late_s - row.delay_expected_s) / row.jitter_expected_s, edges, density=True
+                (times.late_s.ravel() - row.delay_expected_s) / row.jitter_expected_s, edges, density=True
             )
             middle = 0.5 * (edges[1:] + edges[:-1])
             found_us = 1e6 * (row.delay_expected_s + middle * row.jitter_expected_s)
@@ -176,7 +176,7 @@ def _draw_noise(result: PixelResult, figure: Figure) -> None:
         title="still scene: rate over light",
     )
     rate.legend(fontsize=7)
-    _draw_curves(interval, [result.survival])
+    _draw_curves(interval, [result.survival], log=False)
     interval.set(
         yscale="log",
         xlabel="interval [s]",
@@ -206,9 +206,10 @@ def _draw_readout(result: PixelResult, figure: Figure) -> None:
         title="min(in, bandwidth)",
     )
     out.legend(fontsize=7)
-    _draw_curves(batch, [result.batch])
+    _draw_curves(batch, [result.batch], log=False)
+    batch.ticklabel_format(axis="x", style="sci", scilimits=(0, 0))
     batch.set(
         yscale="log", xlabel="rate in [Hz]", ylabel="events read with a row", title="x row_s / (1 - x / B)"
     )
-    _draw_curves(wait, [result.wait])
+    _draw_curves(wait, [result.wait], log=False)
     wait.set(yscale="log", xlabel="load of the arbiter", ylabel="mean wait [s]", title="M/D/1 queue")

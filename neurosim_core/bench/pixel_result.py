@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +20,15 @@ class Curve:
     """Setting, shape [n]."""
     measured: Floats
     """Shape [n]."""
-    expected: Floats
-    """By the closed form, shape [n]."""
+    law: Callable[[Floats], Floats]
+    """The closed form: what is expected at any setting."""
     deviation: Floats | None = None
     """Standard deviation of `measured` by chance, shape [n]; None: nothing is by chance."""
+
+    @property
+    def expected(self) -> Floats:
+        """What the closed form says at the settings, shape [n]."""
+        return np.asarray(self.law(self.x), dtype=np.float64)
 
     @property
     def error_max(self) -> float:
@@ -66,7 +71,7 @@ class BarTimes:
     column: Floats
     """[px]."""
     late_s: Floats
-    """After an ideal pixel [s]."""
+    """After an ideal pixel [s], shape [rows, columns]."""
 
 
 @dataclass(frozen=True, kw_only=True)
