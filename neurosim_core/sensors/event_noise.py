@@ -414,10 +414,11 @@ def make_scan(terms: frozenset[str]) -> Any:
                     if wp.static(leak):
                         cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
                         whole = wp.floor(cycles)
-                        state.fold = wp.int32(whole)
                         leaked = (cycles - whole) * state.on
                         leak_slope = model.leak[pixel][0] * state.on
-                        quiet = range_of(state)
+                        if wp.int32(whole) != state.fold:
+                            state.fold = wp.int32(whole)
+                            quiet = range_of(state)
                     drift = _ZERO
                     deviation = _ZERO
                     if wp.static(stochastic):
