@@ -8,7 +8,8 @@ state, for vehicles of four rotors, and is compiled by Warp like the product's k
     euler     explicit Euler on the components of the quaternion, normalised after each step
     rk4       classical Runge-Kutta on the same, as most simulators have it
     midpoint  implicit midpoint with R_1 = R_0 cay(h w_m), which keeps energy and momentum of a free body
-              (Lie-Poisson); solved by fixed-point iteration, the motor's part in closed form
+              (Lie-Poisson); solved by fixed-point iteration, and by Newton's method with differences where
+              that does not contract; the motor's part in closed form
 
 They have no guard: what they cannot resolve becomes infinite or NaN.
 
@@ -25,8 +26,15 @@ from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench,
 KNOWN_TERMS = frozenset({"motor_lag", *AIR_TERMS, "wind", "full_inertia"})
 """Terms of the product that the baselines have too."""
 
-_ITERATION_COUNT_MAX = wp.constant(100)
-"""Fixed-point iterations of one step; where they contract at all, a dozen reach rounding."""
+_ITERATION_COUNT_MAX = wp.constant(30)
+"""Fixed-point iterations of one step; where they contract well, a dozen reach rounding."""
+_NEWTON_COUNT_MAX = wp.constant(20)
+_CONVERGED = wp.constant(wp.float64(1e-15))  # change of an iterate, as a share of it
+_NEWTON_CONVERGED = wp.constant(wp.float64(1e-12))  # likewise; the Jacobian is of differences
+_DIFFERENCE = wp.constant(wp.float64(1e-7))  # relative step of the differences
+
+_vec6d = wp.types.vector(length=6, dtype=wp.float64)
+_mat66d = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 
 
 @wp.struct
@@ -64,6 +72,36 @@ def _moved(s: Motion, rate: Motion, h: wp.float64) -> Motion:
     moved.body_rate = s.body_rate + h * rate.body_rate
     moved.rotor_speed = s.rotor_speed + h * rate.rotor_speed
     return moved
+
+
+@wp.func
+def _solve6(a: _mat66d, b: _vec6d) -> _vec6d:
+    """Return x with a x = b, by elimination with partial pivoting."""
+    for column in range(6):
+        pivot = column
+        for row in range(column + 1, 6):
+            if wp.abs(a[row, column]) > wp.abs(a[pivot, column]):
+                pivot = row
+        for k in range(6):
+            held = a[column, k]
+            a[column, k] = a[pivot, k]
+            a[pivot, k] = held
+        held = b[column]
+        b[column] = b[pivot]
+        b[pivot] = held
+        for row in range(column + 1, 6):
+            factor = a[row, column] / a[column, column]
+            for k in range(6):
+                a[row, k] = a[row, k] - factor * a[column, k]
+            b[row] = b[row] - factor * b[column]
+    x = _vec6d()
+    for back in range(6):
+        row = 5 - back
+        rest = b[row]
+        for k in range(row + 1, 6):
+            rest -= a[row, k] * x[k]
+        x[row] = rest / a[row, row]
+    return x
 
 
 @functools.cache
@@ -200,6 +238,32 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         return end
 
     @wp.func
+    def cayley_turn(orientation: wp.quatd, h: wp.float64, w: wp.vec3d) -> wp.quatd:
+        u = wp.float64(0.5) * h * w
+        return orientation * wp.normalize(wp.quatd(u[0], u[1], u[2], wp.float64(1.0)))
+
+    @wp.func
+    def midpoint_map(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        h: wp.float64,
+        s: Motion,
+        rotor_speed: wp.vec4d,
+        middle: _vec6d,
+    ) -> _vec6d:
+        """Velocity and body rate in the middle of the step, from guesses of them: a fixed point solves it."""
+        half = wp.float64(0.5) * h
+        v = wp.vec3d(middle[0], middle[1], middle[2])
+        w = wp.vec3d(middle[3], middle[4], middle[5])
+        attitude = wp.normalize(s.orientation + cayley_turn(s.orientation, h, w))
+        force, torque = body_wrench(airframe, quadratic_weight, linear_weight, attitude, v, w, rotor_speed)
+        down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
+        v = s.velocity + half * (down + airframe.mass_inverse * wp.quat_rotate(attitude, force))
+        w = s.body_rate + half * angular_acceleration(airframe, torque, w)
+        return _vec6d(v[0], v[1], v[2], w[0], w[1], w[2])
+
+    @wp.func
     def midpoint_step(
         airframe: Airframe,
         quadratic_weight: wp.array[wp.vec4d],
@@ -209,35 +273,46 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         command: wp.vec4d,
         s: Motion,
     ) -> Motion:
-        half = wp.float64(0.5) * h
-        down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
         speed = s.rotor_speed
         if wp.static(motor_lag):
-            share = half / time_constant_s
+            share = wp.float64(0.5) * h / time_constant_s
             speed = (s.rotor_speed + share * command) / (wp.float64(1.0) + share)
-        v = s.velocity
-        w = s.body_rate
-        turned = s.orientation
+        start = _vec6d(
+            s.velocity[0], s.velocity[1], s.velocity[2], s.body_rate[0], s.body_rate[1], s.body_rate[2]
+        )
+        z = wp.float64(1.0) * start  # a copy: a bare name would be the same variable
+        solved = wp.bool(False)
         for _iteration in range(_ITERATION_COUNT_MAX):
-            u = half * w
-            cayley = wp.normalize(wp.quatd(u[0], u[1], u[2], wp.float64(1.0)))
-            turned = s.orientation * cayley
-            middle = wp.normalize(s.orientation + turned)
-            force, torque = body_wrench(airframe, quadratic_weight, linear_weight, middle, v, w, speed)
-            a = down + airframe.mass_inverse * wp.quat_rotate(middle, force)
-            v_next = s.velocity + half * a
-            w_next = s.body_rate + half * angular_acceleration(airframe, torque, w)
-            change = wp.length(v_next - v) + wp.length(w_next - w)
-            size = wp.length(v_next) + wp.length(w_next)
-            v = v_next
-            w = w_next
-            if change <= wp.float64(1.0e-15) * size:
+            z_next = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, speed, z)
+            size = wp.length(z_next)
+            solved = wp.length(z_next - z) <= _CONVERGED * size and wp.isfinite(size)
+            z = z_next
+            if solved or not wp.isfinite(size):
                 break
+        if not solved:
+            z = wp.float64(1.0) * start
+            for _iteration in range(_NEWTON_COUNT_MAX):
+                image = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, speed, z)
+                jacobian = _mat66d()
+                for column in range(6):
+                    moved = wp.float64(1.0) * z
+                    step = _DIFFERENCE * (wp.float64(1.0) + wp.abs(z[column]))
+                    moved[column] = z[column] + step
+                    slope = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, speed, moved)
+                    for row in range(6):
+                        jacobian[row, column] = -(slope[row] - image[row]) / step
+                    jacobian[column, column] = jacobian[column, column] + wp.float64(1.0)
+                change = _solve6(jacobian, image - z)
+                z = z + change
+                if wp.length(change) <= _NEWTON_CONVERGED * wp.length(z):
+                    break
+        v = wp.vec3d(z[0], z[1], z[2])
+        w = wp.vec3d(z[3], z[4], z[5])
         end = Motion()
         end.position = s.position + h * v
         end.velocity = wp.float64(2.0) * v - s.velocity
         end.body_rate = wp.float64(2.0) * w - s.body_rate
-        end.orientation = wp.normalize(turned)
+        end.orientation = wp.normalize(cayley_turn(s.orientation, h, w))
         end.rotor_speed = speed
         if wp.static(motor_lag):
             end.rotor_speed = wp.float64(2.0) * speed - s.rotor_speed

@@ -27,7 +27,8 @@ SMALL = dataclasses.replace(
         "inertia 1:10:100, 200 rad/s",
         "pitch through 90 degrees at 20 rad/s",
     ),
-    stamps_s=(1, 10),
+    hover_stamps_s=(1, 10),
+    top_stamps_s=(1, 10),
     formats_stamps_s=(1, 10),
     cpu_s=0.001,
 )
