@@ -436,9 +436,9 @@ def _extremes(result: DynamicsResult) -> Table:
             "reference_m": "reference known to [m]",
         },
         rows=rows,
-        note="Steps of 1 ms, or rtol 1e-6. *RKMK4 (ours)* is the product as it is: holds of 10 ms in which its "
-        "guard trips are flown again by Dormand-Prince, and counted. *not finite*: NaN, or 1000 km off. "
-        + " ".join(f"Refused, {r.case}: {r.message}." for r in result.refusals),
+        note="Steps of 1 ms, or rtol 1e-6. *RKMK4 (ours)* is the product as it is: holds of 10 ms in which "
+        "its guard trips are flown again by Dormand-Prince, and counted. *not finite*: NaN, or 1000 km "
+        "off. " + " ".join(f"Refused, {r.case}: {r.message}." for r in result.refusals),
     )
 
 

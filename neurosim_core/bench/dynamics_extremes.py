@@ -152,7 +152,7 @@ def make_flight(case: Case) -> Flight | Refusal:
     try:
         return case.make()
     except ValidationError as error:
-        return Refusal(case=case.name, message=error.errors()[0]["msg"])
+        return Refusal(case=case.name, message=error.errors()[0]["msg"].removeprefix("Value error, "))
 
 
 def measure_trials(
