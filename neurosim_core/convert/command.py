@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from neurosim_core.convert.frames import Description
 
 _HALVED_LOSS_MAX = 0.15
+_BURST_SHARE_MAX = 0.5
 _OPTIONS = {
     "preset": "pixel.preset",
     "size": "size",
@@ -204,12 +205,18 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
             f"{c.event_count:,} ({event_rate:.2f} M/s, {on_share:.0%} brighter), {c.dropped_count:,} dropped",
         ),
         ("time", f"{c.wall_s:.1f} s: real-time factor {c.real_time_factor:.2f}"),
-        (
-            "sampling",
-            "events between frames are interpolated; with every second frame left out there would be "
-            + ("none" if math.isnan(c.halved_loss) else f"{c.halved_loss:.0%} fewer"),
-        ),
+        ("sampling", _sampling(c)),
     ]
+
+
+def _sampling(c: Conversion) -> str:
+    if math.isnan(c.halved_loss) or math.isnan(c.burst_share):
+        return "events between frames are interpolated; nothing moves"
+    return (
+        "events between frames are interpolated; without every second frame "
+        f"{max(c.halved_loss, 0.0):.0%} of them would be missing, and {c.burst_share:.0%} of the pixels that "
+        "fire in an interval do so four times or more"
+    )
 
 
 def _warnings(c: Conversion) -> list[str]:
@@ -217,8 +224,13 @@ def _warnings(c: Conversion) -> list[str]:
     if c.halved_loss > _HALVED_LOSS_MAX:
         notes.append(
             f"the motion is fast for this frame rate: without every second frame {c.halved_loss:.0%} of the "
-            "events would be missing, so as many or more are missing now, and times within an interval are "
-            "those of a cross-fade. Film faster, or take a part where less moves."
+            "events would be missing, so as many or more are missing now. Film faster, or take a part where "
+            "less moves."
+        )
+    if c.burst_share > _BURST_SHARE_MAX:
+        notes.append(
+            f"{c.burst_share:.0%} of the pixels that fire do so four times or more within one interval: edges"
+            " pass them in less than that, and times within an interval are those of a cross-fade."
         )
     if c.code_step > c.threshold:
         notes.append(

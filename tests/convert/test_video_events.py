@@ -177,8 +177,15 @@ def test_what_flickers_is_said_to_need_more_frames(tmp_path):
     low, high = (np.full((3, 4), code, dtype=np.uint8) for code in (50, 200))
     flicker, _ = convert(write_folder(tmp_path / "f", [low, high] * 4 + [low]), tmp_path / "e.h5", fps=10.0)
     assert flicker.halved_loss == 1.0
+    assert flicker.burst_share == 1.0  # 13 events a step
     still, _ = convert(write_folder(tmp_path / "g", [low] * 3), tmp_path / "g.h5", fps=10.0)
     assert np.isnan(still.halved_loss)
+    assert np.isnan(still.burst_share)
+    # events: 1, 0, 14, 12 in the first row, 1, 2, 14, 12 in the second
+    rise = np.array([[50, 60, 50, 60], [50, 60, 50, 60]], np.uint8)
+    jump = np.array([[60, 60, 200, 200], [60, 75, 200, 200]], np.uint8)
+    mixed, _ = convert(write_folder(tmp_path / "h", [rise, jump]), tmp_path / "h.h5", fps=10.0)
+    assert mixed.burst_share == pytest.approx(4 / 7)
 
 
 def test_the_floor_keeps_one_step_of_the_numbers_below_half_a_threshold(tmp_path):

@@ -13,6 +13,8 @@ from PIL import Image
 from neurosim_core.convert.frames import open_source, read_stamps
 from neurosim_core.convert.light import TRANSFERS
 
+SRGB = TRANSFERS["srgb"]
+
 
 def pictures(count, *, seed=0):
     return list(np.random.default_rng(seed).integers(0, 256, (count, 12, 16, 3), dtype=np.uint8))
@@ -86,6 +88,25 @@ def test_floats_are_light(tmp_path):
     source = open_source(tmp_path / "f", fps=1.0)
     np.testing.assert_array_equal(next(iter(source.frames())).luminance, light)
     assert len(source.description.codes) == 0
+
+
+def test_a_video_that_is_to_be_shown_turned_is_turned(tmp_path):
+    """As a phone stores it: 90 degrees counter-clockwise takes the right border to the top."""
+    import av
+
+    picture = pictures(1)[0]
+    file = tmp_path / "v.mp4"
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("png", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 16, 12, "rgb24"
+        stream.set_display_rotation(90)
+        for _ in range(2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode(None))
+    source = open_source(file)
+    assert (source.description.width, source.description.height) == (12, 16)
+    expected = SRGB(picture[:, ::-1].transpose(1, 0, 2) / 255.0) @ np.array([0.2126, 0.7152, 0.0722])
+    np.testing.assert_allclose(next(iter(source.frames())).luminance, expected, rtol=2e-7)
 
 
 def test_what_a_video_does_not_tell_is_said(tmp_path):
