@@ -381,4 +381,6 @@ def _terms(model: Model, state: State) -> dict[str, tuple[str, ...]]:
     terms |= {name: imu.terms for name, imu in state.imus.items()}
     for cast in model.casts:
         terms[", ".join(cast.names)] = (*sorted(cast.outputs), *model.render_terms)
+    for cast_state in state.casts:
+        terms |= {f"pixels of {name}": seen.camera.terms for name, seen in cast_state.events.items()}
     return terms

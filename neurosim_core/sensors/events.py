@@ -108,7 +108,7 @@ class EventCamera:
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
 
     Attributes:
-        terms: What is compiled in beyond the ideal pixel, some of `event_noise.TERMS`.
+        terms: What is computed beyond ideal pixels: some of `event_noise.TERMS`, and "readout".
 
     Raises:
         ValueError: If width, height or seed is out of range.
@@ -147,9 +147,10 @@ class EventCamera:
         self._last = [self._empty(pixel_count, wp.float32) for _ in ring]
         self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in ring]
         self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
-        self.terms = terms_of(config)
+        pixel_terms = terms_of(config)
+        self.terms = pixel_terms if config.readout is None else (*pixel_terms, "readout")
         self._noise: PixelNoise | None = None
-        if self.terms:
+        if pixel_terms:
             self._noise = PixelNoise(
                 config,
                 pixel_count=pixel_count,

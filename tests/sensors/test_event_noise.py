@@ -91,8 +91,8 @@ def test_what_is_off_is_not_there(device):
     assert camera.terms == ()
     assert camera._noise is None
     assert camera._readout is None
-    camera = make_camera(15, 12, device, leak={})
-    assert camera.terms == ("leak",)
+    camera = make_camera(15, 12, device, leak={}, readout={})
+    assert camera.terms == ("leak", "readout")
     memory = camera._noise.memory(0)
     arrays = (memory.reference, memory.filtered, memory.held_ns, memory.next_ns, memory.voltage)
     assert [array.shape[0] for array in arrays] == [0] * 5
