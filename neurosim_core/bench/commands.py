@@ -261,6 +261,7 @@ STUDIES: Sequence[Study] = (
         description="Show patterns of light to the models of real event cameras, and compare what they do "
         "with closed forms.",
         chapter=_pixel,
+        options=frozenset({"device"}),
     ),
     Study(
         name="render",
