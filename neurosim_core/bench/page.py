@@ -40,11 +40,11 @@ section { background: var(--paper); border: 1px solid var(--line); border-radius
 .score b { font-variant-numeric: tabular-nums; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: .875rem; line-height: 1.45; }
-th, td { text-align: left; padding: .4rem .7rem .4rem 0; border-bottom: 1px solid var(--line);
+th, td { text-align: left; padding: .4rem 1.1rem .4rem 0; border-bottom: 1px solid var(--line);
          vertical-align: top; }
 thead th { font-weight: 600; color: var(--soft); vertical-align: bottom; border-bottom-width: 2px; }
 tbody tr:hover { background: var(--wash); }
-.number { text-align: right; font-variant-numeric: tabular-nums; padding-left: .5rem; }
+.number { text-align: right; font-variant-numeric: tabular-nums; }
 td.number { white-space: nowrap; }
 .bars th { font-weight: 600; padding-top: 1.1rem; }
 .bars td p { margin: 0; }

@@ -515,7 +515,7 @@ def _picture_table(result: RenderResult) -> Table:
             "mip_bias": "mip bias",
             "rms": "RMS error",
             "p99": "99 % of errors below",
-            "picture_s": "time [s]",
+            "picture_ms": "time [ms]",
         },
         rows=[
             {
@@ -523,7 +523,7 @@ def _picture_table(result: RenderResult) -> Table:
                 **dataclasses.asdict(row.sampling),
                 "rms": row.rms,
                 "p99": row.p99,
-                "picture_s": row.picture_s,
+                "picture_ms": 1e3 * row.picture_s,
             }
             for row in result.pictures
         ],
@@ -545,13 +545,18 @@ def _pan_table(result: RenderResult) -> Table:
             "wrong_polarity_count": "wrong polarity",
             "spurious_count": "spurious",
             "false_count": "false",
-            "picture_s": "time of a picture [s]",
+            "picture_ms": "time of a picture [ms]",
         },
         rows=[
             {
                 **dataclasses.asdict(row.sampling),
-                **{k: v for k, v in dataclasses.asdict(row).items() if k != "sampling"},
+                "event_count": row.event_count,
+                "true_count": row.true_count,
+                "missing_count": row.missing_count,
+                "wrong_polarity_count": row.wrong_polarity_count,
+                "spurious_count": row.spurious_count,
                 "false_count": row.false_count,
+                "picture_ms": 1e3 * row.picture_s,
             }
             for row in result.pan
         ],
@@ -605,7 +610,8 @@ def _draw_aliasing(result: RenderResult, figure: Figure) -> None:
         axes.set_title(f"false events, {name}")
     for axes in panels.flat:
         axes.axis("off")
-    upper.colorbar(shown, ax=panels[1, 2], location="left", fraction=0.6, aspect=8, label="per pixel")
+    scale = panels[1, 2].inset_axes((0.1, 0.05, 0.08, 0.9))
+    upper.colorbar(shown, cax=scale, label="false events per pixel")
     _draw_counts(result, lower.subplots())
 
 
