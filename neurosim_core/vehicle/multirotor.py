@@ -378,6 +378,7 @@ class Multirotor:
             config.turbulence,
             turbulent="turbulence" in self.terms,
             wind_m_s=config.wind_m_s,
+            ground_height_m=0.0 if config.ground is None else config.ground.height_m,
             seed=seed,
             count=count,
             device=self.device,

@@ -69,7 +69,7 @@ class TurbulenceConfig(Settings):
     It does not blow by itself: see `wind_m_s`."""
     altitude_m: Annotated[float, Field(ge=10 * _FOOT_M, le=1000 * _FOOT_M)] | None = None
     """Height above ground that scale lengths and intensities are taken at [m]; null: that of the vehicle
-    above z = 0, within the 3.048 to 304.8 m that the model is for."""
+    above the ground (z = 0 without one), within the 3.048 to 304.8 m that the model is for."""
     airspeed_m_s: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
     """Speed at which the field passes the vehicle [m/s]; null: that of the vehicle against `wind_m_s`, at
     least 1 m/s."""
@@ -104,6 +104,7 @@ class Wind:
     sigma_w: wp.float64
     along: wp.vec3d  # horizontal direction of the mean wind
     altitude: wp.float64  # 0: that of the vehicle
+    ground_height: wp.float64
     airspeed: wp.float64  # 0: that of the vehicle
     ring: wp.array2d(
         dtype=wp.vec3d
@@ -118,6 +119,7 @@ def make_wind(
     *,
     turbulent: bool,
     wind_m_s: Vector3,
+    ground_height_m: float,
     seed: int,
     count: int,
     device: Any,
@@ -129,6 +131,7 @@ def make_wind(
         turbulence: Parameters; None: still air, in the place of turbulence.
         turbulent: There is turbulence, be it still.
         wind_m_s: Mean wind, which turbulence is aligned with.
+        ground_height_m: z of the ground in W.
         seed: Of the turbulence.
         count: Number of vehicles.
         device: Warp device.
@@ -152,6 +155,7 @@ def make_wind(
         wind.tick_ns = to_ns(turbulence.sample_s)
         wind.sigma_w = sigma_w
         wind.along = wp.vec3d(*along, 0.0)
+        wind.ground_height = ground_height_m
         wind.altitude = turbulence.altitude_m or 0.0
         wind.airspeed = turbulence.airspeed_m_s or 0.0
         wind.ring = wp.zeros((count, TICK_COUNT), dtype=wp.vec3d, device=device)
@@ -222,7 +226,7 @@ def _noise(wind: Wind, vehicle: wp.int32, tick: wp.int64, axis: wp.int32) -> wp.
 
 @wp.func
 def _height_ft(wind: Wind, p_WB: wp.vec3d) -> wp.float64:
-    height_m = p_WB[2]
+    height_m = p_WB[2] - wind.ground_height
     if wind.altitude > wp.float64(0.0):
         height_m = wind.altitude
     return wp.clamp(height_m / wp.float64(_FOOT_M), wp.float64(10.0), wp.float64(1000.0))

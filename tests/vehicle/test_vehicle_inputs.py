@@ -42,7 +42,7 @@ def test_what_must_not_be_zero(name):
 
 @pytest.mark.parametrize("name", sorted(MAY_BE_ZERO))
 def test_what_may_be_zero_flies(name, device):
-    vehicle = Multirotor(preset("hummingbird", **{name: 0.0}), device=device)
+    vehicle = Multirotor(preset("hummingbird", **{name: 0.0}), device=device, terms=HUMMINGBIRD.terms())
     vehicle.step(np.full(4, 500.0), 5 * MS)
     assert np.isfinite(np.concatenate(vehicle.state, axis=1)).all()
 

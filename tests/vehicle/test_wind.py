@@ -11,7 +11,15 @@ from scipy import stats
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from neurosim_core import load_config, simulation
-from neurosim_core.vehicle import GustConfig, Multirotor, MultirotorState, TurbulenceConfig, preset, wind
+from neurosim_core.vehicle import (
+    GroundConfig,
+    GustConfig,
+    Multirotor,
+    MultirotorState,
+    TurbulenceConfig,
+    preset,
+    wind,
+)
 
 MS = 1_000_000
 HUMMINGBIRD = preset("hummingbird")
@@ -245,8 +253,9 @@ def test_spectrum_of_turbulence(device):
 @pytest.mark.parametrize("height_m", [0.5, 3.048, 10.0, 100.0, 304.8, 2000.0])
 def test_turbulence_depends_on_the_height(height_m, device):
     """Intensities of MIL-F-8785C at the height of the vehicle, held beyond 10 and 1000 ft."""
-    vehicle = make_vane(4096, device=device, turbulence=TurbulenceConfig(wind_20ft_m_s=WIND_20FT_M_S), seed=3)
-    vehicle.reset(position=(0.0, 0.0, height_m), rotor_speed=np.full(4, 500.0))
+    turbulence, ground = TurbulenceConfig(wind_20ft_m_s=WIND_20FT_M_S), GroundConfig(height_m=-7.0)
+    vehicle = make_vane(4096, device=device, turbulence=turbulence, ground=ground, seed=3)
+    vehicle.reset(position=(0.0, 0.0, height_m - 7.0), rotor_speed=np.full(4, 500.0))
     sigma = mil_f_8785c(np.clip(height_m, 10.0 * FOOT_M, 1000.0 * FOOT_M))[0]
     for axis in range(3):
         assert variance_is(felt(vehicle)[:, axis], sigma[axis] ** 2)
