@@ -188,13 +188,16 @@ def convert_video(
     Raises:
         FileNotFoundError: There is no such video or folder.
         FileExistsError: `out` is there, and may not be replaced.
+        IsADirectoryError: It is a folder.
         ValueError: A frame cannot be read or has another size, there is only one, or their times do not
             increase by 1 us at least; the crop or the size does not fit.
         ImportError: PyAV or h5py is not installed.
     """
     config = config or ConversionConfig()
     out = Path(out)
-    if out.exists() and (not overwrite or out.is_dir()):
+    if out.is_dir():
+        raise IsADirectoryError(f"the events go to a file, got the folder {out}")
+    if out.exists() and not overwrite:
         raise FileExistsError(f"{out} is already there: add --overwrite, or name another file")
     begin = time.perf_counter()
     source = _open(Path(path), config)

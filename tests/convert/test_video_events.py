@@ -270,6 +270,8 @@ def test_the_command_replaces_nothing_unless_told_to(tmp_path, capsys):
     assert f"{out} is already there: add --overwrite" in capsys.readouterr().err
     assert out.read_text() == "precious"
     assert cli.main([*line, "--overwrite"]) == 0
+    assert cli.main(["convert", str(folder), str(tmp_path), "--fps", "10", "--overwrite"]) == 1
+    assert f"the events go to a file, got the folder {tmp_path}" in capsys.readouterr().err
     assert len(events_of(out).t) > 0
 
 
