@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import field
 from typing import Annotated
 
 from cortex.message import Array, Int64, UInt32, UInt64, Unit, message
@@ -24,6 +25,8 @@ class Simulation:
     """"lockstep" or "streaming"."""
     control_rate_hz: Annotated[float, Unit("Hz")]
     """Control periods a second [Hz]."""
+    thrust_max_n: Annotated[list[float], Unit("N")] = field(default_factory=list)
+    """Thrust of each vehicle with all rotors at their highest speed, in the order of `vehicles` [N]."""
 
 
 @message(name="cortex/Trigger")
@@ -128,6 +131,8 @@ class VehicleStatus:
     """How often it has begun to touch something."""
     undelivered_count: UInt64 = 0
     """As in `SensorStatus`, of its other topics: odometry, rotor speeds, collisions, deliveries."""
+    refused_reason: str = ""
+    """Why the last command was refused; empty if none was."""
 
 
 @message(name="cortex/SimulatorStatus")

@@ -44,6 +44,7 @@ class Inbox:
 
     Attributes:
         missed: The last command that did not fit what was waited for; None if there was none.
+        refusal: Why the last command was refused; empty if none was.
     """
 
     def __init__(self, node: Node, vehicle: str, *, rotor_count: int, lockstep: bool = False) -> None:
@@ -58,6 +59,7 @@ class Inbox:
         policy = reliable(timeout_s=0.1) if lockstep else keep_last()
         self.vehicle = vehicle
         self.missed: Command | None = None
+        self.refusal = ""
         self._widths = {mode: len(MODES[mode].layout) for mode in COMMANDS} | {"motor_speeds": rotor_count}
         self._subscribers: dict[CommandMode, Subscriber[Any]] = {
             cast(CommandMode, mode): node.subscriber(command_topic(vehicle, mode), message, policy=policy)
@@ -187,6 +189,7 @@ class Inbox:
 
     def _refuse(self, reason: str) -> None:
         self._refused += 1
+        self.refusal = reason
         now_s = time.monotonic()
         if now_s - self._logged_s >= _LOG_INTERVAL_S:
             self._logged_s = now_s

@@ -13,6 +13,7 @@ from neurosim_core.live import LiveConfig
 from neurosim_core.nodes import topics
 from neurosim_core.nodes.craft import Craft
 from neurosim_core.pacing import Timings
+from neurosim_core.vehicle.multirotor import MultirotorConfig
 
 STATUS_INTERVAL_S = 0.2
 
@@ -47,6 +48,7 @@ class Board:
                 vehicles=list(config.vehicles),
                 mode=config.live.mode,
                 control_rate_hz=config.control.rate_hz,
+                thrust_max_n=[_thrust_max_n(config.of(name).vehicle.airframe()) for name in config.vehicles],
             )
         )
 
@@ -198,4 +200,9 @@ def _vehicle(craft: Craft, stamp_ns: int) -> VehicleStatus:
         fail_safe_count=helm.counts.fail_safe,
         collision_count=craft.state.counts["collisions"],
         undelivered_count=craft.outlet.other_undelivered_count,
+        refused_reason=craft.inbox.refusal if counts.refused else "",
     )
+
+
+def _thrust_max_n(airframe: MultirotorConfig) -> float:
+    return float(airframe.thrust_coefficients_n_s2.sum() * airframe.rotor_speed_max_rad_s**2)

@@ -112,6 +112,7 @@ def test_bad_commands_are_refused(desk: Desk, mode: str, row: Any, caplog: pytes
         desk.settle(3)
         assert desk.inbox.poll() is None
     assert desk.inbox.counts.refused == 3
+    assert desk.inbox.refusal.startswith(mode)
     assert len(caplog.records) == 1  # not once for each
     assert mode in caplog.text
     desk.send("rates", stamp_ns=5)

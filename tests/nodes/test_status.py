@@ -93,6 +93,8 @@ def test_changed_settings_are_announced_and_recorded(tmp_path: Path):
         assert rig.call("/reset", Reset(seed=5)).accepted
         assert rig.set({"live.fail_safe": "cut"}).accepted
     assert before.source == after.source
+    # Four rotors of the Hummingbird at 1500 rad/s with 5.57e-6 N s^2.
+    assert first.thrust_max_n == pytest.approx([4 * 5.57e-6 * 1500.0**2])
     assert "imu" not in load_config(yaml.safe_load(first.config)).links
     for simulation in (second, late):
         assert load_config(yaml.safe_load(simulation.config)).links["imu"].clock_offset_s == 0.003

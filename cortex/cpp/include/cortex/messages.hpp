@@ -1435,8 +1435,8 @@ struct Codec<::cortex::messages::SensorStatus> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_SensorStatus_D4AD0AAC0CCF4967
 
-#ifndef CORTEX_TYPE_cortex_messages_Simulation_8CDBE28B1B7875C6
-#define CORTEX_TYPE_cortex_messages_Simulation_8CDBE28B1B7875C6
+#ifndef CORTEX_TYPE_cortex_messages_Simulation_269694B7F6067838
+#define CORTEX_TYPE_cortex_messages_Simulation_269694B7F6067838
 namespace cortex::messages {
 struct Simulation {
   std::string config{};
@@ -1444,13 +1444,15 @@ struct Simulation {
   std::vector<std::string> vehicles{};
   std::string mode{};
   double control_rate_hz{};  // Hz
+  std::vector<double> thrust_max_n{};  // N
 
   friend bool operator==(const Simulation& a, const Simulation& b) {
     return a.config == b.config &&
            a.version == b.version &&
            a.vehicles == b.vehicles &&
            a.mode == b.mode &&
-           a.control_rate_hz == b.control_rate_hz;
+           a.control_rate_hz == b.control_rate_hz &&
+           a.thrust_max_n == b.thrust_max_n;
   }
   friend bool operator!=(const Simulation& a, const Simulation& b) { return !(a == b); }
 };
@@ -1459,13 +1461,14 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::Simulation> {
   static constexpr std::string_view name = "cortex/Simulation";
-  static constexpr std::uint64_t fingerprint = 0x8CDBE28B1B7875C6u;
+  static constexpr std::uint64_t fingerprint = 0x269694B7F6067838u;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/Simulation\",\"fields\":[{\"name\":\"config\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},"
       "{\"name\":\"version\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"vehicles\",\"type\":{\"list\":\"st"
       "r\"},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"contr"
-      "ol_rate_hz\",\"type\":\"float64\",\"unit\":\"Hz\",\"frame\":\"\"}]}";
-  static constexpr std::size_t block = 40;
+      "ol_rate_hz\",\"type\":\"float64\",\"unit\":\"Hz\",\"frame\":\"\"},{\"name\":\"thrust_max_n\",\"type\":{\"list\""
+      ":\"float64\"},\"unit\":\"N\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 48;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
   static constexpr bool stamped = false;
@@ -1489,6 +1492,16 @@ struct Codec<::cortex::messages::Simulation> {
     }
     reader.text(at + 24, out.mode);
     reader.scalar(at + 32, out.control_rate_hz);
+    {
+      const auto list2 = reader.list(at + 40, 8);
+      out.thrust_max_n.clear();
+      out.thrust_max_n.reserve(list2.count);
+      for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
+        double item2{};
+        reader.scalar(list2.at + k2 * 8, item2);
+        out.thrust_max_n.push_back(std::move(item2));
+      }
+    }
   }
 
   template <class Sink>
@@ -1505,13 +1518,21 @@ struct Codec<::cortex::messages::Simulation> {
     }
     sink.text(at + 24, message.mode);
     sink.scalar(at + 32, message.control_rate_hz);
+    {
+      const std::size_t start2 =
+          sink.list(at + 40, message.thrust_max_n.size(), 8, 8);
+      for (std::size_t k2 = 0; k2 < message.thrust_max_n.size(); ++k2) {
+        const auto& item2 = message.thrust_max_n[k2];
+        sink.scalar(start2 + k2 * 8, item2);
+      }
+    }
   }
 
   static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Simulation& out) {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_Simulation_8CDBE28B1B7875C6
+#endif  // CORTEX_TYPE_cortex_messages_Simulation_269694B7F6067838
 
 #ifndef CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
 #define CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
@@ -1572,8 +1593,8 @@ struct Codec<::cortex::messages::SimulatorReply> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
 
-#ifndef CORTEX_TYPE_cortex_messages_VehicleStatus_78ECFE6B01F9C7CC
-#define CORTEX_TYPE_cortex_messages_VehicleStatus_78ECFE6B01F9C7CC
+#ifndef CORTEX_TYPE_cortex_messages_VehicleStatus_15C1F6CC547E3916
+#define CORTEX_TYPE_cortex_messages_VehicleStatus_15C1F6CC547E3916
 namespace cortex::messages {
 struct VehicleStatus {
   std::string name{};
@@ -1587,6 +1608,7 @@ struct VehicleStatus {
   std::uint64_t fail_safe_count{};
   std::uint64_t collision_count{};
   std::uint64_t undelivered_count{};
+  std::string refused_reason{};
 
   friend bool operator==(const VehicleStatus& a, const VehicleStatus& b) {
     return a.name == b.name &&
@@ -1599,7 +1621,8 @@ struct VehicleStatus {
            a.fail_safe == b.fail_safe &&
            a.fail_safe_count == b.fail_safe_count &&
            a.collision_count == b.collision_count &&
-           a.undelivered_count == b.undelivered_count;
+           a.undelivered_count == b.undelivered_count &&
+           a.refused_reason == b.refused_reason;
   }
   friend bool operator!=(const VehicleStatus& a, const VehicleStatus& b) { return !(a == b); }
 };
@@ -1608,7 +1631,7 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::VehicleStatus> {
   static constexpr std::string_view name = "cortex/VehicleStatus";
-  static constexpr std::uint64_t fingerprint = 0x78ECFE6B01F9C7CCu;
+  static constexpr std::uint64_t fingerprint = 0x15C1F6CC547E3916u;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/VehicleStatus\",\"fields\":[{\"name\":\"name\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}"
       ",{\"name\":\"command_mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_count\",\"type\":"
@@ -1617,8 +1640,9 @@ struct Codec<::cortex::messages::VehicleStatus> {
       "type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_age_ns\",\"type\":\"int64\",\"unit\":\"ns\",\""
       "frame\":\"\"},{\"name\":\"fail_safe\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"fail_safe_coun"
       "t\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"collision_count\",\"type\":\"uint64\",\"unit\":"
-      "\"\",\"frame\":\"\"},{\"name\":\"undelivered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
-  static constexpr std::size_t block = 88;
+      "\"\",\"frame\":\"\"},{\"name\":\"undelivered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\""
+      "refused_reason\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 96;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
   static constexpr bool stamped = false;
@@ -1639,6 +1663,7 @@ struct Codec<::cortex::messages::VehicleStatus> {
     reader.scalar(at + 64, out.fail_safe_count);
     reader.scalar(at + 72, out.collision_count);
     reader.scalar(at + 80, out.undelivered_count);
+    reader.text(at + 88, out.refused_reason);
   }
 
   template <class Sink>
@@ -1655,16 +1680,17 @@ struct Codec<::cortex::messages::VehicleStatus> {
     sink.scalar(at + 64, message.fail_safe_count);
     sink.scalar(at + 72, message.collision_count);
     sink.scalar(at + 80, message.undelivered_count);
+    sink.text(at + 88, message.refused_reason);
   }
 
   static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::VehicleStatus& out) {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_VehicleStatus_78ECFE6B01F9C7CC
+#endif  // CORTEX_TYPE_cortex_messages_VehicleStatus_15C1F6CC547E3916
 
-#ifndef CORTEX_TYPE_cortex_messages_SimulatorStatus_382EAA25FF6EC90C
-#define CORTEX_TYPE_cortex_messages_SimulatorStatus_382EAA25FF6EC90C
+#ifndef CORTEX_TYPE_cortex_messages_SimulatorStatus_85796E14C8EA717A
+#define CORTEX_TYPE_cortex_messages_SimulatorStatus_85796E14C8EA717A
 namespace cortex::messages {
 struct SimulatorStatus {
   std::int64_t stamp_ns{};  // ns
@@ -1711,7 +1737,7 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::SimulatorStatus> {
   static constexpr std::string_view name = "cortex/SimulatorStatus";
-  static constexpr std::uint64_t fingerprint = 0x382EAA25FF6EC90Cu;
+  static constexpr std::uint64_t fingerprint = 0x85796E14C8EA717Au;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/SimulatorStatus\",\"fields\":[{\"name\":\"stamp_ns\",\"type\":\"int64\",\"unit\":\"ns\",\""
       "frame\":\"\"},{\"name\":\"wall_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"CLOCK_REALTIME\"},{\"name\":"
@@ -1738,8 +1764,9 @@ struct Codec<::cortex::messages::SimulatorStatus> {
       "ame\":\"\"},{\"name\":\"command_age_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"fail_saf"
       "e\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"fail_safe_count\",\"type\":\"uint64\",\"unit\":\"\""
       ",\"frame\":\"\"},{\"name\":\"collision_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"unde"
-      "livered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}}},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"se"
-      "quence\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
+      "livered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"refused_reason\",\"type\":\"str\""
+      ",\"unit\":\"\",\"frame\":\"\"}]}}},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"sequence\",\"type\":\"uint64\",\"unit\""
+      ":\"\",\"frame\":\"\"}]}";
   static constexpr std::size_t block = 136;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
@@ -1775,12 +1802,12 @@ struct Codec<::cortex::messages::SimulatorStatus> {
       }
     }
     {
-      const auto list2 = reader.list(at + 120, 88);
+      const auto list2 = reader.list(at + 120, 96);
       out.vehicles.clear();
       out.vehicles.reserve(list2.count);
       for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
         ::cortex::messages::VehicleStatus item2{};
-        Codec<::cortex::messages::VehicleStatus>::decode(reader, list2.at + k2 * 88, item2);
+        Codec<::cortex::messages::VehicleStatus>::decode(reader, list2.at + k2 * 96, item2);
         out.vehicles.push_back(std::move(item2));
       }
     }
@@ -1813,10 +1840,10 @@ struct Codec<::cortex::messages::SimulatorStatus> {
     }
     {
       const std::size_t start2 =
-          sink.list(at + 120, message.vehicles.size(), 88, 8);
+          sink.list(at + 120, message.vehicles.size(), 96, 8);
       for (std::size_t k2 = 0; k2 < message.vehicles.size(); ++k2) {
         const auto& item2 = message.vehicles[k2];
-        Codec<::cortex::messages::VehicleStatus>::encode(sink, start2 + k2 * 88, item2);
+        Codec<::cortex::messages::VehicleStatus>::encode(sink, start2 + k2 * 96, item2);
       }
     }
     sink.scalar(at + 128, message.sequence);
@@ -1826,7 +1853,7 @@ struct Codec<::cortex::messages::SimulatorStatus> {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_SimulatorStatus_382EAA25FF6EC90C
+#endif  // CORTEX_TYPE_cortex_messages_SimulatorStatus_85796E14C8EA717A
 
 #ifndef CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
 #define CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
