@@ -19,19 +19,20 @@ from typing import Any, Generic, Protocol, TypeVar
 from cortex import Node, Publisher
 from cortex_ros2_bridge import cdr, convert, diagnostics
 from cortex_ros2_bridge.backend.base import Backend, BackendError, RosPublisher
-from cortex_ros2_bridge.config import QOS, BridgeConfig, ConfigError
-from cortex_ros2_bridge.frames import FrameNames
+from cortex_ros2_bridge.config import QOS, BridgeConfig
 from cortex_ros2_bridge.incoming import Caller, Incoming, Target
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Whereabouts
 from cortex_ros2_bridge.routes import (
     CORTEX_TYPES,
     INFO,
+    SHARED,
     Route,
     Seen,
     look,
     make_routes,
     odometry_of,
+    unfit,
     vehicle_of,
 )
 from cortex_ros2_bridge.tally import Tally, Totals
@@ -44,6 +45,10 @@ GONE_S = 10.0
 """For so long a route outlives its Cortex topic, so that a simulator that is restarted finds it open [s]."""
 RETRY_S = 1.0
 """When a route is tried again that the backend could not open [s]."""
+UNFIT_S = 5.0
+"""So long after the first topics are seen, settings that fit none of them are said [s]."""
+TWICE_S = 12.0
+"""So long others may publish our topics too: DDS forgets a bridge that was killed after 10 s [s]."""
 TF_STATIC = "/tf_static"
 
 Key = tuple[str, str, str, str]
@@ -115,23 +120,19 @@ class Bridge:
             node: The Cortex side; it stays open.
 
         Raises:
-            ConfigError: The names of frames are not what they must be, or there is no such option.
             BackendError: The backend cannot publish.
         """
         self.config = config
         self.problems: list[str] = []
         self._backend = backend
         self._node = node
-        try:
-            self._frames = FrameNames(**config.frames)
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"frames: {error}") from None
-        _check_options(config)
+        self._frames = config.frames
         self._lock = threading.RLock()
         self._closed = False
         self._seen: Seen | None = None
         self._retry_s: float | None = None
         self._said: set[str] = set()
+        self._noted: set[str] = set()
         self._links: dict[Key, _Link] = {}
         self._feeds: Shared[Feed] = Shared()
         self._incoming: Shared[Incoming] = Shared()
@@ -147,6 +148,10 @@ class Bridge:
             lambda: backend.publisher(diagnostics.TOPIC, diagnostics.TYPE, QOS["default"]),
         )
         self._diagnosed_s = time.monotonic()
+        self._unfit_s: float | None = None
+        self._twice_s: float | None = None
+        self._notes: list[str] = []
+        self._was_routed = False
         self._failed_s: float | None = None
         self._failure = ""
 
@@ -179,6 +184,7 @@ class Bridge:
                 feed.look()
             self._publish_static()
             if now_s - self._diagnosed_s >= DIAGNOSTICS_INTERVAL_S:
+                self._look_at_others(seen, now_s)
                 self._diagnose(now_s - self._diagnosed_s)
                 self._diagnosed_s = now_s
 
@@ -218,17 +224,26 @@ class Bridge:
                 link.gone_s = None
             elif link.gone_s is None:
                 link.gone_s = now_s + GONE_S
-                logger.info("%s: the Cortex side has gone", link.route)
+                logger.debug("%s: the Cortex side has gone", link.route)
         new = [route for route in routes if route.key not in self._links]
         self._make_way(new)
         for route in new:
             problems += self._open(route, seen, now_s)
+        if any(route.key in self._links for route in new):
+            logger.info("%d routes are open; --verbose or /diagnostics names them", len(self._links))
+        self._cortex_gone(len(wanted))
         self._watch_vehicles(seen)
         self.problems = problems
         for problem in problems:
             if problem not in self._said:
                 logger.warning("%s", problem)
         self._said = set(problems)
+
+    def _cortex_gone(self, count: int) -> None:
+        """Say once that all of the Cortex side has gone."""
+        if not count and self._was_routed:
+            logger.info("the Cortex side has gone; its routes stay open for %g s", GONE_S)
+        self._was_routed = count > 0
 
     def _make_way(self, routes: Iterable[Route]) -> None:
         """Close routes whose Cortex side has gone, if others need their ROS topics in another way."""
@@ -255,14 +270,14 @@ class Bridge:
             self._links[route.key] = _Link(
                 route=route, tally=tally, listeners=listeners, resources=stack.pop_all()
             )
-        logger.info("%s (%s)", route, route.ros_type)
+        logger.debug("%s (%s)", route, route.ros_type)
         return []
 
     def _close_link(self, key: Key) -> None:
         link = self._links.pop(key)
         link.resources.close()
         if not self._closed:
-            logger.info("%s: closed", link.route)
+            logger.debug("%s: closed", link.route)
 
     def _open_out(
         self, route: Route, seen: Seen, stack: contextlib.ExitStack
@@ -303,7 +318,7 @@ class Bridge:
             lambda: self._node.publisher(route.cortex_topic, kind),
         )
         target = Target(route, publisher, convert.IN[route.ros_type, kind], self._context(route))
-        whereabouts = self._vehicles.setdefault(vehicle_of(route.cortex_topic), Whereabouts())
+        whereabouts = self._whereabouts_of(vehicle_of(route.cortex_topic))
 
         def subscribe() -> Incoming:
             incoming = Incoming(whereabouts)
@@ -358,18 +373,70 @@ class Bridge:
         feed.tap(tap, wants)
         stack.callback(feed.untap, tap)
 
+    # Others
+
+    def _look_at_others(self, seen: Seen, now_s: float) -> None:
+        """Say what others do, and settings ask for, that does not work or is done twice."""
+        self._notes = self._of_other_types() + self._of_another_bridge(now_s) + self._of_settings(seen, now_s)
+        for note in self._notes:
+            if note not in self._noted:
+                logger.warning("%s", note)
+        self._noted |= set(self._notes)
+
+    def _of_other_types(self) -> list[str]:
+        """Say which of our topics others use with another type, and which topic is for that."""
+        ours = {route.ros_topic: route for route in self.routes()}
+        notes = []
+        for info in self._backend.topics():
+            route = ours.get(info.topic)
+            if route is None or info.type_name == route.ros_type:
+                continue
+            if route.direction == "out" and info.subscriber_count:
+                notes.append(
+                    f"{info.topic}: a node subscribes to it as {info.type_name}, it is {route.ros_type}"
+                )
+            elif route.direction != "out" and info.publisher_count:
+                right = [other.ros_topic for other in ours.values() if _serves(other, route, info.type_name)]
+                hint = f"; for {info.type_name}: {' or '.join(right)}" if right else ""
+                notes.append(
+                    f"{info.topic}: a node publishes {info.type_name}, wanted is {route.ros_type}{hint}"
+                )
+        return notes
+
+    def _of_another_bridge(self, now_s: float) -> list[str]:
+        """Say that others publish what we do: then ROS gets every message twice, and Cortex every command."""
+        ours = {route.ros_topic for route in self.routes() if route.direction == "out"} - SHARED
+        twice = sorted({t.topic for t in self._backend.topics() if t.publisher_count and t.topic in ours})
+        if not twice:
+            self._twice_s = None
+            return []
+        self._twice_s = now_s if self._twice_s is None else self._twice_s
+        twins = [n for n in self._node.nodes() if n.node != self._node.id and n.name == self.config.node]
+        if not twins and now_s - self._twice_s < TWICE_S:
+            return []
+        who = ", ".join(f"{twin.name}, process {twin.pid} on {twin.host}" for twin in twins)
+        what = f"another bridge ({who})" if twins else "another node"
+        more = f" and {len(twice) - 1} more of our topics" if len(twice) > 1 else ""
+        return [f"{what} publishes {twice[0]}{more} too: ROS gets all of it twice, and Cortex every command"]
+
+    def _of_settings(self, seen: Seen, now_s: float) -> list[str]:
+        """Say which settings have fitted nothing for a while; what fits them may come yet."""
+        if self._unfit_s is None and seen.topics:
+            self._unfit_s = now_s + UNFIT_S
+        if self._unfit_s is None or now_s < self._unfit_s:
+            return []
+        return unfit(seen, self.config)
+
     # Vehicles
 
     def _watch_vehicles(self, seen: Seen) -> None:
         """Follow what time it is for the vehicles that are commanded, and how their frames hang together."""
         for vehicle, whereabouts in self._vehicles.items():
             topic = odometry_of(vehicle, seen)
-            clock = next(
-                (t.topic for t in seen.topics if t.type_name == "cortex/Clock" and t.published), None
-            )
-            if whereabouts.sources == (topic, clock):
+            clock, simulation = (_topic_of(kind, seen) for kind in ("cortex/Clock", "cortex/Simulation"))
+            if whereabouts.sources == (topic, clock, simulation):
                 continue
-            whereabouts.forget((topic, clock))
+            whereabouts.forget((topic, clock, simulation))
             stack = whereabouts.resources
             wants = self._commands_come_for(vehicle)
             if topic is not None:
@@ -378,12 +445,20 @@ class Bridge:
                 )
             if clock is not None:
                 self._tap(self._feed(clock, "cortex/Clock", stack), whereabouts.take_clock, wants, stack)
+            if simulation is not None:  # it says once what the first command already needs
+                feed = self._feed(simulation, "cortex/Simulation", stack)
+                self._tap(feed, whereabouts.take_simulation, lambda: True, stack)
 
     def _keep_static(self) -> None:
         """Forget the transforms of routes that are closed."""
         routes = self.routes()
         sources = {r.cortex_topic for r in routes if r.ros_topic == TF_STATIC}
         self._static.keep(sources, {vehicle_of(r.cortex_topic) for r in routes if r.ros_topic == "/tf"})
+
+    def _whereabouts_of(self, vehicle: str) -> Whereabouts:
+        if vehicle not in self._vehicles:
+            self._vehicles[vehicle] = Whereabouts(vehicle)
+        return self._vehicles[vehicle]
 
     def _commands_come_for(self, vehicle: str) -> Callable[[], bool]:
         whereabouts = self._vehicles[vehicle]
@@ -427,11 +502,12 @@ class Bridge:
     def _diagnose(self, elapsed_s: float) -> None:
         """Publish how everything is doing."""
         failure, self._failure = self._failure, ""
+        wrong = self.problems + self._notes
         statuses = [
             diagnostics.Status(
                 name="bridge",
-                level=diagnostics.ERROR if failure else diagnostics.WARN if self.problems else diagnostics.OK,
-                message="; ".join([failure][: len(failure)] + self.problems) or f"{len(self._links)} routes",
+                level=diagnostics.ERROR if failure else diagnostics.WARN if wrong else diagnostics.OK,
+                message="; ".join([failure, *wrong] if failure else wrong) or f"{len(self._links)} routes",
                 values=(
                     ("backend", self._backend.name),
                     ("distro", self._backend.distro),
@@ -455,9 +531,9 @@ class Bridge:
             )
             link.before = now
         if self._diagnostics.subscriber_count:
-            stamps = [w.now_ns for w in self._vehicles.values() if w.now_ns is not None]
+            stamps = [feed.newest for feed in self._feeds.values()]
             array = diagnostics.diagnostic_array(
-                statuses, stamp_ns=max(stamps, default=0), node=self.config.node
+                statuses, stamp_ns=max(stamps, default=(0.0, 0))[1], node=self.config.node
             )
             try:
                 self._diagnostics.publish(array)
@@ -465,23 +541,18 @@ class Bridge:
                 logger.warning("%s: %s", diagnostics.TOPIC, error)
 
 
+def _topic_of(type_name: str, seen: Seen) -> str | None:
+    return next((t.topic for t in seen.topics if t.type_name == type_name and t.published), None)
+
+
+def _serves(other: Route, route: Route, ros_type: str) -> bool:
+    """Return whether a route takes messages of a type for the vehicle of another one."""
+    same = vehicle_of(other.cortex_topic) == vehicle_of(route.cortex_topic)
+    return other.direction == route.direction and same and other.ros_type == ros_type
+
+
 @functools.cache
 def _warm_up(ros_type: str) -> None:
     """Let code for a type be generated now: with the first message it would hold up a stream for 20 ms."""
     with contextlib.suppress(ValueError):  # what is wrong with the type is said where it is opened
         cdr.decode_record(cdr.encode(message_class(ros_type)()), ros_type)
-
-
-def _check_options(config: BridgeConfig) -> None:
-    """Refuse options that nothing knows; where some routes of a pattern do not know one, it is not for them.
-
-    Raises:
-        ConfigError: There is no such option.
-    """
-    known = frozenset({"queue", "stale_s", "stamp"}).union(*convert.OPTIONS.values())
-    for number, change in enumerate(config.routes):
-        for name in change.options:
-            if name not in known:
-                raise ConfigError(
-                    f"routes[{number}].options: unknown option {name!r}, known: {', '.join(sorted(known))}"
-                )

@@ -5,20 +5,28 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import gc
+import importlib.metadata
 import logging
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import yaml
 
 from cortex import Node
-from cortex_ros2_bridge.config import BridgeConfig, ConfigError, check_namespace, load
-from cortex_ros2_bridge.routes import ROOTED, Route, Seen, look, make_routes
+from cortex_ros2_bridge.config import (
+    BridgeConfig,
+    check_cortex_domain,
+    check_distro,
+    check_namespace,
+    load,
+)
+from cortex_ros2_bridge.options import OPTIONS
+from cortex_ros2_bridge.routes import ROOTED, Route, Seen, known_options, look, make_routes, unfit
 
 INTERRUPTED = 130
 LIST_S = 1.5
@@ -80,7 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--namespace", help="goes before all ROS topics but /clock, /tf, /tf_static, /diagnostics"
     )
-    parser.add_argument("--domain", type=int, help="Cortex domain; that of ROS is ROS_DOMAIN_ID")
+    parser.add_argument(
+        "--cortex-domain", "--domain", type=int, help="domain of Cortex; that of ROS is ROS_DOMAIN_ID"
+    )
+    parser.add_argument("--version", action="version", version=f"cortex-ros2-bridge {_version()}")
     parser.add_argument("--list", action="store_true", help="print which topic would go where, and exit")
     parser.add_argument("--print-config", action="store_true", help="print all settings as YAML, and exit")
     parser.add_argument("--verbose", "-v", action="store_true", help="say when topics are subscribed to, too")
@@ -91,16 +102,25 @@ def _parser() -> argparse.ArgumentParser:
 
 def _config(options: argparse.Namespace) -> BridgeConfig:
     config = load(options.config)
-    changes: dict[str, Any] = {
-        name: value
-        for name in ("backend", "distro", "domain")
+    checks: dict[str, Callable[[str, object], Any]] = {
+        "backend": lambda _, value: value,
+        "distro": check_distro,
+        "cortex_domain": check_cortex_domain,
+        "namespace": check_namespace,
+    }
+    changes = {
+        name: check(f"--{name.replace('_', '-')}", value)
+        for name, check in checks.items()
         if (value := getattr(options, name)) is not None
     }
-    if options.namespace is not None:
-        changes["namespace"] = check_namespace(options.namespace)
-    if changes.get("domain", 0) < 0:
-        raise ConfigError(f"domain must be >= 0, got {changes['domain']}")
     return dataclasses.replace(config, **changes)
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("neurosim")
+    except importlib.metadata.PackageNotFoundError:  # a source tree on PYTHONPATH
+        return "of a source tree"
 
 
 def _bridge(config: BridgeConfig) -> int:
@@ -113,7 +133,7 @@ def _bridge(config: BridgeConfig) -> int:
         config.backend, node_name=config.node, namespace=config.namespace, distro=config.distro
     )
     try:
-        with Node(config.node, domain=config.domain) as node, Bridge(config, backend, node) as bridge:
+        with Node(config.node, domain=config.cortex_domain) as node, Bridge(config, backend, node) as bridge:
             _say(f"/{config.node}: {backend.name}, {backend.distro}; waiting for Cortex topics, Ctrl-C ends")
             gc.collect()
             gc.freeze()  # what is there stays; the collector need not look at it again and again
@@ -125,13 +145,16 @@ def _bridge(config: BridgeConfig) -> int:
 
 
 def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
-    """Print what would go where."""
-    with Node(f"{config.node} list", domain=config.domain) as node:
+    """Print what would go where; return 1 if anything is wrong with that, and it is not to be edited."""
+    with Node(f"{config.node} list", domain=config.cortex_domain) as node:
         node.wait_for_registry(LIST_S)
         seen = _what_there_is(node)
     routes, problems = make_routes(seen, config)
+    problems += unfit(seen, config)
     if as_yaml:
         sys.stdout.write(to_yaml(config, routes))
+    elif not routes and seen.topics:
+        print(f"none of {len(seen.topics)} Cortex topics goes anywhere: see include, exclude and defaults")
     elif not routes:
         print("no Cortex topics that go anywhere; is a simulator running? (cortex topics)")
     else:
@@ -142,7 +165,7 @@ def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
             )
     for problem in problems:
         print(problem, file=sys.stderr)
-    return 0
+    return 1 if problems and not as_yaml else 0
 
 
 def _what_there_is(node: Node) -> Seen:
@@ -176,14 +199,16 @@ def to_yaml(config: BridgeConfig, routes: Sequence[Route]) -> str:
         name.name: getattr(config, name.name) for name in dataclasses.fields(BridgeConfig)
     }
     settings |= {"include": list(config.include), "exclude": list(config.exclude)}
-    settings |= {"rename": dict(config.rename), "frames": dict(config.frames)}
+    settings |= {"rename": dict(config.rename), "frames": dataclasses.asdict(config.frames)}
     settings["routes"] = [
         {
             "cortex": route.cortex_topic,
             "type": route.ros_type,
             "ros": route.ros_topic.removeprefix("" if route.ros_topic in ROOTED else config.namespace),
             "qos": dataclasses.asdict(route.qos),
-            "options": dict(route.options),
+            "options": {
+                name: route.options.get(name, OPTIONS[name].default) for name in sorted(known_options(route))
+            },
         }
         for route in routes
     ]
@@ -208,13 +233,18 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def _give_up() -> None:
+    _say(f"cortex-ros2-bridge: it did not end within {EXIT_S} s, and is ended as it is")
+    os._exit(1)
+
+
 def _stop_at_signals(*, forced: bool) -> threading.Event:
     """Return an event that SIGINT and SIGTERM set; if forced, the process ends soon after, whatever waits."""
     stop = threading.Event()
 
     def end(number: int, frame: object) -> None:
         if not stop.is_set() and forced:
-            timer = threading.Timer(EXIT_S, os._exit, [0])
+            timer = threading.Timer(EXIT_S, _give_up)
             timer.daemon = True
             timer.start()
         stop.set()

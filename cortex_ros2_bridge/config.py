@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +13,10 @@ from typing import Any
 import yaml
 
 from cortex_ros2_bridge.backend.base import Qos
+from cortex_ros2_bridge.backend.names import check_node_name
+from cortex_ros2_bridge.frames import FrameNames
+from cortex_ros2_bridge.options import OPTIONS, check_option
+from cortex_ros2_bridge.typestore import DISTROS
 
 _ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS_TYPE = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
@@ -57,14 +61,14 @@ class BridgeConfig:
     """auto, rclpy, dds, or the name of a bag: run.mcap."""
     distro: str | None = None
     """ROS distribution, such as jazzy; None: ROS_DISTRO, or what the other nodes show."""
-    domain: int | None = None
-    """Cortex domain; None: CORTEX_DOMAIN. That of ROS is ROS_DOMAIN_ID."""
+    cortex_domain: int | None = None
+    """Domain of Cortex; None: CORTEX_DOMAIN. That of ROS is ROS_DOMAIN_ID."""
     node: str = "cortex_bridge"
     """Name of the ROS node."""
     namespace: str = ""
     """Goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics."""
-    frames: Mapping[str, Any] = field(default_factory=dict)
-    """Names of frames in ROS; see `frames.FrameNames`."""
+    frames: FrameNames = field(default_factory=FrameNames)
+    """Names of frames in ROS."""
     defaults: bool = True
     """Whether topics have routes that no entry of `routes` asks for."""
     include: tuple[str, ...] = ("*",)
@@ -102,16 +106,16 @@ def load(source: str | Path | Mapping[str, Any] | None) -> BridgeConfig:
         raise ConfigError(f"{source}: {error}" if isinstance(source, str | Path) else str(error)) from None
 
 
-def check_namespace(value: object) -> str:
-    """Return a namespace with a slash in front and none behind.
+def check_namespace(key: str, value: object) -> str:
+    """Return a namespace with a slash in front and none behind; "" for none.
 
     Raises:
         ConfigError: ROS allows no such name.
     """
     if not isinstance(value, str):
-        raise ConfigError(f"namespace must be a text, got {value!r:.80}")
+        raise ConfigError(f"{key} must be a text, got {value!r:.80}")
     text = value.strip("/")
-    return _ros_name("namespace", f"/{text}") if text else ""
+    return _ros_name(key, f"/{text}") if text else ""
 
 
 def is_ros_name(name: str) -> bool:
@@ -160,31 +164,71 @@ def qos_changes(key: str, value: object) -> dict[str, Any]:
 
 def _bridge_config(raw: object) -> BridgeConfig:
     given = dict(_mapping("the settings", raw))
-    _refuse_unknown("", given, [f.name for f in fields(BridgeConfig)])
-    checked: dict[str, Any] = {}
-    for key, value in given.items():
-        if value is None:
-            continue
-        if key in ("backend", "node", "distro"):
-            checked[key] = _text(key, value)
-        elif key == "domain":
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise ConfigError(f"domain must be an integer >= 0, got {value!r}")
-            checked[key] = value
-        elif key == "namespace":
-            checked[key] = check_namespace(value)
-        elif key == "frames":
-            checked[key] = _mapping(key, value)
-        elif key == "defaults":
-            checked[key] = _flag(key, value)
-        elif key in ("include", "exclude"):
-            checked[key] = tuple(_topic_pattern(f"{key}[{n}]", item) for n, item in _items(key, value))
-        elif key == "rename":
-            pairs = _mapping(key, value).items()
-            checked[key] = {_ros_name(key, old): _ros_name(f"{key}.{old}", new) for old, new in pairs}
-        else:
-            checked[key] = tuple(_route_change(f"routes[{n}]", item) for n, item in _items(key, value))
-    return BridgeConfig(**checked)
+    if "domain" in given and "cortex_domain" not in given:
+        given["cortex_domain"] = given.pop("domain")  # its old name, which is easily taken for that of ROS
+    _refuse_unknown("", given, _CHECKS)
+    return BridgeConfig(
+        **{key: _CHECKS[key](key, value) for key, value in given.items() if value is not None}
+    )
+
+
+def check_distro(key: str, value: object) -> str:
+    """Return the name of a distribution.
+
+    Raises:
+        ConfigError: It is not known.
+    """
+    text = _text(key, value)
+    if text not in DISTROS:
+        raise ConfigError(f"{key} must be one of {', '.join(DISTROS)}, got {text!r}")
+    return text
+
+
+def check_cortex_domain(key: str, value: object) -> int:
+    """Return a domain of Cortex.
+
+    Raises:
+        ConfigError: It is no integer >= 0.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ConfigError(f"{key} must be an integer >= 0, got {value!r}")
+    return value
+
+
+def _node_name(key: str, value: object) -> str:
+    try:
+        return check_node_name(_text(key, value), "")[0]
+    except ValueError as error:
+        raise ConfigError(f"{key}: {error}") from None
+
+
+def _frame_names(key: str, value: object) -> FrameNames:
+    given = _mapping(key, value)
+    _refuse_unknown(key, given, [f.name for f in fields(FrameNames)])
+    try:
+        return FrameNames(**{name: text for name, text in given.items() if text is not None})
+    except (TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(str(error)) from None
+
+
+def _patterns(key: str, value: object) -> tuple[str, ...]:
+    return tuple(_topic_pattern(f"{key}[{n}]", item) for n, item in _items(key, value))
+
+
+def _renames(key: str, value: object) -> dict[str, str]:
+    pairs = _mapping(key, value).items()
+    return {_ros_name(key, old): _ros_name(f"{key}.{old}", new) for old, new in pairs}
+
+
+def _options(key: str, value: object) -> dict[str, Any]:
+    given = _mapping(key, value)
+    _refuse_unknown(key, given, OPTIONS)
+    for name, option in given.items():
+        try:
+            check_option(name, option)
+        except ValueError as error:
+            raise ConfigError(f"{key}: {error}") from None
+    return dict(given)
 
 
 def _route_change(key: str, value: object) -> RouteChange:
@@ -206,7 +250,7 @@ def _route_change(key: str, value: object) -> RouteChange:
     if given.get("qos") is not None:
         checked["qos"] = qos_changes(f"{key}.qos", given["qos"])
     if given.get("options") is not None:
-        checked["options"] = dict(_mapping(f"{key}.options", given["options"]))
+        checked["options"] = _options(f"{key}.options", given["options"])
     if given.get("enabled") is not None:
         checked["enabled"] = _flag(f"{key}.enabled", given["enabled"])
     return RouteChange(**checked)
@@ -260,3 +304,19 @@ def _ros_name(key: str, value: object) -> str:
             f"{key} must be a ROS name such as '/drone/imu', parts begin with a letter, got {text!r}"
         )
     return text
+
+
+_CHECKS: Mapping[str, Callable[[str, object], Any]] = {
+    "backend": _text,
+    "distro": check_distro,
+    "cortex_domain": check_cortex_domain,
+    "node": _node_name,
+    "namespace": check_namespace,
+    "frames": _frame_names,
+    "defaults": _flag,
+    "include": _patterns,
+    "exclude": _patterns,
+    "rename": _renames,
+    "routes": lambda key, value: tuple(_route_change(f"{key}[{n}]", item) for n, item in _items(key, value)),
+}
+"""What makes the value of each setting of what YAML says."""

@@ -30,7 +30,7 @@ class Status:
 def route_status(
     name: str, now: Totals, before: Totals, *, listeners: int, elapsed_s: float, reason: str, types: str
 ) -> Status:
-    """Return how a route is doing: a warning if it lost or refused anything since the last status.
+    """Return how a route is doing: a warning if anything went missing since the last status.
 
     Args:
         name: Of the route.
@@ -41,22 +41,27 @@ def route_status(
         reason: Why the last message was lost or refused.
         types: Which become which.
     """
-    lost, refused = now.lost - before.lost, now.refused - before.refused
+    gone = {
+        "lost": now.lost - before.lost,
+        "refused": now.refused - before.refused,
+        "events dropped by the sensor": now.dropped - before.dropped,
+    }
     rate_hz = (now.sent - before.sent) / elapsed_s if elapsed_s > 0.0 else 0.0
-    if lost or refused:
-        parts = [f"{count} {what}" for count, what in ((lost, "lost"), (refused, "refused")) if count]
+    if any(gone.values()):
+        parts = [f"{count} {what}" for what, count in gone.items() if count]
         message = f"{' and '.join(parts)} in {elapsed_s:.1f} s ({reason})"
     else:
         message = f"{rate_hz:.1f} Hz" if rate_hz else "idle"
     return Status(
         name=name,
-        level=WARN if lost or refused else OK,
+        level=WARN if any(gone.values()) else OK,
         message=message,
         values=(
             ("received", str(now.received)),
             ("sent", str(now.sent)),
             ("lost", str(now.lost)),
             ("refused", str(now.refused)),
+            ("dropped", str(now.dropped)),
             ("rate_hz", f"{rate_hz:.1f}"),
             ("listeners", str(listeners)),
             ("types", types),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import math
 import queue
 import threading
 import time
@@ -34,8 +33,6 @@ logger = logging.getLogger(__name__)
 
 Convert = Callable[[bytes, Context], Any]
 
-STALE_S = 0.5
-"""How far the stamp of a command may be from the newest state; the option `stale_s` changes it [s]."""
 PENDING_S = 1.0
 """How long a command waits for a simulator that is about to subscribe to it [s]."""
 CALL_TIMEOUT_S = 30.0
@@ -53,16 +50,15 @@ class Target:
             publisher: Of the Cortex topic.
             convert: Makes the command of CDR; None: the message is for another target.
             context: What it needs to know besides.
-
-        Raises:
-            ValueError: An option is not what it must be.
         """
         self.route = route
         self.tally = Tally(str(route))
         self.context = context
         self.publisher = publisher
         self.convert = convert
-        self.stale_ns, self.restamp = _check_options(route)
+        stale_s = context.option("stale_s")
+        self.stale_ns = None if stale_s is None else round(stale_s * 1e9)
+        self.restamp = context.option("stamp") == "now"
 
 
 class Incoming:
@@ -146,6 +142,7 @@ class Incoming:
         context = target.context
         context.now_ns = self.whereabouts.now_ns or 0
         context.odometry = self.whereabouts.odometry
+        context.max_thrust_n = self.whereabouts.max_thrust_n
         return target.convert(data, context)
 
     def _deliver(self, target: Target, command: Any) -> None:
@@ -256,23 +253,6 @@ class Caller:
             return str(reply.reason)
         self.tally.send()
         return ""
-
-
-def _check_options(route: Route) -> tuple[int | None, bool]:
-    """Return how far stamps may be off [ns], None: any; and whether commands get a stamp of ours.
-
-    Raises:
-        ValueError: An option is not what it must be.
-    """
-    stale_s = route.options.get("stale_s", STALE_S)
-    if stale_s is not None and (
-        isinstance(stale_s, bool) or not isinstance(stale_s, int | float) or not 0.0 < stale_s < math.inf
-    ):
-        raise ValueError(f"{route}: option stale_s must be > 0 or null, got {stale_s!r}")
-    stamp = route.options.get("stamp", "header")
-    if stamp not in ("header", "now"):
-        raise ValueError(f"{route}: option stamp must be header or now, got {stamp!r}")
-    return None if stale_s is None else round(stale_s * 1e9), stamp == "now"
 
 
 def _staleness(stamp_ns: int, now_ns: int | None, stale_ns: int | None) -> str:

@@ -10,9 +10,19 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from cortex import Node, Subscriber, keep_last
-from cortex.messages import CameraInfo, Clock, Events, Image, Odometry, PointCloud, Transform
+from cortex.messages import (
+    CameraInfo,
+    Clock,
+    Events,
+    Image,
+    Odometry,
+    PointCloud,
+    Simulation,
+    Transform,
+)
+from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, RosPublisher
-from cortex_ros2_bridge.convert import Context, check_transform, static_transforms
+from cortex_ros2_bridge.convert import Context, ConvertError, check_transform, static_transforms
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.routes import Route
 from cortex_ros2_bridge.tally import Tally
@@ -88,11 +98,15 @@ class Outgoing:
         """Convert a message and publish it."""
         tally = self.tally
         tally.receive()
+        if isinstance(message, Events) and message.dropped_count:
+            tally.drop(message.dropped_count)
         try:
             data = self._convert(message, self._context)
+        except (ConvertError, cdr.CdrError) as error:
+            tally.refuse(str(error))
+            return
         except Exception as error:  # whatever is wrong with a message, the next one may be right
             tally.refuse(f"{type(error).__name__}: {error}")
-            logger.debug("%s: a message could not be converted", self.route, exc_info=True)
             return
         if data is None:
             return
@@ -193,6 +207,7 @@ class Feed:
 
     Attributes:
         topic: The topic.
+        newest: When the newest message came [s], and its stamp [ns], if it has one.
     """
 
     def __init__(self, node: Node, topic: str, kind: type[Any], *, latched: bool) -> None:
@@ -215,6 +230,7 @@ class Feed:
         self._queue = QUEUES.get(kind, QUEUE)
         self._subscriber: Subscriber[Any] | None = None
         self._told = (0, 0)
+        self.newest = (0.0, 0)
 
     def tap(self, function: Callable[[Any], None], wants: Callable[[], bool]) -> None:
         """Give each message to a function of the bridge, before the routes get it.
@@ -234,15 +250,9 @@ class Feed:
             del self._taps[function]
 
     def add(self, output: Outgoing) -> None:
-        """Let a route have the messages.
-
-        Raises:
-            ValueError: Its option `queue` is not what it must be.
-        """
-        queue = output.route.options.get("queue", self._queue)
-        if isinstance(queue, bool) or not isinstance(queue, int) or not 1 <= queue <= 65_536:
-            raise ValueError(f"option queue must be an integer from 1 to 65536, got {queue!r}")
-        self._queue = queue
+        """Let a route have the messages."""
+        queue = output.route.options.get("queue")
+        self._queue = self._queue if queue is None else queue
         self._outputs = (*self._outputs, output)
 
     def remove(self, output: Outgoing) -> None:
@@ -299,6 +309,9 @@ class Feed:
         self._last = None
 
     def _take(self, message: Any) -> None:
+        stamp_ns = getattr(message, "stamp_ns", 0)
+        if stamp_ns:
+            self.newest = time.monotonic(), stamp_ns
         with self._lock:
             if self._latched:
                 self._last = message
@@ -329,22 +342,29 @@ class Whereabouts:
 
     Attributes:
         odometry: The newest state; None if none has come.
-        sources: Topics of state and time; None where there is none.
+        max_thrust_n: Thrust with all rotors at their highest speed [N]; None if the simulator has not said.
+        sources: Topics of state, of time and of the simulation; None where there is none.
         resources: What is to be closed when the sources change.
     """
 
-    def __init__(self) -> None:
-        """Know nothing."""
+    def __init__(self, vehicle: str) -> None:
+        """Know nothing.
+
+        Args:
+            vehicle: Its name.
+        """
         self.odometry: Odometry | None = None
-        self.sources: tuple[str | None, str | None] = None, None
+        self.max_thrust_n: float | None = None
+        self.sources: tuple[str | None, ...] = None, None, None
+        self._vehicle = vehicle
         self.resources = contextlib.ExitStack()
         self._clock_ns: int | None = None
 
-    def forget(self, sources: tuple[str | None, str | None]) -> None:
+    def forget(self, sources: tuple[str | None, ...]) -> None:
         """Forget all that came from other sources."""
         self.resources.close()
         self.sources = sources
-        self.odometry = self._clock_ns = None
+        self.odometry = self._clock_ns = self.max_thrust_n = None
 
     def take_odometry(self, message: Odometry) -> None:
         """Take in a state."""
@@ -353,6 +373,11 @@ class Whereabouts:
     def take_clock(self, message: Clock) -> None:
         """Take in the time of the run."""
         self._clock_ns = message.stamp_ns
+
+    def take_simulation(self, message: Simulation) -> None:
+        """Take in what a vehicle can do."""
+        known = dict(zip(message.vehicles, message.thrust_max_n, strict=False))
+        self.max_thrust_n = known.get(self._vehicle)
 
     @property
     def now_ns(self) -> int | None:

@@ -6,6 +6,7 @@ Routes follow from the types of the topics that Cortex's discovery shows, so tha
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import cortex.messages
 from cortex import Node
 from cortex.schema import schema_of
 from cortex.service import service_number
+from cortex_ros2_bridge import convert
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.config import QOS, BridgeConfig, RouteChange, is_ros_name
 
@@ -90,8 +92,10 @@ RULES: tuple[Rule, ...] = (
     Rule("cortex/Transform", "tf2_msgs/msg/TFMessage", "out", "/tf_static", QOS["latched"]),
     Rule("cortex/Image", "sensor_msgs/msg/Image", "out", "{topic}/image_raw", FRAMES),
     Rule("cortex/Image", "sensor_msgs/msg/CameraInfo", "out", "{topic}/camera_info"),
+    Rule("cortex/Image", "sensor_msgs/msg/PointCloud2", "out", "{topic}/points", FRAMES, default=False),
     Rule("cortex/Events", "event_camera_msgs/msg/EventPacket", "out", "{topic}", PACKETS),
     Rule("cortex/Events", "sensor_msgs/msg/Image", "out", "{topic}/image", FRAMES),
+    Rule("cortex/Events", "sensor_msgs/msg/CameraInfo", "out", "{topic}/camera_info"),
     Rule("cortex/Events", "dvs_msgs/msg/EventArray", "out", "{topic}/event_array", PACKETS, default=False),
     Rule("cortex/CameraInfo", "sensor_msgs/msg/CameraInfo", "out", "{parent}/camera_info", QOS["latched"]),
     Rule("cortex/PointCloud", "sensor_msgs/msg/PointCloud2", "out", "{topic}", FRAMES),
@@ -190,6 +194,7 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
     problems = _unknown_types(seen, config)
     routes: list[Route] = []
     images: dict[str, str] = {}
+    unused = {(n, name): set[str]() for n, change in enumerate(config.routes) for name in change.options}
     for route, rule in _candidates(seen):
         if not _wanted(route.cortex_topic, config):
             continue
@@ -198,8 +203,33 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
         there = asked or (rule.default and (config.defaults or bool(fitting)))
         if there and (not fitting or fitting[-1].enabled):
             routes.append(_changed(route, fitting, config, images))
-    problems += _useless(seen, config)
+            _note_options(route, config, unused)
+    problems += _useless(seen, config) + _useless_options(config, unused)
     return _without_conflicts(routes, problems), problems
+
+
+def known_options(route: Route) -> frozenset[str]:
+    """Return the names of the options that a route has."""
+    kind = CORTEX_TYPES[route.cortex_type]
+    if route.direction == "out":
+        return convert.OPTIONS.get(convert.OUT[kind, route.ros_type], frozenset()) | {"queue"}
+    known = convert.OPTIONS.get(convert.IN[route.ros_type, kind], frozenset())
+    return known | {"stale_s", "stamp"} if route.direction == "in" else known
+
+
+def unfit(seen: Seen, config: BridgeConfig) -> list[str]:
+    """Say which entries of `routes` fit nothing that is there, or that may have a route."""
+    routes = [route for route, _ in _candidates(seen) if _wanted(route.cortex_topic, config)]
+    found = []
+    for number, change in enumerate(config.routes):
+        if any(_fits(change, route) for route in routes):
+            continue
+        if any(fnmatchcase(route.cortex_topic, change.cortex) for route in routes):
+            continue  # `_useless` says why
+        near = difflib.get_close_matches(change.cortex, {route.cortex_topic for route in routes}, 1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        found.append(f"routes[{number}]: no Cortex topic fits {change.cortex}{hint}")
+    return found
 
 
 def vehicle_of(topic: str) -> str:
@@ -225,7 +255,7 @@ def odometry_of(vehicle: str, seen: Seen) -> str | None:
 
 def _candidates(seen: Seen) -> list[tuple[Route, Rule]]:
     found = []
-    images = {topic.topic for topic in seen.topics if topic.type_name == "cortex/Image"}
+    pictures = {t.topic for t in seen.topics if t.type_name in ("cortex/Image", "cortex/Events")}
     for topic in seen.topics:
         if not _is_known(topic):
             continue
@@ -234,8 +264,8 @@ def _candidates(seen: Seen) -> list[tuple[Route, Rule]]:
                 continue
             if (rule.direction == "out") != topic.published:
                 continue
-            if rule.cortex_type == "cortex/CameraInfo" and topic.topic.removesuffix(INFO) in images:
-                continue  # goes with each image, and with its stamp
+            if rule.cortex_type == "cortex/CameraInfo" and topic.topic.removesuffix(INFO) in pictures:
+                continue  # goes with each picture, and with its stamp
             if rule.name == "/tf" and topic.topic.rpartition("/")[2] not in _TF_SOURCES:
                 continue
             found.append((_route(rule, topic.topic), rule))
@@ -277,6 +307,28 @@ def _wanted(topic: str, config: BridgeConfig) -> bool:
     return any(fnmatchcase(topic, pattern) for pattern in config.include) and not any(
         fnmatchcase(topic, pattern) for pattern in config.exclude
     )
+
+
+def _note_options(route: Route, config: BridgeConfig, unused: dict[tuple[int, str], set[str]]) -> None:
+    """Cross out the options of the settings that a route knows; note what it knows for the others."""
+    known = known_options(route)
+    for number, change in enumerate(config.routes):
+        if _fits(change, route):
+            for name in change.options:
+                if name in known:
+                    unused.pop((number, name), None)
+                elif (number, name) in unused:
+                    unused[number, name] |= known
+
+
+def _useless_options(config: BridgeConfig, unused: Mapping[tuple[int, str], set[str]]) -> list[str]:
+    """Say which options no route has that their entry fits."""
+    return [
+        f"routes[{number}].options: no route of {config.routes[number].cortex} has the option {name!r}, "
+        f"known: {', '.join(sorted(known))}"
+        for (number, name), known in unused.items()
+        if known  # else there is no such route now
+    ]
 
 
 def _fits(change: RouteChange, route: Route) -> bool:

@@ -22,6 +22,7 @@ class Tally:
         sent: Messages that went out; where a converter makes one of many, fewer than came in.
         lost: Messages that went missing: overtaken in a queue, or not taken by the other side.
         refused: Messages that make no sense: malformed, not finite, stale.
+        dropped: Events that a sensor had no room for, as its messages say; they never were in one.
         reason: Why the last one was lost or refused; empty if none was.
     """
 
@@ -32,7 +33,7 @@ class Tally:
             name: Of the route, for the log.
         """
         self.name = name
-        self.received = self.sent = self.lost = self.refused = 0
+        self.received = self.sent = self.lost = self.refused = self.dropped = 0
         self.reason = ""
         self._said_s = -SAY_INTERVAL_S
         self._unsaid = 0
@@ -60,9 +61,21 @@ class Tally:
             self.lost += count
             self._say("lost", reason, count)
 
+    def drop(self, count: int) -> None:
+        """Count what a sensor had no room for."""
+        with self._lock:
+            self.dropped += count
+            self._say("dropped", "events that did not fit into the sensor's buffer", count)
+
     def totals(self) -> Totals:
         """Return the counts as of now."""
-        return Totals(received=self.received, sent=self.sent, lost=self.lost, refused=self.refused)
+        return Totals(
+            received=self.received,
+            sent=self.sent,
+            lost=self.lost,
+            refused=self.refused,
+            dropped=self.dropped,
+        )
 
     def _say(self, what: str, reason: str, count: int) -> None:
         self.reason = f"{what}: {reason}"
@@ -81,3 +94,4 @@ class Totals:
     sent: int = 0
     lost: int = 0
     refused: int = 0
+    dropped: int = 0

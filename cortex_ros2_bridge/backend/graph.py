@@ -212,12 +212,10 @@ class Graph:
 
     def _compare(self, own: Endpoint, other: Endpoint) -> None:
         """Say once why two endpoints of a topic do not meet."""
-        if own.topic != other.topic or own.kind == other.kind:
+        if own.topic != other.topic or own.kind == other.kind or own.type_name != other.type_name:
             return
         writer, reader = (own, other) if own.kind == "writer" else (other, own)
-        if own.type_name != other.type_name:
-            why = f"its type there is {ros_type(other.type_name)}, not {ros_type(own.type_name)}"
-        elif reader.reliable and not writer.reliable:
+        if reader.reliable and not writer.reliable:
             why = "its subscriber wants it reliable, its publisher is not"
         elif reader.durable and not writer.durable:
             why = "its subscriber wants it transient local, its publisher is volatile"

@@ -78,6 +78,8 @@ class RecordingBackend:
         self.closed_publishers: list[RecordedPublisher] = []
         self.refuse: dict[str, Exception] = {}
         """What opening a topic raises."""
+        self.others: list[TopicInfo] = []
+        """What others have."""
         self._lock = threading.Lock()
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RecordedPublisher:
@@ -105,7 +107,7 @@ class RecordingBackend:
         return made
 
     def topics(self) -> list[TopicInfo]:
-        return []
+        return list(self.others)
 
     def close(self) -> None:
         pass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import logging
+import os
 import threading
 import time
 
@@ -19,7 +20,7 @@ from cortex import messages as msg
 from cortex_ros2_bridge import bridge as bridge_module
 from cortex_ros2_bridge import incoming as incoming_module
 from cortex_ros2_bridge import outgoing as outgoing_module
-from cortex_ros2_bridge.backend.base import BackendError
+from cortex_ros2_bridge.backend.base import BackendError, TopicInfo
 from cortex_ros2_bridge.config import ConfigError
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.typestore import typestore
@@ -613,30 +614,6 @@ def test_options_of_staleness(options, stamp, passes):
             assert craft.recv("motor_speeds").stamp_ns == 10_000_000_000
 
 
-def test_wrong_options_are_a_problem_of_their_route_only():
-    with rig_of({"routes": [{"cortex": "/drone/command/rates", "options": {"stale_s": -1}}]}) as rig:
-        Craft(rig, motor_speeds=msg.MotorCommand, rates=msg.RateThrustCommand)
-        rig.subscribes("/drone/actuators")
-        rig.update_until(lambda: rig.bridge.problems)
-        assert "option stale_s must be > 0 or null, got -1" in rig.bridge.problems[0]
-
-
-def test_an_option_that_nothing_knows_is_refused():
-    with (
-        pytest.raises(ConfigError, match=r"routes\[0\].options: unknown option 'encodng', known: .*encoding"),
-        rig_of({"routes": [{"cortex": "*", "options": {"encodng": "mono"}}]}),
-    ):
-        pass
-
-
-def test_a_queue_that_is_none():
-    with rig_of({"routes": [{"cortex": "/drone/imu", "options": {"queue": 0}}]}) as rig:
-        rig.simulator.publisher("/drone/imu", msg.Imu)
-        rig.update_until(lambda: rig.bridge.problems)
-        assert "option queue must be an integer from 1 to 65536, got 0" in rig.bridge.problems[0]
-        assert "/drone/imu" not in rig.backend.publishers
-
-
 def test_a_refusal_counts_for_the_route_that_the_message_was_meant_for():
     """Of two targets, the mask says which; a mask that neither has is refused, too."""
     with rig_of() as rig:
@@ -764,6 +741,116 @@ def test_closing_gives_up_a_call_that_is_under_way():
 # Both
 
 
+def test_another_type_on_a_topic_is_said_with_the_topic_for_it(monkeypatch, caplog):
+    """The classical mistake: a Twist where a TwistStamped is wanted."""
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    with rig_of() as rig:
+        Craft(rig, velocity=msg.VelocityCommand)
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.opens("/drone/imu")
+        rig.subscribes("/drone/command_velocity")
+        rig.backend.others = [
+            TopicInfo("/drone/command_velocity", "geometry_msgs/msg/Twist", 1, 0),
+            TopicInfo("/drone/imu", "sensor_msgs/msg/Image", 0, 1),
+            TopicInfo("/drone/cmd_vel", "geometry_msgs/msg/Twist", 1, 0),
+            TopicInfo("/elsewhere", "geometry_msgs/msg/Twist", 1, 1),
+        ]
+        with rig.backend.listening("/diagnostics") as (diagnostics,):
+            rig.update_until(lambda: diagnostics.sent)
+            rig.update_until(lambda: "wanted is" in diagnostics.messages()[-1].status[0].message)
+            rig.updates_during()
+            assert diagnostics.messages()[-1].status[0].level == b"\1"
+            rig.backend.others = []
+            rig.update_until(lambda: diagnostics.messages()[-1].status[0].level == b"\0")
+    said = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert said == [
+        "/drone/command_velocity: a node publishes geometry_msgs/msg/Twist, wanted is "
+        "geometry_msgs/msg/TwistStamped; for geometry_msgs/msg/Twist: /drone/cmd_vel",
+        "/drone/imu: a node subscribes to it as sensor_msgs/msg/Image, it is sensor_msgs/msg/Imu",
+    ]
+
+
+def test_another_bridge_is_said_and_named(monkeypatch, caplog):
+    """At once if Cortex shows it, else after a while: DDS remembers a bridge that was killed for 10 s."""
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    with rig_of() as rig:
+        for topic in ("/drone/imu", "/drone/gyro"):
+            rig.simulator.publisher(topic, msg.Imu)
+        rig.opens("/drone/imu", "/drone/gyro")
+        rig.backend.others = [
+            TopicInfo("/clock", "rosgraph_msgs/msg/Clock", 1, 0),
+            TopicInfo("/drone/imu", "sensor_msgs/msg/Imu", 1, 0),
+            TopicInfo("/drone/gyro", "sensor_msgs/msg/Imu", 1, 0),
+        ]
+        rig.updates_during()
+        assert "ROS gets all of it twice" not in caplog.text
+        with Node("cortex_bridge"):
+            rig.update_until(lambda: "ROS gets all of it twice" in caplog.text)
+        assert f"another bridge (cortex_bridge, process {os.getpid()} on" in caplog.text
+        assert "publishes /drone/gyro and 1 more of our topics too" in caplog.text
+        monkeypatch.setattr(bridge_module, "TWICE_S", 0.0)
+        rig.update_until(lambda: "another node publishes /drone/gyro" in caplog.text)
+
+
+def test_settings_that_fit_nothing_are_said_after_a_while(monkeypatch, caplog):
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    monkeypatch.setattr(bridge_module, "UNFIT_S", 0.1)
+    with rig_of({"routes": [{"cortex": "/dron/imu", "qos": "sensor_data"}]}) as rig:
+        rig.simulator.publisher("/drone/imu", msg.Imu)
+        rig.update_until(lambda: "no Cortex topic fits /dron/imu, did you mean /drone/imu?" in caplog.text)
+
+
+def test_events_that_a_sensor_dropped_are_shown(monkeypatch):
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    none = np.zeros(0, np.uint16)
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/events", msg.Events)
+        (ros,) = rig.opens("/drone/events")
+        with rig.listening(sent, "/drone/events"), rig.backend.listening("/diagnostics") as (told,):
+            sent.publish(
+                msg.Events(10_000_000, none, none, np.zeros(0, np.int64), none.astype(np.uint8), 4, 3, 0, 17)
+            )
+            wait_for(lambda: ros.sent)
+            name = "/drone/events -> /drone/events"
+            rig.update_until(lambda: statuses(told).get(name, {}).get("dropped") == "17")
+            texts = [s.message for m in told.messages() for s in m.status if s.name.endswith(name)]
+            assert any("17 events dropped by the sensor" in text for text in texts)
+
+
+def test_a_picture_of_events_and_its_calibration_have_one_stamp():
+    none = np.zeros(0, np.uint16)
+    with rig_of() as rig:
+        info = rig.simulator.publisher("/drone/events/info", msg.CameraInfo, latch=True)
+        info.publish(camera_info("events"))
+        sent = rig.simulator.publisher("/drone/events", msg.Events)
+        names = "/drone/events/image", "/drone/events/camera_info"
+        pictures, infos = rig.opens(*names)
+        rig.update_until(lambda: info.subscriber_count == 1)
+        with rig.listening(sent, *names):
+            for end_ms in range(100, 300, 5):
+                begin_ns, end_ns = (end_ms - 5) * 1_000_000, end_ms * 1_000_000
+                empty = none, none, np.zeros(0, np.int64), none.astype(np.uint8)
+                sent.publish(msg.Events(end_ns, *empty, 4, 3, begin_ns))
+            wait_for(lambda: len(pictures.sent) == len(infos.sent) == 6)
+        stamps = [stamp_ns(message.header) for message in infos.messages()]
+        assert stamps == [stamp_ns(message.header) for message in pictures.messages()]
+        assert stamps == [n * 1_000_000 for n in (100, 135, 170, 200, 235, 270)]
+
+
+def test_the_simulator_says_what_full_thrust_is():
+    """Thrust 1 of the vehicle that is commanded, not of the one that is flown by default."""
+    with rig_of() as rig:
+        craft = Craft(rig, rates=msg.RateThrustCommand)
+        about = rig.simulator.publisher("/simulation", msg.Simulation, latch=True)
+        about.publish(msg.Simulation("", "1", ["other", "drone"], "streaming", 100.0, [40.0, 8.0]))
+        (target,) = rig.subscribes("/drone/attitude_target")
+        rig.update_until(lambda: about.subscriber_count == 1)
+        rig.update_until(lambda: rig.bridge._vehicles["drone"].max_thrust_n == 8.0)
+        rig.update_until(craft.connected)
+        target.put(message_class("mavros_msgs/msg/AttitudeTarget")(type_mask=128, thrust=0.5))
+        assert craft.recv("rates").thrust_n == 4.0
+
+
 def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
     monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.05)
     with rig_of() as rig:
@@ -789,6 +876,7 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
         "sent": "1",
         "lost": "0",
         "refused": "0",
+        "dropped": "0",
         "rate_hz": "",
         "listeners": "1",
         "types": "cortex/Imu and sensor_msgs/msg/Imu",

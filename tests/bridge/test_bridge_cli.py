@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -21,7 +22,8 @@ from cortex import Node
 from cortex import messages as msg
 from cortex_ros2_bridge import bench, cli
 from cortex_ros2_bridge.config import load
-from cortex_ros2_bridge.routes import make_routes
+from cortex_ros2_bridge.options import OPTIONS
+from cortex_ros2_bridge.routes import known_options, make_routes
 
 SETTINGS = {
     "namespace": "/sim",
@@ -56,7 +58,10 @@ def test_printed_settings_make_the_same_routes():
     routes, problems = make_routes(DRONE, config)
     text = cli.to_yaml(config, routes)
     again, problems_again = make_routes(DRONE, load(yaml.safe_load(text)))
-    assert again == routes
+    for one, other in zip(routes, again, strict=True):
+        assert dataclasses.replace(one, options={}) == dataclasses.replace(other, options={})
+        defaults = {name: OPTIONS[name].default for name in known_options(one)}
+        assert other.options == {**defaults, **one.options}
     assert problems == problems_again == []
     assert "!!" not in text
 
@@ -92,13 +97,42 @@ def test_print_config(simulator, capsys, tmp_path):
         "type": "sensor_msgs/msg/Imu",
         "ros": "/drone/imu",
         "qos": {"reliability": "best_effort", "durability": "volatile", "depth": 5},
-        "options": {},
+        "options": {
+            "angular_velocity_std_rad_s": 0.0,
+            "linear_acceleration_std_m_s2": 0.0,
+            "queue": None,
+        },
     }
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"routes": [{"cortex": "/dron/imu"}]}, "routes[0]: no Cortex topic fits /dron/imu"),
+        ({"routes": [{"cortex": "/drone/imu", "type": "sensor_msgs/Imuu"}]}, "sensor_msgs/msg/Imuu"),
+        ({"routes": [{"cortex": "/drone/imu", "options": {"encoding": "evt3"}}]}, "option 'encoding'"),
+        ({"routes": [{"cortex": "/a", "options": {"encoding": "evt2"}}]}, "bridge.yaml: routes[0].options"),
+        ({"frames": {"prefx": "x"}}, "bridge.yaml: frames: unknown key 'prefx'"),
+    ],
+)
+def test_list_says_what_is_wrong_with_settings(settings, said, simulator, capsys, tmp_path):
+    path = tmp_path / "bridge.yaml"
+    path.write_text(yaml.safe_dump(settings))
+    assert cli.main(["--list", "--config", str(path)]) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_list_with_topics_that_may_have_no_routes(simulator, capsys, tmp_path):
+    path = tmp_path / "bridge.yaml"
+    path.write_text("include: ['/dron/*']")
+    assert cli.main(["--list", "--config", str(path)]) == 0
+    assert "none of 2 Cortex topics goes anywhere" in capsys.readouterr().out
 
 
 def test_list_without_anything(capsys, monkeypatch):
     monkeypatch.setattr(cli, "LIST_S", 0.1)
-    assert cli.main(["--list"]) == 0
+    with own_directory(monkeypatch):
+        assert cli.main(["--list"]) == 0
     assert "no Cortex topics" in capsys.readouterr().out
 
 
@@ -107,7 +141,8 @@ def test_list_without_anything(capsys, monkeypatch):
     [
         (["--config", "nothing.yaml"], "cannot read nothing.yaml: No such file or directory"),
         (["--namespace", "a b"], "namespace must be a ROS name"),
-        (["--domain", "-1"], "domain must be >= 0, got -1"),
+        (["--domain", "-1"], "--cortex-domain must be an integer >= 0, got -1"),
+        (["--cortex-domain", "-1"], "--cortex-domain must be an integer >= 0, got -1"),
         (["--backend", "carrier-pigeon"], "carrier-pigeon"),
         (["--distro", "hydro", "--backend", "dds"], "hydro"),
     ],
@@ -123,7 +158,7 @@ def test_wrong_use_is_one_line(arguments, text, capsys):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_within_a_second(number, dds_domain, simulator):
     """With streams open; it says what it does in lines for people."""
-    with BridgeProcess("--backend", "dds", "--distro", "jazzy", "-v") as command:
+    with BridgeProcess("--verbose", "--backend", "dds", "--distro", "jazzy", "-v") as command:
         command.wait_for("/drone/imu -> /drone/imu (sensor_msgs/msg/Imu)")
         assert "/cortex_bridge: dds, jazzy" in command.said
         assert command.end(number) < 1.0 + BUSY_S
@@ -151,7 +186,7 @@ def test_a_service_that_does_not_answer_does_not_hold_it_up(dds_domain, simulato
     simulator.service("/reset", msg.Reset, msg.SimulatorReply, answer)
     ros = DdsBackend(distro="jazzy", node_name="asker")
     try:
-        with BridgeProcess("--backend", "dds", "--distro", "jazzy") as command:
+        with BridgeProcess("--verbose", "--backend", "dds", "--distro", "jazzy") as command:
             command.wait_for("/reset <- /reset ")
             publisher = ros.publisher("/reset", "std_msgs/msg/Empty", Qos())
             wait_for(lambda: publisher.subscriber_count)
@@ -169,7 +204,7 @@ def test_a_bag_of_what_flew(simulator, tmp_path):
 
     sent = simulator.publisher("/drone/gyro", msg.Imu)
     path = tmp_path / "run.mcap"
-    with BridgeProcess("--backend", str(path)) as command:
+    with BridgeProcess("--verbose", "--backend", str(path)) as command:
         command.wait_for("/drone/gyro -> /drone/gyro")
         wait_for(lambda: sent.subscriber_count)
         for stamp_ns in range(1, 4):

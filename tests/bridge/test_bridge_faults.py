@@ -52,7 +52,7 @@ def start(ros: DdsBackend) -> Iterator[Callable[..., BridgeProcess]]:
     started: list[BridgeProcess] = []
 
     def begin(*arguments: str) -> BridgeProcess:
-        started.append(BridgeProcess("--backend", "dds", "--distro", "jazzy", *arguments))
+        started.append(BridgeProcess("--verbose", "--backend", "dds", "--distro", "jazzy", *arguments))
         return started[-1]
 
     yield begin
@@ -161,7 +161,7 @@ def test_a_simulator_that_is_restarted_finds_the_bridge_as_it_was(ros, start):
             wait_for(lambda: heard.last().header.stamp.sec == 100)
             assert heard.subscription.publisher_count == 1
         if run == 0:
-            wait_for(lambda: "has gone" in bridge.said or bridge.hear())
+            wait_for(lambda: "Cortex side has gone" in bridge.said or bridge.hear())
         heard.received.clear()  # nothing of the old run comes any more
 
 

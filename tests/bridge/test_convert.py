@@ -6,6 +6,7 @@ bytes are those of rosbags, and of a file in golden/. `python tests/bridge/test_
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +35,8 @@ from cortex_ros2_bridge.msgs import (
     UInt32,
     Vector3,
 )
+from cortex_ros2_bridge.options import OPTIONS as OPTIONS_OF_ROUTES
+from cortex_ros2_bridge.options import check_option
 from cortex_ros2_bridge.typestore import typestore
 
 GOLDEN = Path(__file__).with_name("golden")
@@ -169,7 +172,7 @@ STATUS = messages.SimulatorStatus(
         messages.SensorStatus("drone", "imu", True, 1, 1000, 2, 2),
         messages.SensorStatus("drone", "rgb", False, 0, 30, 5, 0),
     ],
-    vehicles=[messages.VehicleStatus("drone", "rates", 9, 3, 0, 0, 5, True, 1, 2)],
+    vehicles=[messages.VehicleStatus("drone", "rates", 9, 3, 0, 0, 5, True, 1, 2, 0, "three rotors")],
 )
 
 # By hand: 2 999 999 us = 0x2DC6BF, 3 000 000 us = 0x2DC6C0: high halves 0x2DC, low halves 0x6BF and 0x6C0.
@@ -294,7 +297,7 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
         EVENTS,
         context(camera_info=CAMERA),
         "sensor_msgs/CameraInfo",
-        camera_record("drone/rgb_optical_frame", 2, 999_999_000),
+        camera_record("drone/rgb_optical_frame"),  # as the picture that ends with the window
     ),
     "events_evt3": (
         convert.event_packet,
@@ -471,8 +474,8 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                     "diagnostic_msgs/DiagnosticStatus",
                     1,
                     "simulator",
-                    "running",
-                    "",
+                    "running, 0.5 x real time; 4 steps were late, and 2.500 s slipped so far",
+                    "simulator",
                     [
                         pair("mode", "streaming"),
                         pair("real_time_factor", "0.5"),
@@ -491,7 +494,7 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                         level,
                         name,
                         said,
-                        "",
+                        "drone",
                         [
                             pair("subscriber_count", subscribers),
                             pair("published_count", published),
@@ -500,19 +503,30 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                         ],
                     )
                     for level, name, said, subscribers, published, dropped, injected in (
-                        (0, "sensor drone/imu", "2 dropped", "1", "1000", "2", "2"),
-                        (1, "sensor drone/rgb", "5 dropped", "0", "30", "5", "0"),
+                        (
+                            0,
+                            "sensor drone/imu",
+                            "2 dropped so far, as its link is configured",
+                            "1",
+                            "1000",
+                            "2",
+                            "2",
+                        ),
+                        (1, "sensor drone/rgb", "5 dropped so far", "0", "30", "5", "0"),
                     )
                 ),
                 record(
                     "diagnostic_msgs/DiagnosticStatus",
                     1,
                     "vehicle drone",
-                    "fail-safe",
-                    "",
+                    "no command has come in time: the fail-safe flies; 3 commands refused so far "
+                    "(three rotors); "
+                    "2 collisions so far; commands: rates",
+                    "drone",
                     [
                         pair("command_count", "9"),
                         pair("refused_count", "3"),
+                        pair("refused_reason", "three rotors"),
                         pair("superseded_count", "0"),
                         pair("lost_count", "0"),
                         pair("command_age_ns", "5"),
@@ -567,7 +581,8 @@ def test_out_is_what_rosbags_writes_and_what_it_was_before(name):
 
 def test_every_way_out_is_tested():
     tested = {(type(message), kind.replace("/", "/msg/")) for _, message, _, kind, _ in EXPECTED.values()}
-    assert OUT.keys() - tested == {(messages.Events, "sensor_msgs/msg/Image")}  # below
+    below = {(messages.Events, "sensor_msgs/msg/Image"), (messages.Image, "sensor_msgs/msg/PointCloud2")}
+    assert OUT.keys() - tested == below
     for (_, message, _, kind, _), name in zip(EXPECTED.values(), EXPECTED, strict=True):
         assert OUT[type(message), kind.replace("/", "/msg/")] is EXPECTED[name][0]
 
@@ -835,8 +850,6 @@ def test_events_that_cannot_be_encoded_are_refused():
             convert.event_packet(outside, context(options={"encoding": encoding}))
     with pytest.raises(ConvertError, match="column 8"):
         convert.event_image(outside, context())
-    with pytest.raises(ConvertError, match="evt3 or mono, got 'evt2'"):
-        convert.event_packet(EVENTS, context(options={"encoding": "evt2"}))
     before = messages.Events(
         0, np.array([1], np.uint16), np.array([0], np.uint16), np.array([-5]), np.array([1], U8), 8, 5
     )
@@ -880,12 +893,92 @@ def test_states_that_are_not_finite_are_refused(bad):
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, "0.5", True])
 def test_options_that_are_no_numbers_are_refused(value):
-    with pytest.raises(ConvertError, match="angular_velocity_std_rad_s must be a number >= 0"):
-        convert.imu(IMU, context(options={"angular_velocity_std_rad_s": value}))
+    with pytest.raises(ValueError, match="angular_velocity_std_rad_s must be a number >= 0"):
+        context(options={"angular_velocity_std_rad_s": value})
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("queue", [1, 65_536, None], [0, 65_537, 1.5, True, "7"]),
+        ("encoding", ["evt3", "mono"], ["evt2", None]),
+        ("period_s", [0, 0.1], [-0.1, None]),
+        ("stale_s", [0.1, 5, None], [0, math.inf, "fast"]),
+        ("stamp", ["header", "now"], [True, "later"]),
+        ("max_thrust_n", [None, 1e-3, 100], [0, -1.0, math.nan, "a lot"]),
+        ("frame", ["map", "other/base_link"], ["", 3]),
+    ],
+)
+def test_what_options_must_be(name, good, bad):
+    for value in [*good, OPTIONS_OF_ROUTES[name].default]:
+        check_option(name, value)
+    for value in bad:
+        with pytest.raises(ValueError, match=f"option {name} must be"):
+            check_option(name, value)
+
+
+def test_measurements_that_are_not_finite_are_refused():
+    wrong = messages.Imu(0, np.zeros(3), np.array([0.0, math.nan, 0.0]))
+    with pytest.raises(ConvertError, match="imu: not finite"):
+        convert.imu(wrong, context())
+    fallen = messages.Odometry(0, np.zeros(3), np.zeros(4), np.zeros(3), np.zeros(3))
+    for convert_it in (convert.odometry, convert.odometry_transform):
+        with pytest.raises(ConvertError, match="orientation is zero"):
+            convert_it(fallen, context())
+
+
+def test_diagnostics_judge_the_last_period():
+    """What went wrong once is no warning for ever; the sums stay."""
+    given = context()
+
+    def told(**changes: Any) -> Any:
+        data = convert.simulator_diagnostics(dataclasses.replace(STATUS, **changes), given)
+        return None if data is None else cdr.decode(data, "diagnostic_msgs/msg/DiagnosticArray").status
+
+    quiet = [messages.VehicleStatus("drone", "rates", 9, 3, 0, 0, 5, False, 1, 2)]
+    assert told() is not None
+    assert told(wall_ns=200_000_001) is None
+    assert told(wall_ns=300_000_001, phase="paused") is not None
+    later = told(wall_ns=1_000_000_001, vehicles=quiet)
+    assert [status.level for status in later] == [b"\0"] * 4
+    assert (later[0].message, later[3].message) == ("running, 0.5 x real time", "commands: rates")
+    assert {pair.key: pair.value for pair in later[0].values}["overrun_count"] == "4"
+    more = [dataclasses.replace(quiet[0], refused_count=5)]
+    again = told(wall_ns=3_000_000_001, overrun_count=7, vehicles=more)
+    assert again[0].level == b"\1"
+    assert "3 steps were late, and 0.000 s slipped in 2.0 s" in again[0].message
+    assert again[3].message == "2 commands refused in 2.0 s; commands: rates"
+    anew = told(wall_ns=5_000_000_001, overrun_count=1, vehicles=quiet)  # after a reset
+    assert "1 steps were late" in anew[0].message
+    assert told(wall_ns=6_000_000_001, phase="ended", reason="it hit a wall")[0].level == b"\2"
+
+
+def test_a_picture_of_depths_becomes_a_cloud():
+    """By hand: z along the axis; the centre of pixel (row, column) is at (column + 0.5, row + 0.5)."""
+    lens = messages.CameraInfo(
+        0, 2, 2, np.array([[2.0, 0.0, 1.0], [0.0, 4.0, 1.0], [0.0, 0.0, 1.0]]), "", np.zeros(0), "lens"
+    )
+    depth = np.array([[[2.0], [np.inf]], [[np.nan], [8.0]]], np.float32)
+    picture = messages.Image(STAMP_NS, depth, "32FC1", "drone/depth_optical_frame")
+
+    def points(**options: float) -> Any:
+        data = convert.point_cloud_of_depth(picture, context(camera_info=lens, options=options))
+        sent = cdr.decode(data, "sensor_msgs/msg/PointCloud2")
+        assert sent.header.frame_id == "drone/depth_optical_frame"
+        return np.array(sent.data, U8).view("<f4").reshape(-1, 3).tolist()
+
+    assert points() == [[-0.5, -0.25, 2.0], [2.0, 1.0, 8.0]]
+    assert points(depth_max_m=5.0) == [[-0.5, -0.25, 2.0]]
+    assert convert.point_cloud_of_depth(picture, context()) is None
+    for wrong, reason in ((IMAGE, "not one of rgb8"), (DEPTH, "calibrated for")):
+        with pytest.raises(ConvertError, match=reason):
+            convert.point_cloud_of_depth(wrong, context(camera_info=lens))
 
 
 def test_options_belong_to_conversions():
     assert OPTIONS.keys() <= {*OUT.values(), *IN.values()}
+    known = {"queue", "stale_s", "stamp"}.union(*OPTIONS.values())
+    assert known == OPTIONS_OF_ROUTES.keys()
 
 
 # What comes in
@@ -975,6 +1068,14 @@ def test_attitude_target_with_rates():
     assert take(convert.attitude, message) is None
 
 
+def test_the_vehicle_says_what_full_thrust_is():
+    """An option wins over what the simulator says, and that over the default."""
+    message = target(type_mask=128, thrust=0.5)
+    assert take(convert.rates, message, max_thrust_n=8.0).thrust_n == 4.0
+    assert take(convert.rates, message, max_thrust_n=8.0, options={"max_thrust_n": 20.0}).thrust_n == 10.0
+    assert take(convert.rates, message, options={"max_thrust_n": None}).thrust_n == 0.5 * 50.13
+
+
 def test_ignored_rates_may_be_anything():
     message = target(type_mask=7, thrust=0.5, body_rate=Vector3(x=math.nan, y=math.inf, z=math.nan))
     assert take(convert.attitude, message) is not None
@@ -988,6 +1089,8 @@ def test_ignored_rates_may_be_anything():
     [
         ({"type_mask": 64 + 7}, "ignores thrust"),
         ({"type_mask": 64 + 128}, "ignores thrust"),
+        ({"type_mask": 16}, "does not define: 16"),
+        ({"type_mask": 128 + 32}, "does not define: 32"),
         ({"type_mask": 128 + 1}, "all three"),
         ({"type_mask": 128 + 7}, "all three"),
         ({"type_mask": 128, "body_rate": Vector3(z=math.nan)}, "body rates: not finite"),
@@ -1040,9 +1143,9 @@ def test_velocities_are_turned_to_the_world(frame, expected):
 
 
 def test_velocities_without_a_frame():
-    """REP 147 has command_velocity relative to the body; a joystick flies level."""
+    """Who names none flies level: relative to the tilted body it would sink while it accelerates."""
     command = take(convert.twist_stamped, stamped(TwistStamped(twist=velocity())), odometry=state(TURN))
-    assert command.velocity.tolist() == [3.0, 1.0, 2.0]
+    assert command.velocity == pytest.approx([-2.0, 1.0, 3.0], abs=1e-15)
     command = take(convert.twist, velocity(), odometry=state(TURN))
     assert command.velocity == pytest.approx([-2.0, 1.0, 3.0], abs=1e-15)
 

@@ -37,7 +37,7 @@ from cortex.messages import (
 from cortex.schema import schema_of
 from cortex_ros2_bridge import config
 from cortex_ros2_bridge.config import ConfigError, load
-from cortex_ros2_bridge.routes import Seen, SeenTopic, default_routes, look, make_routes, vehicle_of
+from cortex_ros2_bridge.routes import Seen, SeenTopic, default_routes, look, make_routes, unfit, vehicle_of
 
 
 def topic(name, kind, *, published=True, fingerprint=None):
@@ -95,7 +95,7 @@ def test_every_standard_topic_has_its_routes():
         ("/drone/rgb -> /drone/rgb/camera_info", "sensor_msgs/CameraInfo"),
         ("/drone/events -> /drone/events", "event_camera_msgs/EventPacket"),
         ("/drone/events -> /drone/events/image", "sensor_msgs/Image"),
-        ("/drone/events/info -> /drone/events/camera_info", "sensor_msgs/CameraInfo"),
+        ("/drone/events -> /drone/events/camera_info", "sensor_msgs/CameraInfo"),
         ("/drone/rotor_speeds -> /drone/rotor_speeds", "actuator_msgs/Actuators"),
         ("/drone/path -> /drone/path", "nav_msgs/Path"),
         ("/drone/command/motor_speeds <- /drone/actuators", "actuator_msgs/Actuators"),
@@ -123,9 +123,10 @@ def test_every_standard_topic_has_its_routes():
 
 
 def test_latched_topics_stay_latched():
-    """tf_static, path and calibrations reach those who come later; streams do not wait for anybody."""
-    latched = {r.ros_topic for r in default_routes(DRONE) if r.qos.durability == "transient_local"}
-    assert latched == {"/tf_static", "/simulation", "/drone/path", "/drone/events/camera_info"}
+    """tf_static, path and calibrations without pictures reach those who come later; streams do not."""
+    seen = Seen((*DRONE.topics, topic("/drone/lidar/info", CameraInfo)))
+    latched = {r.ros_topic for r in default_routes(seen) if r.qos.durability == "transient_local"}
+    assert latched == {"/tf_static", "/simulation", "/drone/path", "/drone/lidar/camera_info"}
 
 
 def test_a_command_that_is_only_published_is_no_route():
@@ -166,14 +167,18 @@ def test_qos_and_options_of_a_pattern():
     """Later entries win, and what they do not name stays."""
     settings = {
         "routes": [
-            {"cortex": "*", "type": "event_camera_msgs/EventPacket", "options": {"encoding": "mono", "a": 1}},
+            {
+                "cortex": "*",
+                "type": "event_camera_msgs/EventPacket",
+                "options": {"encoding": "mono", "queue": 1},
+            },
             {"cortex": "/drone/*", "qos": "sensor_data"},
-            {"cortex": "/drone/events", "options": {"a": 2}, "qos": {"depth": 7}},
+            {"cortex": "/drone/events", "options": {"queue": 2}, "qos": {"depth": 7}},
         ]
     }
     routes = routed(settings)
     packets = routes["/drone/events", "EventPacket"]
-    assert packets.options == {"encoding": "mono", "a": 2}
+    assert packets.options == {"encoding": "mono", "queue": 2}
     assert (packets.qos.reliability, packets.qos.depth) == ("best_effort", 7)
     assert routes["/drone/imu", "Imu"].qos == config.QOS["sensor_data"]
     assert routes["/drone/imu", "Imu"].options == {}
@@ -279,7 +284,20 @@ def test_two_routes_that_do_not_go_together(change, reason):
         ),
         ({"routes": [{"cortex": "/a", "enabled": "no"}]}, r"enabled must be true or false, got 'no'"),
         ({"rename": {"/drone": "quad"}}, "rename./drone must be a ROS name"),
-        ({"domain": -1}, "domain must be an integer >= 0, got -1"),
+        ({"domain": -1}, "cortex_domain must be an integer >= 0, got -1"),
+        ({"cortex_domain": True}, "cortex_domain must be an integer >= 0, got True"),
+        ({"distro": "hydro"}, "distro must be one of humble, .*, got 'hydro'"),
+        ({"node": "my node"}, "node: invalid ROS name"),
+        ({"frames": {"prefx": "x"}}, "frames: unknown key 'prefx', known: .*did you mean 'prefix'"),
+        ({"frames": {"map": "two words"}}, "frames.map must be a name"),
+        (
+            {"routes": [{"cortex": "/a", "options": {"max_thrust": 20}}]},
+            r"routes\[0\].options: unknown key 'max_thrust', .*did you mean 'max_thrust_n'",
+        ),
+        (
+            {"routes": [{"cortex": "/a", "options": {"encoding": "evt2"}}]},
+            r"routes\[0\].options: option encoding must be evt3 or mono, got 'evt2'",
+        ),
         ({"include": ["drone"]}, r"include\[0\] must be a Cortex topic"),
         ([1], "the settings must be a mapping"),
     ],
@@ -287,6 +305,35 @@ def test_two_routes_that_do_not_go_together(change, reason):
 def test_wrong_settings_are_refused_with_their_name(settings, message_):
     with pytest.raises(ConfigError, match=message_):
         load(settings)
+
+
+def test_the_old_name_of_the_domain_of_cortex_works():
+    assert load({"domain": 7}) == load({"cortex_domain": 7})
+
+
+def test_an_option_that_no_route_of_its_entry_has_is_a_problem():
+    """One that some of them have is for those."""
+    settings = {"routes": [{"cortex": "/drone/imu", "options": {"encoding": "evt3", "queue": 9}}]}
+    (problem,) = make_routes(DRONE, load(settings))[1]
+    assert problem == (
+        "routes[0].options: no route of /drone/imu has the option 'encoding', "
+        "known: angular_velocity_std_rad_s, linear_acceleration_std_m_s2, queue"
+    )
+    settings = {"routes": [{"cortex": "/drone/*", "options": {"encoding": "mono", "stale_s": 1}}]}
+    assert make_routes(DRONE, load(settings))[1] == []
+
+
+def test_entries_that_fit_nothing_are_said():
+    entries = [{"cortex": "/dron/imu"}, {"cortex": "/drone/command/ratse"}, {"cortex": "/drone/*"}]
+    assert unfit(DRONE, load({"routes": entries})) == [
+        "routes[0]: no Cortex topic fits /dron/imu, did you mean /drone/imu?",
+        "routes[1]: no Cortex topic fits /drone/command/ratse, did you mean /drone/command/rates?",
+    ]
+
+
+def test_depth_becomes_a_cloud_on_request():
+    entry = {"cortex": "/drone/rgb", "type": "sensor_msgs/PointCloud2", "options": {"depth_max_m": 5.0}}
+    assert routed({"routes": [entry]})["/drone/rgb", "PointCloud2"].ros_topic == "/drone/rgb/points"
 
 
 def test_a_settings_file_is_named_in_its_errors(tmp_path):

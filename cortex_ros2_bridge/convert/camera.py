@@ -1,0 +1,172 @@
+"""Pictures, their calibration, and clouds of points."""
+
+from __future__ import annotations
+
+import functools
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortex import messages
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge.convert.context import Context, ConvertError
+from cortex_ros2_bridge.convert.records import header, record
+
+_POINT_FLOAT32 = 7
+_NAMED_PIXELS = {
+    "mono8": ("u1", 1),
+    "mono16": ("u2", 1),
+    "rgb8": ("u1", 3),
+    "bgr8": ("u1", 3),
+    "rgba8": ("u1", 4),
+    "bgra8": ("u1", 4),
+    "rgb16": ("u2", 3),
+    "bgr16": ("u2", 3),
+}
+_PIXEL = re.compile(r"(8|16|32|64)([USF])C([1-9][0-9]*)")
+
+
+def image(message: messages.Image, context: Context) -> Buffer:
+    """Convert to sensor_msgs/Image; encodings are called the same."""
+    data = np.ascontiguousarray(message.data)
+    if data.ndim != 3:
+        raise ConvertError(f"an image must have rows, columns and channels, got shape {data.shape}")
+    height, width, channels = data.shape
+    dtype, expected = _pixel(message.encoding)
+    if data.dtype.newbyteorder("=") != dtype or channels != expected:
+        raise ConvertError(
+            f"{message.encoding} means {expected} channels of {dtype}, got {channels} of {data.dtype}"
+        )
+    made = record("sensor_msgs/msg/Image")(
+        header(message.stamp_ns, message.frame_id or context.frame_id, context),
+        height,
+        width,
+        message.encoding,
+        int(data.dtype.byteorder == ">"),
+        width * channels * data.itemsize,
+        data.reshape(-1).view(np.uint8),
+    )
+    return cdr.encode(made)
+
+
+def image_camera_info(message: messages.Image, context: Context) -> Buffer | None:
+    """Return the calibration of the camera, as sensor_msgs/CameraInfo with the stamp of a picture.
+
+    None, as long as the calibration is not known.
+    """
+    return calibration(message.stamp_ns, context.camera_info, context)
+
+
+def camera_info(message: messages.CameraInfo, context: Context) -> Buffer | None:
+    """Convert to sensor_msgs/CameraInfo.
+
+    In ROS the centre of the first pixel is at 0, in Cortex at 0.5: the principal point moves by half a pixel.
+    """
+    return calibration(message.stamp_ns, message, context)
+
+
+def point_cloud(message: messages.PointCloud, context: Context) -> Buffer:
+    """Convert to sensor_msgs/PointCloud2 with fields x, y, z and, where there are such, intensity and rgb."""
+    count = len(message.points)
+    names = ["x", "y", "z"]
+    names += ["intensity"] if message.intensity is not None else []
+    names += ["rgb"] if message.color is not None else []
+    points = np.empty((count, len(names)), "<f4")
+    points[:, :3] = message.points
+    if message.intensity is not None:
+        points[:, 3] = _of_length("intensity", message.intensity, count)
+    if message.color is not None:
+        color = _of_length("color", message.color, count)
+        packed = points[:, -1:].view("u1")  # a float to PCL and RViz, whose bytes are blue, green, red, 0
+        packed[:, :3], packed[:, 3] = color[:, ::-1], 0
+    describe = record("sensor_msgs/msg/PointField")
+    fields = [describe(name, 4 * index, _POINT_FLOAT32, 1) for index, name in enumerate(names)]
+    made = record("sensor_msgs/msg/PointCloud2")(
+        header(message.stamp_ns, message.frame_id or context.frame_id, context),
+        1,
+        count,
+        fields,
+        False,
+        4 * len(names),
+        points.nbytes,
+        points.reshape(-1).view(np.uint8),
+        bool(np.isfinite(message.points).all()),
+    )
+    return cdr.encode(made)
+
+
+def point_cloud_of_depth(message: messages.Image, context: Context) -> Buffer | None:
+    """Convert a picture of depths [m] (32FC1) to sensor_msgs/PointCloud2, in its optical frame.
+
+    Depth is measured along the axis. Pixels without a finite depth, and beyond the option `depth_max_m`, have
+    no point. A distortion is not undone.
+
+    Returns:
+        None, as long as the calibration is not known.
+    """
+    if message.encoding != "32FC1" or np.ndim(message.data) != 3:
+        raise ConvertError(f"only a picture of depths (32FC1) becomes a cloud, not one of {message.encoding}")
+    lens = context.camera_info
+    if lens is None:
+        return None
+    depth = np.asarray(message.data, np.float32)[:, :, 0]
+    if depth.shape != (lens.height, lens.width):
+        raise ConvertError(f"a picture of {depth.shape} pixels, calibrated for {lens.height, lens.width}")
+    depth_max_m = context.option("depth_max_m")
+    row, column = np.nonzero(depth < (np.inf if depth_max_m is None else depth_max_m))
+    z = depth[row, column]
+    fx, fy, cx, cy = lens.matrix[0, 0], lens.matrix[1, 1], lens.matrix[0, 2], lens.matrix[1, 2]
+    points = np.stack([(column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z, z], axis=1)
+    cloud = messages.PointCloud(message.stamp_ns, points.astype(np.float32), frame_id=message.frame_id)
+    return point_cloud(cloud, context)
+
+
+def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Context) -> Buffer | None:
+    """Return a calibration as sensor_msgs/CameraInfo, with another stamp [ns]; None of none."""
+    if message is None:
+        return None
+    matrix = np.array(message.matrix, np.float64)
+    matrix[0, 2] -= 0.5
+    matrix[1, 2] -= 0.5
+    projection = np.zeros((3, 4))
+    projection[:, :3] = matrix
+    distortion = np.array(message.distortion, np.float64)
+    if not message.distortion_model:
+        distortion = np.zeros(5)
+    made = record("sensor_msgs/msg/CameraInfo")(
+        header(stamp_ns, message.frame_id or context.frame_id, context),
+        message.height,
+        message.width,
+        message.distortion_model or "plumb_bob",
+        distortion,
+        matrix.reshape(-1),
+        np.eye(3).reshape(-1),
+        projection.reshape(-1),
+        0,
+        0,
+        record("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False),
+    )
+    return cdr.encode(made)
+
+
+@functools.cache
+def _pixel(encoding: str) -> tuple[np.dtype[Any], int]:
+    """Return what one channel is, and how many there are."""
+    kind, channels = _NAMED_PIXELS.get(encoding, ("", 0))
+    general = _PIXEL.fullmatch(encoding)
+    if general is not None:
+        bits, letter, count = general.groups()
+        kind, channels = f"{ {'U': 'u', 'S': 'i', 'F': 'f'}[letter] }{int(bits) // 8}", int(count)
+    if not kind or kind == "f1":
+        known = ", ".join(_NAMED_PIXELS)
+        raise ConvertError(f"unknown encoding {encoding!r} of an image, known: {known}, and such as 32FC1")
+    return np.dtype(kind), channels
+
+
+def _of_length(name: str, values: NDArray[Any], count: int) -> NDArray[Any]:
+    if len(values) != count:
+        raise ConvertError(f"a point cloud with {count} points and {len(values)} values of {name}")
+    return values

@@ -1,0 +1,253 @@
+"""Commands and requests of ROS, to those of Cortex. All of these also raise `cdr.CdrError`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortex import messages
+from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
+
+DEFAULT_MAX_THRUST_N = 50.13
+"""Thrust of an AttitudeTarget with thrust 1 [N], if neither an option nor the simulator says otherwise.
+
+It is that of the airframe that Neurosim flies by default: four rotors at 1500 rad/s with 5.57e-6 N s^2."""
+_IGNORE_RATES = (1, 2, 4)
+_IGNORE_THRUST, _IGNORE_ATTITUDE = 64, 128
+_KNOWN_BITS = sum(_IGNORE_RATES) | _IGNORE_THRUST | _IGNORE_ATTITUDE
+
+
+def actuators(data: Buffer, context: Context) -> messages.MotorCommand:
+    """Convert actuator_msgs/Actuators: rotor speeds [rad/s] from `velocity`.
+
+    With the option `max_speed_rad_s`, also from `normalized`, 0 to 1.
+    """
+    message = cdr.decode_record(data, "actuator_msgs/msg/Actuators")
+    speed = np.array(message.velocity, np.float64)
+    if not len(speed) and len(message.normalized):
+        largest = context.option("max_speed_rad_s")
+        if largest is None:
+            raise ConvertError(
+                "Actuators.normalized needs the option max_speed_rad_s; or set velocity [rad/s]"
+            )
+        speed = np.array(message.normalized, np.float64)
+        if (speed > 1.0).any():
+            raise ConvertError(f"Actuators.normalized must be 0 to 1, got {speed.max()}")
+        speed *= largest
+    if not len(speed):
+        raise ConvertError("Actuators.velocity is empty: it holds the speed of each rotor [rad/s]")
+    check_finite("rotor speeds", speed)
+    if (speed < 0.0).any():
+        raise ConvertError(f"rotor speeds must be >= 0, got {speed.min()} rad/s")
+    return messages.MotorCommand(stamp_ns=_stamp_ns(message, context), speed=speed, sequence=context.sequence)
+
+
+def attitude(data: Buffer, context: Context) -> messages.AttitudeCommand | None:
+    """Convert a mavros_msgs/AttitudeTarget whose type_mask does not ignore the attitude.
+
+    Body rates that it does not ignore either must be finite, and are not used: the attitude decides.
+
+    Returns:
+        None if it ignores the attitude.
+    """
+    message = cdr.decode_record(data, "mavros_msgs/msg/AttitudeTarget")
+    if message.type_mask & _IGNORE_ATTITUDE:
+        return None
+    _check_mask(message.type_mask)
+    for bit, axis in zip(_IGNORE_RATES, "xyz", strict=True):
+        if not message.type_mask & bit:
+            check_finite(f"body_rate.{axis}", getattr(message.body_rate, axis))
+    return messages.AttitudeCommand(
+        stamp_ns=_stamp_ns(message, context),
+        thrust_n=_thrust_n(message, context),
+        orientation=_unit(message.orientation),
+        sequence=context.sequence,
+    )
+
+
+def rates(data: Buffer, context: Context) -> messages.RateThrustCommand | None:
+    """Convert a mavros_msgs/AttitudeTarget whose type_mask ignores the attitude, and no rate.
+
+    Returns:
+        None if it does not ignore the attitude.
+    """
+    message = cdr.decode_record(data, "mavros_msgs/msg/AttitudeTarget")
+    if not message.type_mask & _IGNORE_ATTITUDE:
+        return None
+    _check_mask(message.type_mask)
+    if message.type_mask & sum(_IGNORE_RATES):
+        raise ConvertError(
+            f"type_mask {message.type_mask} ignores the attitude and a body rate: all three are needed then"
+        )
+    rate = _xyz(message.body_rate)
+    check_finite("body rates", rate)
+    return messages.RateThrustCommand(
+        stamp_ns=_stamp_ns(message, context),
+        thrust_n=_thrust_n(message, context),
+        body_rate=rate,
+        sequence=context.sequence,
+    )
+
+
+def twist_stamped(data: Buffer, context: Context) -> messages.VelocityCommand:
+    """Convert geometry_msgs/TwistStamped; its frame says what the velocity is relative to.
+
+    base_link: the vehicle as it is tilted now (REP 147); base_footprint: level, x where its nose points; map
+    or odom: the ground. For an empty frame the option `frame` decides, as for a Twist. The yaw rate is always
+    that of the heading, about the vertical.
+    """
+    message = cdr.decode_record(data, "geometry_msgs/msg/TwistStamped")
+    frame = message.header.frame_id or context.option("frame")
+    return _velocity(message.twist, frame, _stamp_ns(message, context), context)
+
+
+def twist(data: Buffer, context: Context) -> messages.VelocityCommand:
+    """Convert geometry_msgs/Twist, in the frame that the option `frame` names, by default base_footprint."""
+    message = cdr.decode_record(data, "geometry_msgs/msg/Twist")
+    return _velocity(message, context.option("frame"), context.now_ns, context)
+
+
+def pose(data: Buffer, context: Context) -> messages.PoseCommand:
+    """Convert geometry_msgs/PoseStamped in the map or odom frame: position and heading; tilt is not used."""
+    message = cdr.decode_record(data, "geometry_msgs/msg/PoseStamped")
+    return _pose_command(message, message.pose.position, message.pose.orientation, context)
+
+
+def trajectory(data: Buffer, context: Context) -> messages.PoseCommand:
+    """Convert the first point of a trajectory_msgs/MultiDOFJointTrajectory in the map or odom frame."""
+    message = cdr.decode_record(data, "trajectory_msgs/msg/MultiDOFJointTrajectory")
+    if not message.points:
+        raise ConvertError("a trajectory without points")
+    if not message.points[0].transforms:
+        raise ConvertError("the first point of the trajectory has no transform")
+    first = message.points[0].transforms[0]
+    return _pose_command(message, first.translation, first.rotation, context)
+
+
+def reset(data: Buffer, context: Context) -> messages.Reset:
+    """Convert neurosim/Reset."""
+    message = cdr.decode_record(data, "neurosim/msg/Reset")
+    chosen: dict[str, Any] = {}
+    if message.use_seed:
+        chosen["seed"] = int(message.seed)
+    if message.use_pose:
+        chosen["position"] = _xyz(message.pose.position)
+        check_finite("position", chosen["position"])
+        chosen["orientation"] = _unit(message.pose.orientation)
+    if message.use_twist:
+        chosen["velocity"] = _xyz(message.twist.linear)
+        chosen["body_rate"] = _xyz(message.twist.angular)
+        check_finite("twist", chosen["velocity"], chosen["body_rate"])
+    return messages.Reset(vehicle=message.vehicle, **chosen)
+
+
+def reset_empty(data: Buffer, context: Context) -> messages.Reset:
+    """Convert std_msgs/Empty to a reset to what is configured."""
+    cdr.decode_record(data, "std_msgs/msg/Empty")
+    return messages.Reset()
+
+
+def trigger(data: Buffer, context: Context) -> messages.Trigger:
+    """Convert std_msgs/Empty to a request without arguments."""
+    cdr.decode_record(data, "std_msgs/msg/Empty")
+    return messages.Trigger(context.sequence)
+
+
+def steps(data: Buffer, context: Context) -> messages.Step:
+    """Convert std_msgs/UInt32: control periods to go on for."""
+    count = cdr.decode_record(data, "std_msgs/msg/UInt32").data
+    if count < 1:
+        raise ConvertError("a step of 0 control periods")
+    return messages.Step(count)
+
+
+def _xyz(vector: Any) -> NDArray[np.float64]:
+    return np.array([vector.x, vector.y, vector.z], np.float64)
+
+
+def _unit(quaternion: Any) -> NDArray[np.float64]:
+    q = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], np.float64)
+    check_finite("orientation", q)
+    norm = math.hypot(*q)
+    if not 0.9 < norm < 1.1:  # rounded numbers of people are fine, zeros and angles are not
+        raise ConvertError(f"orientation is no unit quaternion (x, y, z, w): {q.tolist()}")
+    return q / norm
+
+
+def _stamp_ns(message: Any, context: Context) -> int:
+    stamp = message.header.stamp
+    if stamp.sec < 0 or stamp.nanosec >= 1_000_000_000:
+        raise ConvertError(f"a stamp of {stamp.sec} s and {stamp.nanosec} ns")
+    return stamp.sec * 1_000_000_000 + stamp.nanosec or context.now_ns
+
+
+def _thrust_n(message: Any, context: Context) -> float:
+    if message.type_mask & _IGNORE_THRUST:
+        raise ConvertError(f"type_mask {message.type_mask} ignores thrust, without which nothing flies")
+    if not 0.0 <= message.thrust <= 1.0:  # also refuses nan
+        raise ConvertError(f"thrust must be 0 to 1, got {message.thrust}")
+    return float(message.thrust) * max_thrust_n(context)
+
+
+def max_thrust_n(context: Context) -> float:
+    """Return the thrust of an AttitudeTarget with thrust 1: the option, else what the simulator says [N]."""
+    chosen = context.option("max_thrust_n")
+    if chosen is None:
+        chosen = context.max_thrust_n
+    return DEFAULT_MAX_THRUST_N if chosen is None else float(chosen)
+
+
+def _check_mask(mask: int) -> None:
+    """Refuse bits that mean something else than what is read, such as MAVLink's THRUST_BODY_SET (32)."""
+    if mask & ~_KNOWN_BITS:
+        raise ConvertError(
+            f"type_mask {mask} has bits that AttitudeTarget does not define: {mask & ~_KNOWN_BITS}"
+        )
+
+
+def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> messages.VelocityCommand:
+    velocity, rate = _xyz(message.linear), _xyz(message.angular)
+    check_finite("velocity", velocity, rate)
+    if rate[0] or rate[1]:
+        raise ConvertError(
+            f"angular.x and angular.y must be 0: only the heading can turn, got {rate.tolist()}"
+        )
+    kind = context.frames.kind_of(frame, context.vehicle)
+    if kind is None:
+        names = (
+            f"{context.frames.body_of(context.vehicle)}, base_footprint, {context.frames.ros(frames.WORLD)}"
+        )
+        raise ConvertError(f"a velocity in frame {frame!r}, known: {names}")
+    if kind != "world":
+        if context.odometry is None:
+            raise ConvertError(f"no odometry yet that would say how {frame} is turned")
+        q = context.odometry.orientation
+        if kind == "heading":
+            half = 0.5 * frames.yaw_rad(q)
+            q = np.array([0.0, 0.0, math.sin(half), math.cos(half)])
+        velocity = frames.rotate(q, velocity)
+    return messages.VelocityCommand(
+        stamp_ns=stamp_ns, velocity=velocity, yaw_rate_rad_s=float(rate[2]), sequence=context.sequence
+    )
+
+
+def _pose_command(message: Any, point: Any, quaternion: Any, context: Context) -> messages.PoseCommand:
+    frame = message.header.frame_id
+    if frame and context.frames.kind_of(frame, context.vehicle) != "world":
+        world = context.frames.ros(frames.WORLD)
+        raise ConvertError(
+            f"a pose in frame {frame!r}, known: {world}, {context.frames.odom_of(context.vehicle)}"
+        )
+    position = _xyz(point)
+    check_finite("position", position)
+    return messages.PoseCommand(
+        stamp_ns=_stamp_ns(message, context),
+        position=position,
+        yaw_rad=frames.yaw_rad(_unit(quaternion)),
+        sequence=context.sequence,
+    )

@@ -1,0 +1,173 @@
+"""Events: as packets, as arrays, and drawn as pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cortex import messages
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge.convert.camera import calibration
+from cortex_ros2_bridge.convert.context import Context, ConvertError
+from cortex_ros2_bridge.convert.records import header, record
+from cortex_ros2_bridge.event_codec import (
+    Bytes,
+    EventCodecError,
+    EventPicture,
+    Evt3Encoder,
+    dvs_size,
+    encode_mono,
+    write_dvs,
+)
+
+_NO_BYTES: Bytes = np.empty(0, np.uint8)
+
+
+def event_packet(message: messages.Events, context: Context) -> Buffer:
+    """Convert to event_camera_msgs/EventPacket; the option `encoding` is evt3 (default) or mono.
+
+    As drivers do it, its stamp is the time of the first event; of a packet without events, the end of its
+    window. `time_base` is that time in mono, and 0 in evt3, where it has no meaning.
+    """
+    encoding = context.option("encoding")
+    stamp_ns = _events_stamp_ns(message)
+    base_us = stamp_ns // 1000
+    if encoding == "mono" and base_us < 0:
+        raise ConvertError(f"mono holds no time before 0, got {base_us} us")
+    prefix = cdr.encode(
+        record("event_camera_msgs/msg/EventPacket")(
+            header(stamp_ns, message.frame_id or context.frame_id, context),
+            message.height,
+            message.width,
+            message.sequence,
+            base_us * 1000 if encoding == "mono" else 0,
+            encoding,
+            False,
+            _NO_BYTES,
+        )
+    )
+    room = _Room(prefix)
+    columns = (message.t, message.x, message.y, message.polarity)
+    try:
+        if encoding == "mono":
+            encode_mono(
+                *columns, width=message.width, height=message.height, base_us=base_us, allocate=room.make
+            )
+        else:
+            encoder = context.remembered("evt3", Evt3Encoder)
+            encoder.encode(
+                *columns, width=message.width, height=message.height, end_us=base_us, allocate=room.make
+            )
+    except EventCodecError as error:
+        raise ConvertError(str(error)) from error
+    return room.message()
+
+
+def event_array(message: messages.Events, context: Context) -> Buffer:
+    """Convert to dvs_msgs/EventArray, which older programs use; stamped as an event packet is."""
+    prefix = cdr.encode(
+        record("dvs_msgs/msg/EventArray")(
+            header(_events_stamp_ns(message), message.frame_id or context.frame_id, context),
+            message.height,
+            message.width,
+            [],
+        )
+    )
+    room = _Room(prefix)
+    count = len(message.t)
+    try:
+        write_dvs(
+            room.make(dvs_size(count), count=count),
+            message.t,
+            message.x,
+            message.y,
+            message.polarity,
+            width=message.width,
+            height=message.height,
+        )
+    except EventCodecError as error:
+        raise ConvertError(str(error)) from error
+    return room.message()
+
+
+def event_image(message: messages.Events, context: Context) -> Buffer | None:
+    """Draw events, and return a sensor_msgs/Image (rgb8) each time that the option `period_s` has passed.
+
+    White where there was no event, else the last one: blue is brighter, red is darker. The default is 1/30 s
+    of simulated time. A picture ends with the window in which a multiple of the period lies, and has its
+    stamp.
+    """
+    size = (int(message.width), int(message.height))
+    if context.memory.get("picture_size") != size:
+        context.memory["picture_size"] = size
+        context.memory["picture"] = EventPicture(width=size[0], height=size[1])
+    picture: EventPicture = context.memory["picture"]
+    if message.stamp_ns < context.memory.get("seen_until_ns", message.stamp_ns):  # time was set back
+        picture.take()
+    ends = _ends_picture(message, context)
+    try:
+        picture.add(message.x, message.y, message.polarity)
+    except EventCodecError as error:
+        raise ConvertError(str(error)) from error
+    if not ends:
+        return None
+    data = picture.take()
+    made = record("sensor_msgs/msg/Image")(
+        header(message.stamp_ns, message.frame_id or context.frame_id, context),
+        size[1],
+        size[0],
+        "rgb8",
+        0,
+        3 * size[0],
+        data.reshape(-1),
+    )
+    return cdr.encode(made)
+
+
+def events_camera_info(message: messages.Events, context: Context) -> Buffer | None:
+    """Return the calibration of an event camera with the stamp of a picture of `event_image`.
+
+    None between these pictures, and as long as the calibration is not known. The option `period_s` must be
+    that of the pictures.
+    """
+    if not _ends_picture(message, context):
+        return None
+    return calibration(message.stamp_ns, context.camera_info, context)
+
+
+def _ends_picture(message: messages.Events, context: Context) -> bool:
+    """Return whether a multiple of the period lies in the window, or between it and the one before.
+
+    So all who see the same windows, to draw or to calibrate, find the same ones, whenever they began.
+    """
+    period_ns = max(round(context.option("period_s") * 1e9), 1)
+    until_ns: int = context.memory.get("seen_until_ns", message.start_ns)
+    context.memory["seen_until_ns"] = message.stamp_ns
+    begin_ns = until_ns if until_ns <= message.stamp_ns else message.start_ns
+    return message.stamp_ns // period_ns > begin_ns // period_ns
+
+
+class _Room:
+    """Makes room behind the beginning of a message for what its last field holds: nothing is copied twice."""
+
+    def __init__(self, prefix: memoryview) -> None:
+        """Begin with a message whose last field is an empty sequence: the last 4 bytes are its length, 0."""
+        self._prefix = prefix
+        self._buffer = _NO_BYTES
+
+    def make(self, size: int, *, count: int | None = None) -> Bytes:
+        """Return so many bytes to write to, and up to 3 more; `count` elements, None: of one byte."""
+        begin = len(self._prefix)
+        self._buffer = np.empty(begin + (size + 3 & -4), np.uint8)
+        self._buffer[:begin] = self._prefix
+        self._buffer[begin - 4 : begin].view("<u4")[0] = size if count is None else count
+        return self._buffer[begin:]
+
+    def message(self) -> memoryview:
+        """Return the message."""
+        return self._buffer.data.toreadonly()
+
+
+def _events_stamp_ns(message: messages.Events) -> int:
+    """Return the time of the first event, or of the end of a window without any [ns]."""
+    return int(message.t[0]) * 1000 if len(message.t) else message.stamp_ns

@@ -1,0 +1,152 @@
+"""What a simulator says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from cortex import messages
+from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge.convert.context import Context
+from cortex_ros2_bridge.convert.records import header, point, record
+
+DIAGNOSTICS_INTERVAL_NS = 900_000_000
+"""Shortest wall-clock time between two arrays of one phase [ns]: about one a second, as others send them."""
+
+_OK, _WARN, _ERROR = 0, 1, 2
+_SIMULATOR_VALUES = (
+    *("mode", "real_time_factor", "real_time_factor_wanted", "step_count"),
+    *("step_median_ns", "step_p99_ns", "late_p99_ns", "overrun_count", "slipped_ns"),
+)
+_SENSOR_VALUES = ("subscriber_count", "published_count", "dropped_count", "injected_lost_count")
+_VEHICLE_VALUES = (
+    *("command_count", "refused_count", "refused_reason", "superseded_count", "lost_count"),
+    *("command_age_ns", "fail_safe_count", "collision_count"),
+)
+
+
+def text(message: messages.Text, context: Context) -> Buffer:
+    """Convert to std_msgs/String."""
+    return cdr.encode(record("std_msgs/msg/String")(message.text))
+
+
+def simulation(message: messages.Simulation, context: Context) -> Buffer:
+    """Convert to std_msgs/String: the settings, as YAML."""
+    return cdr.encode(record("std_msgs/msg/String")(message.config))
+
+
+def collision(message: messages.Collision, context: Context) -> Buffer:
+    """Convert to neurosim/Collision, in the map frame."""
+    made = record("neurosim/msg/Collision")(
+        header(message.stamp_ns, frames.WORLD, context), point(message.position), float(message.clearance_m)
+    )
+    return cdr.encode(made)
+
+
+def simulator_status(message: messages.SimulatorStatus, context: Context) -> Buffer:
+    """Convert to neurosim/SimulatorStatus; counts are sums over sensors and vehicles."""
+    second, nanosecond = divmod(message.slipped_ns, 1_000_000_000)
+    made = record("neurosim/msg/SimulatorStatus")(
+        header(message.stamp_ns, "", context),
+        message.phase,
+        message.reason,
+        message.mode,
+        message.real_time_factor,
+        message.real_time_factor_wanted,
+        message.step_count,
+        message.overrun_count,
+        record("builtin_interfaces/msg/Duration")(second, nanosecond),
+        sum(sensor.dropped_count for sensor in message.sensors),
+        sum(vehicle.refused_count for vehicle in message.vehicles),
+        sum(vehicle.collision_count for vehicle in message.vehicles),
+        any(vehicle.fail_safe for vehicle in message.vehicles),
+    )
+    return cdr.encode(made)
+
+
+def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -> Buffer | None:
+    """Convert to diagnostic_msgs/DiagnosticArray: of the simulator, of each sensor and vehicle.
+
+    What is counted is judged over the time since the array before, and said in `message`; `values` are sums.
+
+    Returns:
+        None, if the array before is not a second old and the phase is the same.
+    """
+    before: messages.SimulatorStatus | None = context.memory.get("judged")
+    if before is not None and not _is_due(message, before):
+        return None
+    context.memory["judged"] = message
+    judged = _Judged(message, before)
+    statuses = [_of_simulator(message, judged)]
+    statuses += [_of_sensor(sensor, judged) for sensor in message.sensors]
+    statuses += [_of_vehicle(vehicle, judged) for vehicle in message.vehicles]
+    array = record("diagnostic_msgs/msg/DiagnosticArray")
+    return cdr.encode(array(header(message.stamp_ns, "", context), statuses))
+
+
+def _is_due(message: messages.SimulatorStatus, before: messages.SimulatorStatus) -> bool:
+    return message.phase != before.phase or abs(message.wall_ns - before.wall_ns) >= DIAGNOSTICS_INTERVAL_NS
+
+
+class _Judged:
+    """Compares a status with the one before."""
+
+    def __init__(self, now: messages.SimulatorStatus, before: messages.SimulatorStatus | None) -> None:
+        self._before: dict[str, Any] = {}
+        if before is not None:
+            self._before = {"": before}
+            self._before |= {f"{sensor.vehicle}/{sensor.name}": sensor for sensor in before.sensors}
+            self._before |= {vehicle.name: vehicle for vehicle in before.vehicles}
+        elapsed_s = 0.0 if before is None else abs(now.wall_ns - before.wall_ns) / 1e9
+        self.period = f"in {elapsed_s:.1f} s" if before is not None else "so far"
+
+    def more(self, now: Any, name: str, of: str = "") -> int:
+        """Return by how much a count has grown; all of it, if it is new or began anew."""
+        count: int = getattr(now, name)
+        then = getattr(self._before.get(of), name, 0)
+        return count - then if count >= then else count
+
+
+def _of_simulator(message: messages.SimulatorStatus, judged: _Judged) -> Any:
+    late, slipped_ns = judged.more(message, "overrun_count"), judged.more(message, "slipped_ns")
+    said = f"{message.phase}: {message.reason}" if message.reason else message.phase
+    if message.phase == "running":
+        said += f", {message.real_time_factor:.3g} x real time"
+    if late or slipped_ns:
+        said += f"; {late} steps were late, and {slipped_ns / 1e9:.3f} s slipped {judged.period}"
+    level = _ERROR if message.phase == "ended" else _WARN if late or slipped_ns else _OK
+    return _status(level, "simulator", said, "simulator", message, _SIMULATOR_VALUES)
+
+
+def _of_sensor(sensor: messages.SensorStatus, judged: _Judged) -> Any:
+    name = f"{sensor.vehicle}/{sensor.name}"
+    dropped = judged.more(sensor, "dropped_count", name)
+    unwanted = dropped > judged.more(sensor, "injected_lost_count", name)
+    said = "ok" if sensor.active else "idle"
+    if dropped:
+        said = f"{dropped} dropped {judged.period}" + ("" if unwanted else ", as its link is configured")
+    level = _WARN if unwanted else _OK
+    return _status(level, f"sensor {name}", said, sensor.vehicle, sensor, _SENSOR_VALUES)
+
+
+def _of_vehicle(vehicle: messages.VehicleStatus, judged: _Judged) -> Any:
+    trouble = ["no command has come in time: the fail-safe flies"] if vehicle.fail_safe else []
+    refused = judged.more(vehicle, "refused_count", vehicle.name)
+    if refused:
+        reason = f" ({vehicle.refused_reason})" if vehicle.refused_reason else ""
+        trouble.append(f"{refused} commands refused {judged.period}{reason}")
+    collisions = judged.more(vehicle, "collision_count", vehicle.name)
+    if collisions:
+        trouble.append(f"{collisions} collisions {judged.period}")
+    mode = f"commands: {vehicle.command_mode}" if vehicle.command_mode else "no command yet"
+    said = "; ".join([*trouble, mode])
+    return _status(
+        _WARN if trouble else _OK, f"vehicle {vehicle.name}", said, vehicle.name, vehicle, _VEHICLE_VALUES
+    )
+
+
+def _status(level: int, name: str, said: str, hardware: str, source: Any, values: Sequence[str]) -> Any:
+    pair = record("diagnostic_msgs/msg/KeyValue")
+    pairs = [pair(key, str(getattr(source, key))) for key in values]
+    return record("diagnostic_msgs/msg/DiagnosticStatus")(level, name, said, hardware, pairs)

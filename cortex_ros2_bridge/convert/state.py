@@ -1,0 +1,184 @@
+"""State of vehicles: time, inertial measurements, odometry, frames, rotors, paths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortex import messages
+from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
+from cortex_ros2_bridge.convert.records import (
+    header,
+    pose_of,
+    quaternion,
+    record,
+    time_of,
+    transform_record,
+    vector,
+)
+from cortex_ros2_bridge.frames import FrameNames
+
+_NO_FLOATS: NDArray[np.float64] = np.empty(0)
+
+
+def clock(message: messages.Clock, context: Context) -> Buffer:
+    """Convert to rosgraph_msgs/Clock."""
+    return cdr.encode(record("rosgraph_msgs/msg/Clock")(time_of(message.stamp_ns)))
+
+
+def imu(message: messages.Imu, context: Context) -> Buffer:
+    """Convert to sensor_msgs/Imu, without an orientation (its covariance begins with -1); at rest z is 9.81.
+
+    The options `angular_velocity_std_rad_s` and `linear_acceleration_std_m_s2` give standard deviations of
+    one sample, of which the covariances are made; 0, as in ROS, means that they are unknown.
+    """
+    check_finite("imu", message.angular_rate, message.specific_force)
+    unknown = np.zeros(9)
+    unknown[0] = -1.0
+    made = record("sensor_msgs/msg/Imu")(
+        header(message.stamp_ns, context.frame_id, context),
+        quaternion((0.0, 0.0, 0.0, 1.0)),
+        unknown,
+        vector(message.angular_rate),
+        _diagonal([context.option("angular_velocity_std_rad_s")] * 3),
+        vector(message.specific_force),
+        _diagonal([context.option("linear_acceleration_std_m_s2")] * 3),
+    )
+    return cdr.encode(made)
+
+
+def odometry(message: messages.Odometry, context: Context) -> Buffer:
+    """Convert to nav_msgs/Odometry: the pose in the odom frame, the velocity turned into the body frame.
+
+    The options `position_std_m`, `orientation_std_rad`, `velocity_std_m_s` and `angular_velocity_std_rad_s`
+    give standard deviations, of which the covariances are made; 0 is the default.
+    """
+    check_finite("odometry", message.velocity, message.body_rate)
+    _check_pose(message)
+    pose = record("geometry_msgs/msg/PoseWithCovariance")(
+        pose_of(message.position, message.orientation),
+        _diagonal([context.option("position_std_m")] * 3 + [context.option("orientation_std_rad")] * 3),
+    )
+    velocity = frames.rotate_back(message.orientation, message.velocity)
+    twist = record("geometry_msgs/msg/TwistWithCovariance")(
+        record("geometry_msgs/msg/Twist")(vector(velocity), vector(message.body_rate)),
+        _diagonal(
+            [context.option("velocity_std_m_s")] * 3 + [context.option("angular_velocity_std_rad_s")] * 3
+        ),
+    )
+    head = record("std_msgs/msg/Header")(time_of(message.stamp_ns), context.frames.odom_of(context.vehicle))
+    return cdr.encode(
+        record("nav_msgs/msg/Odometry")(head, context.frames.body_of(context.vehicle), pose, twist)
+    )
+
+
+def odometry_transform(message: messages.Odometry, context: Context) -> Buffer:
+    """Convert to tf2_msgs/TFMessage: from the odom frame to the body frame."""
+    _check_pose(message)
+    names = context.frames
+    return _transforms(
+        [
+            transform_record(
+                message.stamp_ns,
+                names.odom_of(context.vehicle),
+                names.body_of(context.vehicle),
+                message.position,
+                message.orientation,
+            )
+        ]
+    )
+
+
+def transform(message: messages.Transform, context: Context) -> Buffer:
+    """Convert to tf2_msgs/TFMessage."""
+    return _transforms([_transform_of(message, context.frames)])
+
+
+def static_transforms(
+    transforms: Iterable[messages.Transform], vehicles: Iterable[str], names: FrameNames
+) -> Buffer:
+    """Return one tf2_msgs/TFMessage with all static transforms, and those from map to each vehicle's odom.
+
+    Args:
+        transforms: Where sensors sit.
+        vehicles: Names of the vehicles.
+        names: Names of frames in ROS.
+
+    Raises:
+        ConvertError: A transform has numbers that are not finite, or no rotation.
+    """
+    roots = [
+        transform_record(
+            0, names.ros(frames.WORLD), names.odom_of(vehicle), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+        )
+        for vehicle in vehicles
+    ]
+    return _transforms(roots + [_transform_of(each, names) for each in transforms])
+
+
+def check_transform(message: messages.Transform, names: FrameNames) -> None:
+    """Raise `ConvertError` unless a transform is one: finite, with a rotation, between two frames."""
+    _transform_of(message, names)
+
+
+def rotor_speeds(message: messages.RotorSpeeds, context: Context) -> Buffer:
+    """Convert to actuator_msgs/Actuators, velocities in the order of the rotors."""
+    speed = np.ascontiguousarray(message.speed, dtype=np.float64)
+    head = record("std_msgs/msg/Header")(time_of(message.stamp_ns), context.frames.body_of(context.vehicle))
+    return cdr.encode(record("actuator_msgs/msg/Actuators")(head, _NO_FLOATS, speed, _NO_FLOATS))
+
+
+def path(message: messages.Path, context: Context) -> Buffer:
+    """Convert to nav_msgs/Path; each pose is stamped with its time, and not turned."""
+    check_finite("path", message.position)
+    if len(message.time_ns) != len(message.position):
+        raise ConvertError(f"a path with {len(message.time_ns)} times for {len(message.position)} positions")
+    frame = message.frame_id or frames.WORLD
+    level = (0.0, 0.0, 0.0, 1.0)
+    stamped = record("geometry_msgs/msg/PoseStamped")
+    poses = [
+        stamped(header(time_ns, frame, context), pose_of(position, level))
+        for time_ns, position in zip(message.time_ns.tolist(), message.position, strict=True)
+    ]
+    return cdr.encode(record("nav_msgs/msg/Path")(header(message.stamp_ns, frame, context), poses))
+
+
+def _check_pose(message: messages.Odometry) -> None:
+    """Raise `ConvertError` for what tf would refuse message by message."""
+    check_finite("odometry", message.position, message.orientation)
+    if not np.any(message.orientation):
+        raise ConvertError("odometry: its orientation is zero")
+
+
+def _diagonal(deviations: list[float]) -> NDArray[np.float64]:
+    """Return a covariance without correlations, row by row."""
+    covariance = np.zeros(len(deviations) ** 2)
+    covariance[:: len(deviations) + 1] = np.square(deviations)
+    return covariance
+
+
+def _transform_of(message: messages.Transform, names: FrameNames) -> Any:
+    what = f"transform to {message.child!r}"
+    check_finite(what, message.translation, message.rotation)
+    if not message.child or not message.parent:
+        raise ConvertError(f"a transform from {message.parent!r} to {message.child!r}")
+    if names.ros(message.parent) == names.ros(message.child):
+        raise ConvertError(f"{what}: its parent is itself, which tf2 refuses")
+    if not np.any(message.rotation):
+        raise ConvertError(f"{what}: its rotation is zero")
+    return transform_record(
+        message.stamp_ns,
+        names.ros(message.parent),
+        names.ros(message.child),
+        message.translation,
+        message.rotation,
+    )
+
+
+def _transforms(records: list[Any]) -> Buffer:
+    return cdr.encode(record("tf2_msgs/msg/TFMessage")(records))
