@@ -15,6 +15,7 @@ import neurosim_core as ns
 from neurosim_core import simulation
 from neurosim_core.control import make_controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.render import launch
 from neurosim_core.vehicle import DynamicsError
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
@@ -535,6 +536,14 @@ def test_adaptive_events_do_not_depend_on_batches(settings, lane_count, instants
     expected = fly(settings, sensors=ADAPTIVE)
     got = fly_ahead(settings, lane_count, sensors=ADAPTIVE, instants_per_launch=instants)
     assert content(got) == content(expected)
+
+
+def test_adaptive_events_do_not_depend_on_the_number_of_threads(settings, monkeypatch):
+    runs = []
+    for count in (1, 3):
+        monkeypatch.setattr(launch, "core_count", lambda count=count: count)
+        runs.append(content(fly(settings, sensors=ADAPTIVE)))
+    assert runs[0] == runs[1]
 
 
 def test_adaptive_events_do_not_depend_on_the_other_cameras(settings):
