@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from multirotor_oracle import NO_AERO, angle, solve
+from pydantic import ValidationError
 
 from neurosim_core import load_config, simulation
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
@@ -90,6 +91,21 @@ def test_fast_tops_are_redone(device):
     assert vehicle.effort.redone_count.tolist() == [2]
     momentum = np.diag(inertia) * vehicle.state.body_rate[0]
     assert np.linalg.norm(momentum) == pytest.approx(2000.0 * np.linalg.norm(np.diag(inertia)), rel=1e-5)
+
+
+def test_moments_1_10_100_at_200_rad_s(device):
+    """No body has them, and the settings say so; the equations do not mind, and turn at 1e4 rad/s inside."""
+    inertia = ((1e-5, 0, 0), (0, 1e-4, 0), (0, 0, 1e-3))
+    with pytest.raises(ValidationError, match="no body has principal moments"):
+        preset("hummingbird", **{**ISOLATED, "inertia_kg_m2": inertia})
+    config = preset("hummingbird", **ISOLATED).model_copy(update={"inertia_kg_m2": inertia})
+    vehicle = Multirotor(config, device=device)
+    vehicle.reset(body_rate=200.0 / np.sqrt(3.0) * np.ones(3))
+    start = one(vehicle.state)
+    held = np.zeros((3, 4))
+    _, attitude_error = errors(fly(vehicle, held), solve(config, start, held, 0.01))
+    assert attitude_error < 1e-4
+    assert vehicle.effort.redone_count.tolist() == [3]
 
 
 @pytest.mark.parametrize("tau_s", [5e-3, 1e-6])
