@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurosim_core.clock import Rate
-from neurosim_core.schedule import Schedule, batch_end_ns, boundaries, boundary_count_max
+from neurosim_core.schedule import TICKS_PER_INSTANT, Schedule, batch_end_ns, boundaries, boundary_count_max
 
 hertz = st.sampled_from([20.0, 30.0, 100.0, 200.0, 333.0, 400.0, 500.0])
 schedules = st.builds(
@@ -18,6 +18,7 @@ schedules = st.builds(
     samplers=st.lists(hertz.map(Rate), max_size=2).map(tuple),
     casts=st.lists(hertz.map(Rate), max_size=2).map(tuple),
     instants_per_launch=st.integers(min_value=1, max_value=16),
+    sparse=st.sets(st.integers(min_value=0, max_value=1)).map(frozenset),
 )
 
 
@@ -50,7 +51,7 @@ def test_no_batch_exceeds_its_buffers(schedule):
         batch = boundaries(schedule, start, end)
         assert len(batch) <= boundary_count_max(schedule)
         for index in range(len(schedule.casts)):
-            assert sum(index in b.casts for b in batch) <= schedule.instants_per_launch
+            assert sum(index in b.casts for b in batch) <= schedule.ticks_per_batch(index)
 
 
 def test_a_batch_ends_with_the_last_instant_of_a_launch():
@@ -61,3 +62,16 @@ def test_a_batch_ends_with_the_last_instant_of_a_launch():
     assert batch_end_ns(schedule, 4_000_000, 10**9) == 36_000_000
     assert batch_end_ns(schedule, 0, 15_000_000) == 15_000_000
     assert batch_end_ns(replace(schedule, casts=()), 0, 10**9) == 80_000_000
+
+
+def test_a_batch_takes_more_ticks_of_a_cast_that_renders_only_some():
+    schedule = Schedule(
+        control=Rate(200.0),
+        samplers=(),
+        casts=(Rate(10_000.0), Rate(30.0)),
+        instants_per_launch=16,
+        sparse=frozenset({0}),
+    )
+    assert schedule.ticks_per_batch(0) == 16 * TICKS_PER_INSTANT
+    assert schedule.ticks_per_batch(1) == 16
+    assert batch_end_ns(schedule, 0, 10**9) == 1_600_000 * TICKS_PER_INSTANT

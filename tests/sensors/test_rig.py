@@ -52,6 +52,37 @@ def test_two_event_cameras_with_other_pixels_share_a_cast():
     assert cast.event_cameras == ("a", "b")
 
 
+ADAPTIVE = {**EVENTS, "max_displacement_px": 0.5}
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        EVENTS,
+        {**ADAPTIVE, "max_displacement_px": 1.0},
+        {**ADAPTIVE, "packet_rate_hz": 60},
+        {"kind": "rgb", "lens": LENS, "rate_hz": 20},
+    ],
+    ids=["every tick", "displacement", "packets", "pictures"],
+)
+def test_an_adaptive_camera_shares_its_renders_with_none_that_needs_others(camera):
+    adaptive, other = casts({"adaptive": ADAPTIVE, "other": camera})
+    assert adaptive.event_cameras == ("adaptive",)
+    assert (adaptive.max_displacement_px, adaptive.outputs) == (0.5, {"log_radiance"})
+    assert other.max_displacement_px == camera.get("max_displacement_px")
+
+
+def test_adaptive_cameras_that_need_the_same_renders_share_them():
+    (cast,) = casts({"a": ADAPTIVE, "b": {**ADAPTIVE, "pixel": {"threshold_on": 0.4}}})
+    assert cast.event_cameras == ("a", "b")
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 101.0, float("nan")])
+def test_a_displacement_out_of_range_is_refused(value):
+    with pytest.raises(ValueError, match="max_displacement_px"):
+        casts({"events": {**EVENTS, "max_displacement_px": value}})
+
+
 def test_slow_image_cameras_join_fast_ones():
     (cast,) = casts({"slow": {"kind": "rgb", "lens": LENS, "rate_hz": 10},
                      "fast": {"kind": "depth", "lens": LENS, "rate_hz": 30}})  # fmt: skip
