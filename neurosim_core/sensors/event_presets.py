@@ -79,8 +79,8 @@ _DAVIS346 = Preset(
         "readout": {"kind": "event", "bandwidth_hz": 12e6},
     },
     sources="Gallego et al. (2022), table 1: smallest contrast 14.3 - 22.5 % (taken as ON and OFF, which the"
-    " table does not say), 12 Meps, 0.1 ON events / s. Hu, Liu, Delbruck (2021), v2e: its default mismatch"
-    " 0.03 and spread of noise rates 0.1 decades, set to match a DAVIS346.",
+    " table does not say), 12 Meps, 0.1 ON events / s. Mismatch 0.03 and a spread of noise rates of 0.1"
+    " decades are the defaults of v2e (Hu, Liu, Delbruck 2021), not measurements of this sensor.",
 )
 
 _GEN3 = Preset(
