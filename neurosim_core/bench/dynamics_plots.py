@@ -48,8 +48,13 @@ def dynamics_plots(result: DynamicsResult) -> list[Plot]:
     return [
         Plot(
             name="dynamics-work-precision",
-            title="Error against CPU time",
-            draw=functools.partial(_draw_work_precision, result),
+            title="Position error against CPU time",
+            draw=functools.partial(_draw_work_precision, result, "position_m", "position error [m]"),
+        ),
+        Plot(
+            name="dynamics-work-precision-attitude",
+            title="Attitude error against CPU time",
+            draw=functools.partial(_draw_work_precision, result, "attitude_rad", "attitude error [rad]"),
         ),
         Plot(
             name="dynamics-step",
@@ -65,31 +70,32 @@ def dynamics_plots(result: DynamicsResult) -> list[Plot]:
     ]
 
 
-def _draw_work_precision(result: DynamicsResult, figure: Figure) -> None:
+def _draw_work_precision(result: DynamicsResult, field: str, label: str, figure: Figure) -> None:
+    """Draw one field of the errors, a panel a flight."""
     figure.set_size_inches(8.0, 6.4)
     panels = figure.subplots(2, 3, sharex=True).ravel()
     for axes, solved in zip(panels, result.flights, strict=False):
         name = solved.flight.name
         for method, style in _STYLES.items():
             rows = [s for s in result.samples if (s.flight, s.method) == (name, method)]
-            errors = _shown([s.errors.position_m for s in rows])
+            errors = _shown([getattr(s.errors, field) for s in rows])
             axes.plot([s.cpu_s_per_s for s in rows], errors, label=method, **style)
         for peer in result.peers:
             if peer.flight == name and peer.method in _ROTORPY_MARKERS:
                 axes.plot(
                     [peer.cpu_s_per_s],
-                    _shown([peer.errors.position_m]),
+                    _shown([getattr(peer.errors, field)]),
                     linestyle="none",
                     color="black",
                     marker=_ROTORPY_MARKERS[peer.method],
                     markersize=8,
                     label=peer.method,
                 )
-        _mark_reference(axes, solved.reference.uncertainty.position_m)
+        _mark_reference(axes, getattr(solved.reference.uncertainty, field))
         axes.set(xscale="log", yscale="log", ylim=(0.5 * _ERROR_MIN, 1e2), title=_PANELS.get(name, name))
         axes.yaxis.set_major_locator(_decades(3))
     for axes in panels[::3]:
-        axes.set_ylabel("position error [m]")
+        axes.set_ylabel(label)
     for axes in panels[2:5]:
         axes.set_xlabel("CPU [s per simulated s]")
         axes.tick_params(labelbottom=True)
@@ -107,10 +113,10 @@ def _shown(errors: Sequence[float]) -> list[float]:
     return [max(e, _ERROR_MIN) if np.isfinite(e) and e < 1e3 else np.nan for e in errors]
 
 
-def _mark_reference(axes: Axes, uncertainty_m: float) -> None:
+def _mark_reference(axes: Axes, uncertainty: float) -> None:
     axes.axhspan(
         1e-30,
-        max(uncertainty_m, _ERROR_MIN),
+        max(uncertainty, _ERROR_MIN),
         color="0.85",
         zorder=0,
         label="below what is known of the reference",

@@ -254,6 +254,7 @@ def test_plots_are_drawn(chapter):
     pytest.importorskip("matplotlib")
     assert [plot.name for plot in chapter.plots] == [
         "dynamics-work-precision",
+        "dynamics-work-precision-attitude",
         "dynamics-step",
         "dynamics-motor",
         "dynamics-drift",
