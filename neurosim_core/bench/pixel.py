@@ -168,7 +168,7 @@ def _bar_bars(result: PixelResult) -> list[Bar]:
     worst = max(_jitter_sigma(row) for row in result.jitter)
     return [
         Bar(
-            text="bar: delay and jitter along a row are those of mismatch and low-pass, to "
+            text="bar: delay, jitter and sharpness along a row are those of mismatch and low-pass, to "
             f"{SIGMA_MAX} standard deviations and a stamp of 1 us",
             measured=f"{worst:.2g} standard deviations",
             met=worst <= SIGMA_MAX,
@@ -177,13 +177,19 @@ def _bar_bars(result: PixelResult) -> list[Bar]:
 
 
 def _jitter_sigma(row: Jitter) -> float:
-    """Return how far delay and jitter are off, in standard deviations; below a stamp they are not."""
+    """Return how far delay, jitter and sharpness are off, in standard deviations."""
     deviation_s = row.jitter_expected_s / math.sqrt(row.count)
-    delay_s = max(0.0, abs(row.delay_s - row.delay_expected_s) - STAMP_S)
-    jitter_s = max(0.0, abs(row.jitter_s - row.jitter_expected_s) - STAMP_S)
-    if deviation_s == 0.0:
-        return math.inf if max(delay_s, jitter_s) > 0.0 else 0.0
-    return max(delay_s / deviation_s, jitter_s * math.sqrt(2.0) / deviation_s)
+    return max(
+        _sigma(row.delay_s - row.delay_expected_s, deviation_s),
+        _sigma(row.jitter_s - row.jitter_expected_s, deviation_s / math.sqrt(2.0)),
+        _sigma(row.span_s - row.span_expected_s, row.span_deviation_s / math.sqrt(row.count)),
+    )
+
+
+def _sigma(error_s: float, deviation_s: float) -> float:
+    """Return an error beyond a stamp in standard deviations."""
+    beyond_s = max(0.0, abs(error_s) - STAMP_S)
+    return beyond_s / deviation_s if deviation_s > 0.0 else math.inf if beyond_s > 0.0 else 0.0
 
 
 def _dark_bars(result: PixelResult) -> list[Bar]:
@@ -359,9 +365,14 @@ def _jitter_table(result: PixelResult) -> Table:
             "delay_expected_s": "theory",
             "jitter_s": "jitter [s]",
             "jitter_expected_s": "theory ",
+            "span_s": "first to last event [s]",
+            "span_expected_s": "theory  ",
             "count": "pixels",
         },
-        rows=[dataclasses.asdict(row) for row in result.jitter],
+        rows=[
+            {k: v for k, v in dataclasses.asdict(row).items() if k != "span_deviation_s"}
+            for row in result.jitter
+        ],
         note="An edge of 0.7 in log radiance, 4 px wide, at 1000 px/s: the first event of each pixel, after "
         "that of an ideal one. Jitter is the standard deviation along the rows.",
     )

@@ -325,34 +325,45 @@ _BAR_SPEED_PX_S = 1000.0
 _BAR_FRAMES_PER_PX = 4
 
 
-def measure_bar(bench: TestBench) -> tuple[list[BarTimes], list[Jitter]]:
-    """Let an edge pass along rows of pixels, and compare when each fires first with when an ideal one does.
+_BAR_SLOPE = _BAR_HEIGHT * _BAR_SPEED_PX_S / _BAR_EDGE_PX
+_BAR_MISMATCH = 0.02
+_BAR_CUTOFF_HZ = 300.0
 
-    Log radiance of the edge rises linearly by 0.7 over 4 px, at 1000 px/s, so mismatch sigma moves the first
-    event by sigma / slope; a low-pass delays it by a time that solves slope (t - tau (1 - e^(-t/tau))) = C.
+
+def measure_bar(bench: TestBench) -> tuple[list[BarTimes], list[Jitter]]:
+    """Let an edge pass along rows of pixels, and compare when each fires with when an ideal one does.
+
+    Log radiance of the edge rises linearly by 0.7 over 4 px, at 1000 px/s. Mismatch sigma moves the first
+    event by sigma / slope; a low-pass delays it. How sharp the edge is left is the time from the first event
+    of a pixel to its last.
     """
     width, rows = bench.pick(256, 96), bench.pick(16, 4)
-    slope = _BAR_HEIGHT * _BAR_SPEED_PX_S / _BAR_EDGE_PX
-    sigma = 0.02
-    cutoff_hz = 300.0
-    models = (
-        ("ideal", make_pixel(), 0.0, 0.0),
+    tau_s = 1.0 / (2.0 * math.pi * _BAR_CUTOFF_HZ)
+    first_s, last_s = (_reached_s(count * THRESHOLD, tau_s) for count in (1, _bar_count(THRESHOLD)))
+    ideal_s = (_bar_count(THRESHOLD) - 1.0) * THRESHOLD / _BAR_SLOPE
+    spread = {"sigma_on": _BAR_MISMATCH, "sigma_off": _BAR_MISMATCH}
+    models = (  # name, pixel; then by theory: delay, jitter, mean and deviation of the time to the last event
+        ("ideal", make_pixel(), 0.0, 0.0, ideal_s, 0.0),
         (
-            f"mismatch {sigma:g}",
-            make_pixel(threshold_spread={"sigma_on": sigma, "sigma_off": sigma}),
+            f"mismatch {_BAR_MISMATCH:g}",
+            make_pixel(threshold_spread=spread),
             0.0,
-            sigma / slope,
+            _BAR_MISMATCH / _BAR_SLOPE,
+            *_mismatched_span_s(),
         ),
         (
-            f"low-pass {cutoff_hz:g} Hz",
-            make_pixel(low_pass={"cutoff_hz": cutoff_hz}, white_radiance=1e-3),
-            _ramp_delay_s(slope, 1.0 / (2.0 * math.pi * cutoff_hz)),
+            f"low-pass {_BAR_CUTOFF_HZ:g} Hz",
+            make_pixel(low_pass={"cutoff_hz": _BAR_CUTOFF_HZ}, white_radiance=1e-3),
+            first_s - THRESHOLD / _BAR_SLOPE,
+            0.0,
+            last_s - first_s,
             0.0,
         ),
     )
     times, jitters = [], []
-    for name, config, delay_s, jitter_s in models:
-        late_s = _edge_times(bench, config, width, rows) - THRESHOLD / slope
+    for name, config, delay_s, jitter_s, span_s, span_deviation_s in models:
+        first, last = _edge_times(bench, config, width, rows)
+        late_s = first - THRESHOLD / _BAR_SLOPE
         times.append(BarTimes(name=name, column=np.arange(width, dtype=float), late_s=late_s))
         jitters.append(
             Jitter(
@@ -361,35 +372,59 @@ def measure_bar(bench: TestBench) -> tuple[list[BarTimes], list[Jitter]]:
                 delay_expected_s=delay_s,
                 jitter_s=float(late_s.std()),
                 jitter_expected_s=jitter_s,
+                span_s=float((last - first).mean()),
+                span_expected_s=span_s,
+                span_deviation_s=span_deviation_s,
                 count=late_s.size,
             )
         )
     return times, jitters
 
 
-def _ramp_delay_s(slope: float, tau_s: float) -> float:
-    """Return how much later a low-passed ramp reaches the threshold than the ramp [s]."""
-    due_s = THRESHOLD / slope
-
-    def missing(time_s: float) -> float:
-        return slope * (time_s - tau_s * -math.expm1(-time_s / tau_s)) - THRESHOLD
-
-    return float(brentq(missing, due_s, due_s + 2.0 * tau_s, xtol=1e-12)) - due_s
+def _bar_count(threshold: float) -> int:
+    """Return how many events the edge gives a pixel."""
+    return int(_BAR_HEIGHT / threshold)
 
 
-def _edge_times(bench: TestBench, config: EventCameraConfig, width: int, rows: int) -> Floats:
-    """Return the times of first events after the edge came to each pixel [s], shape [rows, width]."""
-    frame_count = _BAR_FRAMES_PER_PX * (width + int(_BAR_EDGE_PX) + 2) + 1
+def _mismatched_span_s() -> tuple[float, float]:
+    """Return mean and standard deviation of the time from first to last event under mismatch [s]."""
+    threshold = THRESHOLD + _BAR_MISMATCH * np.linspace(-8.0, 8.0, 200_001)
+    density = stats.norm.pdf(threshold, THRESHOLD, _BAR_MISMATCH)
+    density /= density.sum()
+    span_s = (np.floor(_BAR_HEIGHT / threshold) - 1.0) * threshold / _BAR_SLOPE
+    mean_s = float((density * span_s).sum())
+    return mean_s, math.sqrt(float((density * (span_s - mean_s) ** 2).sum()))
+
+
+def _reached_s(level: float, tau_s: float) -> float:
+    """Return when a low-passed edge reaches a level, after it comes [s].
+
+    Until the end T of the ramp it is slope (t - tau (1 - e^(-t / tau))), then it approaches the height.
+    """
+    end_s = _BAR_EDGE_PX / _BAR_SPEED_PX_S
+
+    def ramp(time_s: float) -> float:
+        return _BAR_SLOPE * (time_s + tau_s * math.expm1(-time_s / tau_s))
+
+    if level > ramp(end_s):
+        return end_s + tau_s * math.log((_BAR_HEIGHT - ramp(end_s)) / (_BAR_HEIGHT - level))
+    return float(brentq(lambda time_s: ramp(time_s) - level, 0.0, end_s, xtol=1e-12))
+
+
+def _edge_times(bench: TestBench, config: EventCameraConfig, width: int, rows: int) -> tuple[Floats, Floats]:
+    """Return when first and last events come after the edge came to a pixel [s], shape [rows, width]."""
+    frame_count = _BAR_FRAMES_PER_PX * (width + int(_BAR_EDGE_PX) + 4) + 1
     place_px = np.arange(frame_count) / _BAR_FRAMES_PER_PX  # of the front
     column = np.arange(width)
     rise = np.clip((place_px[:, None] - column) / _BAR_EDGE_PX, 0.0, 1.0)
     log = np.repeat((_BAR_HEIGHT * rise)[:, None, :], rows, axis=1)
     events = bench.expose(config, log, place_px / _BAR_SPEED_PX_S)
     pixel = events.y.astype(np.int64) * width + events.x
-    first_s = np.full(rows * width, np.nan)
-    found, first = np.unique(pixel, return_index=True)
-    first_s[found] = 1e-6 * (events.t[first] + 0.5)
-    return first_s.reshape(rows, width) - column / _BAR_SPEED_PX_S
+    first_s, last_s = np.full((2, rows * width), np.nan)
+    first_s[pixel[::-1]] = 1e-6 * (events.t[::-1] + 0.5)  # of equal indices the last assignment stays
+    last_s[pixel] = 1e-6 * (events.t + 0.5)
+    came_s = column / _BAR_SPEED_PX_S
+    return first_s.reshape(rows, width) - came_s, last_s.reshape(rows, width) - came_s
 
 
 # ---- darkness --------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ def pixel_plots(result: PixelResult) -> list[Plot]:
         Plot(name="pixel-edge", title="Moving bar", draw=lambda figure: _draw_bar(result, figure)),
         Plot(name="pixel-noise", title="Darkness", draw=lambda figure: _draw_noise(result, figure)),
         Plot(name="pixel-readout", title="Readout", draw=lambda figure: _draw_readout(result, figure)),
+        Plot(name="pixel-sensors", title="Presets", draw=lambda figure: _draw_presets(result, figure)),
     ]
 
 
@@ -213,3 +214,39 @@ def _draw_readout(result: PixelResult, figure: Figure) -> None:
     )
     _draw_curves(wait, [result.wait], log=False)
     wait.set(yscale="log", xlabel="load of the arbiter", ylabel="mean wait [s]", title="M/D/1 queue")
+
+
+def _draw_presets(result: PixelResult, figure: Figure) -> None:
+    """Draw thresholds with their mismatch, and the noise of a still scene, sensor by sensor."""
+    threshold, noise = figure.subplots(1, 2, sharey=True, width_ratios=(1.3, 1.0))
+    places = np.arange(len(result.presets), dtype=float)
+    for kind, color, marker, shift in (
+        ("on", COLORS[0], MARKERS[0], -0.12),
+        ("off", COLORS[1], MARKERS[1], 0.12),
+    ):
+        rows = places + shift
+        value, expected = (
+            np.array([getattr(row, f"threshold_{kind}{end}") for row in result.presets])
+            for end in ("", "_expected")
+        )
+        spread = [row.mismatch_on for row in result.presets]
+        threshold.plot(expected, rows, color=color, marker="|", ms=12, ls="")
+        threshold.errorbar(
+            value, rows, xerr=spread, color=color, marker=marker, ls="", mfc="none", lw=1.0, capsize=2.0,
+            label=kind.upper(),
+        )  # fmt: skip
+        rate, theory = (
+            np.array([getattr(row, f"dark_{kind}{end}_hz") for row in result.presets])
+            for end in ("", "_expected")
+        )
+        shown = theory > 1e-6
+        noise.plot(theory[shown], rows[shown], color=color, marker="|", ms=12, ls="")
+        noise.plot(rate[shown], rows[shown], color=color, marker=marker, ls="", mfc="none")
+    threshold.set_yticks(places, [row.name for row in result.presets])
+    threshold.invert_yaxis()
+    threshold.set(
+        xlabel="threshold in log radiance, and mismatch (bars)", title="on a ramp (strokes: as set)"
+    )
+    threshold.set_xlim(left=0.0)
+    threshold.legend()
+    noise.set(xscale="log", xlabel="events a second and pixel [Hz]", title="still scene (strokes: theory)")

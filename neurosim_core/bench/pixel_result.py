@@ -59,6 +59,11 @@ class Jitter:
     jitter_s: float
     """Standard deviation of the times of the first events along the row [s]."""
     jitter_expected_s: float
+    span_s: float
+    """Mean time from the first event of a pixel to its last: how sharp the edge is left [s]."""
+    span_expected_s: float
+    span_deviation_s: float
+    """Its standard deviation from pixel to pixel by theory [s]."""
     count: int
     """Pixels that it was taken from."""
 

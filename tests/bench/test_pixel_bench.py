@@ -53,7 +53,7 @@ def wrong_jitter(result):
         ("s_curve_distance", lambda r: 2.0, "step: S-curves"),
         ("latency", lambda r: scaled(r.latency, 1.002), "step: latency"),
         ("corner", lambda r: scaled(r.corner, 1.02), "sine: the gain"),
-        ("jitter", wrong_jitter, "bar: delay and jitter"),
+        ("jitter", wrong_jitter, "bar: delay, jitter"),
         ("dark", lambda r: scaled(r.dark, 1.2), "darkness: rates"),
         ("survival_distance", lambda r: 2.0, "darkness: intervals"),
         ("throughput", lambda r: scaled(r.throughput, 1.1), "readout: throughput"),
