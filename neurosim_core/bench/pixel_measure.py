@@ -698,6 +698,8 @@ def _measure_preset(bench: TestBench, name: str) -> PresetRow:
         threshold_off_expected=1.0 / stochastic.k1 if stochastic else config.threshold_off,
         mismatch_on=on[1],
         mismatch_on_expected=spread.sigma_on if spread else 0.0,
+        mismatch_off=off[1],
+        mismatch_off_expected=spread.sigma_off if spread else 0.0,
         dark_on_hz=on_hz,
         dark_on_expected_hz=expected_on,
         dark_off_hz=off_hz,

@@ -229,7 +229,7 @@ def _draw_presets(result: PixelResult, figure: Figure) -> None:
             np.array([getattr(row, f"threshold_{kind}{end}") for row in result.presets])
             for end in ("", "_expected")
         )
-        spread = [row.mismatch_on for row in result.presets]
+        spread = [getattr(row, f"mismatch_{kind}") for row in result.presets]
         threshold.plot(expected, rows, color=color, marker="|", ms=12, ls="")
         threshold.errorbar(
             value, rows, xerr=spread, color=color, marker=marker, ls="", mfc="none", lw=1.0, capsize=2.0,

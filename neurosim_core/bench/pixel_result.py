@@ -93,6 +93,8 @@ class PresetRow:
     mismatch_on: float
     """Standard deviation of the threshold from pixel to pixel, in log radiance."""
     mismatch_on_expected: float
+    mismatch_off: float
+    mismatch_off_expected: float
     dark_on_hz: float
     """ON events a second and pixel of a still scene at a tenth of white [Hz]."""
     dark_on_expected_hz: float
