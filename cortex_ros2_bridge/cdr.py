@@ -62,14 +62,19 @@ def encode(message: Any) -> memoryview:
         raise CdrError(f"cannot encode a {type_name}: {error}") from error
 
 
-def decode(data: Buffer, type_name: str) -> Any:
+def decode(data: Buffer, type_name: str | type[Any]) -> Any:
     """Return the message in a buffer, as an object of `msgs.message_class(type_name)`; its arrays are copies.
+
+    Args:
+        data: The message.
+        type_name: Such as "sensor_msgs/msg/Imu", or the class that `msgs` has for it.
 
     Raises:
         CdrError: The data are cut off or too long, hold a length beyond their end, or are no plain CDR.
         UnknownTypeError: There is no such type.
     """
-    return _deserialise(data, type_name, _message_store())
+    name = type_name if isinstance(type_name, str) else type_name_of(type_name())
+    return _deserialise(data, name, _message_store())
 
 
 def decode_record(data: Buffer, type_name: str) -> Any:

@@ -5,12 +5,14 @@
     imu.orientation_covariance[0] = -1.0
 
 A stand-in has the constructor, attributes, defaults, constants and array types of the class that rclpy uses.
-It refuses, with an `AssertionError`, what that refuses when it checks its fields.
+It refuses what that refuses when it checks its fields, as those of Humble always do, and those of Jazzy with
+ROS_PYTHON_CHECK_FIELDS=1: with an `AssertionError`, or the error of the array that the constructor makes.
 """
 
 from __future__ import annotations
 
 import array
+import difflib
 import functools
 import importlib
 import math
@@ -224,14 +226,13 @@ def _field(name: str, desc: Any) -> Field:
             dtype = np.dtype("uint8" if base == "char" else base)
             check = _fixed(name, base, dtype, size)
             default = functools.partial(np.zeros, size, dtype)
-            convert = functools.partial(np.array, dtype=dtype)
         elif base in TYPE_CODES:
             check = _sequence(name, base, size)
             default = functools.partial(array.array, TYPE_CODES[base])
-            convert = functools.partial(_to_array, name, base)
+            convert = functools.partial(_to_array, base)
         else:
             one = _field(name, element)
-            check = _list(name, one.check, size, exact=kind == Nodetype.ARRAY)
+            check = _list(name, one, size, exact=kind == Nodetype.ARRAY)
             default = functools.partial(_defaults, one, size) if kind == Nodetype.ARRAY else list
     return Field(name, f"_{name}", _idl_type(desc), check, default, convert)
 
@@ -284,10 +285,11 @@ def _byte(name: str, _base: str, _limit: int) -> Callable[[Any], Any]:
 
 def _int(name: str, base: str, _limit: int) -> Callable[[Any], Any]:
     low, high = _bounds(base)
+    kind = "integer" if low else "unsigned integer"
 
     def check(value: Any) -> Any:
         assert isinstance(value, int), f"The '{name}' field must be of type 'int'"
-        assert low <= value <= high, f"The '{name}' field must be an integer in [{low}, {high}]"
+        assert low <= value <= high, f"The '{name}' field must be an {kind} in [{low}, {high}]"
         return value
 
     return check
@@ -330,7 +332,9 @@ def _is_collection(value: Any) -> bool:
 def _fixed(name: str, base: str, dtype: np.dtype[Any], size: int) -> Callable[[Any], Any]:
     def check(value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            assert value.dtype == dtype, f"The '{name}' numpy.ndarray() must have the dtype of '{dtype}'"
+            assert value.dtype == dtype, (
+                f"The '{name}' numpy.ndarray() must have the dtype of 'numpy.{dtype}'"
+            )
             assert value.shape == (size,), f"The '{name}' numpy.ndarray() must have a size of {size}"
             return value
         assert _is_collection(value), f"The '{name}' field must be a set or sequence"
@@ -351,30 +355,36 @@ def _sequence(name: str, base: str, limit: int) -> Callable[[Any], Any]:
             assert _is_collection(value), f"The '{name}' field must be a set or sequence"
             if not isinstance(value, np.ndarray | bytes):
                 _check_numbers(name, base, value)
-            value = _to_array(name, base, value)
+            try:
+                value = _to_array(base, value)
+            except (TypeError, OverflowError) as error:
+                raise AssertionError(
+                    f"The '{name}' field must be a set or sequence and each value of {base}: {error}"
+                ) from None
         assert not limit or len(value) <= limit, f"The '{name}' field must be at most {limit} long"
         return value
 
     return check
 
 
-def _to_array(name: str, base: str, value: Any) -> array.array[Any]:
-    """Return a sequence of numbers as an array; without a Python loop where it is one already."""
+def _to_array(base: str, value: Any) -> array.array[Any]:
+    """Return a sequence of numbers as an array; without a Python loop where it is one already.
+
+    Raises:
+        TypeError: It is none of numbers, or has more than one dimension.
+        OverflowError: A number does not fit.
+    """
     code = TYPE_CODES[base]
     flat: array.array[Any] = array.array(code)
-    assert np.ndim(value) == 1 or not isinstance(value, np.ndarray), (
-        f"The '{name}' field must have one dimension, got a numpy.ndarray() with {np.ndim(value)}"
-    )
+    if isinstance(value, np.ndarray) and value.ndim != 1:
+        raise TypeError(f"only arrays of one dimension can be converted, got {value.ndim}")
     if isinstance(value, np.ndarray) and value.dtype == np.dtype("uint8" if base == "char" else base):
         flat.frombytes(np.ascontiguousarray(value).view(np.uint8).data)
         return flat
     if code == "B" and isinstance(value, bytes | bytearray):
         flat.frombytes(value)
         return flat
-    try:
-        return array.array(code, value)
-    except (TypeError, OverflowError) as error:
-        raise AssertionError(f"The '{name}' field must be a sequence of {base}: {error}") from None
+    return array.array(code, value)
 
 
 def _check_numbers(name: str, base: str, values: Any) -> None:
@@ -383,11 +393,18 @@ def _check_numbers(name: str, base: str, values: Any) -> None:
         check(value)
 
 
-def _list(name: str, check: Callable[[Any], Any], size: int, *, exact: bool) -> Callable[[Any], Any]:
+def _list(name: str, one: Field, size: int, *, exact: bool) -> Callable[[Any], Any]:
+    kind = type(one.default()).__name__
+
     def check_all(value: Any) -> Any:
         assert _is_collection(value), f"The '{name}' field must be a set or sequence"
         for element in value:
-            check(element)
+            try:
+                one.check(element)
+            except AssertionError:
+                raise AssertionError(
+                    f"The '{name}' field must be a set or sequence and each value of type '{kind}'"
+                ) from None
         if exact:
             assert len(value) == size, f"The '{name}' field must be a set or sequence with length {size}"
         else:
@@ -410,7 +427,9 @@ def _by_base_name() -> dict[str, str]:
 
 def __getattr__(name: str) -> Any:
     if name.startswith("_") or name not in _by_base_name():
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        near = difflib.get_close_matches(name, _by_base_name(), 1) if not name.startswith("_") else []
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     return message_class(_by_base_name()[name])
 
 

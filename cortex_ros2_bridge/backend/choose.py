@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import logging
 from pathlib import Path
 
 from cortex_ros2_bridge.backend.base import Backend, BackendError
+
+_log = logging.getLogger(__name__)
 
 INSTALL = "pip install 'neurosim[ros2]'"
 
@@ -50,6 +53,8 @@ def open_backend(
             )
         from cortex_ros2_bridge.backend.rclpy_ import RclpyBackend
 
+        if distro is not None:
+            _log.warning("--distro %s has no effect: rclpy speaks for the distribution it is of", distro)
         return RclpyBackend(node_name=node_name, namespace=namespace, domain=domain)
     if importlib.util.find_spec("cyclonedds") is None:
         raise BackendError(f"neither rclpy nor cyclonedds is installed: {INSTALL}")

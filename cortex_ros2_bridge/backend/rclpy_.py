@@ -120,6 +120,9 @@ class RclpyBackend:
         for part in parts:
             part.close()
         self._executor.shutdown(timeout_sec=_CLOSE_S)
+        pool = getattr(self._executor, "_executor", None)
+        if pool is not None:  # rclpy leaves the threads of its executor behind
+            pool.shutdown(wait=False)
         self._thread.join(_CLOSE_S)
         self._node.destroy_node()
         self._context.try_shutdown()

@@ -16,9 +16,11 @@ from processes import ROOT, SOON_S
 class BridgeProcess:
     """The command in a process, with its standard error."""
 
-    def __init__(self, *arguments: str) -> None:
+    backend = ""
+
+    def __init__(self, *arguments: str, python: str = sys.executable) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "cortex_ros2_bridge", *arguments],
+            [python, "-m", "cortex_ros2_bridge", *arguments],
             env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"},
             stderr=subprocess.PIPE,
         )

@@ -169,8 +169,11 @@ def test_bytes_are_those_of_rclpy():
         if importlib.util.find_spec(type_name.split("/")[0]) is None:
             continue
         message = random_message(type_name, np.random.default_rng(3))
-        theirs = serialization.serialize_message(message)
-        assert bytes(cdr.encode(message))[: len(theirs)] == theirs
-        assert cdr.decode(theirs, type_name) == serialization.deserialize_message(theirs, type(message))
+        ours, theirs = bytes(cdr.encode(message)), serialization.serialize_message(message)
+        assert serialization.deserialize_message(ours, type(message)) == message
+        assert cdr.decode(theirs, type_name) == message
+        # Fast CDR leaves bytes between fields as they happen to be, and does not pad the end.
+        assert len(theirs) <= len(ours) < len(theirs) + 4
+        assert sum(a != b for a, b in zip(ours, theirs, strict=False)) < 0.1 * len(theirs) + 4
         compared += 1
     assert compared > 5

@@ -46,7 +46,7 @@ from cortex_ros2_bridge.typestore import (
     typestore,
 )
 
-WRONG = (AssertionError, TypeError)
+WRONG = (AssertionError, OverflowError, TypeError)
 """What the classes raise with and without ROS_PYTHON_CHECK_FIELDS=1; ours always check."""
 ROUTED = sorted({name for _, name in OUT} | {name for name, _ in IN})
 HASHES = Path(__file__).with_name("golden") / "type_hashes.txt"
@@ -205,25 +205,28 @@ def test_attributes_that_do_not_exist_cannot_be_set():
     [
         (lambda: Vector3(x=1), "'x' field must be of type 'float'"),
         (lambda: Vector3(x="1"), "'x' field must be of type 'float'"),
-        (lambda: Image(height=-1), "'height' field must be an integer in"),
-        (lambda: Image(height=2**32), "'height' field must be an integer in"),
+        (lambda: Image(height=-1), "'height' field must be an unsigned integer in"),
+        (lambda: Image(height=2**32), "'height' field must be an unsigned integer in"),
         (lambda: Image(height=1.0), "'height' field must be of type 'int'"),
         (lambda: Image(encoding=b"rgb8"), "'encoding' field must be of type 'str'"),
         (lambda: Image(header=Vector3()), "'header' field must be a sub message of type 'Header'"),
-        (lambda: Image(data=[256]), "data"),
+        (lambda: Image(data=[256]), "unsigned byte integer is greater than maximum"),
         (lambda: setattr(Image(), "data", [0.5]), "data"),
         (lambda: setattr(Image(), "data", array.array("f", [1.0])), "type code of 'B'"),
-        (lambda: setattr(Imu(), "orientation_covariance", np.zeros(9, np.float32)), "dtype of 'float64'"),
+        (
+            lambda: setattr(Imu(), "orientation_covariance", np.zeros(9, np.float32)),
+            "dtype of 'numpy.float64'",
+        ),
         (lambda: setattr(Imu(), "orientation_covariance", np.zeros(8)), "size of 9"),
         (lambda: setattr(Imu(), "orientation_covariance", [0.0] * 8), "length 9"),
         (lambda: PointCloud2(is_bigendian=1), "'is_bigendian' field must be of type 'bool'"),
-        (lambda: PointCloud2(fields=[Vector3()]), "sub message of type 'PointField'"),
+        (lambda: PointCloud2(fields=[Vector3()]), "set or sequence and each value of type 'PointField'"),
         (lambda: DiagnosticStatus(level=1), "'level' field must be of type 'bytes'"),
         (lambda: AttitudeTarget(thrust=1e39), "'thrust' field must be a float in"),
     ],
 )
 def test_values_of_a_wrong_type_or_range_are_refused(change, reason):
-    with pytest.raises(AssertionError, match=reason):
+    with pytest.raises(WRONG, match=reason):
         change()
 
 
@@ -234,12 +237,14 @@ def test_arrays_are_those_of_rclpy_whatever_they_are_made_of():
         assert Image(data=data).data == array.array("B", range(12))
     assert Image(data=flat[::2]).data.tolist() == [0, 2, 4, 6, 8, 10]
     assert Actuators(velocity=[1, 2]).velocity == array.array("d", [1.0, 2.0])
-    imu = Imu(orientation_covariance=[0, 1, 2, 3, 4, 5, 6, 7, 8])
+    imu = Imu(orientation_covariance=[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
     assert imu.orientation_covariance.dtype == np.float64
     ours = np.ones(9)
     imu.orientation_covariance = ours
     assert imu.orientation_covariance is ours
-    assert CameraInfo(k=list(range(9))).k.shape == (9,)
+    assert CameraInfo(k=[float(n) for n in range(9)]).k.shape == (9,)
+    with pytest.raises(AssertionError):
+        CameraInfo(k=list(range(9)))
     message = Actuators()
     message.velocity.extend([3.0, 4.0])
     assert message.velocity.tolist() == [3.0, 4.0]

@@ -1,0 +1,156 @@
+"""The bridge and real nodes of ROS 2 (rclpy), in processes of their own, through DDS and through rclpy.
+
+They run where rclpy imports in this Python, or where NEUROSIM_ROS_PYTHON names one in which it does, with
+what the bridge needs (pyzmq, msgspec, rosbags). INSTALL says how to make that without a ROS installation.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bridge_process import BridgeProcess
+from bridge_rig import imu, odometry
+from processes import ROOT, Child, wait_for
+from runtime_directory import own_directory
+
+from cortex import Node
+from cortex import messages as msg
+
+INSTALL = (
+    "no rclpy; pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-{sensor,nav,geometry,std,diagnostic,"
+    "rosgraph,trajectory}-msgs ros-jazzy-std-srvs pyzmq msgspec rosbags numpy pyyaml, in this Python or in that of "
+    "NEUROSIM_ROS_PYTHON"
+)
+ROS_PYTHON = os.environ.get("NEUROSIM_ROS_PYTHON") or (
+    sys.executable if importlib.util.find_spec("rclpy") is not None else ""
+)
+pytestmark = pytest.mark.skipif(not ROS_PYTHON, reason=INSTALL)
+
+
+class RosNode(Child):
+    """A process of `ros_peer.py`: what it can do is there."""
+
+    def __init__(self) -> None:
+        self.role = "ros_peer"
+        self._rest = b""
+        self.process = subprocess.Popen(
+            [ROS_PYTHON, str(Path(__file__).with_name("ros_peer.py"))],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+        )
+
+    def do(self, what: str, **arguments: Any) -> Any:
+        """Let it do something, and return what came of it."""
+        return self.ask(do=what, **arguments)["answer"]
+
+
+@pytest.fixture
+def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A domain on this host, found as ROS does: no settings of Cyclone DDS, which Fast DDS does not know."""
+    for name in ("ROS_DISTRO", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 102)))
+    with own_directory(monkeypatch):
+        yield
+
+
+@pytest.fixture
+def ros_node(ros_domain: None) -> Iterator[RosNode]:
+    node = RosNode()
+    yield node
+    node.end()
+
+
+@pytest.fixture(params=["dds", "rclpy"])
+def bridge(request: pytest.FixtureRequest, ros_domain: None) -> Iterator[BridgeProcess]:
+    """A bridge through DDS, in this Python without ROS; or through rclpy."""
+    python = sys.executable if request.param == "dds" else ROS_PYTHON
+    with BridgeProcess("--verbose", "--backend", request.param, python=python) as process:
+        process.wait_for("waiting for Cortex topics")
+        process.backend = request.param
+        yield process
+
+
+def test_a_node_of_ros_hears_sees_and_commands(bridge: BridgeProcess, ros_node: RosNode) -> None:
+    """It starts after the bridge, on this host only: measurements, the graph, types, and commands back."""
+    with Node("simulator") as simulator:
+        measured = simulator.publisher("/drone/imu", msg.Imu)
+        state = simulator.publisher("/drone/odometry", msg.Odometry, latch=True)
+        commands = simulator.subscriber("/drone/command/velocity", msg.VelocityCommand)
+        bridge.wait_for("/drone/imu -> /drone/imu")
+        ros_node.do("subscribe", topic="/drone/imu", type_name="sensor_msgs/msg/Imu", reliable=False)
+        ros_node.do("control", state="/drone/odometry", command="/drone/command_velocity")
+        wait_for(lambda: measured.subscriber_count and state.subscriber_count)
+        wait_for(lambda: measured.publish(imu(7_000_000_005)) and ros_node.do("heard", topic="/drone/imu")[0])
+        assert ros_node.do("heard", topic="/drone/imu")[1:] == [7_000_000_005, "drone/imu"]
+        assert commands.wait_for_publisher(15.0)
+        for number in range(1, 51):
+            stamp_ns = 8_000_000_000 + number
+
+            def command(stamp_ns: int = stamp_ns) -> Any:
+                state.publish(odometry(stamp_ns))
+                got = commands.recv(1.0)
+                return got is not None and got.stamp_ns == stamp_ns and got
+
+            assert wait_for(command).velocity.tolist() == [2.0, 0.0, 0.0]
+        assert "cortex_bridge" in ros_node.do("nodes")
+        (publisher,) = ros_node.do("publishers", topic="/drone/imu")
+        assert publisher == [
+            "cortex_bridge",
+            "sensor_msgs/msg/Imu",
+            ros_node.do("own_hash", type_name="sensor_msgs/msg/Imu"),
+        ]
+    assert bridge.end(signal.SIGINT) < 5.0
+
+
+def test_who_comes_late_gets_what_is_latched_and_no_other(bridge: BridgeProcess, ros_node: RosNode) -> None:
+    """Also by quality of service: who wants a stream latched does not get it, and is told so."""
+    with Node("simulator") as simulator:
+        path = simulator.publisher("/drone/path", msg.Path, latch=True)
+        path.publish(msg.Path(3_000_000_001, np.array([1, 2]), np.zeros((2, 3))))
+        measured = simulator.publisher("/drone/imu", msg.Imu)
+        bridge.wait_for("/drone/path -> /drone/path")
+        ros_node.do("subscribe", topic="/drone/path", type_name="nav_msgs/msg/Path", latched=True)
+        ros_node.do("subscribe", topic="/drone/imu", type_name="sensor_msgs/msg/Imu", latched=True)
+        wait_for(lambda: ros_node.do("heard", topic="/drone/path")[0])
+        assert ros_node.do("heard", topic="/drone/path")[1:] == [3_000_000_001, "map"]
+        measured.publish(imu(5))
+        assert measured.subscriber_count == 0
+        assert ros_node.do("heard", topic="/drone/imu")[0] == 0
+
+
+def test_a_wrong_type_is_said_with_the_right_topic(bridge: BridgeProcess, ros_node: RosNode) -> None:
+    with Node("simulator") as simulator:
+        simulator.publisher("/drone/imu", msg.Imu)
+        bridge.wait_for("/drone/imu -> /drone/imu")
+        ros_node.do("subscribe", topic="/drone/imu", type_name="sensor_msgs/msg/Image")
+        bridge.wait_for("/drone/imu: a node subscribes to it as sensor_msgs/msg/Image")
+
+
+@pytest.mark.parametrize("bridge", ["rclpy"], indirect=True)
+def test_services_of_a_real_node(bridge: BridgeProcess, ros_node: RosNode) -> None:
+    """Not through DDS: services of Fast DDS and of Cyclone DDS do not know each other."""
+    with Node("simulator") as simulator:
+        asked = []
+
+        def pause(request: msg.Trigger) -> msg.SimulatorReply:
+            asked.append(request)
+            return msg.SimulatorReply(len(asked) == 1, "" if len(asked) == 1 else "again", 0, "paused")
+
+        simulator.service("/pause", msg.Trigger, msg.SimulatorReply, pause)
+        assert ros_node.do("call", name="/pause") == [True, ""]
+        assert ros_node.do("call", name="/pause") == [False, "again"]
