@@ -325,7 +325,7 @@ def _summary(result: LeaveOutResult) -> str:
     return (
         "Each case flew in a process of its own, on the CPU, with launches, allocations and imports counted "
         "as they happened. Per step of the integration (1 ms; sensors and control included) a flight with an "
-        f"IMU alone takes {1e6 * least.step_s:.0f} us, one with every sensor and term "
+        f"IMU alone takes {1e6 * least.step_s:.0f} us of CPU time, one with every sensor and term "
         f"{1e6 * most.step_s:,.0f} us, {most.step_s / least.step_s:,.0f} times as much; set-up takes "
         f"{least.setup_s:.1f} s and {most.setup_s:.1f} s, Warp's arrays {least.array_bytes / 2**20:.1f} MiB "
         f"and {most.array_bytes / 2**20:.1f} MiB. Dynamics without the terms that a vehicle does not need "
@@ -391,8 +391,8 @@ def _count_table(result: LeaveOutResult) -> Table:
             "texture_mib": "texels on the host [MiB]",
             "flight_allocations_per_s": "allocations per s in flight",
             "resident_mib": "most memory of the process [MiB]",
-            "setup_s": "set-up [s]",
-            "step_us": "time per step [us]",
+            "setup_s": "set-up [s of CPU]",
+            "step_us": "CPU time per step [us]",
             "full_step_us": "with everything on [us]",
         },
         rows=[
@@ -416,7 +416,7 @@ def _count_table(result: LeaveOutResult) -> Table:
         note="On the CPU, in a process for each run. Slices of one launch count once. Arrays are those that "
         "Warp allocates in the set-up, in flight those of its second half; pictures are arrays with the rows "
         "and columns of a camera. A step is one of the integration, 1 ms, with all that sensors and control "
-        "take.",
+        "take. CPU time is that of all threads.",
     )
 
 
@@ -478,7 +478,7 @@ def _draw(result: LeaveOutResult, figure: Figure) -> None:
     panels = figure.subplots(1, 3, sharey=True)
     titles = [case.title for case in result.cases]
     figures = (
-        ("time per step [us]", [1e6 * probe.step_s for _, probe in _rows(result)]),
+        ("CPU time per step [us]", [1e6 * probe.step_s for _, probe in _rows(result)]),
         ("launches per simulated second", [probe.launches_per_s for _, probe in _rows(result)]),
         ("Warp arrays [MiB]", [probe.array_bytes / 2**20 for _, probe in _rows(result)]),
     )
