@@ -47,6 +47,35 @@ def make_rkmk4(equations: Equations) -> Any:
     rotor_nodes = equations.rotors.nodes
 
     @wp.func
+    def gust_at(
+        airframe: Airframe,
+        around: Surroundings,
+        vehicle: wp.int32,
+        start_ns: wp.int64,
+        t: wp.float64,
+        q: wp.quatd,
+        v: wp.vec3d,
+        air_0: wp.vec3d,
+    ):
+        """Change of the air speed in B0 since the beginning of the step, by the wind alone."""
+        return wp.quat_rotate_inv(q, v - wind_at(airframe, around.wind, vehicle, start_ns, t)) - air_0
+
+    @wp.func
+    def above_ground(
+        around: Surroundings,
+        quadratic: wp.vec4d,
+        z_1: wp.float64,
+        up_0: wp.vec3d,
+        duration_s: wp.float64,
+        velocity_0: wp.vec3d,
+    ):
+        """Height of a stage that is reached at a velocity in B0, and the sums over the rotors there."""
+        z = z_1
+        if wp.static(near_ground):
+            z = z_1 + duration_s * wp.dot(up_0, velocity_0)
+        return z, lift(around.ground, z, quadratic)
+
+    @wp.func
     def fly_fixed(
         airframe: Airframe,
         around: Surroundings,
@@ -128,7 +157,7 @@ def make_rkmk4(equations: Equations) -> Any:
                 down_0 = wp.quat_rotate_inv(q, down)
                 velocity_0 = wp.quat_rotate_inv(q, v)
                 up_0 = wp.quat_rotate_inv(q, up_0)
-                quadratic_1 = lift(around.ground, z_1, quadratic_1)
+            quadratic_1 = lift(around.ground, z_1, quadratic_1)
 
             force_1, w_1 = forces(
                 airframe, around.ground, quadratic_1, linear_1, air_0, velocity_0, up_0, z_1, w
@@ -139,23 +168,10 @@ def make_rkmk4(equations: Equations) -> Any:
             rate_2 = w + half * w_1
             air_2 = air_0 + half * (a_1 + down_0)
             velocity_2 = velocity_0 + half * (a_1 + down_0)
-            lifted_2 = quadratic_2
-            z_2 = z_1
-            if wp.static(near_ground):
-                z_2 = z_1 + half * wp.dot(up_0, velocity_0)
-                lifted_2 = lift(around.ground, z_2, quadratic_2)
-            gust_2 = wp.vec3d()
-            gust_4 = wp.vec3d()
             if wp.static(changing_wind):
-                gust_2 = (
-                    wp.quat_rotate_inv(q, v - wind_at(airframe, around.wind, vehicle, start_ns, t + half))
-                    - air_0
-                )
-                gust_4 = (
-                    wp.quat_rotate_inv(q, v - wind_at(airframe, around.wind, vehicle, start_ns, t + h))
-                    - air_0
-                )
+                gust_2 = gust_at(airframe, around, vehicle, start_ns, t + half, q, v, air_0)
                 air_2 += gust_2
+            z_2, lifted_2 = above_ground(around, quadratic_2, z_1, up_0, half, velocity_0)
             a_2, w_2 = rates(
                 airframe, around.ground, lifted_2, linear_2, u_2, air_2, velocity_2, up_0, z_2, rate_2
             )
@@ -165,13 +181,9 @@ def make_rkmk4(equations: Equations) -> Any:
             rate_3 = w + half * w_2
             air_3 = air_0 + half * (a_2 + down_0)
             velocity_3 = velocity_0 + half * (a_2 + down_0)
-            lifted_3 = quadratic_2
-            z_3 = z_1
-            if wp.static(near_ground):
-                z_3 = z_1 + half * wp.dot(up_0, velocity_2)
-                lifted_3 = lift(around.ground, z_3, quadratic_2)
             if wp.static(changing_wind):
                 air_3 += gust_2
+            z_3, lifted_3 = above_ground(around, quadratic_2, z_1, up_0, half, velocity_2)
             a_3, w_3 = rates(
                 airframe, around.ground, lifted_3, linear_2, u_3, air_3, velocity_3, up_0, z_3, rate_3
             )
@@ -181,14 +193,11 @@ def make_rkmk4(equations: Equations) -> Any:
             rate_4 = w + h * w_3
             air_4 = air_0 + h * (a_3 + down_0)
             velocity_4 = velocity_0 + h * (a_3 + down_0)
-            z_4 = z_1
-            if wp.static(near_ground):
-                z_4 = z_1 + h * wp.dot(up_0, velocity_3)
-                quadratic_4 = lift(around.ground, z_4, quadratic_4)
             if wp.static(changing_wind):
-                air_4 += gust_4
+                air_4 += gust_at(airframe, around, vehicle, start_ns, t + h, q, v, air_0)
+            z_4, lifted_4 = above_ground(around, quadratic_4, z_1, up_0, h, velocity_3)
             a_4, w_4 = rates(
-                airframe, around.ground, quadratic_4, linear_4, u_4, air_4, velocity_4, up_0, z_4, rate_4
+                airframe, around.ground, lifted_4, linear_4, u_4, air_4, velocity_4, up_0, z_4, rate_4
             )
             u_rate_4 = chart_rate_4(u_4, rate_4)
 
@@ -202,7 +211,7 @@ def make_rkmk4(equations: Equations) -> Any:
             if wp.static(motor_lag):
                 lag_force, lag_torque = rotor_wrench(
                     airframe,
-                    quadratic_1 - two * lifted_2 + quadratic_4,
+                    quadratic_1 - two * lifted_2 + lifted_4,
                     linear_1 - two * linear_2 + linear_4,
                     air_0,
                     w,
