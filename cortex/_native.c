@@ -9,10 +9,13 @@
 
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <errno.h>
+#include <poll.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
 #include <time.h>
+#include <unistd.h>
 #include <structmember.h>
 
 #define NPY_NO_DEPRECATED_API NPY_1_19_API_VERSION
@@ -31,6 +34,9 @@ enum {
     HEADER_SIZE = 64,
     HEAD_SIZE = 24,
     RECORD_SIZE = 24,
+    SLOT_FRAME_SIZE = HEADER_SIZE + 8 + 32,
+    READ_BYTES = 1 << 16,
+    GATHER_MAX = 256,
 };
 static const Py_ssize_t BODY_LIMIT = (Py_ssize_t)1 << 32;
 
@@ -544,6 +550,62 @@ failed:
     return NULL;
 }
 
+PyDoc_STRVAR(gather_doc,
+"gather($self, receive, again, expected, limit, latency, clock_offset_ns, /)\n--\n\n"
+"Read plain frames that follow one another, for types of fixed size, and join their bodies.\n\n"
+"Returns:\n"
+"    The sequence expected next, the bodies one after the other, how many they are, and what ended it, as `drain`.\n");
+
+static PyObject *flat_gather(Flat *flat, PyObject *const *arguments, Py_ssize_t count) {
+    if (!arguments_are(count, 6)) return NULL;
+    PyObject *latency = arguments[4];
+    int64_t expected = PyLong_AsLongLong(arguments[2]);
+    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[3]);
+    const int64_t clock_offset_ns = PyLong_AsLongLong(arguments[5]);
+    if (PyErr_Occurred()) return NULL;
+    if (!PyList_Check(latency) || PyList_GET_SIZE(latency) == 0) {
+        PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
+        return NULL;
+    }
+    const Py_ssize_t size = flat->block;
+    if (flat->has_tail || !flat->has_head) {
+        PyErr_SetString(PyExc_ValueError, "only bodies of fixed size are gathered");
+        return NULL;
+    }
+    PyObject *frames[GATHER_MAX], *frame = NULL, *bodies = NULL;
+    Py_ssize_t found = 0;
+    while (found < limit && found < GATHER_MAX) {
+        PyObject *flags[2] = {NULL, dont_wait};
+        frame = PyObject_Vectorcall(arguments[0], flags + 1, 1 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+        if (frame == NULL) {
+            if (!PyErr_ExceptionMatches(arguments[1])) goto done;
+            PyErr_Clear();
+            break;
+        }
+        if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE + size) break;
+        const char *bytes = PyBytes_AS_STRING(frame);
+        uint64_t rest[5];
+        memcpy(rest, bytes + HEAD_SIZE, sizeof rest);
+        if (memcmp(bytes, flat->head, HEAD_SIZE) || rest[0] != (uint64_t)expected || rest[3] != (uint64_t)size) break;
+        frames[found] = frame;
+        frame = NULL;
+        expected += 1;
+        const int64_t elapsed_ns = monotonic_ns() - (int64_t)rest[2] - clock_offset_ns;
+        if (found++ % 8 == 0 && !note_latency(latency, elapsed_ns)) goto done;
+    }
+    bodies = PyBytes_FromStringAndSize(NULL, found * size);
+    for (Py_ssize_t index = 0; bodies != NULL && index < found; ++index) {
+        memcpy(PyBytes_AS_STRING(bodies) + index * size, PyBytes_AS_STRING(frames[index]) + HEADER_SIZE, (size_t)size);
+    }
+done:
+    for (Py_ssize_t index = 0; index < found; ++index) Py_DECREF(frames[index]);
+    if (bodies == NULL) {
+        Py_XDECREF(frame);
+        return NULL;
+    }
+    return Py_BuildValue("LNnN", (long long)expected, bodies, found, frame != NULL ? frame : Py_NewRef(Py_None));
+}
+
 PyDoc_STRVAR(decode_doc,
 "decode($self, buffer, offset, size, /)\n--\n\n"
 "The message of `size` bytes of a bytes object, or of an array of bytes, from an offset on; None if they are not as\n"
@@ -709,6 +771,7 @@ static PyMethodDef flat_methods[] = {
     {"encode", (PyCFunction)(void (*)(void))flat_encode, METH_FASTCALL, encode_doc},
     {"read", (PyCFunction)flat_read, METH_O, read_doc},
     {"drain", (PyCFunction)(void (*)(void))flat_drain, METH_FASTCALL, drain_doc},
+    {"gather", (PyCFunction)(void (*)(void))flat_gather, METH_FASTCALL, gather_doc},
     {"decode", (PyCFunction)(void (*)(void))flat_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };
@@ -743,7 +806,7 @@ typedef struct {
     vectorcallfunc vectorcall;
     Flat *flat;
     PyObject *acquire, *release, *slowly, *retry, *again;
-    PyObject *send; /* NULL or None: every message goes the long way */
+    PyObject *sends; /* a tuple; empty or NULL: every message goes the long way */
     Py_ssize_t limit;
     uint64_t sequence;
     int64_t bytes;
@@ -758,33 +821,36 @@ PyDoc_STRVAR(gate_doc,
 "    acquire: Takes the lock.\n"
 "    release: Gives it back.\n"
 "    slowly: Called without the lock with a message that has to go the long way.\n"
-"    retry: Called with the lock held and a frame that `send` had no room for.\n"
-"    again: What `send` raises then.\n"
+"    retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.\n"
+"    again: What that raised.\n"
 "    limit: Most bytes of a body.\n");
 
 /* Send with the lock held; NULL without error if the message has to go the long way. */
 static PyObject *gate_send(Gate *gate, PyObject *message) {
-    if (gate->send == NULL || gate->send == Py_None) return NULL;
+    if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
     const int64_t now_ns = monotonic_ns();
     if (now_ns >= gate->refresh_ns) return NULL;
     PyObject *frame = make_frame(gate->flat, message, gate->sequence, now_ns, gate->limit);
     if (frame == NULL) return NULL;
     gate->sequence += 1;
     gate->bytes += PyBytes_GET_SIZE(frame) - HEADER_SIZE;
-    PyObject *send = Py_NewRef(gate->send);
-    PyObject *arguments[3] = {NULL, frame, dont_wait};
-    PyObject *sent = PyObject_Vectorcall(send, arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
-    Py_DECREF(send);
-    PyObject *result = NULL;
-    if (sent != NULL) {
-        Py_DECREF(sent);
-        result = Py_NewRef(Py_True);
-    } else if (PyErr_ExceptionMatches(gate->again)) {
-        PyErr_Clear();
-        result = PyObject_CallOneArg(gate->retry, frame);
+    PyObject *sends = Py_NewRef(gate->sends); /* who comes or goes meanwhile replaces it */
+    int on_time = 1;
+    for (Py_ssize_t place = 0; on_time >= 0 && place < PyTuple_GET_SIZE(sends); ++place) {
+        PyObject *arguments[3] = {NULL, frame, dont_wait};
+        PyObject *sent = PyObject_Vectorcall(
+            PyTuple_GET_ITEM(sends, place), arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+        if (sent == NULL && PyErr_ExceptionMatches(gate->again)) {
+            PyErr_Clear();
+            sent = PyObject_CallFunction(gate->retry, "On", frame, place);
+            if (sent == Py_False) on_time = 0;
+        }
+        if (sent == NULL) on_time = -1;
+        Py_XDECREF(sent);
     }
+    Py_DECREF(sends);
     Py_DECREF(frame);
-    return result;
+    return on_time < 0 ? NULL : PyBool_FromLong(on_time);
 }
 
 static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t flags, PyObject *keywords) {
@@ -842,7 +908,7 @@ static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
     Py_VISIT(gate->slowly);
     Py_VISIT(gate->retry);
     Py_VISIT(gate->again);
-    Py_VISIT(gate->send);
+    Py_VISIT(gate->sends);
     return 0;
 }
 
@@ -853,7 +919,7 @@ static int gate_clear(Gate *gate) {
     Py_CLEAR(gate->slowly);
     Py_CLEAR(gate->retry);
     Py_CLEAR(gate->again);
-    Py_CLEAR(gate->send);
+    Py_CLEAR(gate->sends);
     return 0;
 }
 
@@ -864,7 +930,7 @@ static void gate_dealloc(Gate *gate) {
 }
 
 static PyMemberDef gate_members[] = {
-    {"send", T_OBJECT, offsetof(Gate, send), 0, "Takes a frame and flags; None: every message goes the long way."},
+    {"sends", T_OBJECT, offsetof(Gate, sends), 0, "Take a frame and flags; none: every message goes the long way."},
     {"sequence", T_ULONGLONG, offsetof(Gate, sequence), 0, "Of the next message."},
     {"bytes", T_LONGLONG, offsetof(Gate, bytes), 0, "Of all bodies so far."},
     {"refresh_ns", T_LONGLONG, offsetof(Gate, refresh_ns), 0, "When the next message goes the long way."},
@@ -886,6 +952,283 @@ static PyTypeObject GateType = {
     .tp_members = gate_members,
 };
 
+/* Pipes; see `pipe.py`, which does the same in Python. */
+
+typedef struct {
+    PyObject_HEAD
+    int fd;
+    PyObject *again;
+    PyObject *left; /* a frame that was written in part, or NULL */
+    Py_ssize_t written;
+} PipeWriter;
+
+/* Write as much as there is room for; -1: no room at all. A reader that is gone takes everything. */
+static Py_ssize_t write_some(int fd, const char *data, Py_ssize_t size) {
+    Py_ssize_t written = 0;
+    while (written < size) {
+        const ssize_t count = write(fd, data + written, (size_t)(size - written));
+        if (count >= 0) {
+            written += count;
+        } else if (errno == EAGAIN || errno == EWOULDBLOCK) {
+            return written ? written : -1;
+        } else if (errno != EINTR) {
+            return size;
+        }
+    }
+    return written;
+}
+
+/* Write the rest of a frame; whether all is written. */
+static int flush_left(PipeWriter *writer) {
+    if (writer->left == NULL) return 1;
+    const Py_ssize_t size = PyBytes_GET_SIZE(writer->left);
+    const char *data = PyBytes_AS_STRING(writer->left) + writer->written;
+    const Py_ssize_t count = write_some(writer->fd, data, size - writer->written);
+    if (count > 0) writer->written += count;
+    if (writer->written < size) return 0;
+    Py_CLEAR(writer->left);
+    return 1;
+}
+
+/* Write a frame; 0 if there is no room. */
+static int write_frame(PipeWriter *writer, PyObject *frame) {
+    if (!flush_left(writer)) return 0;
+    const Py_ssize_t size = PyBytes_GET_SIZE(frame);
+    const Py_ssize_t count = write_some(writer->fd, PyBytes_AS_STRING(frame), size);
+    if (count < 0) return 0;
+    if (count < size) {
+        writer->left = Py_NewRef(frame);
+        writer->written = count;
+    }
+    return 1;
+}
+
+static PyObject *frame_argument(PyObject *const *arguments, Py_ssize_t count) {
+    if (count < 1 || count > 2 || !PyBytes_CheckExact(arguments[0])) {
+        PyErr_SetString(PyExc_TypeError, "expected a frame as bytes, and flags");
+        return NULL;
+    }
+    return arguments[0];
+}
+
+static PyObject *writer_send(PipeWriter *writer, PyObject *const *arguments, Py_ssize_t count) {
+    PyObject *frame = frame_argument(arguments, count);
+    if (frame == NULL) return NULL;
+    if (write_frame(writer, frame)) Py_RETURN_NONE;
+    PyErr_SetNone(writer->again);
+    return NULL;
+}
+
+static PyObject *writer_offer(PipeWriter *writer, PyObject *const *arguments, Py_ssize_t count) {
+    PyObject *frame = frame_argument(arguments, count);
+    if (frame == NULL) return NULL;
+    write_frame(writer, frame);
+    Py_RETURN_NONE;
+}
+
+static PyObject *writer_flush(PipeWriter *writer, PyObject *unused) {
+    (void)unused;
+    return PyBool_FromLong(flush_left(writer));
+}
+
+static PyObject *writer_close(PipeWriter *writer, PyObject *unused) {
+    (void)unused;
+    const int fd = writer->fd;
+    writer->fd = -1;
+    if (fd >= 0) close(fd);
+    Py_RETURN_NONE;
+}
+
+static PyObject *writer_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
+    static char *names[] = {"fd", "again", NULL};
+    int fd;
+    PyObject *again;
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "iO:PipeWriter", names, &fd, &again)) return NULL;
+    PipeWriter *writer = (PipeWriter *)type->tp_alloc(type, 0);
+    if (writer == NULL) return NULL;
+    writer->fd = fd;
+    writer->again = Py_NewRef(again);
+    return (PyObject *)writer;
+}
+
+static void writer_dealloc(PipeWriter *writer) {
+    if (writer->fd >= 0) close(writer->fd);
+    Py_XDECREF(writer->again);
+    Py_XDECREF(writer->left);
+    Py_TYPE(writer)->tp_free((PyObject *)writer);
+}
+
+static PyMethodDef writer_methods[] = {
+    {"send", (PyCFunction)(void (*)(void))writer_send, METH_FASTCALL, "Write a frame; `again` if there is no room."},
+    {"offer", (PyCFunction)(void (*)(void))writer_offer, METH_FASTCALL, "Write a frame if there is room."},
+    {"flush", (PyCFunction)writer_flush, METH_NOARGS, "Write the rest of a frame; whether all is written."},
+    {"close", (PyCFunction)writer_close, METH_NOARGS, "Write no more."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyTypeObject PipeWriterType = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "cortex._native.PipeWriter",
+    .tp_doc = "PipeWriter(fd, again)\n--\n\nThe publisher's end of a pipe, which owns the descriptor.",
+    .tp_basicsize = sizeof(PipeWriter),
+    .tp_flags = Py_TPFLAGS_DEFAULT,
+    .tp_new = writer_new,
+    .tp_dealloc = (destructor)writer_dealloc,
+    .tp_methods = writer_methods,
+};
+
+typedef struct {
+    PyObject_HEAD
+    int fd, socket_fd;
+    PyObject *receive, *again;
+    int wait_ms;
+    int broken;
+    char *buffer;
+    Py_ssize_t begin, end, capacity;
+} PipeReader;
+
+/* Size of the frame that begins the buffer; 0: its header is not there yet; -1: it is no frame. */
+static Py_ssize_t frame_size(const char *data, Py_ssize_t available) {
+    if (available < HEADER_SIZE) return 0;
+    if (memcmp(data, "CTX", 3)) return -1;
+    if (data[3] == 'S') return SLOT_FRAME_SIZE;
+    uint64_t body;
+    memcpy(&body, data + 48, 8);
+    return (data[3] == 'M' || data[3] == 'B') && body <= (uint64_t)1 << 30 ? HEADER_SIZE + (Py_ssize_t)body : -1;
+}
+
+/* Make room for a frame of `size` bytes from `begin` on, and for a read; 0: no memory. */
+static int make_room(PipeReader *reader, Py_ssize_t size) {
+    const Py_ssize_t held = reader->end - reader->begin;
+    const Py_ssize_t wanted = (size > READ_BYTES ? size : READ_BYTES) + READ_BYTES;
+    if (reader->capacity < wanted) {
+        char *larger = PyMem_Malloc((size_t)wanted);
+        if (larger == NULL) return 0;
+        memcpy(larger, reader->buffer + reader->begin, (size_t)held);
+        PyMem_Free(reader->buffer);
+        reader->buffer = larger;
+        reader->capacity = wanted;
+    } else if (reader->begin > 0) {
+        memmove(reader->buffer, reader->buffer + reader->begin, (size_t)held);
+    }
+    reader->begin = 0;
+    reader->end = held;
+    return 1;
+}
+
+/* The next frame of the pipe where it lies, until the next call; NULL if there is none, perhaps with an error. */
+static const char *peek_frame(PipeReader *reader, Py_ssize_t *size) {
+    while (!reader->broken) {
+        const Py_ssize_t held = reader->end - reader->begin;
+        *size = frame_size(reader->buffer + reader->begin, held);
+        if (*size < 0) {
+            *size = held;
+            reader->broken = 1;
+        }
+        if (reader->broken || (*size > 0 && *size <= held)) {
+            reader->begin += *size;
+            return reader->buffer + reader->begin - *size;
+        }
+        if (reader->capacity - reader->end < READ_BYTES || *size > reader->capacity - reader->begin) {
+            if (!make_room(reader, *size)) {
+                PyErr_NoMemory();
+                return NULL;
+            }
+        }
+        ssize_t count;
+        do count = read(reader->fd, reader->buffer + reader->end, READ_BYTES);
+        while (count < 0 && errno == EINTR);
+        if (count <= 0) return NULL;
+        reader->end += count;
+    }
+    return NULL;
+}
+
+/* The next frame of the pipe as bytes; NULL if there is none, perhaps with an error. */
+static PyObject *next_frame(PipeReader *reader) {
+    Py_ssize_t size;
+    const char *data = peek_frame(reader, &size);
+    return data == NULL ? NULL : PyBytes_FromStringAndSize(data, size);
+}
+
+static PyObject *reader_receive(PipeReader *reader, PyObject *flags) {
+    const long wanted = PyLong_AsLong(flags);
+    if (wanted == -1 && PyErr_Occurred()) return NULL;
+    PyObject *frame = next_frame(reader);
+    if (frame != NULL || PyErr_Occurred()) return frame;
+    frame = PyObject_CallOneArg(reader->receive, dont_wait);
+    if (frame != NULL || (wanted & 1) || !PyErr_ExceptionMatches(reader->again)) return frame;
+    PyErr_Clear();
+    struct pollfd sources[2] = {{reader->fd, POLLIN, 0}, {reader->socket_fd, POLLIN, 0}};
+    Py_BEGIN_ALLOW_THREADS
+    poll(sources, 2, reader->wait_ms);
+    Py_END_ALLOW_THREADS
+    if (PyErr_CheckSignals() < 0) return NULL;
+    frame = next_frame(reader);
+    if (frame != NULL || PyErr_Occurred()) return frame;
+    return PyObject_CallOneArg(reader->receive, dont_wait);
+}
+
+static PyObject *reader_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
+    static char *names[] = {"fd", "socket_fd", "receive", "again", "wait_ms", NULL};
+    int fd, socket_fd, wait_ms;
+    PyObject *receive, *again;
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "iiOOi:PipeReader", names, &fd, &socket_fd, &receive, &again,
+                                     &wait_ms))
+        return NULL;
+    PipeReader *reader = (PipeReader *)type->tp_alloc(type, 0);
+    if (reader == NULL) return NULL;
+    reader->fd = fd;
+    reader->socket_fd = socket_fd;
+    reader->wait_ms = wait_ms;
+    reader->receive = Py_NewRef(receive);
+    reader->again = Py_NewRef(again);
+    reader->buffer = PyMem_Malloc(2 * READ_BYTES);
+    if (reader->buffer == NULL) {
+        Py_DECREF(reader);
+        return PyErr_NoMemory();
+    }
+    reader->capacity = 2 * READ_BYTES;
+    return (PyObject *)reader;
+}
+
+static int reader_traverse(PipeReader *reader, visitproc visit, void *arg) {
+    Py_VISIT(reader->receive);
+    Py_VISIT(reader->again);
+    return 0;
+}
+
+static int reader_clear(PipeReader *reader) {
+    Py_CLEAR(reader->receive);
+    Py_CLEAR(reader->again);
+    return 0;
+}
+
+static void reader_dealloc(PipeReader *reader) {
+    PyObject_GC_UnTrack(reader);
+    reader_clear(reader);
+    PyMem_Free(reader->buffer);
+    Py_TYPE(reader)->tp_free((PyObject *)reader);
+}
+
+static PyMethodDef reader_methods[] = {
+    {"receive", (PyCFunction)reader_receive, METH_O, "Take the next frame; `again` if there is none."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyTypeObject PipeReaderType = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "cortex._native.PipeReader",
+    .tp_doc = "PipeReader(fd, socket_fd, receive, again, wait_ms)\n--\n\nThe subscriber's end of a pipe.",
+    .tp_basicsize = sizeof(PipeReader),
+    .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC,
+    .tp_new = reader_new,
+    .tp_traverse = (traverseproc)reader_traverse,
+    .tp_clear = (inquiry)reader_clear,
+    .tp_dealloc = (destructor)reader_dealloc,
+    .tp_methods = reader_methods,
+};
+
 static struct PyModuleDef native_module = {
     PyModuleDef_HEAD_INIT,
     .m_name = "cortex._native",
@@ -895,15 +1238,20 @@ static struct PyModuleDef native_module = {
 
 PyMODINIT_FUNC PyInit__native(void) {
     import_array();
-    if (PyType_Ready(&FlatType) < 0 || PyType_Ready(&GateType) < 0) return NULL;
+    PyTypeObject *types[] = {&FlatType, &GateType, &PipeWriterType, &PipeReaderType};
+    const char *names[] = {"Flat", "Gate", "PipeWriter", "PipeReader"};
+    for (int index = 0; index < 4; ++index) {
+        if (PyType_Ready(types[index]) < 0) return NULL;
+    }
     dont_wait = PyLong_FromLong(1);
     if (dont_wait == NULL) return NULL;
     PyObject *module = PyModule_Create(&native_module);
     if (module == NULL) return NULL;
-    if (PyModule_AddObjectRef(module, "Flat", (PyObject *)&FlatType) < 0
-        || PyModule_AddObjectRef(module, "Gate", (PyObject *)&GateType) < 0) {
-        Py_DECREF(module);
-        return NULL;
+    for (int index = 0; index < 4; ++index) {
+        if (PyModule_AddObjectRef(module, names[index], (PyObject *)types[index]) < 0) {
+            Py_DECREF(module);
+            return NULL;
+        }
     }
     return module;
 }

@@ -21,9 +21,19 @@ class Flat:
         clock_offset_ns: int,
         /,
     ) -> tuple[int, int, bytes | None]: ...
+    def gather(
+        self,
+        receive: Callable[[int], Any],
+        again: type[BaseException],
+        expected: int,
+        limit: int,
+        latency: list[int],
+        clock_offset_ns: int,
+        /,
+    ) -> tuple[int, bytes, int, bytes | None]: ...
 
 class Gate:
-    send: Callable[..., Any] | None
+    sends: tuple[Callable[..., Any], ...]
     sequence: int
     bytes: int
     refresh_ns: int
@@ -33,8 +43,26 @@ class Gate:
         acquire: Callable[[], Any],
         release: Callable[[], Any],
         slowly: Callable[[Any], bool],
-        retry: Callable[[Any], bool],
+        retry: Callable[[Any, int], bool],
         again: type[BaseException],
         limit: int,
     ) -> None: ...
     def __call__(self, message: Any, /) -> bool: ...
+
+class PipeWriter:
+    def __init__(self, fd: int, again: type[BaseException]) -> None: ...
+    def send(self, frame: bytes, flags: int = 0, /) -> None: ...
+    def offer(self, frame: bytes, flags: int = 0, /) -> None: ...
+    def flush(self) -> bool: ...
+    def close(self) -> None: ...
+
+class PipeReader:
+    def __init__(
+        self,
+        fd: int,
+        socket_fd: int,
+        receive: Callable[[int], bytes],
+        again: type[BaseException],
+        wait_ms: int,
+    ) -> None: ...
+    def receive(self, flags: int, /) -> bytes: ...

@@ -18,8 +18,8 @@ monotonic_ns = time.monotonic_ns
 class Gate(Protocol):
     """Sends the messages of one publisher, and counts them."""
 
-    send: Callable[..., Any] | None
-    """Takes a frame and flags; None: every message goes the long way."""
+    sends: tuple[Callable[..., Any], ...]
+    """Take a frame and flags; none: every message goes the long way."""
     sequence: int
     """Of the next message."""
     bytes: int
@@ -33,10 +33,10 @@ class Gate(Protocol):
 
 
 class LongGate:
-    """Where a message cannot be sent at once: each goes the long way, whatever `send` is."""
+    """Where a message cannot be sent at once: each goes the long way, whatever `sends` are."""
 
     def __init__(self, slowly: Callable[[Any], bool]) -> None:
-        self.send: Callable[..., Any] | None = None
+        self.sends: tuple[Callable[..., Any], ...] = ()
         self.sequence = 0
         self.bytes = 0
         self.refresh_ns = 0
@@ -53,7 +53,7 @@ def make_gate(
     lock: Any,
     *,
     slowly: Callable[[Any], bool],
-    retry: Callable[[bytes], bool],
+    retry: Callable[[bytes, int], bool],
     limit: int,
 ) -> Gate:
     """Build the gate of one publisher.
@@ -63,11 +63,12 @@ def make_gate(
         head: What its frames begin with: the first 24 bytes of the header.
         lock: Held while sending.
         slowly: Called without the lock with a message that has to go the long way.
-        retry: Called with the lock held and a frame for which `send` had no room.
+        retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.
         limit: Most bytes of a body that is sent so.
     """
     flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
     if flat is None:
         return LongGate(slowly)
-    gate: Gate = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
-    return gate
+    gate: Any = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
+    gate.sends = ()
+    return gate  # type: ignore[no-any-return]

@@ -14,6 +14,7 @@ import numpy as np
 import zmq
 
 from cortex.outlet import DONTWAIT, SNDMORE, Backoff, Outlet, Outlets
+from cortex.pipe import Writer, open_writer
 from cortex.shm import Ring, ShmUnavailable
 from cortex.wire import (
     HEADER_SIZE,
@@ -32,10 +33,17 @@ from cortex.wire import (
 COLUMNS = 64
 RING_BYTES = 4 << 20
 """A ring of small slots takes this much, so that it stays in cache."""
+DEEP_RING_BYTES = 16 << 20
+DEEP_SLOTS = 128
+"""What a ring takes, and how many slots, where a reader keeps more messages than by default."""
+DEEP_QUOTA = 67
+"""A reader that may hold so many messages keeps more than by default, see `keep_last`."""
 RING_BYTES_MAX = 2 << 30
 PRIVATE_BYTES = 64 << 20
 """Most memory outside rings that waits to be sent."""
 RINGS_ALIVE = 4
+PIPES_MAX = 3
+"""A publisher writes each pipe itself; of further readers ZeroMQ takes care, in a thread of its own."""
 RETRY_S = 5.0
 """After a ring could not be made, none is tried for so long."""
 _SLOT_REST = struct.Struct(REST.format + "Q")
@@ -50,6 +58,10 @@ class Reader:
     request: AttachKey
     outlet: Outlet
     column: int | None
+    pipe: Writer | None = None
+    """Where its frames go; None: to the outlet."""
+    late: bool = False
+    """Its pipe was full for too long: it holds up nothing until it has room again."""
 
     @property
     def timeout_s(self) -> float:
@@ -116,6 +128,7 @@ class LargeSender:
         self._has_strict = False
         self._timeout_s = 0.0
         self._slot_outlets: list[Outlet] = []
+        self._piped: list[Reader] = []
         self._inline_outlets: list[Outlet] = []
 
     def _plan(self) -> None:
@@ -124,6 +137,8 @@ class LargeSender:
         self._shares = max(1, len(self._columns) + len(inline))
         ring = self._ring = self._rings[-1] if self._rings else None
         self._slots_wanted = 2 * self._shares + 2
+        if ring is not None and any(r.request.quota >= DEEP_QUOTA for r in self._columns.values()):
+            self._slots_wanted = max(self._slots_wanted, min(DEEP_SLOTS, DEEP_RING_BYTES // ring.slot_bytes))
         self._pin_quota = 0 if ring is None else max(1, (ring.slots - 1) // self._shares)
 
         def quota(reader: Reader) -> int:
@@ -136,7 +151,8 @@ class LargeSender:
         self._has_strict = any(r.request.strict for r in (*self._columns.values(), *self._inline))
         self._inline_strict = any(reader.request.strict for reader in self._inline)
         self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
-        self._slot_outlets = list({reader.outlet for reader in self._columns.values()})
+        self._slot_outlets = list({reader.outlet for reader in self._columns.values() if reader.pipe is None})
+        self._piped = [reader for reader in self._columns.values() if reader.pipe is not None]
         self._inline_outlets = list({reader.outlet for reader in self._inline})
 
     def admit(self, key: bytes, request: AttachKey, outlet: Outlet) -> Reader:
@@ -144,7 +160,9 @@ class LargeSender:
         column = None
         if request.shared_memory and outlet.local:
             column = next((c for c in range(COLUMNS) if c not in self._columns), None)
-        reader = Reader(key, request, outlet, column)
+        piped = column is not None and len(self._piped) < PIPES_MAX
+        pipe = open_writer(outlet.directory, request.reader) if piped else None
+        reader = Reader(key, request, outlet, column, pipe)
         if column is None:
             self._inline.append(reader)
         else:
@@ -161,6 +179,8 @@ class LargeSender:
             self._late.discard(reader.column)
             for ring in self._rings:
                 ring.free_column(reader.column)
+        if reader.pipe is not None:
+            reader.pipe.close()
         self._plan()
 
     def answer(self, reader: Reader, sequence: int, latched: bytes) -> bytes:
@@ -287,6 +307,7 @@ class LargeSender:
         mask: int,
         stamps: Stamps,
         send_strict: Callable[[Outlet, bytes, int], bool],
+        send_piped: Callable[[Reader, bytes], bool],
     ) -> tuple[bool, bool]:
         """Hand a written slot to all readers; the caller holds the lock.
 
@@ -296,6 +317,7 @@ class LargeSender:
             mask: The columns that get a lease, from `grant`.
             stamps: Number and times of the message.
             send_strict: Sends one frame over a strict outlet with these flags, waiting for room.
+            send_piped: Writes one frame into a reader's pipe, waiting for room if it is a reliable one.
 
         Returns:
             Whether every reliable reader was served in time, and whether some inline one was passed over.
@@ -307,9 +329,13 @@ class LargeSender:
                 sent = self._send_joined(outlet, slot, size, stamps, send_strict)
                 passed_over |= not sent
                 on_time &= sent or not outlet.strict
+            if self._piped:
+                frame = self._message_head + REST.pack(*stamps, size, 0) + slot.buffer[:size].tobytes()
+                for reader in self._piped:
+                    on_time &= send_piped(reader, frame)
             return on_time, passed_over
         ring.commit(slot.number, stamps.sequence, size, mask)
-        if self._slot_outlets:
+        if self._columns:
             place = ring.ring_id << 32 | slot.number
             # The ring's place goes along: an announcement that was dropped on its way does no harm.
             frame = (
@@ -320,6 +346,8 @@ class LargeSender:
                     outlet.send(frame, DONTWAIT)
                 elif not outlet.try_send(frame) and not send_strict(outlet, frame, 0):
                     on_time = False
+            for reader in self._piped:
+                on_time &= send_piped(reader, frame)
         for outlet in self._inline_outlets:
             sent = self._send_large(outlet, slot, size, REST.pack(*stamps, size, 0), send_strict)
             passed_over |= not sent

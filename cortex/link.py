@@ -7,6 +7,7 @@ import re
 import secrets
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ import zmq
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import new_socket
 from cortex.packer import make_reader
+from cortex.pipe import Offer
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
@@ -104,7 +106,7 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read, self.drain = make_reader(codec, self.message_head)
+        self.read, self.drain, self.gather = make_reader(codec, self.message_head)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,
@@ -117,15 +119,22 @@ class Link:
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
+        self._directory = (
+            Path(address.removeprefix("ipc://")).parent if address.startswith("ipc://") else None
+        )
+        self._offer: Offer | None = None
+        """A pipe; stays open until the end, as its descriptor is waited for."""
         self.socket = new_socket(
             zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
         )
         self.socket.rcvtimeo = BLOCK_MS
-        self.receive: Callable[..., bytes] = super(zmq.Socket, self.socket).recv
+        self._receive_socket: Callable[..., bytes] = super(zmq.Socket, self.socket).recv
+        self.receive: Callable[..., bytes] = self._receive_socket
+        self._piped = False
         try:
             if secure is not None:
                 secure(self.socket)
-            self.fd = int(self.socket.get(zmq.FD))
+            self._socket_fd = int(self.socket.get(zmq.FD))
             self.socket.connect(address)
             for head in (self._message_prefix, *list(self._handlers)[:3]):
                 if head != self._slot_head or shared_memory:
@@ -134,11 +143,17 @@ class Link:
             self._ask(shared_memory=shared_memory)
         except BaseException:
             self.socket.close(0)
+            self._close_offer()
             raise
 
     def _ask(self, *, shared_memory: bool) -> None:
         policy = self._policy
         self._reader = secrets.randbits(64) or 1
+        if shared_memory and self._directory is not None:
+            try:
+                self._offer = Offer(self._directory, self._reader)
+            except OSError as error:
+                logger.info("%s: no pipe: %s", self.record.topic, error)
         key = AttachKey(
             self.source,
             self._reader,
@@ -349,11 +364,32 @@ class Link:
             if self._large_subscribed:
                 self.socket.unsubscribe(self._large_head)
                 self._large_subscribed = False
+        if first and self._offer is not None and self._offer.taken():
+            self._use_pipe(self._offer)
         if not first or self.expected >= 0:
             return []
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
         return items
+
+    def _use_pipe(self, offer: Offer) -> None:
+        """The publisher sends all that follows through our pipe."""
+        self.receive = offer.reader(self._socket_fd, self._receive_socket, BLOCK_MS).receive
+        self._piped = True
+        for head in (self._message_prefix, self.batch_head, self._slot_head):
+            self.socket.unsubscribe(head)
+
+    def _use_socket(self) -> None:
+        """What follows comes through the socket again, as we shall be another reader to the publisher."""
+        self.receive = self._receive_socket
+        self._piped = False
+        for head in (self._message_prefix, self.batch_head, self._slot_head):
+            self.socket.subscribe(head)
+
+    @property
+    def fds(self) -> tuple[int, ...]:
+        """Descriptors that become readable when something may have come."""
+        return (self._socket_fd,) if self._offer is None else (self._socket_fd, self._offer.fd)
 
     def _open_ring(self, place: RingPlace) -> RingView | None:
         """Map a ring that the publisher has told us of; without it, go on without shared memory."""
@@ -386,6 +422,8 @@ class Link:
     def _do_without_shared_memory(self, error: ShmUnavailable) -> None:
         logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, error)
         self._close_rings()  # before the publisher can learn that our column is free
+        if self._piped:
+            self._use_socket()
         if not self._large_subscribed:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
@@ -401,6 +439,11 @@ class Link:
         """
         self._close_rings()
         self.socket.close(0)
+        self._close_offer()
+
+    def _close_offer(self) -> None:
+        if self._offer is not None:
+            self._offer.close()
 
     def _close_rings(self) -> None:
         for ring in self._rings.values():

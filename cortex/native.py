@@ -23,11 +23,15 @@ from cortex.schema import ArrayType, FieldType, Schema
 _Flat: Any = None
 NativeGate: Any = None
 """Sends small messages; see `gate.py`. There is one wherever `make_flat` returns something."""
+NativePipeWriter: Any = None
+NativePipeReader: Any = None
+"""The ends of a pipe; see `pipe.py`."""
 if not os.environ.get("CORTEX_PURE_PYTHON"):
     with contextlib.suppress(ImportError):  # there was no compiler when this was installed
         from cortex import _native
 
         _Flat, NativeGate = _native.Flat, _native.Gate
+        NativePipeWriter, NativePipeReader = _native.PipeWriter, _native.PipeReader
 _NUMBER, _BOOL, _FIXED, _VARIABLE, _STR, _BYTES = range(6)
 _RANK_MAX = 8
 _SHARED_MAX = 16

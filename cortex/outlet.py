@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import zmq
@@ -52,6 +53,8 @@ class Outlet:
     strict: bool
     local: bool
     """Over ipc or inproc: readers may share memory."""
+    directory: Path | None = None
+    """Where its unix socket lies, and readers offer pipes."""
 
     def __post_init__(self) -> None:
         # pyzmq's own `send` spends half of its time on checking arguments that we never pass.
@@ -100,7 +103,8 @@ def open_outlet(
     except zmq.ZMQError:
         socket.close(0)
         raise
-    return Outlet(socket, strict, local)
+    paths = [Path(address.removeprefix("ipc://")) for address in addresses if address.startswith("ipc://")]
+    return Outlet(socket, strict, local, paths[0].parent if paths else None)
 
 
 class Outlets:

@@ -91,10 +91,12 @@ class Publisher(Generic[T]):
             self._head,
             outlets.lock,
             slowly=self._publish_slowly,
-            retry=self._send_strict_all,
+            retry=self._send_again,
             limit=inline_max,
         )
-        """Sends small messages if they go to one outlet and nothing special is to be done."""
+        """Sends small messages if nothing special is to be done."""
+        self._targets: tuple[Outlet | Reader | None, ...] = ()
+        """What the gate's `sends` belong to; None where they never refuse."""
         self._large_lock = threading.Lock()
         self._large = LargeSender(
             self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
@@ -102,6 +104,7 @@ class Publisher(Generic[T]):
         self._readers: dict[bytes, Reader] = {}
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_outlets: tuple[Outlet, ...] = ()
+        self._strict_pipes: tuple[Reader, ...] = ()
         self._latched = b""
         self._was_large = False
         self._crowded = False
@@ -254,7 +257,7 @@ class Publisher(Generic[T]):
             self._latched = frame
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
-        return self._send_strict_all(frame) if self._strict_outlets else True
+        return self._send_strict_all(frame)
 
     def _send_strict_all(self, frame: bytes) -> bool:
         on_time = not self._late
@@ -263,9 +266,70 @@ class Publisher(Generic[T]):
                 outlet.send(frame, DONTWAIT)
             except zmq.Again:
                 on_time &= self._send_strict(outlet, frame, 0)
+        for reader in self._strict_pipes:
+            on_time &= self._send_piped(reader, frame)
         if not on_time:
             self._timeouts += 1
         return on_time
+
+    def _send_again(self, frame: bytes, place: int) -> bool:
+        """Send what the gate could not; the lock is held, and let go while sleeping."""
+        target = self._targets[place] if place < len(self._targets) else None
+        on_time = True
+        if isinstance(target, Reader):
+            on_time = self._send_piped(target, frame)
+        elif target is not None:
+            on_time = self._send_strict(target, frame, 0)
+        if not on_time:
+            self._timeouts += 1
+        return on_time
+
+    def _send_piped(self, reader: Reader, frame: bytes) -> bool:
+        """Write into a reader's pipe, waiting if it is a reliable one; the lock as in `_send_strict`.
+
+        Returns:
+            False if a reliable reader lost the frame.
+        """
+        pipe = reader.pipe
+        assert pipe is not None
+        if not reader.request.strict:
+            pipe.offer(frame)
+            return True
+        backoff = Backoff(reader.timeout_s)
+        blocked = False
+        try:
+            while True:
+                try:
+                    pipe.send(frame)
+                except zmq.Again:
+                    pass
+                else:
+                    reader.late = False
+                    return True
+                if reader.late:
+                    return False
+                if not blocked:
+                    blocked = True
+                    self._block()
+                self._lock.release()
+                try:
+                    more = backoff.wait()
+                finally:
+                    self._lock.acquire()
+                self._check_open()
+                self._outlets.refresh()
+                if reader.key not in self._readers:
+                    return True
+                if not more:
+                    if not self._timeouts:
+                        self._outlets.note(
+                            f"{self.topic}: a reliable subscriber was too late and lost a message"
+                        )
+                    reader.late = True
+                    return False
+        finally:
+            if blocked:
+                self._blocked = False
 
     def _send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
         """Send, waiting for the slowest reliable reader; the lock is held, and let go while sleeping."""
@@ -380,7 +444,9 @@ class Publisher(Generic[T]):
         if self.latch:
             head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
             self._latched = head + slot.buffer[:size].tobytes()
-        sent, inline_passed_over = self._large.send(slot, size, mask, stamps, self._send_strict)
+        sent, inline_passed_over = self._large.send(
+            slot, size, mask, stamps, self._send_strict, self._send_piped
+        )
         self._skipped += passed_over or inline_passed_over
         on_time &= sent and not self._late
         self._timeouts += not on_time
@@ -420,6 +486,8 @@ class Publisher(Generic[T]):
         self._readers[key] = reader
         self._route()
         sequence = self._batch_sequence if self._batch else self._gate.sequence
+        if reader.pipe is not None:  # this tells the reader that all else comes there
+            reader.pipe.offer(self._batch_head + REST.pack(sequence, 0, monotonic_ns(), 0, 0))
         answer = self._large.answer(reader, sequence, self._latched)
         if outlet.strict:
             if not outlet.try_send(answer):
@@ -445,11 +513,19 @@ class Publisher(Generic[T]):
 
     def _route(self) -> None:
         """Work out where messages go, when readers or what is sent have changed."""
-        outlets = {reader.outlet for reader in self._readers.values()}
-        self._lossy_sends = tuple(outlet.send for outlet in outlets if not outlet.strict)
+        readers = self._readers.values()
+        outlets = {reader.outlet for reader in readers if reader.pipe is None}
+        pipes = [reader for reader in readers if reader.pipe is not None]
+        lossy = [reader.pipe.offer for reader in pipes if reader.pipe and not reader.request.strict]
+        sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
+        self._lossy_sends = (*sends, *lossy)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
-        usual = self._plain and not self._was_large and not self._late and len(outlets) == 1
-        self._gate.send = next(iter(outlets)).send if usual else None
+        self._strict_pipes = tuple(reader for reader in pipes if reader.request.strict)
+        strict = [reader.pipe.send for reader in self._strict_pipes if reader.pipe]
+        usual = self._plain and not self._was_large and not self._late
+        waiting: list[Callable[..., Any]] = [outlet.send for outlet in self._strict_outlets]
+        self._gate.sends = (*self._lossy_sends, *waiting, *strict) if usual else ()
+        self._targets = (*[None] * len(self._lossy_sends), *self._strict_outlets, *self._strict_pipes)
 
     def tick(self, now_ns: int) -> None:
         """Free what the sockets have sent, end a burst; called by the node now and then."""
@@ -457,6 +533,9 @@ class Publisher(Generic[T]):
             try:
                 if not self._closed:
                     self._large.prune()
+                    for reader in self._readers.values():
+                        if reader.pipe is not None:
+                            reader.pipe.flush()
                     if self._told != self._gate.sequence:
                         self._told, self._tell_after_ns = self._gate.sequence, SILENCE_NS
                     if self._readers and now_ns - self._gate.refresh_ns > self._tell_after_ns:
@@ -476,6 +555,9 @@ class Publisher(Generic[T]):
             send(frame, DONTWAIT)
         for outlet in self._strict_outlets:
             outlet.try_send(frame)
+        for reader in self._strict_pipes:
+            if reader.pipe is not None:
+                reader.pipe.offer(frame)
         self._tell_after_ns = min(2 * self._tell_after_ns, now_ns - self._gate.refresh_ns + SILENCE_MAX_NS)
 
     @property
@@ -530,6 +612,9 @@ class Publisher(Generic[T]):
             if taken_in or not backoff.wait():
                 break
         with self._lock:
+            for reader in self._readers.values():
+                if reader.pipe is not None:
+                    reader.pipe.close()
             self._readers.clear()
             self._route()
             self._large.close()

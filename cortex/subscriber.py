@@ -162,7 +162,9 @@ class Subscriber(Generic[T]):
         with self._turn:
             for link in self._links:
                 link.whole_batches = True
-        records: np.ndarray = self._receive(timeout_s, self._join, whole=True)
+        records = self._gather()
+        if records is None:
+            records = self._receive(timeout_s, self._join, whole=True)
         return records
 
     def __iter__(self) -> Iterator[T]:
@@ -204,7 +206,7 @@ class Subscriber(Generic[T]):
 
     def _watched(self) -> tuple[int, list[int]]:
         with self._turn:
-            return self._generation, [self.wakeup.fd, *(link.fd for link in self._links)]
+            return self._generation, [self.wakeup.fd, *(fd for link in self._links for fd in link.fds)]
 
     def _on_wake(self, fd: int) -> None:
         if fd == self.wakeup.fd:
@@ -242,9 +244,7 @@ class Subscriber(Generic[T]):
             if self._problems:
                 raise self._problems.popleft()
             if not self.policy.reliable and (
-                not queue
-                or self.policy.depth < DRAIN_MAX
-                or monotonic_ns() - self._drained_ns > FRESH_NS
+                not queue or self.policy.depth < DRAIN_MAX or monotonic_ns() - self._drained_ns > FRESH_NS
             ):
                 self._drain()
             if not queue and whole:
@@ -326,6 +326,34 @@ class Subscriber(Generic[T]):
         if any(len(body) != fixed for body in bodies):
             raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
         return np.frombuffer(b"".join(bodies), dtype)
+
+    def _gather(self) -> np.ndarray | None:
+        """The plain messages that wait in the sockets, as one array; None if there are none."""
+        codec = self.codec
+        assert codec is not None
+        with self._turn:
+            if self._queue or self._closed or self._problems or not self.policy.reliable:
+                return None
+            for link in self._rotated():
+                if link.gather is None or link.codec is not codec:
+                    continue
+                link.expected, bodies, count, frame = link.gather(
+                    link.receive,
+                    zmq.Again,
+                    link.expected,
+                    self.policy.depth,
+                    self.counters.latency,
+                    link.clock_offset_ns,
+                )
+                if frame is not None:
+                    self._exhausted = False
+                    self._accept(link, frame, timed=True)
+                if count:
+                    self.counters.received += count
+                    return np.frombuffer(bodies, codec.record_dtype)
+                if frame is not None:
+                    return None
+        return None
 
     def _receive_one(self, *, block: bool = False) -> None:
         """Read one frame into the queue; the lock is held.
@@ -518,7 +546,8 @@ class Subscriber(Generic[T]):
         poll = select.poll()
         poll.register(self.wakeup.fd, select.POLLIN)
         for link in self._links:
-            poll.register(link.fd, select.POLLIN)
+            for fd in link.fds:
+                poll.register(fd, select.POLLIN)
         return poll
 
     def dispatch(self, *, block: bool = False) -> bool:
@@ -595,7 +624,7 @@ class Subscriber(Generic[T]):
     def fds(self) -> list[int]:
         """File descriptors that become readable when a message may have come."""
         with self._turn:
-            return [link.fd for link in self._links]
+            return [fd for link in self._links for fd in link.fds]
 
     def top_up(self, now_ns: int) -> None:
         """Read the sockets of a subscriber that nobody reads at the moment; for the node's control thread.

@@ -37,6 +37,12 @@ class Numbers:
     name: str
 
 
+@message
+class Numbers3:
+    stamp_ns: int
+    value: float
+
+
 HEAD = message_head(MESSAGE, 7, schema_of(Sample).fingerprint, stamped=True)
 
 
@@ -57,7 +63,7 @@ def test_bodies_are_those_of_the_general_code(value):
     body = codec.plan(value)
     expected = bytearray(body.size)
     body.write(memoryview(expected))
-    assert flat.encode(value, 1 << 20) == expected
+    assert flat.encode(value, 1 << 30) == expected
     assert flat.encode(value, body.size - 1) is None
     assert flat.decode(bytes(expected), 0, body.size) == value
 
@@ -194,6 +200,28 @@ def test_drain_is_that_of_python(frames, expected, limit):
     assert drain(flat.drain) == drain(lambda *rest: packer.drain(reader.read, *rest))
 
 
+@pytest.mark.parametrize("case", range(4))
+def test_gather_is_that_of_python(case):
+    flat, codec = flat_of(Numbers3, HEAD), codec_of(Numbers3)
+    frames = [flat.frame(Numbers3(s, float(s)), s, 0, 1000) for s in range(20)]
+    frames, expected, limit = [
+        (frames, 0, 64),
+        (frames, 0, 7),
+        (frames[:3] + frames[5:], 0, 64),
+        ([*frames[:2], b"other"], 0, 64),
+    ][case]
+
+    def gather(reader):
+        latency, script = [0] * 8, Script(frames)
+        return reader(script, zmq.Again, expected, limit, latency, 10**12), latency, len(script.frames)
+
+    reader = packer.make_reader(codec, HEAD)
+    found = gather(reader.gather)
+    assert found == gather(lambda *rest: packer.gather(HEAD, codec.fixed_size, *rest))
+    records = np.frombuffer(found[0][1], codec.record_dtype)
+    assert records["value"].tolist() == list(range(found[0][2]))
+
+
 def test_drain_passes_errors_on():
     def broken(flags):
         raise OSError("gone")
@@ -214,7 +242,7 @@ class Taken:
         self.gate = gate.make_gate(
             codec_of(Sample), HEAD, self.lock, slowly=self.slowly, retry=self.retry, limit=1000
         )
-        self.gate.send = self.send
+        self.gate.sends = (self.send,)
         self.gate.refresh_ns = 2**62
 
     def send(self, frame, flags):
@@ -227,9 +255,9 @@ class Taken:
         self.slow.append(value)
         return True
 
-    def retry(self, frame):
+    def retry(self, frame, place):
         assert self.lock.locked()
-        self.retried.append(frame)
+        self.retried.append((frame, place))
         return False
 
 
@@ -252,7 +280,7 @@ def test_what_goes_the_long_way():
     taken.gate.refresh_ns = 0
     taken.gate(sample())
     taken.gate.refresh_ns = 2**62
-    taken.gate.send = None
+    taken.gate.sends = ()
     taken.gate(sample())
     assert taken.slow == [large, wrong, sample(), sample()]
     assert (taken.sent, taken.gate.sequence, taken.gate.bytes) == ([], 0, 0)
@@ -264,7 +292,7 @@ def test_a_full_queue_and_an_error_leave_the_lock_free():
     def full(frame, flags):
         raise zmq.Again
 
-    taken.gate.send = full
+    taken.gate.sends = (full,)
     assert taken.gate(sample()) is False
     assert len(taken.retried) == 1
     assert not taken.lock.locked()
@@ -272,7 +300,7 @@ def test_a_full_queue_and_an_error_leave_the_lock_free():
     def broken(frame, flags):
         raise zmq.ZMQError(zmq.ENOTSOCK)
 
-    taken.gate.send = broken
+    taken.gate.sends = (broken,)
     with pytest.raises(zmq.ZMQError):
         taken.gate(sample())
     assert not taken.lock.locked()
