@@ -31,8 +31,10 @@ logger = logging.getLogger(__name__)
 
 Convert = Callable[[Any, Context], "Buffer | None"]
 
-QUEUES: dict[type[Any], int] = {Image: 16, PointCloud: 16, Events: 128}
-"""Messages that wait for their conversion; the option `queue` changes it."""
+QUEUES: dict[type[Any], int] = {Image: 72, PointCloud: 72, Events: 128}
+"""Messages that wait for their conversion; the option `queue` changes it.
+
+More than by default, so that Cortex makes room in shared memory for those that wait while others are busy."""
 QUEUE = 1024
 REMIND_S = (0.1, 0.5, 2.0)
 """When the last message of a latched topic is sent again after somebody in ROS has come [s].
