@@ -537,8 +537,9 @@ def _summary(
             f"{finest.setting:g} px {finest.missing_count / study.reference_count:.1%} of the events are "
             "missing: details that pass a pixel between two renders. To choose costs at most "
             f"{choosing_us:.2g} us for each tick of the clock, a render {study.render_ms * 1e3:.3g} us.",
-            "Adaptive sampling bounds how far things move between two renders, not the time between them: "
-            "where the vehicle is slow, events are off by as much of a pixel, which is more microseconds.",
+            "Adaptive sampling bounds how far things move between two renders, not the time: where the "
+            "vehicle is slow, events are off by as much of a pixel, which is more microseconds. It pays on "
+            "flights with slow and fast parts, such as this one; at an even speed a fixed rate is as good.",
             f"Distance: Victor and Purpura (1996), q = {COST_PER_S:g}/s, of each pixel and polarity, summed, "
             "and divided by the events of the reference. Its alignment matches events at most "
             f"{2e3 / COST_PER_S:g} ms apart.",

@@ -28,6 +28,10 @@ What a ray hits of a moving body is a point of the body, and moves with it: wher
 function of time. The corners of the bounding boxes of bodies count as well, whether something hides them or
 not, if the box overlaps the picture and the corner is no further outside of it than the picture is large.
 
+It pays where a flight has slow and fast parts, as renders follow the speed; where the speed hardly changes, a
+fixed rate gives the same events for as many renders. What a render costs should be more than what the choice
+costs for the ticks between two renders: on a fast GPU and a small picture a fixed rate may be cheaper.
+
 Limit: an object of the scene that no ray hits is not seen to move. It is narrower than the spacing, and it
 moves at most by f |t| / z px relative to the far background, for the translation t of the camera between two
 renders and its distance z. As the grid shifts, it is found sooner or later while it is in view.
