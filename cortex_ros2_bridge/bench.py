@@ -1,14 +1,16 @@
-"""`cortex-ros2-bridge bench`: what the bridge costs on this machine, one `name value unit` a line.
+"""`cortex-ros2-bridge bench`: is the bridge right, and what does it cost here; one `name value unit` a line.
 
-Three processes: a Cortex publisher, the bridge, and a DDS subscriber. Messages are stamped when they are
-published, so that a latency is everything from `publish` in Cortex to the callback in DDS: both transports,
-the conversion, and the bridge.
+Bytes are compared with those of rosbags and, where it imports, rclpy. For latencies there are three
+processes: a Cortex publisher, the bridge, and a DDS subscriber. Messages are stamped when they are published,
+so that a latency is everything from `publish` in Cortex to the callback in DDS: both transports, the
+conversion, and the bridge. At the end flights of a controller on DDS, and all bars: met or missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import json
 import os
 import platform
@@ -32,6 +34,10 @@ from cortex.messages import Events, Image, Imu
 WIDTH, HEIGHT = 640, 480
 EVENTS_PER_PACKET = 10_000
 TICK_NS = 1_000_000
+CONVERSION_MAX_MS = {"convert.events_100k_evt3": 1.0, "convert.events_100k_mono": 1.0}
+LATENCY_MAX_MS = {"image": 3.0, "imu": 1.5}
+RATIO_MAX = 1.1
+"""What the median latencies, conversions and the error of a flight may be."""
 MATCH_S = 20.0
 """Longest wait until everybody has found each other [s]."""
 PROFILE = "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/>\
@@ -76,6 +82,9 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--seconds", type=float, default=5.0, help="length of each measurement [s]")
     parser.add_argument("--encoding", default="evt3", choices=["evt3", "mono"], help="of the events")
+    parser.add_argument(
+        "--no-flights", dest="flights", action="store_false", help="leave out flights in a closed loop"
+    )
     parser.add_argument("--role", choices=["publish", "subscribe"], help=argparse.SUPPRESS)
     parser.add_argument("--streams", default="", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -87,8 +96,15 @@ def main(arguments: Sequence[str]) -> int:
         return _subscribe(options.streams.split(","))
     print(f"# {platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, "
           f"NumPy {np.__version__}, events as {options.encoding}")  # fmt: skip
+    bars = Bars()
+    for name, (right, count) in bytes_check().items():
+        print(f"bytes.{name} {right} of {count} messages", flush=True)
+        bars.add(f"bytes.{name}: all the same", right == count)
     for name, milliseconds in conversions().items():
         print(f"{name} {milliseconds:.3f} ms", flush=True)
+        if name in CONVERSION_MAX_MS:
+            limit = CONVERSION_MAX_MS[name]
+            bars.add(f"{name} <= {limit:g} ms", milliseconds <= limit)
     for streams in (("imu",), ("image", "events"), ("image", "events", "imu")):
         for name, result in end_to_end(streams, seconds=options.seconds, encoding=options.encoding).items():
             title = f"{'+'.join(streams)}.{name}"
@@ -96,7 +112,107 @@ def main(arguments: Sequence[str]) -> int:
             print(f"{title}.lost_in_bridge {result.lost_in_bridge} messages")
             for which, value in zip(("median", "p99", "max"), result.latency_ms, strict=True):
                 print(f"{title}.latency_{which} {value:.3f} ms", flush=True)
-    return 0
+            if len(streams) != 1 or name == "imu":
+                bars.add(f"{title}: nothing lost", result.received == result.sent)
+            if name in LATENCY_MAX_MS:
+                limit = LATENCY_MAX_MS[name]
+                bars.add(f"{title}.latency_median <= {limit:g} ms", result.latency_ms[0] <= limit)
+    for flight in closed_loops() if options.flights else ():
+        title = f"flight.{flight['live_mode']}.{flight['mode']}"
+        ratio = flight["rms_m"] / flight["in_process_rms_m"]
+        print(f"{title}.error {1e3 * flight['rms_m']:.2f} mm")
+        print(f"{title}.error_in_process {1e3 * flight['in_process_rms_m']:.2f} mm", flush=True)
+        bars.add(f"{title}.error <= {RATIO_MAX:g} x in process (it is {ratio:.3f} x)", ratio <= RATIO_MAX)
+    return bars.tell()
+
+
+class Bars:
+    """What must be reached, and what was."""
+
+    def __init__(self) -> None:
+        self._lines: list[tuple[str, bool]] = []
+
+    def add(self, text: str, met: bool) -> None:
+        """Note a bar."""
+        self._lines.append((text, met))
+
+    def tell(self) -> int:
+        """Print all of them; return the exit status: 1 if one was missed."""
+        for text, met in self._lines:
+            print(f"# {'met   ' if met else 'MISSED'} {text}")
+        return 0 if all(met for _, met in self._lines) else 1
+
+
+def bytes_check() -> dict[str, tuple[int, int]]:
+    """Return, by check, how many messages were as they must be, of how many.
+
+    rosbags: what `cdr.encode` makes of each routed type are the bytes of rosbags. rclpy: messages that one
+    encodes and the other decodes are the same; only types that are installed. evt3, mono: packets over three
+    wraps of time are decoded to the same events.
+    """
+    from cortex_ros2_bridge import cdr, convert
+    from cortex_ros2_bridge.msgs import Message, message_class
+    from cortex_ros2_bridge.typestore import typestore
+
+    found: dict[str, list[bool]] = {"rosbags": [], "evt3": [], "mono": []}
+    try:
+        from rclpy.serialization import deserialize_message, serialize_message
+
+        found["rclpy"] = []
+    except ImportError:
+        pass
+    for ros_type in sorted({name for _, name in convert.OUT} | {name for name, _ in convert.IN}):
+        message = message_class(ros_type)()
+        ours = bytes(cdr.encode(message))
+        record = cdr.decode_record(ours, ros_type)
+        theirs = bytes(typestore().serialize_cdr(record, ros_type))
+        found["rosbags"].append(ours == theirs + bytes(-len(theirs) % 4))
+        if "rclpy" in found and not isinstance(message, Message):
+            back = cdr.decode(serialize_message(message), ros_type)
+            found["rclpy"].append(deserialize_message(ours, type(message)) == message == back)
+    for encoding in ("evt3", "mono"):
+        found[encoding] = list(_round_trips(encoding))
+    return {name: (sum(right), len(right)) for name, right in found.items()}
+
+
+def _round_trips(encoding: str) -> Iterator[bool]:
+    """Encode and decode packets of 0.25 s over 60 s of random events, and say which came back the same."""
+    from cortex_ros2_bridge import cdr, convert
+    from cortex_ros2_bridge.event_codec import Evt3Decoder, decode_mono
+    from cortex_ros2_bridge.frames import FrameNames
+
+    rng = np.random.default_rng(2)
+    context = convert.Context(frames=FrameNames(), vehicle="bench", options={"encoding": encoding})
+    decoder = Evt3Decoder()
+    for number in range(240):
+        events = make_events(rng, 1 + number % 7 * 300, stamp_ns=(number + 1) * 250 * TICK_NS)
+        data = convert.event_packet(events, context)
+        packet = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
+        if encoding == "evt3":
+            columns = decoder.decode(packet.events, width=WIDTH, height=HEIGHT)
+            t_us = columns.t
+        else:
+            columns = decode_mono(packet.events, base_ns=packet.time_base)
+            t_us = columns.t // 1000
+        pairs = ((t_us, events.t), (columns.x, events.x), (columns.y, events.y))
+        same = all(np.array_equal(one, other) for one, other in pairs)
+        yield same and np.array_equal(columns.polarity, events.polarity)
+
+
+def closed_loops() -> Iterator[dict[str, Any]]:
+    """Fly with a simulator, if there is one, and a controller that only speaks DDS; yield what came of it."""
+    if importlib.util.find_spec("neurosim_core") is None:
+        print("# no flights: neurosim_core is not installed")
+        return
+    flights = subprocess.run(
+        [sys.executable, "-m", "neurosim_core.bench.bridge_flight"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    yield from (json.loads(line) for line in flights.stdout.splitlines() if line.startswith("{"))
+    if flights.returncode:
+        raise RuntimeError(f"the flights have failed: {flights.stderr.strip().splitlines()[-1]}")
 
 
 def conversions(repeats: int = 30) -> dict[str, float]:

@@ -12,10 +12,11 @@ import pytest
 import yaml
 from test_routes import topic
 
-from cortex.messages import Events, Image, Odometry, PointCloud, PoseCommand
+from cortex.messages import Events, Image, Odometry
 from cortex.messages import Path as PathMessage
 from cortex_ros2_bridge.cli import _parser
-from cortex_ros2_bridge.routes import Seen, default_routes
+from cortex_ros2_bridge.config import load as settings
+from cortex_ros2_bridge.routes import Seen, make_routes
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted((ROOT / "launch").glob("*.launch.py"))
@@ -212,24 +213,26 @@ DISPLAYS = {
     "nav_msgs/msg/Path": "Path",
     "sensor_msgs/msg/PointCloud2": "PointCloud2",
     "sensor_msgs/msg/Image": "Image",
-    "geometry_msgs/msg/PoseStamped": "SetGoal",
 }
 
 
 def test_rviz_shows_what_the_bridge_publishes():
-    """Every topic has the name, the type and a quality of service that fits the default route."""
+    """Every topic has the name, the type and a quality of service that fits its route.
+
+    The cloud of the depth camera is there on request, so its display is off. No tool commands a vehicle: one
+    message is no command for longer than `live.command_timeout_s`, and RViz stamps it with another time.
+    """
     seen = Seen(
         (
             topic("/drone/odometry", Odometry),
             topic("/drone/path", PathMessage),
-            topic("/drone/points", PointCloud),
             topic("/drone/rgb", Image),
             topic("/drone/depth", Image),
             topic("/drone/events", Events),
-            topic("/drone/command/position", PoseCommand, published=False),
         )
     )
-    routes = {route.ros_topic: route for route in default_routes(seen)}
+    asked = {"routes": [{"cortex": "/drone/depth", "type": "sensor_msgs/PointCloud2"}]}
+    routes = {route.ros_topic: route for route in make_routes(seen, settings(asked))[0]}
     path = ROOT / "rviz" / "neurosim.rviz"
     manager = yaml.safe_load(path.read_text())["Visualization Manager"]
     shown = set()
@@ -242,6 +245,9 @@ def test_rviz_shows_what_the_bridge_publishes():
                 assert route.qos.durability == "transient_local"
             shown.add(route.ros_type)
     assert shown == set(DISPLAYS)
+    assert not any("Topic" in tool for tool in manager["Tools"])
+    (cloud,) = [one for one in manager["Displays"] if one["Class"].endswith("/PointCloud2")]
+    assert not cloud["Enabled"]
     assert manager["Global Options"]["Fixed Frame"] == "map"
     assert any(display["Class"].endswith("/TF") for display in manager["Displays"])
 
@@ -252,6 +258,6 @@ def test_rviz_for_another_vehicle(fake_launch, tmp_path):
     path = Path(module.rviz_config("alpha", "/sim/"))
     try:
         assert all(name.startswith("/sim/alpha/") for name in topics_of(path))
-        assert len(topics_of(path)) == 7
+        assert len(topics_of(path)) == 6
     finally:
         path.unlink()

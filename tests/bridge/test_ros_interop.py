@@ -28,8 +28,8 @@ from cortex import messages as msg
 
 INSTALL = (
     "no rclpy; pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-{sensor,nav,geometry,std,diagnostic,"
-    "rosgraph,trajectory}-msgs ros-jazzy-std-srvs pyzmq msgspec rosbags numpy pyyaml, in this Python or in that of "
-    "NEUROSIM_ROS_PYTHON"
+    "rosgraph,trajectory}-msgs ros-jazzy-std-srvs pyzmq msgspec rosbags numpy pyyaml, in this Python or "
+    "in that of NEUROSIM_ROS_PYTHON"
 )
 ROS_PYTHON = os.environ.get("NEUROSIM_ROS_PYTHON") or (
     sys.executable if importlib.util.find_spec("rclpy") is not None else ""

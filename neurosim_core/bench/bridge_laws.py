@@ -1,4 +1,4 @@
-"""What flies the figure eight, in one process and through DDS: a state in, a command out."""
+"""What flies the figure eight of the bridge's benchmark, in one process and through DDS."""
 
 from __future__ import annotations
 
@@ -30,12 +30,18 @@ SETTINGS: dict[str, Any] = {
 Law = Callable[..., np.ndarray]
 
 
-def config() -> SimulationConfig:
-    return load_config(SETTINGS)
+def flight_config(live_mode: str = "lockstep") -> SimulationConfig:
+    """Return the settings of a flight, in lockstep or streaming."""
+    return load_config(settings_of(live_mode))
+
+
+def settings_of(live_mode: str) -> dict[str, Any]:
+    """Return the settings of a flight as YAML has them."""
+    return {**SETTINGS, "live": {**SETTINGS["live"], "mode": live_mode}}
 
 
 def make_law(mode: str, settings: SimulationConfig, path: Path) -> Law:
-    """A function of stamp_ns, position, velocity, orientation, body_rate and rotor_speed; in W, xyzw, in B.
+    """Return a function of a state, by names; position and velocity in W, xyzw, rates in B.
 
     motor_speeds: the geometric controller of `neurosim_core.control`. attitude: its outer loop, in Python.
     """
@@ -44,7 +50,7 @@ def make_law(mode: str, settings: SimulationConfig, path: Path) -> Law:
         return PathFollower(path, airframe, settings.control.gains, mode="motor_speeds").command
     gains, cursor = settings.control.gains, PathCursor(path)
 
-    def attitude(*, stamp_ns, position, velocity, orientation, body_rate, rotor_speed):
+    def attitude(*, stamp_ns: int, position: Any, velocity: Any, orientation: Any, **_: Any) -> np.ndarray:
         point = cursor.at(stamp_ns)
         force = point["acceleration"] + np.array([0.0, 0.0, GRAVITY_M_S2])
         force = force + gains.position_gain_per_s2 * (point["position"] - position)
@@ -72,8 +78,10 @@ class Errors:
         self.squares: list[float] = []
 
     def add(self, stamp_ns: int, position: Any) -> None:
+        """Take in where the vehicle was."""
         self.squares.append(float(np.sum((self._cursor.at(stamp_ns)["position"] - position) ** 2)))
 
     @property
     def rms_m(self) -> float:
+        """Root of the mean square [m]."""
         return math.sqrt(sum(self.squares) / len(self.squares))

@@ -1,7 +1,8 @@
 """A controller as a foreign node: it speaks DDS by public functions of cyclonedds, with types of its own.
 
-It flies the figure eight with the modes of its arguments, one after the other, asks for a reset after each,
-and prints a line of JSON for each flight. It knows nothing of Cortex and of the bridge.
+Its arguments are the DDS domain, lockstep or streaming, and modes of commands. It flies the figure eight with
+one mode after the other, asks for a reset after each, and prints a line of JSON for each flight. It knows
+nothing of Cortex and of the bridge.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
-from flight_laws import DURATION_S, MAX_THRUST_N, Errors, config, make_law
 
+from neurosim_core.bench.bridge_laws import DURATION_S, MAX_THRUST_N, Errors, flight_config, make_law
 from neurosim_core.simulation import plan_paths
 
 
 def struct(name: str, **fields: Any) -> Any:
+    """Return a type of DDS."""
     return make_idl_struct(name.rpartition(".")[2], name, fields)
 
 
@@ -70,6 +72,7 @@ IGNORE_RATES = 1 + 2 + 4
 
 
 def qos(depth: int) -> Qos:
+    """Return what ROS has by default, with a depth."""
     return Qos(
         Policy.DataRepresentation(use_cdrv0_representation=True),
         Policy.Reliability.Reliable(duration(milliseconds=100)),
@@ -88,7 +91,7 @@ class Ear:
         self.waitset.attach(condition)
 
     def take(self) -> Any:
-        """The next message."""
+        """Return the next message."""
         while not (samples := self.reader.take(1)):
             if not self.waitset.wait(duration(seconds=30)):
                 raise TimeoutError(f"nothing comes on {self.reader.topic.name}")
@@ -96,24 +99,26 @@ class Ear:
 
 
 def stamp_ns(header: Any) -> int:
+    """Return a stamp [ns]."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def turn(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """A vector of the body in the world; q is xyzw."""
+    """Return a vector of the body in the world; q is xyzw."""
     u = 2.0 * np.cross(q[:3], v)
     return v + q[3] * u + np.cross(q[:3], u)
 
 
 def numbers(*parts: Any) -> np.ndarray:
+    """Return numbers as an array."""
     return np.array(parts, np.float64)
 
 
 class Pilot:
     """One flight after the other."""
 
-    def __init__(self, domain: int) -> None:
-        self.settings = config()
+    def __init__(self, domain: int, live_mode: str) -> None:
+        self.settings = flight_config(live_mode)
         (self.path,) = plan_paths(self.settings).values()
         participant = DomainParticipant(domain)
         self.odometry = Ear(participant, "rt/sim/drone/odometry", Odometry)
@@ -128,13 +133,14 @@ class Pilot:
         }
 
     def rotor_speed(self, wanted_ns: int) -> np.ndarray:
-        """The speeds that belong to a state: they come on a topic of their own."""
+        """Return the speeds that belong to a state: they come on a topic of their own."""
         while True:
             message = self.rotors.take()
             if stamp_ns(message.header) == wanted_ns:
                 return np.array(message.velocity)
 
     def fly(self, mode: str) -> dict[str, Any]:
+        """Fly one figure eight, and return its error."""
         law, errors = make_law(mode, self.settings, self.path), Errors(self.path)
         end_ns, last_ns, row = round(DURATION_S * 1e9), -1, numbers()
         while True:
@@ -165,6 +171,7 @@ class Pilot:
             self.command(mode, state.header, row.tolist())
 
     def command(self, mode: str, header: Any, row: list[float]) -> None:
+        """Send a command with the stamp of the state that it answers."""
         if mode == "motor_speeds":
             command = Actuators(header=header, position=[], velocity=row, normalized=[])
         else:
@@ -178,13 +185,15 @@ class Pilot:
         self.writers[mode].write(command)
 
     def reset(self) -> None:
+        """Ask for a new run."""
         self.writers["reset"].write(Empty(structure_needs_at_least_one_member=0))
 
 
 def main() -> None:
+    """Fly."""
     wp.config.log_level = wp.LOG_WARNING
-    pilot = Pilot(int(sys.argv[1]))
-    for mode in sys.argv[2:]:
+    pilot = Pilot(int(sys.argv[1]), sys.argv[2])
+    for mode in sys.argv[3:]:
         print(json.dumps(pilot.fly(mode)), flush=True)
         pilot.reset()
 
