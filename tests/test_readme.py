@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
-from neurosim_core import cli
+from neurosim_core import cli, load_config
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -86,6 +87,9 @@ EXAMPLES = named("example", "python") | named(
 )
 
 
+SETTINGS = named("settings", "yaml", (ROOT / "docs" / "sensors.md").read_text(encoding="utf-8"))
+
+
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_examples(name, tmp_path):
     done = subprocess.run(
@@ -97,16 +101,26 @@ def test_examples(name, tmp_path):
     assert count == 5 * 64 * 48 if name == "parts" else count > 1000
 
 
+@pytest.mark.parametrize("name", sorted(SETTINGS))
+def test_settings_of_the_documentation(name):
+    """They are read, and each sets something that is off by default."""
+    config = load_config(yaml.safe_load(SETTINGS[name]))
+    assert config != load_config({"duration_s": config.duration_s})
+
+
 def test_the_other_commands(house, tmp_path):
     """The list under "What else there is", shortened where a flight would take long."""
     listed = commands("alone")
-    assert len(listed) == 6
+    assert len(listed) == 8
     small = (
         " --duration 0.05 --set sensors.events.kind=event_camera"
         " --set 'sensors.events.lens={width: 32, height: 24, horizontal_fov_rad: 1.5}'"
     )
     (tmp_path / "house.glb").symlink_to(house)
     for command in sorted(listed, key=lambda c: "print-config" not in c):  # makes scene.yaml first
+        if "convert" in command or "bench all" in command:  # flown in tests/convert and tests/bench
+            assert cli._parser().parse_args(command.split()[1:]).command is not None
+            continue
         if command.startswith("neurosim run") and "print-config" not in command:
             command += small
         elif "view" in command:
