@@ -70,10 +70,7 @@ class Evt3Encoder:
 
     def encode(
         self,
-        t_us: NDArray[np.int64],
-        x: NDArray[np.uint16],
-        y: NDArray[np.uint16],
-        polarity: NDArray[np.uint8],
+        events: EventColumns,
         *,
         width: int,
         height: int,
@@ -83,10 +80,7 @@ class Evt3Encoder:
         """Return a packet, in which time is written before the first event.
 
         Args:
-            t_us: Times, sorted [us], shape [n].
-            x: Columns [px], shape [n].
-            y: Rows [px], shape [n].
-            polarity: 1: brighter, 0: darker, shape [n].
+            events: What to write, with times in microseconds.
             width: Of the sensor [px].
             height: Of the sensor [px].
             end_us: Time of a packet without events [us].
@@ -98,8 +92,9 @@ class Evt3Encoder:
         """
         if width > _EVT3_SIZE_MAX or height > _EVT3_SIZE_MAX:
             raise EventCodecError(f"evt3 holds at most 2048 x 2048 pixels, not {width} x {height}; use mono")
+        t_us, x, y, polarity = events
         count = len(t_us)
-        _check(t_us, x, y, polarity, width, height)
+        _check(events, width, height)
         first_of_group = np.empty(count, bool)
         if count:
             first_of_group[0] = True
@@ -124,9 +119,9 @@ class Evt3Encoder:
         out[where] = words
         if len(self._scratch) < count:
             self._scratch = np.empty(count * 5 // 4, np.uint32)
-        events = self._scratch[:count]
-        _write_events(events[:, None], x, y, polarity)
-        out[is_event] = events
+        places = self._scratch[:count]
+        _write_events(places[:, None], x, y, polarity)
+        out[is_event] = places
         return out.view(np.uint8)
 
     def _wraps(self, times: NDArray[np.int64]) -> bool:
@@ -242,10 +237,7 @@ class Evt3Decoder:
 
 
 def encode_mono(
-    t_us: NDArray[np.int64],
-    x: NDArray[np.uint16],
-    y: NDArray[np.uint16],
-    polarity: NDArray[np.uint8],
+    events: EventColumns,
     *,
     width: int,
     height: int,
@@ -255,10 +247,7 @@ def encode_mono(
     """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
 
     Args:
-        t_us: Times, sorted [us], shape [n].
-        x: Columns [px], shape [n].
-        y: Rows [px], shape [n].
-        polarity: 1: brighter, 0: darker, shape [n].
+        events: What to write, with times in microseconds.
         width: Of the sensor [px].
         height: Of the sensor [px].
         base_us: Time not after that of the first event [us].
@@ -270,8 +259,9 @@ def encode_mono(
     """
     if width > 2**16 or height > 2**15:
         raise EventCodecError(f"mono holds at most 65536 x 32768 pixels, not {width} x {height}")
+    t_us, x, y, polarity = events
     count = len(t_us)
-    _check(t_us, x, y, polarity, width, height)
+    _check(events, width, height)
     if count and not 0 <= int(t_us[0]) - base_us <= int(t_us[-1]) - base_us <= _MONO_SPAN_MAX_US:
         raise EventCodecError(
             f"mono holds times from its base to 4.29 s later, got {t_us[0]} to {t_us[-1]} us for {base_us} us"
@@ -324,10 +314,7 @@ def dvs_size(count: int) -> int:
 
 def write_dvs(
     out: Bytes,
-    t_us: NDArray[np.int64],
-    x: NDArray[np.uint16],
-    y: NDArray[np.uint16],
-    polarity: NDArray[np.uint8],
+    events: EventColumns,
     *,
     width: int,
     height: int,
@@ -336,10 +323,7 @@ def write_dvs(
 
     Args:
         out: Bytes to write to, `dvs_size` of them and 3 more, from a multiple of 4 on in the message.
-        t_us: Times, sorted [us], shape [n].
-        x: Columns [px], shape [n].
-        y: Rows [px], shape [n].
-        polarity: 1: brighter, 0: darker, shape [n].
+        events: What to write, with times in microseconds.
         width: Of the sensor [px].
         height: Of the sensor [px].
 
@@ -347,7 +331,8 @@ def write_dvs(
         EventCodecError: An event is outside of the sensor or has another polarity; times decrease, reach over
             more than 71 minutes, or have seconds of more than 32 bits.
     """
-    _check(t_us, x, y, polarity, width, height)
+    t_us, x, y, polarity = events
+    _check(events, width, height)
     out[:] = 0
     if not len(t_us):
         return
@@ -401,14 +386,8 @@ class EventPicture:
         return picture
 
 
-def _check(
-    t_us: NDArray[np.int64],
-    x: NDArray[np.uint16],
-    y: NDArray[np.uint16],
-    polarity: NDArray[np.uint8],
-    width: int,
-    height: int,
-) -> None:
+def _check(events: EventColumns, width: int, height: int) -> None:
+    t_us, x, y, polarity = events
     _check_pixels(x, y, polarity, width, height)
     if not len(t_us) == len(x):
         raise EventCodecError(f"there are {len(t_us)} times for {len(x)} events")

@@ -13,6 +13,7 @@ from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.event_codec import (
     Bytes,
     EventCodecError,
+    EventColumns,
     EventPicture,
     Evt3Encoder,
     dvs_size,
@@ -47,16 +48,16 @@ def event_packet(message: messages.Events, context: Context) -> Buffer:
         )
     )
     room = _Room(prefix)
-    columns = (message.t, message.x, message.y, message.polarity)
+    columns = _columns(message)
     try:
         if encoding == "mono":
             encode_mono(
-                *columns, width=message.width, height=message.height, base_us=base_us, allocate=room.make
+                columns, width=message.width, height=message.height, base_us=base_us, allocate=room.make
             )
         else:
             encoder = context.remembered("evt3", Evt3Encoder)
             encoder.encode(
-                *columns, width=message.width, height=message.height, end_us=base_us, allocate=room.make
+                columns, width=message.width, height=message.height, end_us=base_us, allocate=room.make
             )
     except EventCodecError as error:
         raise ConvertError(str(error)) from error
@@ -78,10 +79,7 @@ def event_array(message: messages.Events, context: Context) -> Buffer:
     try:
         write_dvs(
             room.make(dvs_size(count), count=count),
-            message.t,
-            message.x,
-            message.y,
-            message.polarity,
+            _columns(message),
             width=message.width,
             height=message.height,
         )
@@ -144,7 +142,11 @@ def _ends_picture(message: messages.Events, context: Context) -> bool:
     until_ns: int = context.memory.get("seen_until_ns", message.start_ns)
     context.memory["seen_until_ns"] = message.stamp_ns
     begin_ns = until_ns if until_ns <= message.stamp_ns else message.start_ns
-    return message.stamp_ns // period_ns > begin_ns // period_ns
+    return bool(message.stamp_ns // period_ns > begin_ns // period_ns)
+
+
+def _columns(message: messages.Events) -> EventColumns:
+    return EventColumns(message.t, message.x, message.y, message.polarity)
 
 
 class _Room:

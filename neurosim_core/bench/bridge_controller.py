@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from cyclonedds import idl
 from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
@@ -28,9 +28,11 @@ from neurosim_core.simulation import plan_paths
 
 def struct(name: str, **fields: Any) -> Any:
     """Return a type of DDS."""
-    return make_idl_struct(name.rpartition(".")[2], name, fields)
+    return idl.make_idl_struct(name.rpartition(".")[2], name, fields)
 
 
+types: Any = idl.types
+"""Types of fields; mypy does not see that they take parameters."""
 f64 = types.float64
 Time = struct("builtin_interfaces.msg.dds_.Time_", sec=types.int32, nanosec=types.uint32)
 Header = struct("std_msgs.msg.dds_.Header_", stamp=Time, frame_id=str)
@@ -106,7 +108,8 @@ def stamp_ns(header: Any) -> int:
 def turn(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return a vector of the body in the world; q is xyzw."""
     u = 2.0 * np.cross(q[:3], v)
-    return v + q[3] * u + np.cross(q[:3], u)
+    turned: np.ndarray = v + q[3] * u + np.cross(q[:3], u)
+    return turned
 
 
 def numbers(*parts: Any) -> np.ndarray:

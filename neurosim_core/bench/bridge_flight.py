@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import yaml
 
@@ -31,7 +32,7 @@ from neurosim_core.bench.bridge_laws import (
 )
 from neurosim_core.simulation import Model, make_fleet, make_state, observe, step
 
-MODES = ("attitude", "motor_speeds")
+MODES: tuple[Literal["attitude", "motor_speeds"], ...] = ("attitude", "motor_speeds")
 LIVE_MODES = ("lockstep", "streaming")
 LIMIT_S = 120.0
 """Longest time of the flights of one process; they take ten seconds on a machine that does nothing else."""
@@ -111,7 +112,7 @@ def measure_flights(live_mode: str, *, domain: int) -> list[Flight]:
     ]
 
 
-def fly_in_process(model: Model, mode: str) -> float:
+def fly_in_process(model: Model, mode: Literal["attitude", "motor_speeds"]) -> float:
     """Fly the same figure eight with the same law, and without anybody else; return the error [m]."""
     state = make_state(model)
     law, errors = make_law(mode, model.config, model.path), Errors(model.path)

@@ -87,7 +87,7 @@ def packet(begin_us: int, end_us: int, count: int, seed: int = 0) -> Packet:
 
 
 def encode(encoder: Evt3Encoder, events: Packet, end_us: int = 0) -> bytes:
-    return bytes(encoder.encode(*events, **SIZE, end_us=end_us))
+    return bytes(encoder.encode(EventColumns(*events), **SIZE, end_us=end_us))
 
 
 def rows(columns: EventColumns | Packet) -> list[tuple[int, int, int, int]]:
@@ -276,9 +276,9 @@ def test_events_that_do_not_fit_are_refused(encoding, change, reason):
     good = Packet(np.array([5, 6]), *(np.array([1, 1], np.uint16) for _ in "xy"), np.array([0, 1], np.uint8))
     wrong = good._replace(**change)
     encode_it = {
-        "evt3": lambda: Evt3Encoder().encode(*wrong, **SIZE, end_us=0),
-        "mono": lambda: encode_mono(*wrong, **SIZE, base_us=0),
-        "dvs": lambda: write_dvs(np.zeros(32, np.uint8), *wrong, **SIZE),
+        "evt3": lambda: Evt3Encoder().encode(EventColumns(*wrong), **SIZE, end_us=0),
+        "mono": lambda: encode_mono(EventColumns(*wrong), **SIZE, base_us=0),
+        "dvs": lambda: write_dvs(np.zeros(32, np.uint8), EventColumns(*wrong), **SIZE),
     }[encoding]
     with pytest.raises(EventCodecError, match=reason):
         encode_it()
@@ -286,12 +286,12 @@ def test_events_that_do_not_fit_are_refused(encoding, change, reason):
 
 def test_sensors_that_are_too_large_are_refused():
     nothing = packet(0, 1, 0)
-    Evt3Encoder().encode(*nothing, width=2048, height=2048, end_us=0)
+    Evt3Encoder().encode(EventColumns(*nothing), width=2048, height=2048, end_us=0)
     with pytest.raises(EventCodecError, match="use mono"):
-        Evt3Encoder().encode(*nothing, width=2049, height=10, end_us=0)
-    encode_mono(*nothing, width=65536, height=32768, base_us=0)
+        Evt3Encoder().encode(EventColumns(*nothing), width=2049, height=10, end_us=0)
+    encode_mono(EventColumns(*nothing), width=65536, height=32768, base_us=0)
     with pytest.raises(EventCodecError, match="65536 x 32768"):
-        encode_mono(*nothing, width=10, height=32769, base_us=0)
+        encode_mono(EventColumns(*nothing), width=10, height=32769, base_us=0)
 
 
 def test_the_last_pixel_of_the_largest_sensors():
@@ -299,24 +299,24 @@ def test_the_last_pixel_of_the_largest_sensors():
         np.array([1]), np.array([2047], np.uint16), np.array([2047], np.uint16), np.array([1], np.uint8)
     )
     size = {"width": 2048, "height": 2048}
-    data = Evt3Encoder().encode(*last, **size, end_us=0)
+    data = Evt3Encoder().encode(EventColumns(*last), **size, end_us=0)
     assert rows(Evt3Decoder().decode(data, **size)) == rows(last)
     last = last._replace(x=np.array([65535], np.uint16), y=np.array([32767], np.uint16))
-    data = encode_mono(*last, width=65536, height=32768, base_us=1)
+    data = encode_mono(EventColumns(*last), width=65536, height=32768, base_us=1)
     assert rows(decode_mono(data, base_ns=1000)) == [(1000, 65535, 32767, 1)]
 
 
 def test_mono_word_of_one_event():
     """By hand: brighter, row 3, column 5, 7 us after the base."""
     one = Packet(np.array([107]), np.array([5], np.uint16), np.array([3], np.uint16), np.array([1], np.uint8))
-    data = bytes(encode_mono(*one, **SIZE, base_us=100))
+    data = bytes(encode_mono(EventColumns(*one), **SIZE, base_us=100))
     assert int.from_bytes(data, "little") == 1 << 63 | 3 << 48 | 5 << 32 | 7000
 
 
 @pytest.mark.parametrize("base_us", [0, 50, 10**12])
 def test_mono_there_and_back(base_us):
     events = packet(base_us, base_us + 4_294_967, 5000)
-    data = encode_mono(*events, **SIZE, base_us=base_us)
+    data = encode_mono(EventColumns(*events), **SIZE, base_us=base_us)
     decoded = decode_mono(data, base_ns=base_us * 1000)
     assert np.array_equal(decoded.t, events.t * 1000)
     for ours, theirs in zip(decoded[1:], events[1:], strict=True):
@@ -327,10 +327,10 @@ def test_mono_there_and_back(base_us):
 def test_mono_times_that_are_too_far_apart_are_refused():
     one = np.ones(2, np.uint16)
     events = Packet(np.array([10, 4_294_977]), one, one, one.astype(np.uint8))
-    encode_mono(*events, **SIZE, base_us=10)
+    encode_mono(EventColumns(*events), **SIZE, base_us=10)
     for base_us in (9, 11):
         with pytest.raises(EventCodecError, match=r"4\.29 s"):
-            encode_mono(*events, **SIZE, base_us=base_us)
+            encode_mono(EventColumns(*events), **SIZE, base_us=base_us)
     with pytest.raises(EventCodecError, match="words of 8 bytes"):
         decode_mono(b"1234567", base_ns=0)
 
@@ -340,7 +340,7 @@ def test_dvs_records_are_those_of_an_event_array(count):
     """Against the encoding of the messages, one by one."""
     events = packet(1_500_000, 3_500_000, count)
     out = np.full(16 * count, 0xEE, np.uint8)
-    write_dvs(out, *events, **SIZE)
+    write_dvs(out, EventColumns(*events), **SIZE)
     record, time = cdr.record_class("dvs_msgs/msg/Event"), cdr.record_class("builtin_interfaces/msg/Time")
     header = cdr.record_class("std_msgs/msg/Header")(time(0, 0), "")
     messages = [record(x, y, time(t // 10**6, t % 10**6 * 1000), bool(p)) for t, x, y, p in rows(events)]
@@ -352,8 +352,9 @@ def test_dvs_records_are_those_of_an_event_array(count):
 @pytest.mark.parametrize(("first", "last"), [(0, 2**32), (0, 10**15), (2**31 * 10**6, 2**31 * 10**6)])
 def test_dvs_times_that_are_too_far_apart_or_too_late_are_refused(first, last):
     ones = np.ones(2, np.uint16)
+    columns = EventColumns(np.array([first, last]), ones, ones, ones.astype(np.uint8))
     with pytest.raises(EventCodecError, match="dvs_msgs cannot hold"):
-        write_dvs(np.zeros(32, np.uint8), np.array([first, last]), ones, ones, ones.astype(np.uint8), **SIZE)
+        write_dvs(np.zeros(32, np.uint8), columns, **SIZE)
 
 
 def test_picture_shows_the_last_event_of_each_pixel():
