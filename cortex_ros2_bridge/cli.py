@@ -134,7 +134,10 @@ def _bridge(config: BridgeConfig) -> int:
     )
     try:
         with Node(config.node, domain=config.cortex_domain) as node, Bridge(config, backend, node) as bridge:
-            _say(f"/{config.node}: {backend.name}, {backend.distro}; waiting for Cortex topics, Ctrl-C ends")
+            where = getattr(backend, "directory", None)
+            into = f" into {where}/ (rosbag2)" if where is not None else ""
+            how = f"{backend.name}{into}, {backend.distro}"
+            _say(f"/{config.node}: {how}; waiting for Cortex topics, Ctrl-C ends")
             gc.collect()
             gc.freeze()  # what is there stays; the collector need not look at it again and again
             sys.setswitchinterval(SWITCH_S)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from typing import Any, Literal, NamedTuple, Protocol
 
 from cyclonedds.domain import DomainParticipant
@@ -23,6 +24,12 @@ from cortex_ros2_bridge.backend.idl import make_struct, types
 _log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "fast", "public"]
+ENTITIES = threading.RLock()
+"""Held while entities of Cyclone DDS are made or deleted, and while discovery is read.
+
+Each of these goes through the binding for Python, which lets other threads run meanwhile, with types that
+entities share. Once a process crashed in the making of a topic while discovery was followed; 10^5 topics on
+three threads did not make it do so again, nor did valgrind find anything. Messages do not take this lock."""
 _ANY = 0x7F
 """Samples of all states."""
 

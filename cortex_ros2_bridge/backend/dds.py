@@ -32,7 +32,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, Trigger
-from cortex_ros2_bridge.backend.cyclone import Choice, Refused, Transport, choose_transport
+from cortex_ros2_bridge.backend.cyclone import ENTITIES, Choice, Refused, Transport, choose_transport
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
 from cortex_ros2_bridge.backend.graph import (
@@ -131,10 +131,11 @@ class DdsBackend:
         self._parts: dict[Any, None] = {}
         _domains.enter(self._domain, cyclone_config(known))
         try:
-            self._participant: Any = DomainParticipant(
-                self._domain, DdsQos(Policy.Userdata(ENCLAVE), Policy.EntityName(PARTICIPANT_NAME))
-            )
-            self._transport = choose_transport(self._participant, transport)
+            with ENTITIES:
+                self._participant: Any = DomainParticipant(
+                    self._domain, DdsQos(Policy.Userdata(ENCLAVE), Policy.EntityName(PARTICIPANT_NAME))
+                )
+                self._transport = choose_transport(self._participant, transport)
             self._graph = Graph(
                 self._participant, self._transport, node_name=node_name, namespace=namespace, distro=known
             )
@@ -231,7 +232,10 @@ class _Site(NamedTuple):
             qos.durability == "transient_local",
         )
         try:
-            entity = make(self.participant, Topic(self.participant, topic, kind), _dds_qos(qos, user_data))
+            with ENTITIES:
+                entity = make(
+                    self.participant, Topic(self.participant, topic, kind), _dds_qos(qos, user_data)
+                )
             self.graph.add(entity.guid.bytes, own)
         except (DDSException, Refused) as error:
             raise BackendError(f"the {role} of {topic} cannot be made: {error}") from error
@@ -285,7 +289,8 @@ class DdsPublisher:
         """Withdraw the publisher."""
         if self._writer is not None:
             self._site.graph.remove(self._guid)
-            self._writer = None
+            with ENTITIES:
+                self._writer = None
             self._site.forget(self)
 
 
@@ -295,7 +300,8 @@ class _Receiver:
     def __init__(self, site: _Site, reader: Any, limit: int, deliver: Delivery, name: str) -> None:
         self._deliver = deliver
         self._closed = threading.Event()
-        self._guard = GuardCondition(site.participant)
+        with ENTITIES:
+            self._guard = GuardCondition(site.participant)
         self._thread = threading.Thread(
             target=self._run, args=(site, reader, limit, name), name=f"ros {name}", daemon=True
         )
@@ -311,9 +317,10 @@ class _Receiver:
 
     def _run(self, site: _Site, reader: Any, limit: int, name: str) -> None:
         try:
-            waitset = WaitSet(site.participant)
-            waitset.attach(self._guard)
-            waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
+            with ENTITIES:
+                waitset = WaitSet(site.participant)
+                waitset.attach(self._guard)
+                waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
             while not self._closed.is_set():
                 waitset.wait(duration(infinite=True))
                 for message in site.transport.take(reader, limit):
@@ -362,7 +369,8 @@ class DdsSubscription:
             self._lost_count = self.lost_count
             self._receiver.close()
             self._site.graph.remove(self._guid)
-            self._reader = None
+            with ENTITIES:
+                self._reader = None
             self._site.forget(self)
 
 
@@ -403,7 +411,8 @@ class DdsService:
             self._receiver.close()
             for guid in self._guids:
                 self._site.graph.remove(guid)
-            self._reader = self._writer = None
+            with ENTITIES:
+                self._reader = self._writer = None
             self._site.forget(self)
 
     def _answer(self, request: bytes) -> None:

@@ -37,7 +37,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from cortex_ros2_bridge.backend.base import TopicInfo
-from cortex_ros2_bridge.backend.cyclone import Refused, Transport
+from cortex_ros2_bridge.backend.cyclone import ENTITIES, Refused, Transport
 from cortex_ros2_bridge.backend.idl import idl_struct
 from cortex_ros2_bridge.backend.names import TOPIC_PREFIX, ros_topic, ros_type
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, type_hash, typestore
@@ -110,7 +110,8 @@ class Graph:
         if distro is not None:
             self._speak(distro)
         self._open = True
-        self._guard = GuardCondition(participant)
+        with ENTITIES:
+            self._guard = GuardCondition(participant)
         self._thread = threading.Thread(target=self._follow, name="ros-graph", daemon=True)
         self._thread.start()
 
@@ -149,24 +150,15 @@ class Graph:
         with self._lock:
             self._own.clear()
             self._announce()
-            self._writer = None
+            with ENTITIES:
+                self._writer = None
         self._open = False
         self._guard.set(True)
         self._thread.join(_CLOSE_S)
 
     def _follow(self) -> None:
         try:
-            waitset = WaitSet(self._participant)
-            waitset.attach(self._guard)
-            readers = []
-            for kind in (
-                BuiltinTopicDcpsParticipant,
-                BuiltinTopicDcpsPublication,
-                BuiltinTopicDcpsSubscription,
-            ):
-                reader = BuiltinDataReader(self._participant, kind)
-                waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
-                readers.append(reader)
+            waitset, readers = self._watch()
             while self._open:
                 self._take_participants(readers[0])
                 self._take_endpoints(readers[1], "writer")
@@ -176,6 +168,17 @@ class Graph:
         except (DDSException, Refused):
             if self._open:
                 _log.exception("the ROS graph is not followed any more")
+
+    def _watch(self) -> tuple[Any, list[Any]]:
+        """Return what wakes the thread up, and readers of participants, writers and readers of others."""
+        kinds = BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+        with ENTITIES:
+            waitset = WaitSet(self._participant)
+            waitset.attach(self._guard)
+            readers = [BuiltinDataReader(self._participant, kind) for kind in kinds]
+            for reader in readers:
+                waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
+        return waitset, readers
 
     def _take_participants(self, reader: Any) -> None:
         for sample, alive in _samples(reader):
@@ -262,8 +265,9 @@ class Graph:
         )
         if distro != "humble":
             qos = Qos(Policy.Userdata(user_data_of_type(DISCOVERY_TYPE, distro)), base=qos)
-        topic = Topic(self._participant, DISCOVERY_TOPIC, idl_struct(DISCOVERY_TYPE, distro))
-        self._writer = DataWriter(self._participant, topic, qos)
+        with ENTITIES:
+            topic = Topic(self._participant, DISCOVERY_TOPIC, idl_struct(DISCOVERY_TYPE, distro))
+            self._writer = DataWriter(self._participant, topic, qos)
         self._layout = distro
         self._announce()
 
@@ -300,7 +304,11 @@ class Graph:
 
 def _samples(reader: Any) -> Iterator[tuple[Any, bool]]:
     """Take what is new in discovery; whether it is there or gone."""
-    while samples := reader.take(_BATCH):
+    while True:
+        with ENTITIES:
+            samples = reader.take(_BATCH)
+        if not samples:
+            return
         for sample in samples:
             info = sample.sample_info
             yield sample, info.valid_data and info.instance_state == InstanceState.Alive
