@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shutil
 import signal
@@ -39,13 +40,13 @@ def neurosim(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "neurosim_core", *map(str, arguments)]
 
 
-def make_settings(folder: Path) -> Path:
+def make_settings(folder: Path, *, mode: str = "streaming") -> Path:
     """A hover in an empty room of 6 x 6 x 3 m, which is loaded at once."""
     room = trimesh.creation.box((6.0, 6.0, 3.0))
     room.invert()
     room.export(folder / "room.obj")
     settings = folder / "room.yaml"
-    settings.write_text(SETTINGS)
+    settings.write_text(f"{SETTINGS}live: {{mode: {mode}}}\n")
     return settings
 
 
@@ -112,8 +113,8 @@ class Stack:
 
 
 @pytest.fixture(scope="module")
-def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
-    """All three, the simulator last; at the end nothing of them may be left."""
+def stack(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
+    """All three in a mode, the simulator last; at the end nothing of them may be left."""
     directory = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
     files = set(os.listdir("/dev/shm"))
     with pytest.MonkeyPatch.context() as patch:
@@ -121,7 +122,7 @@ def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
         patch.delenv("CORTEX_DOMAIN", raising=False)
         patch.setenv("PYTHONPATH", str(ROOT))
         patch.setenv("PYTHONUNBUFFERED", "1")
-        stack = Stack(make_settings(tmp_path_factory.mktemp("room")))
+        stack = Stack(make_settings(tmp_path_factory.mktemp("room"), mode=request.param))
         try:
             for name in ("controller", "viewer"):
                 stack.start(name)
@@ -150,16 +151,11 @@ def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
     assert not shared - files
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("simulator",),
-        ("controller",),
-        ("viewer",),
-        ("simulator", "controller", "viewer"),
-    ],
-    ids="-".join,
-)
+ALL = ("simulator", "controller", "viewer")
+
+
+@pytest.mark.parametrize("stack", ["streaming"], indirect=True)
+@pytest.mark.parametrize("names", [*((name,) for name in ALL), *itertools.permutations(ALL)], ids="-".join)
 def test_the_others_go_on_without_those_that_are_killed_and_meet_them_again(stack, names):
     """Killed together with SIGKILL, and started again in this order; the others stay the same processes."""
     for name in names:
@@ -181,6 +177,26 @@ def test_the_others_go_on_without_those_that_are_killed_and_meet_them_again(stac
     stack.wait_for_flight()
     assert all(process.poll() is None for process in others.values())
     assert len(stack.running) == 3
+
+
+@pytest.mark.parametrize("stack", ["lockstep"], indirect=True)
+@pytest.mark.parametrize("name", ALL)
+def test_in_lockstep_time_stands_still_until_who_was_killed_is_back(stack, name):
+    stack.kill(name)
+    others = {other: process.process for other, process in stack.running.items()}
+    if name == "controller":
+        waiting = stack.wait_for_status(lambda s: s.phase == "waiting")
+        assert "command" in waiting.reason
+    elif name == "viewer":
+        stack.wait_for_flight()
+    else:
+        stack.hear("controller", "waiting for a simulator")
+        stack.hear("viewer", "the simulator is gone")
+    stack.start(name)
+    if name != "viewer":
+        stack.hear("controller", "flying drone")
+    stack.wait_for_flight()
+    assert all(process.poll() is None for process in others.values())
 
 
 def test_ctrl_c_ends_all_that_one_command_started(runtime, tmp_path, monkeypatch):
