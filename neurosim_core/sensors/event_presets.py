@@ -125,7 +125,8 @@ _V2E_CLEAN = Preset(
     width=346,
     height=260,
     pixel={"threshold_spread": {"sigma_on": 0.02, "sigma_off": 0.02}},
-    sources="Hu, Liu, Delbruck (2021), v2e; its published code, option clean: thresholds 0.2, mismatch 0.02.",
+    sources="Hu, Liu, Delbruck (2021), v2e; its code (SensorsINI/v2e, set_dvs_params), option clean:"
+    " thresholds 0.2, mismatch 0.02, nothing else.",
 )
 
 _V2E_NOISY = Preset(
@@ -135,13 +136,14 @@ _V2E_NOISY = Preset(
     pixel={
         "threshold_spread": {"sigma_on": 0.05, "sigma_off": 0.05},
         "low_pass": {"cutoff_hz": 30.0, "dark_radiance": round(20 / 255, 4)},
-        "refractory_s": 0.01,
         "leak": {"rate_hz": 0.1, "spread_decades": 0.1},
         "shot_noise": {"rate_hz": 5.0, "bright_factor": 0.25, "spread_decades": 0.0},
     },
-    sources="Hu, Liu, Delbruck (2021), v2e; its published code, option noisy: thresholds 0.2, mismatch 0.05,"
-    " 30 Hz at white with 20 of 255 added to the light, refractory time 10 ms, leak 0.1 Hz with 0.1 decades,"
-    " shot noise 5 Hz falling to a quarter at white.",
+    sources="Hu, Liu, Delbruck (2021), v2e; its code (SensorsINI/v2e, set_dvs_params), option noisy:"
+    " thresholds 0.2, mismatch 0.05, 30 Hz at white with 20 of 255 added to the light, leak 0.1 Hz with"
+    " noise_rate_cov_decades 0.1, shot noise 5 Hz falling to a quarter at white, no refractory time (one old"
+    " version has 10 ms). The spread of 0.1 decades is that of the leak alone there, as here; its jitter of"
+    " the leak in time, a tenth, is left out.",
 )
 
 

@@ -42,6 +42,17 @@ def test_contrasts_are_logarithms():
     assert 1.0 / k1 == pytest.approx(0.19, abs=1e-3)  # its threshold, in log radiance
 
 
+def test_v2e_is_as_published():
+    """`set_dvs_params` of its code: clean has mismatch alone, noisy no refractory time."""
+    clean, noisy = (EventCameraConfig(preset=f"v2e_{name}") for name in ("clean", "noisy"))
+    assert terms_of(clean) == ("spread",)
+    assert (clean.threshold_on, clean.threshold_off, clean.threshold_spread.sigma_on) == (0.2, 0.2, 0.02)
+    assert (noisy.threshold_on, noisy.threshold_off, noisy.threshold_spread.sigma_off) == (0.2, 0.2, 0.05)
+    assert (noisy.low_pass.cutoff_hz, noisy.leak.rate_hz, noisy.shot_noise.rate_hz) == (30.0, 0.1, 5.0)
+    assert (noisy.leak.spread_decades, noisy.shot_noise.spread_decades) == (0.1, 0.0)
+    assert (clean.refractory_s, noisy.refractory_s) == (0.0, 0.0)
+
+
 def test_single_keys_win():
     pixel = pixel_of(
         load({"preset": "v2e_noisy", "threshold_on": 0.3, "leak": {"rate_hz": 0.7}, "shot_noise": None})
@@ -49,7 +60,6 @@ def test_single_keys_win():
     assert pixel.threshold_on == 0.3
     assert pixel.leak == LeakConfig(rate_hz=0.7, spread_decades=0.1)
     assert pixel.shot_noise is None
-    assert pixel.refractory_s == 0.01
     assert pixel.low_pass.cutoff_hz == 30.0
     later = load_config(
         {"sensors": {"dvs": {"kind": "event_camera", "pixel": {"preset": "v2e_noisy"}}}},
@@ -94,7 +104,7 @@ def test_darkness_and_glare_stay_finite(device):
     """The whole range of log radiance that is accepted, in both laws."""
     samples = np.array([0.0, -1000.0, 1000.0, -1000.0, 0.0, 1000.0], np.float32).reshape(-1, 1, 1)
     for config in (
-        EventCameraConfig(preset="v2e_noisy", low_pass={"dark_radiance": 0.0}, refractory_s=0.0),
+        EventCameraConfig(preset="v2e_noisy", low_pass={"dark_radiance": 0.0}),
         EventCameraConfig(preset="voltmeter_dvs346", stochastic={"k2": 0.0, "k3": 0.0}),
     ):
         camera = EventCamera(config, width=1, height=1, device=device)
