@@ -608,13 +608,14 @@ def test_discovery_serves_until_interrupted(runtime: Path, make_node: MakeNode) 
     assert errors.startswith("cortex discovery: the registry of domain 0 serves this host only\n")
 
 
-def test_a_directory_of_others_is_not_to_be_closed_to_them(runtime: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "shared"
+def test_a_directory_of_others_is_not_to_be_closed_to_them(runtime: Path) -> None:
+    folder = runtime.with_name(f"{runtime.name}-shared")  # `tmp_path` may be too long for a socket
     folder.mkdir()
     folder.chmod(0o1777)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CORTEX_RUNTIME_DIR", str(folder))
         status, _, errors = cortex("topics")
+    folder.rmdir()
     assert status == 1
     assert errors.endswith("is one that others use, too: choose a directory of your own\n")
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -26,10 +28,18 @@ from cortex.host import (
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.fixture
+def short_path():
+    """A directory whose path leaves room for sockets, which `tmp_path` may not."""
+    folder = Path(tempfile.mkdtemp(prefix="ctx-", dir="/tmp"))
+    yield folder
+    shutil.rmtree(folder)
+
+
 @pytest.fixture(autouse=True)
-def base(tmp_path, monkeypatch):
-    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path / "run"))
-    return tmp_path / "run"
+def base(short_path, monkeypatch):
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(short_path / "run"))
+    return short_path / "run"
 
 
 @pytest.mark.parametrize(("text", "expected"), [(None, 0), ("0", 0), ("232", 232), ("007", 7)])
@@ -80,10 +90,10 @@ def test_a_directory_that_others_may_enter_is_refused(base):
         runtime_dir(0)
 
 
-def test_a_link_is_refused(base, tmp_path):
+def test_a_link_is_refused(base, short_path):
     base.mkdir(mode=0o700)
-    (tmp_path / "elsewhere").mkdir(mode=0o700)
-    (base / "0").symlink_to(tmp_path / "elsewhere")
+    (short_path / "elsewhere").mkdir(mode=0o700)
+    (base / "0").symlink_to(short_path / "elsewhere")
     with pytest.raises(PermissionError, match="not a link"):
         runtime_dir(0)
 
@@ -121,10 +131,10 @@ def test_host_id_is_the_same_in_another_process(base):
     assert subprocess.check_output(command, cwd=ROOT, text=True).strip() == host_id()
 
 
-def test_host_id_differs_where_sockets_cannot_be_shared(base, monkeypatch, tmp_path):
+def test_host_id_differs_where_sockets_cannot_be_shared(base, monkeypatch, short_path):
     runtime_dir(0)
     here = host_id()
-    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path / "other"))
+    monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(short_path / "other"))
     assert host_id() != here
 
 

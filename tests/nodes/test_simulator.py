@@ -692,7 +692,7 @@ def test_a_collision_ends_the_run_until_the_reset():
 
 def test_motion_that_cannot_be_computed_ends_the_run():
     with LiveRig(make_config(**{"live.real_time_factor": 0.0})) as rig:
-        assert rig.call("/reset", Reset(body_rate=np.array([1e6, 0.0, 0.0]))).accepted
+        assert rig.call("/reset", Reset(body_rate=np.array([1e9, 0.0, 0.0]))).accepted
         rig.send(rig.hover())
         ended = rig.wait_for_status(lambda status: status.phase == "ended")
         assert "the motion of drone cannot be computed" in ended.reason
