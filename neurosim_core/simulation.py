@@ -213,13 +213,19 @@ class State:
     """Wall-clock time by phase [s]."""
 
 
-def load_scene(config: ApartmentConfig | MeshSceneConfig) -> Scene:
+def load_scene(config: ApartmentConfig | MeshSceneConfig, *, pictures: bool = True) -> Scene:
     """Generate or read a scene.
+
+    Args:
+        config: Which one.
+        pictures: Decode the textures of a file now, or when they are first looked at, if ever.
 
     Raises:
         SceneError: A file cannot be used.
     """
-    return make_apartment(config) if isinstance(config, ApartmentConfig) else load_mesh_scene(config)
+    if isinstance(config, ApartmentConfig):
+        return make_apartment(config)
+    return load_mesh_scene(config, pictures=pictures)
 
 
 def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | None = None) -> Model:
@@ -256,9 +262,9 @@ def make_fleet(
 
     device = _device(config.device)
     with phase("scene"):
-        scene = load_scene(config.scene)
         members = {name: config.of(name) for name in config.vehicles}
         seeing = any(plan_casts(member.sensors) for member in members.values())
+        scene = load_scene(config.scene, pictures=seeing)
         bodies = make_bodies(config.bodies) if seeing else ()
     with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
@@ -288,7 +294,8 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
         ValueError: The scene cannot be loaded, or no path exists.
     """
     members = {name: config.of(name) for name in (vehicles or config.vehicles)}
-    free_space = make_free_space(load_scene(config.scene), config.free_space, device=_device(config.device))
+    scene = load_scene(config.scene, pictures=False)
+    free_space = make_free_space(scene, config.free_space, device=_device(config.device))
     return {name: _plan(member, free_space) for name, member in members.items()}
 
 

@@ -13,8 +13,9 @@ import binascii
 import json
 import math
 import struct
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -53,18 +54,19 @@ _UNREADABLE = {
 _MAX_DEPTH = 256
 
 
-def read_gltf(path: Path, *, textures_required: bool) -> Source:
+def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> Source:
     """Read the default scene of a glTF file.
 
     Args:
         path: The .gltf or .glb file.
         textures_required: Whether a texture file that is not there is an error, or noted and left out.
+        pictures: Decode textures now, or when they are first looked at.
 
     Raises:
         SceneError: If the file is truncated, malformed, or needs an extension that is not read.
     """
     try:
-        return _Reader(path, textures_required=textures_required).read()
+        return _Reader(path, textures_required=textures_required, pictures=pictures).read()
     except (KeyError, IndexError, TypeError, AttributeError, struct.error, ValueError) as error:
         if isinstance(error, SceneError):
             raise
@@ -79,10 +81,18 @@ def read_gltf(path: Path, *, textures_required: bool) -> Source:
         raise SceneError(f"{path}: malformed glTF, {wrong}; a glTF 2.0 validator says where") from error
 
 
+def _picture_of(path: Path, index: int) -> NDArray[np.uint8]:
+    """Return the texels of a picture of a file that has been read before."""
+    texels = _Reader(path, textures_required=True, pictures=True).decoded(index)
+    assert texels is not None, "a required picture that is missing is an error"
+    return texels
+
+
 class _Reader:
-    def __init__(self, path: Path, *, textures_required: bool) -> None:
+    def __init__(self, path: Path, *, textures_required: bool, pictures: bool) -> None:
         self.path = path
         self.textures_required = textures_required
+        self.pictures = pictures
         self.source = Source(unit_reason="glTF is in metres by specification", up_default="y")
         self.tree, self.binary = self._split(path.read_bytes())
         version = str(self.tree.get("asset", {}).get("version", "2.0"))
@@ -212,35 +222,38 @@ class _Reader:
         webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
         return int(entry.get("source", webp.get("source", -1)))
 
-    def _pictures(self, wanted: set[int]) -> dict[int, NDArray[np.uint8]]:
+    def _image(self, index: int) -> tuple[str, bytes | None]:
+        """Return name and bytes of a picture; no bytes: its file is not there, and need not be."""
+        image = self._entry("images", index)
+        name = image.get("name") or (
+            image["uri"] if "uri" in image and not image["uri"].startswith("data:") else f"image {index}"
+        )
+        data = bytes(self._view(image["bufferView"])[0]) if "bufferView" in image else self._uri(image["uri"])
+        if data is None and self.textures_required:
+            raise SceneError(
+                f"{self.path}: texture file {image['uri']!r} is missing beside it; put it there, or "
+                "set missing_texture to 'ignore' to use the base colour alone"
+            )
+        return name, data
+
+    def decoded(self, index: int) -> NDArray[np.uint8] | None:
+        """Return the texels of a picture; None: its file is not there."""
+        name, data = self._image(index)
+        return None if data is None else decode_picture(data, file=str(self.path), name=name)
+
+    def _later(self, index: int) -> Callable[[], NDArray[np.uint8]] | None:
+        """Return what reads the file again and decodes a picture; None: its file is not there."""
+        return None if self._image(index)[1] is None else partial(_picture_of, self.path, index)
+
+    def _pictures(self, wanted: set[int]) -> dict[int, NDArray[np.uint8] | Callable[[], NDArray[np.uint8]]]:
         """Decode images, several at once: Pillow releases the interpreter lock."""
-
-        def decode(index: int) -> NDArray[np.uint8] | None:
-            image = self._entry("images", index)
-            name = image.get("name") or (
-                image["uri"] if "uri" in image and not image["uri"].startswith("data:") else f"image {index}"
-            )
-            data = (
-                bytes(self._view(image["bufferView"])[0])
-                if "bufferView" in image
-                else self._uri(image["uri"])
-            )
-            if data is None:
-                if self.textures_required:
-                    raise SceneError(
-                        f"{self.path}: texture file {image['uri']!r} is missing beside it; put it there, or "
-                        "set missing_texture to 'ignore' to use the base colour alone"
-                    )
-                return None
-            return decode_picture(data, file=str(self.path), name=name)
-
         order = sorted(wanted)
         with ThreadPoolExecutor(max_workers=4) as pool:
-            decoded = dict(zip(order, pool.map(decode, order), strict=True))
-        missing = sum(picture is None for picture in decoded.values())
+            found = list(pool.map(self.decoded if self.pictures else self._later, order))
+        missing = sum(picture is None for picture in found)
         if missing:
             self.source.notes.append(f"{missing} texture files are missing; base colours are used alone.")
-        return {index: picture for index, picture in decoded.items() if picture is not None}
+        return {index: picture for index, picture in zip(order, found, strict=True) if picture is not None}
 
     def _materials(self) -> list[dict[str, Any]]:
         """Fill the materials; return for each how its texture coordinates are found."""
@@ -276,7 +289,7 @@ class _Reader:
                 "emissiveStrength", 1.0
             )
             glow_picture = pictures.get(index_of.get(id(emissive), -1)) if emissive else None
-            if glow_picture is not None and glow.any():
+            if glow_picture is not None and not callable(glow_picture) and glow.any():
                 glow = glow * srgb_to_linear(glow_picture).mean(axis=(0, 1), dtype=np.float64)
                 glowing += 1
             self.source.materials.append(

@@ -65,7 +65,7 @@ class MeshSceneConfig(Settings):
     """Linear radiance that a white surface facing down reflects of the ambient light."""
 
 
-def load_mesh_scene(config: MeshSceneConfig) -> Scene:
+def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     """Read a mesh file: every instance in metres, z up, with materials, textures and lights.
 
     Every assumption that was made is a sentence in the scene's `notes`. Transparent and metallic materials
@@ -73,13 +73,18 @@ def load_mesh_scene(config: MeshSceneConfig) -> Scene:
     by two texels: bilinear lookup between three texel centres gives the linear blend of its corners.
     Lights come from KHR_lights_punctual; where there is none, lamps are hung under the ceilings.
 
+    Args:
+        config: The file, and how it is meant.
+        pictures: Decode textures now. Else those of glTF are decoded when they are first looked at, if ever:
+            until then no library is imported for them, and an emissive texture counts as white.
+
     Raises:
         SceneError: If the file is missing, of an unknown format, truncated or malformed; if a texture is
             missing or cannot be decoded; if a vertex in use is not finite; if no face is left; if the scene
             reaches farther than 20 km from the origin.
     """
     path = config.file.expanduser()
-    source = _read(path, config)
+    source = _read(path, config, pictures)
     notes = list(source.notes)
     unit_m, sentence = _unit(config, source)
     notes.insert(0, sentence)
@@ -113,7 +118,7 @@ def load_mesh_scene(config: MeshSceneConfig) -> Scene:
     )
 
 
-def _read(path: Path, config: MeshSceneConfig) -> Source:
+def _read(path: Path, config: MeshSceneConfig, pictures: bool) -> Source:
     if path.is_dir():
         raise SceneError(f"{path}: a directory; name a mesh file in it ({_formats()})")
     if not path.exists():
@@ -122,7 +127,7 @@ def _read(path: Path, config: MeshSceneConfig) -> Source:
     required = config.missing_texture == "error"
     if suffix in _GLTF:
         _check_size(path)
-        return read_gltf(path, textures_required=required)
+        return read_gltf(path, textures_required=required, pictures=pictures)
 
     from neurosim_core.scene.trimesh_reader import formats, read_with_trimesh  # takes a second
 

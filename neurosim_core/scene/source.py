@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -82,9 +82,15 @@ class TextureStore:
 
     def __init__(self) -> None:
         self._by_pixels: dict[bytes, Texture] = {}
+        self._undecoded: dict[Callable[[], NDArray[np.uint8]], Texture] = {}
 
-    def add(self, srgb: NDArray[np.uint8], *, name: str) -> Texture:
-        """Return the texture with these texels (uint8 [H, W, 3]), a known one where there is one."""
+    def add(self, srgb: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]], *, name: str) -> Texture:
+        """Return the texture with these texels (uint8 [H, W, 3]), a known one where there is one.
+
+        What decodes them may be given instead: it is called when the texture is first looked at.
+        """
+        if callable(srgb):
+            return self._undecoded.setdefault(srgb, Texture(name=name, srgb=srgb))
         key = hashlib.blake2b(srgb.tobytes(), digest_size=16).digest() + repr(srgb.shape).encode()
         return self._by_pixels.setdefault(key, Texture(name=name, srgb=srgb))
 

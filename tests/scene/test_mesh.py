@@ -455,6 +455,22 @@ def test_equal_pictures_are_one_texture(tmp_path):
     assert scene.materials[0].texture is scene.materials[1].texture
 
 
+def test_pictures_may_wait_until_somebody_looks(tmp_path):
+    """The same triangles and texels; one picture that two materials wear is decoded once."""
+    model = Gltf().textured([(0, 0), (1, 0), (0, 1)])
+    model.tree["materials"].append({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}})
+    model.node(mesh=model.mesh(material=1))
+    now = load(tmp_path / "a.glb", model.glb())
+    later = load_mesh_scene(MeshSceneConfig(file=tmp_path / "a.glb"), pictures=False)
+    for name in ("vertices", "faces", "normals", "uv", "face_material", "face_instance"):
+        np.testing.assert_array_equal(getattr(later, name), getattr(now, name))
+    textures = [material.texture for material in later.materials]
+    assert textures[0] is textures[1]
+    assert not textures[0].painted
+    np.testing.assert_array_equal(textures[0].srgb, now.materials[0].texture.srgb)
+    assert textures[0].painted
+
+
 @pytest.mark.parametrize("mode", ["L", "P", "RGBA", "I;16"])
 def test_pictures_of_every_kind(tmp_path, mode):
     """Grey 200 whatever the picture's kind; 16 bits are scaled, not clipped."""
