@@ -106,6 +106,8 @@ class EventCamera:
         scan_count_max: How many stacks may be fed before the first of them is collected.
         on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
+        terms: What is compiled in beyond ideal pixels, some of `event_noise.TERMS`; by default what the
+            configuration asks for.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise.TERMS`, and "readout".
@@ -125,6 +127,7 @@ class EventCamera:
         seed: int = 0,
         scan_count_max: int = 1,
         on_host: bool = False,
+        terms: Sequence[str] | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -147,7 +150,7 @@ class EventCamera:
         self._last = [self._empty(pixel_count, wp.float32) for _ in ring]
         self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in ring]
         self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
-        pixel_terms = terms_of(config)
+        pixel_terms = terms_of(config) if terms is None else tuple(terms)
         self.terms = pixel_terms if config.readout is None else (*pixel_terms, "readout")
         self._noise: PixelNoise | None = None
         if pixel_terms:
@@ -158,6 +161,7 @@ class EventCamera:
                 seed=seed,
                 sensor=sensor,
                 device=self.device,
+                terms=pixel_terms,
             )
         self._screened = self.device.is_cpu and self._noise is None
         scratch = pixel_count if self._screened else 0

@@ -17,6 +17,7 @@ Reference: IEEE Std 952-1997, annex C, for the Allan variances: N^2 / T (white),
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,9 @@ from neurosim_core.vehicle import Multirotor
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
 """Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...
 1000."""
+
+TERMS = ("white", "walk", "instability", "saturation", "quantisation")
+"""All errors that may be compiled in."""
 
 _PROCESSES = len(CORRELATION_TIMES_S)
 _BLOCK_DIM = 32
@@ -201,6 +205,7 @@ class Imu:
         seed: Seed of the run, 0 <= seed < 2^64.
         name: Name of the sensor; two sensors of one run with different names have independent noise.
         slot_count: Samples that the output arrays hold.
+        terms: The errors to compile in, some of `TERMS`; by default those that the configuration asks for.
 
     Attributes:
         specific_force: Output in S [m/s^2], device array of vec3d, shape [slot, vehicle].
@@ -209,12 +214,22 @@ class Imu:
     """
 
     def __init__(
-        self, config: ImuConfig, vehicle: Multirotor, *, seed: int = 0, name: str = "imu", slot_count: int = 1
+        self,
+        config: ImuConfig,
+        vehicle: Multirotor,
+        *,
+        seed: int = 0,
+        name: str = "imu",
+        slot_count: int = 1,
+        terms: Sequence[str] | None = None,
     ) -> None:
         if slot_count < 1:
             raise ValueError(f"slot_count must be >= 1, got {slot_count}")
         self.config = config
-        self.terms = _terms(config)
+        self.terms = _terms(config) if terms is None else tuple(terms)
+        unknown = sorted(set(self.terms) - set(TERMS))
+        if unknown:
+            raise ValueError(f"unknown terms {unknown}, known: {', '.join(TERMS)}")
         device, count = vehicle.device, vehicle.count
         self.specific_force = wp.zeros((slot_count, count), dtype=wp.vec3d, device=device)
         self.angular_rate = wp.zeros((slot_count, count), dtype=wp.vec3d, device=device)

@@ -112,10 +112,8 @@ def test_terms_with_zero_coefficients_change_no_bit(terms, device):
     """Zero spread, time, rates, and an infinite bandwidth: the events of the ideal camera."""
     frames, stamps = walk()
     ideal = feed(make_camera(15, 12, device), frames, stamps)
-    camera = make_camera(15, 12, device)
-    camera._noise = event_noise.PixelNoise(
-        camera.config, pixel_count=180, ring_size=2, seed=3, sensor="", device=camera.device, terms=terms
-    )
+    camera = EventCamera(EventCameraConfig(), width=15, height=12, device=device, seed=3, terms=terms)
+    assert camera.terms == terms
     assert len(ideal.t) > 1000
     assert_same(ideal, feed(camera, frames, stamps))
 
