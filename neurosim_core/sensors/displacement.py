@@ -64,9 +64,13 @@ through the generated apartment and a furnished house at 346x260, what moved mos
 most 5 % further than allowed over 480 renders; with 32 px it was 14 %, with 8 px 2 %."""
 
 _BLOCK = 64
-"""Ticks that are chosen from together."""
-_AHEAD_ON_CPU = 16
-"""Ticks after a render that a CPU looks at together; most renders come earlier than the end of a batch."""
+"""Ticks that are chosen from together; on CUDA all pairs of them are compared."""
+_BLOCK_ON_CPU = 128
+"""There it is the calls that cost, and only those pairs are compared that are asked for."""
+_SPLIT_MIN = 1 << 14
+"""Probes to be cast or compared, times ticks, from which on all cores of a CPU are worth the trouble."""
+_AHEAD_MIN = 2
+"""Least number of ticks that a CPU compares at once with a render."""
 _CHUNK_ON_CUDA = 64
 """Probes that one thread compares there."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
@@ -294,6 +298,7 @@ def rule_kernels(moving: bool) -> _Kernels:
         shifts: wp.array[wp.vec2],
         # Out:
         points_out: wp.array2d[wp.vec4d],
+        seen_out: wp.array2d[wp.vec3d],
         owner_out: wp.array2d[int],
     ) -> None:
         index = first + wp.tid()
@@ -324,7 +329,11 @@ def rule_kernels(moving: bool) -> _Kernels:
                     point = wp.vec4d(p_O[0], p_O[1], p_O[2], wp.float64(1.0))
                     owner = body
             owner_out[row, probe] = owner
-        points_out[row, probe] = point
+            points_out[row, probe] = point
+            point = _point_of(owner, row, point, bodies)
+        else:
+            points_out[row, probe] = point
+        seen_out[row, probe] = _see(point, origin, poses.q_WC[row], lens)
 
     @wp.kernel(module="unique", enable_backward=False)
     def compare(
@@ -339,6 +348,7 @@ def rule_kernels(moving: bool) -> _Kernels:
         poses: _Poses,
         bodies: _Bodies,
         points: wp.array2d[wp.vec4d],
+        seen: wp.array2d[wp.vec3d],
         owner: wp.array2d[int],
         # In/out:
         moved: wp.array2d[float],
@@ -354,12 +364,10 @@ def rule_kernels(moving: bool) -> _Kernels:
         most = float(0.0)
         for probe in range(begin, wp.min(begin + chunk, probes)):
             point = points[row, probe]
-            later = point
             if wp.static(moving):
-                later = _point_of(owner[row, probe], tick + 1, point, bodies)
-                point = _point_of(owner[row, probe], row, point, bodies)
-            before = _see(point, poses.p_WC[row], poses.q_WC[row], lens)
-            after = _see(later, poses.p_next_WC[tick], poses.q_next_WC[tick], lens)
+                point = _point_of(owner[row, probe], tick + 1, point, bodies)
+            before = seen[row, probe]
+            after = _see(point, poses.p_next_WC[tick], poses.q_next_WC[tick], lens)
             if _in_picture(before, lens) or _in_picture(after, lens):
                 most = wp.max(most, _distance(before, after))
         wp.atomic_max(moved, row, tick, most)
@@ -374,10 +382,12 @@ def _carry_row(
     # In/out:
     poses: _Poses,
     points: wp.array2d[wp.vec4d],
+    seen: wp.array2d[wp.vec3d],
     owner: wp.array2d[int],
 ) -> None:
     probe = wp.tid()
     points[0, probe] = points[row, probe]
+    seen[0, probe] = seen[row, probe]
     if owner.shape[0] > 0:
         owner[0, probe] = owner[row, probe]
     if probe == 0:
@@ -431,7 +441,8 @@ class DisplacementRule:
         self._lens = _Pinhole()
         self._lens.fx, self._lens.fy, self._lens.cx, self._lens.cy = lens.intrinsics()
         self._lens.width, self._lens.height = lens.width, lens.height
-        rows = _BLOCK + 1
+        self._block = _BLOCK_ON_CPU if self._on_cpu else _BLOCK
+        rows = self._block + 1
 
         def zeros(shape: Any, dtype: Any) -> Any:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -440,16 +451,18 @@ class DisplacementRule:
         self._poses.p_WC, self._poses.p_next_WC = zeros(rows, wp.vec3d), zeros(rows, wp.vec3d)
         self._poses.q_WC, self._poses.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
         self._points = zeros((rows, self._probe_count), wp.vec4d)
+        self._seen = zeros((rows, self._probe_count), wp.vec3d)
         self._make_bodies(arrays, rows)
         self._moved = zeros((rows, rows), float)
         self._moved_on_host = HostCopy(self._moved)
-        self._slots, self._step_s = zeros(_BLOCK, int), zeros(_BLOCK, wp.float64)
+        self._slots, self._step_s = zeros(self._block, int), zeros(self._block, wp.float64)
         self._shifts = zeros(rows, wp.vec2)
         self._inputs = [HostInput(array) for array in (self._slots, self._step_s, self._shifts)]
         self._done = Milestone(device)
         self._started = False
         self._last_ns = 0
         self._measured: dict[int, int] = {}
+        self._ahead = _AHEAD_MIN
 
     def _make_bodies(self, arrays: SceneArrays, rows: int) -> None:
         """Take over the bodies of a scene, if it has any."""
@@ -491,8 +504,8 @@ class DisplacementRule:
         """
         self.coarse_count = 0
         chosen: list[int] = []
-        for begin in range(0, len(slots), _BLOCK):
-            block = slice(begin, begin + _BLOCK)
+        for begin in range(0, len(slots), self._block):
+            block = slice(begin, begin + self._block)
             self._load(states, slots[block], stamps_ns[block], vehicle)
             found = [begin + tick for tick in self._choose(forced[block])]
             self._last_ns = stamps_ns[found[-1]] if found else self._last_ns
@@ -509,6 +522,7 @@ class DisplacementRule:
         for tick, must in enumerate(forced, start=1):
             if must or not self._started or self._moved_px(last, tick, count) > self._limit_px:
                 chosen.append(tick - 1)
+                self._ahead = max(tick - last, _AHEAD_MIN)
                 last = tick
                 self._started = True
         self.coarse_count += sum(self._moved_px(t + 1, t + 1, count) > self._limit_px for t in chosen)
@@ -517,7 +531,7 @@ class DisplacementRule:
                 _carry_row,
                 dim=self._probe_count,
                 inputs=[last],
-                outputs=[self._poses, self._points, self._owner],
+                outputs=[self._poses, self._points, self._seen, self._owner],
                 device=self._device,
             )
         return chosen
@@ -550,13 +564,17 @@ class DisplacementRule:
         self._measured = {}
 
     def _moved_px(self, row: int, tick: int, count: int) -> float:
-        """Return the largest displacement from a render in a row to the tick after another row [px]."""
+        """Return the largest displacement from a render in a row to the tick after another row [px].
+
+        A CPU compares a few ticks at once: about as many as passed before the last render, then ever more.
+        """
         if self._on_cpu and tick >= self._measured.get(row, -1):
             begin = self._measured.get(row, row)
-            end = min(max(begin, tick) + _AHEAD_ON_CPU, count + 1)
+            end = min(tick + self._ahead, count + 1)
             fresh = row not in self._measured and row > 0
             self._measure(row, int(fresh), row, 1, begin, end - begin)
             self._measured[row] = end
+            self._ahead = min(2 * self._ahead, self._block)
         return float(self._moved_on_host.view(row, 1)[0, tick])
 
     def _measure(
@@ -577,8 +595,9 @@ class DisplacementRule:
                     self._bodies,
                     self._shifts,
                 ],
-                outputs=[self._points, self._owner],
+                outputs=[self._points, self._seen, self._owner],
                 device=self._device,
+                thread_count=self._threads(cast_count),
             )
         chunk = self._probe_count if self._on_cpu else _CHUNK_ON_CUDA
         launch_split(
@@ -593,10 +612,12 @@ class DisplacementRule:
                 self._poses,
                 self._bodies,
                 self._points,
+                self._seen,
                 self._owner,
             ],
             outputs=[self._moved],
             device=self._device,
+            thread_count=self._threads(row_count * tick_count),
         )
         if self._body_count > 0:
             launch_split(
@@ -605,7 +626,12 @@ class DisplacementRule:
                 inputs=[self._lens, row, tick, tick_count, self._poses, self._bodies],
                 outputs=[self._moved],
                 device=self._device,
+                thread_count=self._threads(row_count * tick_count),
             )
         self._moved_on_host.fetch(row, row_count)
         self._done.set()
         self._done.wait()
+
+    def _threads(self, times: int) -> int | None:
+        """Return how many threads of a CPU look at all probes so many times; None: all cores."""
+        return None if times * self._probe_count >= _SPLIT_MIN else 1
