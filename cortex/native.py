@@ -11,11 +11,9 @@ from typing import Any
 
 from cortex.fast import describe_arrays
 from cortex.layout import (
-    LARGE_ARRAY_BYTES,
     SCALAR_CODES,
     array_dtype,
     block_size,
-    fixed_bytes,
     measure_fields,
 )
 from cortex.schema import ArrayType, FieldType, Schema
@@ -76,7 +74,7 @@ def _row(kind: FieldType, array: Any) -> tuple[Any, ...] | None:
             names[axis] = name
         return _VARIABLE, "-", array.dtype, tuple(sizes), tuple(names), array.head
     if isinstance(kind, ArrayType):
-        if fixed_bytes(kind) >= LARGE_ARRAY_BYTES or len(kind.shape) > _RANK_MAX:
+        if len(kind.shape) > _RANK_MAX:
             return None
         return _FIXED, "-", array_dtype(kind), kind.shape, (-1,) * len(kind.shape), 0
     if not isinstance(kind, str):
