@@ -22,7 +22,6 @@ from neurosim_core.vehicle.equations import Equations
 from neurosim_core.vehicle.rotors import RotorSums
 from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_OK, STATUS_VELOCITY
 from neurosim_core.vehicle.surroundings import Surroundings
-from neurosim_core.vehicle.wind import time_to_tick
 
 _PROPORTIONAL = wp.constant(wp.float64(0.2 - 0.75 * 0.04))
 _INTEGRAL = wp.constant(wp.float64(0.04))
@@ -85,8 +84,7 @@ def make_dormand_prince(equations: Equations) -> Any:
     attitude, body rate [rad/s]. It returns the last four, the number of evaluations, and why it failed or
     STATUS_OK.
     """
-    air_terms, wind, changing_wind = equations.air_terms, equations.wind, equations.changing_wind
-    turbulence = equations.turbulence and air_terms
+    wind, changing_wind = equations.wind, equations.changing_wind
     near_ground = equations.ground or equations.ground_effect
     rates, lift, wind_at, sums_at = equations.rates, equations.lift, equations.wind_at, equations.rotors.at
 
@@ -156,8 +154,6 @@ def make_dormand_prince(equations: Equations) -> Any:
         evaluation_count = wp.int32(1)
         while t < duration_s:
             h = wp.min(h, _ROTATION_MAX_RAD / (wp.length(_part(y, 9)) + wp.float64(1e-9)))
-            if wp.static(turbulence):
-                h = wp.min(h, time_to_tick(around.wind, start_ns, t))
             last = bool(t + wp.float64(1.01) * h >= duration_s)
             if last:
                 h = duration_s - t

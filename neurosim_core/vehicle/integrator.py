@@ -10,11 +10,12 @@ import warp as wp
 from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
 from neurosim_core.vehicle.dormand_prince import make_dormand_prince
 from neurosim_core.vehicle.equations import make_equations
+from neurosim_core.vehicle.motor import projected_exponential
 from neurosim_core.vehicle.rkmk4 import make_rkmk4
 from neurosim_core.vehicle.rotors import RotorSums, held_command
 from neurosim_core.vehicle.status import STATUS_COMMAND, STATUS_OK
 from neurosim_core.vehicle.surroundings import Surroundings
-from neurosim_core.vehicle.wind import draw_turbulence, start_turbulence
+from neurosim_core.vehicle.wind import draw_turbulence, start_turbulence, time_to_tick
 
 
 @wp.struct
@@ -22,6 +23,7 @@ class Interval:
     """What a batch is moved by. One parameter: on a CPU each costs a quarter of a microsecond a launch."""
 
     duration_ns: wp.int64
+    max_step_ns: wp.int64
     step_s: wp.float64
     step_count: wp.int32
     speed_nodes: wp.vec3d  # see `motor.LagConstants`
@@ -62,6 +64,31 @@ class Kernels(NamedTuple):
     """Draws the turbulence at time 0; None without."""
 
 
+@wp.func
+def part_of(interval: Interval, duration_ns: wp.int64) -> Interval:
+    """Return the first part of an interval, in equal steps of its own; see `motor.lag_constants`."""
+    part = Interval()
+    step_count = (duration_ns + interval.max_step_ns - wp.int64(1)) / interval.max_step_ns
+    part.duration_ns = duration_ns
+    part.max_step_ns = interval.max_step_ns
+    part.step_count = wp.int32(step_count)
+    part.step_s = wp.float64(duration_ns) / wp.float64(step_count) * wp.float64(1e-9)
+    part.lag_rate = interval.lag_rate
+    part.rtol = interval.rtol
+    part.atol = interval.atol
+    part.evaluation_count_max = interval.evaluation_count_max
+    if part.step_s == interval.step_s:
+        part.speed_nodes = interval.speed_nodes
+        part.square_nodes = interval.square_nodes
+        part.decay = interval.decay
+    else:
+        z = interval.lag_rate * part.step_s
+        part.speed_nodes = projected_exponential(z)
+        part.square_nodes = projected_exponential(wp.float64(2.0) * z)
+        part.decay = wp.exp(-z)
+    return part
+
+
 @functools.cache
 def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     """Return the kernels that compute only the given terms (see `multirotor.TERMS`).
@@ -75,29 +102,16 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
     wind, changing_wind, turbulence = equations.wind, equations.changing_wind, equations.turbulence
     near_ground = equations.ground or equations.ground_effect
     forces, lift, wind_at = equations.forces, equations.lift, equations.wind_at
+    set_step = equations.rotors.set_step
     fly_fixed = make_rkmk4(equations)
     fly_adaptive = make_dormand_prince(equations)
     name = "_".join(sorted(terms)) or "rigid"
     module = wp.get_module(f"neurosim_core.vehicle.integrator.{name}" + (".adaptive" if adaptive else ""))
 
-    @wp.kernel(module=module, enable_backward=False)
-    def advance(
-        # Model:
-        airframe: Airframe,
-        around: Surroundings,
-        interval: Interval,
-        # In/out:
-        batch: Batch,
-    ):
-        vehicle = wp.tid()
-        if batch.status[vehicle] != STATUS_OK:
-            return
+    @wp.func
+    def fly(airframe: Airframe, around: Surroundings, interval: Interval, batch: Batch, vehicle: wp.int32):
+        """Move one vehicle by an interval, or set its status and leave it where it is."""
         rotor_count = batch.rotor_speed_command.shape[1]
-        for rotor in range(rotor_count):
-            if not wp.isfinite(batch.rotor_speed_command[vehicle, rotor]):
-                batch.status[vehicle] = STATUS_COMMAND
-                return
-
         # sums over the rotors of Omega^2 = c^2 + 2 c d + d^2 and Omega = c + d, where d = Omega_0 - c decays
         quadratic_cc = wp.vec4d()
         quadratic_cd = wp.vec4d()
@@ -121,8 +135,6 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
         q = batch.orientation[vehicle]
         w = batch.body_rate[vehicle]
         start_ns = batch.stamp_ns[vehicle]
-        if wp.static(turbulence):
-            draw_turbulence(around.wind, airframe, vehicle, start_ns + interval.duration_ns, x, v)
         remaining = wp.float64(0.0)
         redo = wp.bool(True)
         if wp.static(not adaptive):
@@ -164,13 +176,44 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
             c = held_command(airframe, batch.rotor_speed_command, vehicle, rotor)
             if wp.static(rotor_lags):
                 remaining = wp.exp(
-                    -around.rotors.lags[rotor].rate * wp.float64(interval.step_count) * interval.step_s
+                    -around.rotors.lags[0, rotor].rate * wp.float64(interval.step_count) * interval.step_s
                 )
             if wp.static(motor_lag):
                 batch.rotor_speed[vehicle, rotor] = c + remaining * (batch.rotor_speed[vehicle, rotor] - c)
             else:
                 batch.rotor_speed[vehicle, rotor] = c
         batch.stamp_ns[vehicle] += interval.duration_ns
+
+    @wp.kernel(module=module, enable_backward=False)
+    def advance(
+        # Model:
+        airframe: Airframe,
+        around: Surroundings,
+        interval: Interval,
+        # In/out:
+        batch: Batch,
+    ):
+        vehicle = wp.tid()
+        if batch.status[vehicle] != STATUS_OK:
+            return
+        for rotor in range(batch.rotor_speed_command.shape[1]):
+            if not wp.isfinite(batch.rotor_speed_command[vehicle, rotor]):
+                batch.status[vehicle] = STATUS_COMMAND
+                return
+        if wp.static(not turbulence):
+            fly(airframe, around, interval, batch, vehicle)
+        else:
+            left_ns = wp.int64(interval.duration_ns)
+            while left_ns > wp.int64(0) and batch.status[vehicle] == STATUS_OK:
+                now_ns = batch.stamp_ns[vehicle]
+                draw_turbulence(
+                    around.wind, airframe, vehicle, now_ns, batch.position[vehicle], batch.velocity[vehicle]
+                )
+                part = part_of(interval, wp.min(left_ns, time_to_tick(around.wind, now_ns)))
+                if wp.static(rotor_lags):
+                    set_step(around.rotors, vehicle, part.step_s)
+                fly(airframe, around, part, batch, vehicle)
+                left_ns -= part.duration_ns
 
     @wp.kernel(module=module, enable_backward=False)
     def accelerate(

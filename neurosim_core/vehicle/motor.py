@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def,untyped-decorator,operator"
 """Rotor speed dynamics: a first-order lag towards the command, in closed form.
 
 With a command c held over a step of h seconds, Omega(s) = c + (Omega_0 - c) exp(-z s), s = t / h in [0, 1]
@@ -11,8 +12,11 @@ order 1 for tau << h.
 import math
 from typing import NamedTuple
 
+import warp as wp
+
 _SERIES_BELOW = 0.3
 """Below, the closed forms of the moments cancel; 14 terms of the series are exact to rounding there."""
+_SERIES_TERM_COUNT = 14
 _RATE_MAX_1_S = 1e300  # so that rate t is 0 at t = 0 also for tau = 0
 
 
@@ -55,7 +59,7 @@ def _projected_exponential(z: float) -> tuple[float, float, float]:
 def _moments(z: float) -> tuple[float, float, float]:
     """Integrals of s^n exp(-z s) over [0, 1], n = 0, 1, 2."""
     if z < _SERIES_BELOW:
-        terms = [(-z) ** k / math.factorial(k) for k in range(14)]
+        terms = [(-z) ** k / math.factorial(k) for k in range(_SERIES_TERM_COUNT)]
         m0, m1, m2 = (sum(term / (k + n + 1) for k, term in enumerate(terms)) for n in range(3))
         return m0, m1, m2
     if math.isinf(z):
@@ -64,3 +68,27 @@ def _moments(z: float) -> tuple[float, float, float]:
     m0 = -math.expm1(-z) / z
     m1 = (m0 - rest) / z
     return m0, m1, (2.0 * m1 - rest) / z
+
+
+@wp.func
+def projected_exponential(z: wp.float64) -> wp.vec3d:
+    """Return what `lag_constants` has as nodes for z = h / tau or 2 h / tau, on the device."""
+    one = wp.float64(1.0)
+    m0 = wp.float64(0.0)
+    m1 = wp.float64(0.0)
+    m2 = wp.float64(0.0)
+    if z < wp.static(wp.float64(_SERIES_BELOW)):
+        term = one
+        for k in range(wp.static(_SERIES_TERM_COUNT)):
+            m0 += term / wp.float64(k + 1)
+            m1 += term / wp.float64(k + 2)
+            m2 += term / wp.float64(k + 3)
+            term *= -z / wp.float64(k + 1)
+    else:
+        rest = wp.exp(-z)
+        m0 = (one - rest) / z
+        m1 = (m0 - rest) / z
+        m2 = (wp.float64(2.0) * m1 - rest) / z
+    a1 = wp.float64(3.0) * (wp.float64(2.0) * m1 - m0)
+    a2 = wp.float64(5.0) * (wp.float64(6.0) * (m2 - m1) + m0)
+    return wp.vec3d(m0 - a1 + a2, m0 - wp.float64(0.5) * a2, m0 + a1 + a2)

@@ -29,7 +29,7 @@ from neurosim_core.vehicle.motor import LagConstants, lag_constants
 from neurosim_core.vehicle.rotors import RotorLag, Rotors
 from neurosim_core.vehicle.status import STATUS_TERMS
 from neurosim_core.vehicle.surroundings import Surroundings
-from neurosim_core.vehicle.wind import INTERVAL_TICKS_MAX, GustConfig, TurbulenceConfig, make_wind
+from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig, make_wind
 
 TERMS = (
     "motor_lag",
@@ -224,7 +224,8 @@ class Effort(NamedTuple):
 class DynamicsError(ArithmeticError):
     """The motion of a vehicle cannot be integrated, or its command was not finite.
 
-    The vehicle is held at its last good state, the beginning of the interval that failed, until it is reset;
+    The vehicle is held at its last good state, the beginning of the interval that failed (in turbulence: of
+    its part from tick to tick), until it is reset;
     other vehicles of the batch are not affected.
 
     Attributes:
@@ -289,13 +290,13 @@ class Multirotor:
     captured in a CUDA graph. Rotor speed commands outside the range of the rotors saturate, as they do in a
     motor controller.
 
-    An interval is what one call of `advance` covers. It is flown in equal steps of RKMK4 (`rkmk4.py`). Where
-    these do not resolve the motion of a vehicle, its interval is flown again from its beginning in adaptive
-    steps of Dormand-Prince 5(4) (`dormand_prince.py`), on the device, and counted (`effort`). The criterion
-    is RK4's embedded difference h/6 |k1 - k2 - k3 + k4| on velocity and body rate, against sqrt(1e-3^2 +
-    (1e-2 |.|)^2); it catches blow-up and is no estimate of accuracy. A vehicle that adaptive steps cannot
-    move either stops at the beginning of the interval: its `status` is set on the device, and `check` raises
-    DynamicsError.
+    An interval is what one call of `advance` covers, cut at the ticks of turbulence. It is flown in equal
+    steps of RKMK4 (`rkmk4.py`). Where these do not resolve the motion of a vehicle, its interval is flown
+    again from its beginning in adaptive steps of Dormand-Prince 5(4) (`dormand_prince.py`), on the device,
+    and counted (`effort`). The criterion is RK4's embedded difference h/6 |k1 - k2 - k3 + k4| on velocity and
+    body rate, against sqrt(1e-3^2 + (2e-3 |.|)^2); it catches blow-up and is no estimate of accuracy. A
+    vehicle that adaptive steps cannot move either stops at the beginning of the interval: its `status` is set
+    on the device, and `check` raises DynamicsError.
 
     Args:
         config: Parameters, the same for all vehicles.
@@ -388,8 +389,9 @@ class Multirotor:
         self._begin: wp.Launch | None = None
         if self._kernels.begin is not None:
             self._begin = self._record(self._kernels.begin, self._surroundings(), self.arrays.position)
-        self._launches: dict[int, tuple[wp.Launch, ...]] = {}
+        self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
+        self._own_lags: wp.array2d[Any] | None = None
         self.reset()
 
     def reset(
@@ -480,11 +482,10 @@ class Multirotor:
         """
         if not isinstance(duration_ns, (int, np.integer)):
             raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
-        launches = self._launches.get(duration_ns)
-        if launches is None:
-            launches = self._record_advance(duration_ns)
-        for launch in launches:
-            launch.launch()
+        launch = self._launches.get(duration_ns)
+        if launch is None:
+            launch = self._record_advance(duration_ns)
+        launch.launch()
         self._stamp_ns += duration_ns
 
     def accelerate(self) -> None:
@@ -557,22 +558,17 @@ class Multirotor:
         )
         return launch
 
-    def _record_advance(self, duration_ns: int) -> tuple[wp.Launch, ...]:
-        """Prepare the launches for one duration, and keep them."""
+    def _record_advance(self, duration_ns: int) -> wp.Launch:
+        """Prepare the launch for one duration, and keep it."""
         if duration_ns <= 0:
             raise ValueError(f"duration_ns must be > 0, got {duration_ns}")
         if duration_ns > (longest_ns := (2**31 - 1) * self.max_step_ns):
             raise ValueError(f"duration_ns must be at most 2^31 steps, {longest_ns}, got {duration_ns}")
-        longest_ns = duration_ns
-        if "turbulence" in self.terms:
-            longest_ns = INTERVAL_TICKS_MAX * int(self._wind.tick_ns)
-        parts_ns = [min(longest_ns, duration_ns - begin) for begin in range(0, duration_ns, longest_ns)]
-        recorded = {part_ns: self._record_interval(part_ns) for part_ns in set(parts_ns)}
-        launches = tuple(recorded[part_ns] for part_ns in parts_ns)
+        launch = self._record_interval(duration_ns)
         if len(self._launches) >= _LAUNCH_COUNT_MAX:
             del self._launches[next(iter(self._launches))]
-        self._launches[duration_ns] = launches
-        return launches
+        self._launches[duration_ns] = launch
+        return launch
 
     def _record_interval(self, duration_ns: int) -> wp.Launch:
         step_count = -(-duration_ns // self.max_step_ns)
@@ -582,6 +578,7 @@ class Multirotor:
         interval = _struct(
             Interval,
             duration_ns=duration_ns,
+            max_step_ns=self.max_step_ns,
             step_s=step_s,
             step_count=step_count,
             speed_nodes=wp.vec3d(*lags[0].speed_nodes),
@@ -606,18 +603,24 @@ class Multirotor:
             speed=self.arrays.rotor_speed,
         )
         if lags and "rotor_lags" in self.terms:
-            rows = [
-                _struct(
-                    RotorLag,
-                    speed_nodes=wp.vec3d(*lag.speed_nodes),
-                    square_nodes=wp.vec3d(*lag.square_nodes),
-                    rate=lag.rate_1_s,
-                )
-                for lag in lags
-            ]
-            rotors.lags = wp.array(rows, dtype=RotorLag, device=self.device)
+            rotors.lags = self._rotor_lags(lags)
         around: Surroundings = _struct(Surroundings, wind=self._wind, ground=self._ground, rotors=rotors)
         return around
+
+    def _rotor_lags(self, lags: Sequence[LagConstants]) -> wp.array2d[Any]:
+        """Return the lags of one length of step, or what kernels set them in for each vehicle."""
+        if self._own_lags is not None:
+            return self._own_lags
+        own = "turbulence" in self.terms
+        table = np.zeros((self.count if own else 1, len(lags)), dtype=RotorLag.numpy_dtype())
+        table["rate"] = [lag.rate_1_s for lag in lags]
+        if not own:
+            table["speed_nodes"] = [lag.speed_nodes for lag in lags]
+            table["square_nodes"] = [lag.square_nodes for lag in lags]
+        array: wp.array2d[Any] = wp.array(table, dtype=RotorLag, device=self.device)
+        if own:
+            self._own_lags = array
+        return array
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neurosim_core.vehicle.aerodynamics import Airframe, vec10d
+from neurosim_core.vehicle.motor import projected_exponential
 
 
 @wp.struct
@@ -33,6 +34,7 @@ class RotorLag:
     speed_nodes: wp.vec3d
     square_nodes: wp.vec3d
     rate: wp.float64
+    step: wp.float64  # [s]
 
 
 @wp.struct
@@ -41,7 +43,7 @@ class Rotors:
 
     quadratic_weight: wp.array(dtype=wp.vec4d)
     linear_weight: wp.array(dtype=vec10d)
-    lags: wp.array(dtype=RotorLag)
+    lags: wp.array2d(dtype=RotorLag)  # [1, R]; where parts of an interval have steps of their own, [N, R]
     command: wp.array2d(dtype=wp.float64)
     speed: wp.array2d(dtype=wp.float64)
 
@@ -51,6 +53,8 @@ class RotorFunctions(NamedTuple):
 
     at: Any
     """(airframe, sums, rotors, vehicle, t) -> sums times Omega^2 and Omega at t [s] in the interval."""
+    set_step: Any
+    """(rotors, vehicle, step) -> none: makes the lags of one vehicle those of steps of another length [s]."""
     nodes: Any
     """(airframe, rotors, vehicle, t) -> the same as the stages of a step from t see them, for rotors of
     unequal lags: three sums times Omega^2, three times Omega."""
@@ -66,15 +70,16 @@ def make_rotor_functions(terms: frozenset[str], *, air_terms: bool) -> RotorFunc
     """Return the sums over the rotors that the given terms need."""
     motor_lag = "motor_lag" in terms
     rotor_lags = "rotor_lags" in terms
+    own_lags = "turbulence" in terms
 
     @wp.func
     def sums_at(airframe: Airframe, sums: RotorSums, rotors: Rotors, vehicle: wp.int32, t: wp.float64):
         quadratic = sums.quadratic_cc
         linear = sums.linear_c
         if wp.static(rotor_lags):
-            for rotor in range(rotors.lags.shape[0]):
+            for rotor in range(rotors.lags.shape[1]):
                 c = held_command(airframe, rotors.command, vehicle, rotor)
-                d = (rotors.speed[vehicle, rotor] - c) * wp.exp(-rotors.lags[rotor].rate * t)
+                d = (rotors.speed[vehicle, rotor] - c) * wp.exp(-rotors.lags[0, rotor].rate * t)
                 quadratic += (wp.float64(2.0) * c + d) * d * rotors.quadratic_weight[rotor]
                 if wp.static(air_terms):
                     linear += d * rotors.linear_weight[rotor]
@@ -93,9 +98,12 @@ def make_rotor_functions(terms: frozenset[str], *, air_terms: bool) -> RotorFunc
         linear_1 = vec10d()
         linear_2 = vec10d()
         linear_4 = vec10d()
-        for rotor in range(rotors.lags.shape[0]):
+        row = wp.int32(0)
+        if wp.static(own_lags):
+            row = vehicle
+        for rotor in range(rotors.lags.shape[1]):
             c = held_command(airframe, rotors.command, vehicle, rotor)
-            lag = rotors.lags[rotor]
+            lag = rotors.lags[row, rotor]
             d = (rotors.speed[vehicle, rotor] - c) * wp.exp(-lag.rate * t)
             cd = wp.float64(2.0) * c * d
             dd = d * d
@@ -109,4 +117,14 @@ def make_rotor_functions(terms: frozenset[str], *, air_terms: bool) -> RotorFunc
                 linear_4 += lag.speed_nodes[2] * d * rotors.linear_weight[rotor]
         return quadratic_1, quadratic_2, quadratic_4, linear_1, linear_2, linear_4
 
-    return RotorFunctions(sums_at, lagging_nodes)
+    @wp.func
+    def set_step(rotors: Rotors, vehicle: wp.int32, step: wp.float64):
+        for rotor in range(rotors.lags.shape[1]):
+            lag = rotors.lags[vehicle, rotor]
+            if lag.step != step:
+                lag.speed_nodes = projected_exponential(lag.rate * step)
+                lag.square_nodes = projected_exponential(wp.float64(2.0) * lag.rate * step)
+                lag.step = step
+                rotors.lags[vehicle, rotor] = lag
+
+    return RotorFunctions(sums_at, set_step, lagging_nodes)

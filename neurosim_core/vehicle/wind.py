@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
-"""Wind: a constant, discrete gusts, and Dryden turbulence, as functions of time alone.
+"""Wind: a constant, discrete gusts, and Dryden turbulence that a vehicle meets on its way.
 
 Turbulence follows the low-altitude model: a frozen field that passes the vehicle at its air speed V, with
 scale lengths and intensities that depend on the height h above ground [ft] and on the wind at 20 ft:
@@ -12,7 +12,12 @@ In dimensionless time theta = V t / L the components over sigma are white noise 
 the mean wind and through (1 + 1.732 p) / (1 + p)^2 across it and vertically. Their autocorrelations are
 exp(-theta) and (1 - theta / 2) exp(-theta). The filters are sampled at fixed ticks: with the exact transition
 matrix and the exact covariance of the noise between two ticks, and with random numbers addressed by the tick,
-so the same wind blows whatever the steps, sensors and batches are. Between ticks it is linear.
+with scale lengths and intensities for height and air speed at the tick before. Intervals are cut at ticks, so
+the same wind blows on the same flight whatever the intervals, sensors and batches are. Between ticks it is
+linear.
+
+Left out: the angular gusts p, q, r of the model, so all rotors and the frame meet one wind, and it turns a
+vehicle only by what it does to rotors and frame alike; and the shear of the mean wind with height.
 
 Reference: MIL-F-8785C (1980), 3.7.1.2 and 3.7.2.3 (Dryden form), 3.7.1.3 (discrete gust), 3.7.3.4 (low
 altitude); MIL-HDBK-1797 (1997), appendix A, which has half the lateral and vertical scale lengths in formulas
@@ -32,11 +37,7 @@ from neurosim_core.random import normal2, random_bits, stream_id
 from neurosim_core.settings import Settings
 from neurosim_core.vehicle.aerodynamics import Airframe
 
-TICK_COUNT = 32
-"""Ticks of turbulence that are kept for each vehicle, in a ring."""
-INTERVAL_TICKS_MAX = TICK_COUNT - 3
-"""The longest interval that fits, in ticks: it may begin and end within a tick, and one more is read."""
-
+_TICK_COUNT = 2  # ticks of turbulence that are kept for each vehicle: it flies between them
 _FOOT_M = 0.3048
 _STREAM = wp.constant(wp.uint32(stream_id("vehicle/turbulence")))
 _SQRT_2 = wp.constant(wp.float64(math.sqrt(2.0)))
@@ -69,12 +70,12 @@ class TurbulenceConfig(Settings):
     It does not blow by itself: see `wind_m_s`."""
     altitude_m: Annotated[float, Field(ge=10 * _FOOT_M, le=1000 * _FOOT_M)] | None = None
     """Height above ground that scale lengths and intensities are taken at [m]; null: that of the vehicle
-    above the ground (z = 0 without one), within the 3.048 to 304.8 m that the model is for."""
+    above the ground (z = 0 without one) at each tick, within the 3.048 to 304.8 m that the model is for."""
     airspeed_m_s: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
-    """Speed at which the field passes the vehicle [m/s]; null: that of the vehicle against `wind_m_s`, at
-    least 1 m/s."""
+    """Speed at which the field passes the vehicle [m/s]; null: that of the vehicle against `wind_m_s`
+    at each tick, at least 1 m/s."""
     sample_s: Annotated[float, Field(ge=1e-4, le=1.0)] = 0.01
-    """Time between two ticks of the turbulence [s]; linear in between."""
+    """Time between two ticks of the turbulence [s]; linear in between. No step is longer."""
 
     @field_validator("sample_s")
     @classmethod
@@ -106,9 +107,7 @@ class Wind:
     altitude: wp.float64  # 0: that of the vehicle
     ground_height: wp.float64
     airspeed: wp.float64  # 0: that of the vehicle
-    ring: wp.array2d(
-        dtype=wp.vec3d
-    )  # turbulence in W at tick k in column k modulo TICK_COUNT, [N, TICK_COUNT]
+    ring: wp.array2d(dtype=wp.vec3d)  # turbulence in W at tick k in column k modulo 2, [N, 2]
     filters: wp.array(dtype=_vec5d)  # states of the filters as of the last tick: u; v and w two each, [N]
     last_tick: wp.array(dtype=wp.int64)  # [N]
 
@@ -158,7 +157,7 @@ def make_wind(
         wind.ground_height = ground_height_m
         wind.altitude = turbulence.altitude_m or 0.0
         wind.airspeed = turbulence.airspeed_m_s or 0.0
-        wind.ring = wp.zeros((count, TICK_COUNT), dtype=wp.vec3d, device=device)
+        wind.ring = wp.zeros((count, _TICK_COUNT), dtype=wp.vec3d, device=device)
         wind.filters = wp.zeros(count, dtype=_vec5d, device=device)
         wind.last_tick = wp.zeros(count, dtype=wp.int64, device=device)
     return wind
@@ -262,13 +261,13 @@ def start_turbulence(wind: Wind, vehicle: wp.int32, p_WB: wp.vec3d):
 
 @wp.func
 def draw_turbulence(
-    wind: Wind, airframe: Airframe, vehicle: wp.int32, until_ns: wp.int64, p_WB: wp.vec3d, v_W: wp.vec3d
+    wind: Wind, airframe: Airframe, vehicle: wp.int32, now_ns: wp.int64, p_WB: wp.vec3d, v_W: wp.vec3d
 ):
-    """Draw the ticks up to the first one at `until_ns` or after, at the height and air speed given."""
-    tick = wind.last_tick[vehicle]
-    needed = (until_ns + wind.tick_ns - wp.int64(1)) / wind.tick_ns
-    if tick >= needed:
+    """Draw the next tick if now is the one before it, at the height and air speed of now."""
+    tick = now_ns / wind.tick_ns
+    if tick < wind.last_tick[vehicle]:
         return
+    tick += wp.int64(1)
     height_ft = _height_ft(wind, p_WB)
     profile = wp.float64(0.177) + wp.float64(0.000823) * height_ft
     length_m = wp.float64(_FOOT_M) * height_ft / wp.pow(profile, wp.float64(1.2))
@@ -279,13 +278,11 @@ def draw_turbulence(
     theta = passed_m / length_m
     theta_w = passed_m / (wp.float64(_FOOT_M) * height_ft)
     z = wind.filters[vehicle]
-    while tick < needed:
-        tick += wp.int64(1)
-        u = _next_along(z[0], theta, _noise(wind, vehicle, tick, 0)[0])
-        v = _next_across(wp.vec2d(z[1], z[2]), theta, _noise(wind, vehicle, tick, 1))
-        w = _next_across(wp.vec2d(z[3], z[4]), theta_w, _noise(wind, vehicle, tick, 2))
-        z = _vec5d(u, v[0], v[1], w[0], w[1])
-        wind.ring[vehicle, wp.int32(tick % wp.int64(TICK_COUNT))] = _output(wind, z, height_ft)
+    u = _next_along(z[0], theta, _noise(wind, vehicle, tick, 0)[0])
+    v = _next_across(wp.vec2d(z[1], z[2]), theta, _noise(wind, vehicle, tick, 1))
+    w = _next_across(wp.vec2d(z[3], z[4]), theta_w, _noise(wind, vehicle, tick, 2))
+    z = _vec5d(u, v[0], v[1], w[0], w[1])
+    wind.ring[vehicle, wp.int32(tick % wp.int64(_TICK_COUNT))] = _output(wind, z, height_ft)
     wind.filters[vehicle] = z
     wind.last_tick[vehicle] = tick
 
@@ -297,21 +294,16 @@ def _turbulence_at(wind: Wind, vehicle: wp.int32, start_ns: wp.int64, t: wp.floa
     s = (wp.float64(start_ns - tick * wind.tick_ns) * wp.float64(1e-9) + t) / tick_s
     whole = wp.floor(s)
     tick += wp.int64(whole)
-    count = wp.int64(TICK_COUNT)
+    count = wp.int64(_TICK_COUNT)
     before = wind.ring[vehicle, wp.int32(tick % count)]
     after = wind.ring[vehicle, wp.int32((tick + wp.int64(1)) % count)]
     return before + (s - whole) * (after - before)
 
 
 @wp.func
-def time_to_tick(wind: Wind, start_ns: wp.int64, t: wp.float64) -> wp.float64:
-    """Return the time to the next tick of the turbulence, where its slope jumps, at least 1 ns [s]."""
-    tick_s = wp.float64(wind.tick_ns) * wp.float64(1e-9)
-    s = wp.float64(start_ns % wind.tick_ns) * wp.float64(1e-9) + t
-    left = tick_s * (wp.floor(s / tick_s) + wp.float64(1.0)) - s
-    if left < wp.float64(1e-9):
-        left += tick_s
-    return left
+def time_to_tick(wind: Wind, now_ns: wp.int64) -> wp.int64:
+    """Return the time to the next tick of the turbulence, where its slope jumps, > 0 [ns]."""
+    return wind.tick_ns - now_ns % wind.tick_ns
 
 
 class WindFunctions(NamedTuple):

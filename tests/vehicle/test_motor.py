@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.integrate import quad
 
-from neurosim_core.vehicle.motor import lag_constants
+from neurosim_core.vehicle.motor import lag_constants, projected_exponential
 
 
 @pytest.mark.parametrize("z", [1e-9, 1e-3, 0.1, 0.1499, 0.1501, 0.299, 0.301, 1.0, 7.0, 50.0, 1e3, 1e6])
@@ -28,3 +29,19 @@ def test_no_time_constant_means_at_once():
 
 def test_tiny_time_constants_stay_finite():
     assert np.isfinite(np.concatenate(lag_constants(1e-3, 5e-324)[:2])).all()
+
+
+@wp.kernel
+def _project(z: wp.array[wp.float64], nodes_out: wp.array[wp.vec3d]) -> None:
+    row = wp.tid()
+    nodes_out[row] = projected_exponential(z[row])
+
+
+def test_the_device_projects_alike(device):
+    z = np.array([1e-9, 1e-3, 0.1, 0.299, 0.3, 0.301, 1.0, 7.0, 50.0, 1e3, 1e297])
+    nodes = wp.zeros(len(z), dtype=wp.vec3d, device=device)
+    wp.launch(
+        _project, dim=len(z), inputs=[wp.array(z, dtype=wp.float64, device=device), nodes], device=device
+    )
+    expected = [lag_constants(value, 1.0).speed_nodes for value in z]
+    assert nodes.numpy() == pytest.approx(np.array(expected), abs=2e-14)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -288,18 +290,80 @@ def test_axes_follow_the_mean_wind(device):
 
 
 def test_the_same_wind_whatever_the_steps_and_the_batch(device):
-    """It is addressed by the tick; fixed altitude and air speed, so that the flight does not matter."""
+    """It is addressed by the tick; fixed altitude and air speed: no flight matters."""
     config = MODERATE.model_copy(update={"sample_s": 0.01})
     whole = make_vane(7, device=device, turbulence=config, seed=11)
     fine = listen(whole, 5 * MS, 200)[::20]  # every 0.1 s
     coarse = listen(make_vane(3, device=device, turbulence=config, seed=11), TICK_NS, 10)
     assert fine[:, :3] == pytest.approx(coarse, abs=1e-9)
     at_once = make_vane(3, device=device, turbulence=config, seed=11)
-    at_once.step(np.full(4, 500.0), 1_000 * MS)  # more ticks than are kept: several intervals
+    at_once.step(np.full(4, 500.0), 1_000 * MS)
     assert felt(at_once) == pytest.approx(coarse[-1], abs=1e-9)
     other = make_vane(3, device=device, turbulence=config, seed=12)
     assert not np.isclose(felt(other), coarse[0]).any()
     assert len(np.unique(np.round(coarse[0], 9))) == 9  # vehicles and axes are independent
+
+
+def climb(parts_ms, *, sample_s: float, device: str, **settings) -> np.ndarray:
+    """Fly for 1 s out of trim at the vehicle's own height and air speed, in calls of the given lengths."""
+    config = preset(
+        "hummingbird",
+        wind_m_s=(3.0, 1.0, 0.0),
+        turbulence=TurbulenceConfig(wind_20ft_m_s=15.4, sample_s=sample_s),
+        **settings,
+    )
+    vehicle = Multirotor(config, device=device)
+    vehicle.reset(position=(0.0, 0.0, 10.0), velocity=(4.0, -1.0, 6.0))
+    for command in config.hover_rotor_speed_rad_s * np.array(
+        [[1.01, 0.99, 1.0, 1.02], [1.0, 1.01, 1.0, 0.99]]
+    ):
+        vehicle.command(command)
+        until_ns = vehicle.stamp_ns + 500 * MS
+        for part_ms in itertools.cycle(parts_ms):
+            vehicle.advance(min(round(part_ms * MS), until_ns - vehicle.stamp_ns))
+            if vehicle.stamp_ns == until_ns:
+                break
+    vehicle.check()
+    state = vehicle.state
+    assert 12.0 < state.position[0, 2] < 20.0  # scale and intensity have changed on the way
+    return np.concatenate(state, axis=1)[0]
+
+
+@pytest.mark.parametrize("sample_s", [0.01, 0.003, 0.0237])
+@pytest.mark.parametrize("lags", [(), (1.0, 1.1, 0.9, 1.0)], ids=["one lag", "four lags"])
+def test_the_same_wind_whatever_the_intervals(sample_s, lags, device):
+    """Height and air speed are those at the ticks, where intervals are cut, not those where calls begin."""
+    scale = {"motor_time_constant_scale": lags}
+    whole = climb([500], sample_s=sample_s, device=device, **scale)
+    for parts_ms in ([1], [10], [250], [3, 5, 2], [5, 3]):
+        assert climb(parts_ms, sample_s=sample_s, device=device, **scale) == pytest.approx(
+            whole, rel=1e-12, abs=1e-12
+        )
+    # steps of another length: their error, as without turbulence
+    odd = climb([33.333333, 16.666667], sample_s=sample_s, device=device, **scale)
+    assert odd == pytest.approx(whole, rel=1e-8, abs=1e-8)
+
+
+def test_a_further_sensor_does_not_change_the_wind():
+    """Control at 125 Hz; stamps at 200 Hz cut other intervals."""
+    settings = {
+        "device": "cpu",
+        "duration_s": 1.0,
+        "scene": {"kind": "apartment", "rooms": 1},
+        "vehicle": {"parameters": {"turbulence": {"wind_20ft_m_s": 15.4}, "wind_m_s": [2.0, 0.0, 0.0]}},
+        "control": {"rate_hz": 125},
+        "path": {"kind": "hover"},
+    }
+    own = {"odometry": {"kind": "odometry", "rate_hz": 25}}
+    ends = []
+    for sensors in (own, {**own, "imu": {"kind": "imu", "rate_hz": 200}}):
+        model = simulation.make_model(load_config({**settings, "sensors": sensors}))
+        state = simulation.make_state(model)
+        while state.stamp_ns < 1_000 * MS:
+            simulation.step(model, state, np.full(4, 1.01 * HUMMINGBIRD.hover_rotor_speed_rad_s))
+        ends.append(np.concatenate(state.vehicle.state, axis=1)[0])
+        assert state.stamp_ns == 1_000 * MS
+    assert ends[1] == pytest.approx(ends[0], rel=1e-12, abs=1e-12)
 
 
 def test_turbulence_is_linear_between_ticks(device):
