@@ -16,7 +16,6 @@ import warp as wp
 
 _SERIES_BELOW = 0.3
 """Below, the closed forms of the moments cancel; 14 terms of the series are exact to rounding there."""
-_SERIES_TERM_COUNT = 14
 _RATE_MAX_1_S = 1e300  # so that rate t is 0 at t = 0 also for tau = 0
 
 
@@ -59,7 +58,7 @@ def _projected_exponential(z: float) -> tuple[float, float, float]:
 def _moments(z: float) -> tuple[float, float, float]:
     """Integrals of s^n exp(-z s) over [0, 1], n = 0, 1, 2."""
     if z < _SERIES_BELOW:
-        terms = [(-z) ** k / math.factorial(k) for k in range(_SERIES_TERM_COUNT)]
+        terms = [(-z) ** k / math.factorial(k) for k in range(14)]
         m0, m1, m2 = (sum(term / (k + n + 1) for k, term in enumerate(terms)) for n in range(3))
         return m0, m1, m2
     if math.isinf(z):
@@ -77,9 +76,9 @@ def projected_exponential(z: wp.float64) -> wp.vec3d:
     m0 = wp.float64(0.0)
     m1 = wp.float64(0.0)
     m2 = wp.float64(0.0)
-    if z < wp.static(wp.float64(_SERIES_BELOW)):
+    if z < one:  # the closed forms cancel
         term = one
-        for k in range(wp.static(_SERIES_TERM_COUNT)):
+        for k in range(20):
             m0 += term / wp.float64(k + 1)
             m1 += term / wp.float64(k + 2)
             m2 += term / wp.float64(k + 3)
