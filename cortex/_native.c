@@ -37,6 +37,9 @@ enum {
     SLOT_FRAME_SIZE = HEADER_SIZE + 8 + 32,
     READ_BYTES = 1 << 16,
     GATHER_MAX = 256,
+    BATCH_COUNT = 64,       /* as in publisher.py */
+    BATCH_BYTES = 128 * 1024,
+    BATCH_NS = 150000,
 };
 static const Py_ssize_t BODY_LIMIT = (Py_ssize_t)1 << 32;
 
@@ -327,29 +330,37 @@ static PyObject *flat_frame(Flat *flat, PyObject *const *arguments, Py_ssize_t c
     return frame == NULL ? none_or_error(NULL) : frame;
 }
 
-PyDoc_STRVAR(record_doc,
-"record($self, message, publish_ns, limit, /)\n--\n\n"
-"A record of a batch, padded to 8 bytes; None as for `frame`.");
-
-static PyObject *flat_record(Flat *flat, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 3)) return NULL;
-    PyObject *message = arguments[0];
-    const int64_t publish_ns = PyLong_AsLongLong(arguments[1]);
-    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[2]);
-    if (PyErr_Occurred()) return NULL;
+/* A record of a batch; NULL without error if the message is not as usual. */
+static PyObject *make_record(const Flat *flat, PyObject *message, int64_t publish_ns, Py_ssize_t limit) {
     Layout layout = {.stamp_ns = 0};
-    if (!lay_out(flat, message, &layout) || layout.end > limit) Py_RETURN_NONE;
+    if (!lay_out(flat, message, &layout) || layout.end > limit) return NULL;
     const Py_ssize_t padded = align_to(layout.end, 8);
     PyObject *record = PyBytes_FromStringAndSize(NULL, RECORD_SIZE + padded);
     if (record == NULL) return NULL;
     char *out = PyBytes_AS_STRING(record);
-    if (!write_body(flat, message, &layout, out + RECORD_SIZE)) return none_or_error(record);
+    if (!write_body(flat, message, &layout, out + RECORD_SIZE)) {
+        Py_DECREF(record);
+        return NULL;
+    }
     memset(out + RECORD_SIZE + layout.end, 0, (size_t)(padded - layout.end));
     memcpy(out, &layout.stamp_ns, 8);
     memcpy(out + 8, &publish_ns, 8);
     const uint32_t sizes[2] = {(uint32_t)layout.end, 0};
     memcpy(out + 16, sizes, sizeof sizes);
     return record;
+}
+
+PyDoc_STRVAR(record_doc,
+"record($self, message, publish_ns, limit, /)\n--\n\n"
+"A record of a batch, padded to 8 bytes; None as for `frame`.");
+
+static PyObject *flat_record(Flat *flat, PyObject *const *arguments, Py_ssize_t count) {
+    if (!arguments_are(count, 3)) return NULL;
+    const int64_t publish_ns = PyLong_AsLongLong(arguments[1]);
+    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[2]);
+    if (PyErr_Occurred()) return NULL;
+    PyObject *record = make_record(flat, arguments[0], publish_ns, limit);
+    return record == NULL ? none_or_error(NULL) : record;
 }
 
 PyDoc_STRVAR(encode_doc,
@@ -606,6 +617,39 @@ done:
     return Py_BuildValue("LNnN", (long long)expected, bodies, found, frame != NULL ? frame : Py_NewRef(Py_None));
 }
 
+PyDoc_STRVAR(records_doc,
+"records($self, frame, count, /)\n--\n\n"
+"The messages of a batch's records, as a list; None if they are not as usual, or do not fill the frame.");
+
+static PyObject *flat_records(Flat *flat, PyObject *const *arguments, Py_ssize_t argument_count) {
+    if (!arguments_are(argument_count, 2)) return NULL;
+    PyObject *frame = arguments[0];
+    const Py_ssize_t count = PyLong_AsSsize_t(arguments[1]);
+    if (count == -1 && PyErr_Occurred()) return NULL;
+    if (!PyBytes_CheckExact(frame) || count < 0) Py_RETURN_NONE;
+    const char *bytes = PyBytes_AS_STRING(frame);
+    const Py_ssize_t end = PyBytes_GET_SIZE(frame);
+    if (end < HEADER_SIZE || count > (end - HEADER_SIZE) / RECORD_SIZE) Py_RETURN_NONE;
+    PyObject *messages = PyList_New(count);
+    Py_ssize_t offset = HEADER_SIZE;
+    for (Py_ssize_t index = 0; messages != NULL && index < count; ++index) {
+        uint32_t sizes[2];
+        PyObject *message = NULL;
+        if (end - offset >= RECORD_SIZE) {
+            memcpy(sizes, bytes + offset + 16, sizeof sizes);
+            offset += RECORD_SIZE;
+            if (sizes[1] == 0 && align_to(sizes[0], 8) <= end - offset) {
+                message = read_body(flat, frame, bytes + offset, sizes[0]);
+                offset += align_to(sizes[0], 8);
+            }
+        }
+        if (message == NULL) return none_or_error(messages);
+        PyList_SET_ITEM(messages, index, message);
+    }
+    if (messages != NULL && offset != end) return none_or_error(messages);
+    return messages;
+}
+
 PyDoc_STRVAR(decode_doc,
 "decode($self, buffer, offset, size, /)\n--\n\n"
 "The message of `size` bytes of a bytes object, or of an array of bytes, from an offset on; None if they are not as\n"
@@ -772,6 +816,7 @@ static PyMethodDef flat_methods[] = {
     {"read", (PyCFunction)flat_read, METH_O, read_doc},
     {"drain", (PyCFunction)(void (*)(void))flat_drain, METH_FASTCALL, drain_doc},
     {"gather", (PyCFunction)(void (*)(void))flat_gather, METH_FASTCALL, gather_doc},
+    {"records", (PyCFunction)(void (*)(void))flat_records, METH_FASTCALL, records_doc},
     {"decode", (PyCFunction)(void (*)(void))flat_decode, METH_FASTCALL, decode_doc},
     {NULL, NULL, 0, NULL},
 };
@@ -811,11 +856,15 @@ typedef struct {
     uint64_t sequence;
     int64_t bytes;
     int64_t refresh_ns;
+    /* A batch that is being collected: its first record is put in by Python, which starts the clock. */
+    PyObject *records; /* a list; NULL or None: messages are not collected */
+    PyObject *flush;
+    int64_t batch_bytes, batch_start_ns, last_ns;
 } Gate;
 
 PyDoc_STRVAR(gate_doc,
-"Gate(flat, acquire, release, slowly, retry, again, limit)\n--\n\n"
-"Called with a message, it sends it; see `gate.py`, which does the same in Python.\n\n"
+"Gate(flat, acquire, release, slowly, retry, again, limit, flush)\n--\n\n"
+"Called with a message, it sends it, or adds it to a batch that has begun; see `gate.py`.\n\n"
 "Args:\n"
 "    flat: Makes the frames; has a head.\n"
 "    acquire: Takes the lock.\n"
@@ -823,10 +872,31 @@ PyDoc_STRVAR(gate_doc,
 "    slowly: Called without the lock with a message that has to go the long way.\n"
 "    retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.\n"
 "    again: What that raised.\n"
-"    limit: Most bytes of a body.\n");
+"    limit: Most bytes of a body.\n"
+"    flush: Called with the lock held when a batch is full; sends it.\n");
+
+/* Add to the batch that is being collected, with the lock held; NULL as below. */
+static PyObject *gate_collect(Gate *gate, PyObject *message) {
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns) return NULL;
+    PyObject *record = make_record(gate->flat, message, now_ns, gate->limit);
+    if (record == NULL) return NULL;
+    gate->batch_bytes += PyBytes_GET_SIZE(record);
+    const int failed = PyList_Append(gate->records, record);
+    Py_DECREF(record);
+    if (failed) return NULL;
+    gate->sequence += 1;
+    gate->last_ns = now_ns;
+    if (PyList_GET_SIZE(gate->records) >= BATCH_COUNT || gate->batch_bytes >= BATCH_BYTES
+        || now_ns - gate->batch_start_ns >= BATCH_NS)
+        return PyObject_CallNoArgs(gate->flush);
+    Py_RETURN_TRUE;
+}
 
 /* Send with the lock held; NULL without error if the message has to go the long way. */
 static PyObject *gate_send(Gate *gate, PyObject *message) {
+    if (gate->records != NULL && PyList_CheckExact(gate->records) && PyList_GET_SIZE(gate->records))
+        return gate_collect(gate, message);
     if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
     const int64_t now_ns = monotonic_ns();
     if (now_ns >= gate->refresh_ns) return NULL;
@@ -882,11 +952,11 @@ static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t fl
 }
 
 static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"flat", "acquire", "release", "slowly", "retry", "again", "limit", NULL};
-    PyObject *flat, *acquire, *release, *slowly, *retry, *again;
+    static char *names[] = {"flat", "acquire", "release", "slowly", "retry", "again", "limit", "flush", NULL};
+    PyObject *flat, *acquire, *release, *slowly, *retry, *again, *flush;
     Py_ssize_t limit;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOn:Gate", names, &FlatType, &flat, &acquire, &release,
-                                     &slowly, &retry, &again, &limit))
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOnO:Gate", names, &FlatType, &flat, &acquire, &release,
+                                     &slowly, &retry, &again, &limit, &flush))
         return NULL;
     Gate *gate = (Gate *)type->tp_alloc(type, 0);
     if (gate == NULL) return NULL;
@@ -897,6 +967,7 @@ static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *key
     gate->slowly = Py_NewRef(slowly);
     gate->retry = Py_NewRef(retry);
     gate->again = Py_NewRef(again);
+    gate->flush = Py_NewRef(flush);
     gate->limit = limit;
     return (PyObject *)gate;
 }
@@ -909,6 +980,8 @@ static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
     Py_VISIT(gate->retry);
     Py_VISIT(gate->again);
     Py_VISIT(gate->sends);
+    Py_VISIT(gate->records);
+    Py_VISIT(gate->flush);
     return 0;
 }
 
@@ -920,6 +993,8 @@ static int gate_clear(Gate *gate) {
     Py_CLEAR(gate->retry);
     Py_CLEAR(gate->again);
     Py_CLEAR(gate->sends);
+    Py_CLEAR(gate->records);
+    Py_CLEAR(gate->flush);
     return 0;
 }
 
@@ -931,6 +1006,10 @@ static void gate_dealloc(Gate *gate) {
 
 static PyMemberDef gate_members[] = {
     {"sends", T_OBJECT, offsetof(Gate, sends), 0, "Take a frame and flags; none: every message goes the long way."},
+    {"records", T_OBJECT, offsetof(Gate, records), 0, "Those of the batch that is being collected; None: none is."},
+    {"batch_bytes", T_LONGLONG, offsetof(Gate, batch_bytes), 0, "Their bytes."},
+    {"batch_start_ns", T_LONGLONG, offsetof(Gate, batch_start_ns), 0, "When the first was published."},
+    {"last_ns", T_LONGLONG, offsetof(Gate, last_ns), 0, "When the last message was published."},
     {"sequence", T_ULONGLONG, offsetof(Gate, sequence), 0, "Of the next message."},
     {"bytes", T_LONGLONG, offsetof(Gate, bytes), 0, "Of all bodies so far."},
     {"refresh_ns", T_LONGLONG, offsetof(Gate, refresh_ns), 0, "When the next message goes the long way."},

@@ -26,6 +26,14 @@ class Gate(Protocol):
     """Of all bodies so far."""
     refresh_ns: int
     """When the next message goes the long way, on the monotonic clock."""
+    records: list[Any] | None
+    """Those of the batch that is being collected; None where none ever is."""
+    batch_bytes: int
+    """Their bytes."""
+    batch_start_ns: int
+    """When the first of them was published, on the monotonic clock."""
+    last_ns: int
+    """When the last message was published."""
 
     def __call__(self, message: Any, /) -> bool:
         """Send a message; False if a reliable subscriber lost it."""
@@ -40,6 +48,10 @@ class LongGate:
         self.sequence = 0
         self.bytes = 0
         self.refresh_ns = 0
+        self.records: list[Any] | None = None
+        self.batch_bytes = 0
+        self.batch_start_ns = 0
+        self.last_ns = 0
         self._slowly = slowly
 
     def __call__(self, message: Any, /) -> bool:
@@ -55,6 +67,7 @@ def make_gate(
     slowly: Callable[[Any], bool],
     retry: Callable[[bytes, int], bool],
     limit: int,
+    flush: Callable[[], bool],
 ) -> Gate:
     """Build the gate of one publisher.
 
@@ -65,10 +78,11 @@ def make_gate(
         slowly: Called without the lock with a message that has to go the long way.
         retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.
         limit: Most bytes of a body that is sent so.
+        flush: Called with the lock held when a batch is full; sends it.
     """
     flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
     if flat is None:
         return LongGate(slowly)
-    gate: Any = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit)
+    gate: Any = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit, flush)
     gate.sends = ()
     return gate  # type: ignore[no-any-return]

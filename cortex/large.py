@@ -42,7 +42,7 @@ RING_BYTES_MAX = 2 << 30
 PRIVATE_BYTES = 64 << 20
 """Most memory outside rings that waits to be sent."""
 RINGS_ALIVE = 4
-PIPES_MAX = 3
+PIPES_MAX = 2
 """A publisher writes each pipe itself; of further readers ZeroMQ takes care, in a thread of its own."""
 RETRY_S = 5.0
 """After a ring could not be made, none is tried for so long."""

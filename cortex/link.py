@@ -106,7 +106,7 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read, self.drain, self.gather = make_reader(codec, self.message_head)
+        self.read, self.drain, self.gather, self.records = make_reader(codec, self.message_head)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,
@@ -303,6 +303,11 @@ class Link:
             end, offset = len(frame), HEADER_SIZE
             if size != end - HEADER_SIZE or (count == 0) != (size == 0) or count > size // RECORD.size:
                 raise MalformedMessage(f"a batch of {end} bytes that says {count} records of {size}")
+            quickly = self.records(frame, count) if self.records is not None and count else None
+            if quickly is not None:
+                if self.advance(first, count):
+                    messages.extend(quickly)
+                return
             decode, unpack = self.codec.decode, RECORD.unpack_from
             decoded: list[Any] = []
             while offset + RECORD.size <= end and len(decoded) < count:

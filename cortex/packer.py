@@ -30,6 +30,8 @@ class Reader(NamedTuple):
     """Read what waits in a socket; see `drain` below."""
     gather: Callable[..., tuple[int, bytes, int, bytes | None]] | None
     """Read what waits and join the bodies, for types of fixed size; see `gather` below."""
+    records: Callable[[bytes, int], list[Any] | None] | None
+    """The messages of a batch's frame with so many records; None: not as it should be."""
 
 
 def make_record_packer(codec: Codec, head: bytes) -> PackRecord:
@@ -51,7 +53,7 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
     """
     flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
     if flat is not None:
-        return Reader(flat.read, flat.drain, None if codec.fixed_size is None else flat.gather)
+        return Reader(flat.read, flat.drain, None if codec.fixed_size is None else flat.gather, flat.records)
     decode, unpack = codec.decode, REST.unpack_from
 
     def read(frame: bytes) -> tuple[int, int, Any] | None:
@@ -68,7 +70,7 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
     gatherer = None
     if codec.fixed_size is not None:
         gatherer = functools.partial(gather, head, codec.fixed_size)
-    return Reader(read, functools.partial(drain, read), gatherer)
+    return Reader(read, functools.partial(drain, read), gatherer, None)
 
 
 def drain(

@@ -93,6 +93,7 @@ class Publisher(Generic[T]):
             slowly=self._publish_slowly,
             retry=self._send_again,
             limit=inline_max,
+            flush=self._flush,
         )
         """Sends small messages if nothing special is to be done."""
         self._targets: tuple[Outlet | Reader | None, ...] = ()
@@ -116,10 +117,9 @@ class Publisher(Generic[T]):
         libzmq sends it nothing until it has caught up."""
         self._blocked = False
         self._batch: list[bytes] = []
+        if self._gathers:
+            self._gate.records = self._batch
         self._batch_sequence = 0
-        self._batch_bytes = 0
-        self._batch_start_ns = 0
-        self._last_ns = 0
         self._on_batch = on_batch
         self._on_close = on_close
         self._closed = False
@@ -148,7 +148,7 @@ class Publisher(Generic[T]):
             now_ns = monotonic_ns()
             if now_ns >= self._gate.refresh_ns:
                 self._prepare(now_ns)
-            if self._gathers and (self._batch or now_ns - self._last_ns < BURST_NS):
+            if self._gathers and (self._batch or now_ns - self._gate.last_ns < BURST_NS):
                 record = self._pack_record(message, now_ns, self._inline_max)
                 if record is not None:
                     return self._collect(record, now_ns)
@@ -246,9 +246,9 @@ class Publisher(Generic[T]):
         """Send or collect a small message; the lock is held."""
         size = len(body)
         if self._gathers:
-            if self._batch or now_ns - self._last_ns < BURST_NS:
+            if self._batch or now_ns - self._gate.last_ns < BURST_NS:
                 return self._collect(RECORD.pack(stamp_ns, now_ns, size, 0) + body + bytes(-size % 8), now_ns)
-            self._last_ns = now_ns
+            self._gate.last_ns = now_ns
         self._gate.bytes += size
         sequence = self._gate.sequence
         self._gate.sequence = sequence + 1
@@ -365,17 +365,17 @@ class Publisher(Generic[T]):
         batch = self._batch
         if not batch:
             self._batch_sequence = self._gate.sequence
-            self._batch_start_ns = now_ns
+            self._gate.batch_start_ns = now_ns
             if self._on_batch is not None:
                 self._on_batch()
-        self._last_ns = now_ns
+        self._gate.last_ns = now_ns
         self._gate.sequence += 1
         batch.append(record)
-        self._batch_bytes += len(record)
+        self._gate.batch_bytes += len(record)
         if (
             len(batch) >= BATCH_COUNT
-            or self._batch_bytes >= BATCH_BYTES
-            or now_ns - self._batch_start_ns >= BATCH_NS
+            or self._gate.batch_bytes >= BATCH_BYTES
+            or now_ns - self._gate.batch_start_ns >= BATCH_NS
         ):
             return self._flush()
         return True
@@ -387,9 +387,9 @@ class Publisher(Generic[T]):
         records = b"".join(self._batch)
         self._gate.bytes += len(records) - RECORD.size * len(self._batch)
         first = self._batch_sequence
-        rest = REST.pack(first, 0, self._batch_start_ns, len(records), self._gate.sequence - first)
+        rest = REST.pack(first, 0, self._gate.batch_start_ns, len(records), self._gate.sequence - first)
         self._batch.clear()
-        self._batch_bytes = 0
+        self._gate.batch_bytes = 0
         frame = self._batch_head + rest + records
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
@@ -402,7 +402,7 @@ class Publisher(Generic[T]):
             Whether a batch still waits.
         """
         with self._lock:
-            if self._batch and not self._blocked and now_ns - self._batch_start_ns >= BATCH_NS:
+            if self._batch and not self._blocked and now_ns - self._gate.batch_start_ns >= BATCH_NS:
                 self._flush()
             return bool(self._batch)
 

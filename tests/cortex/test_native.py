@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 import threading
+import time
 from collections import deque
 
 import numpy as np
@@ -13,7 +14,7 @@ import zmq
 from hypothesis import given
 from random_schemas import any_message, flat_schemas
 
-from cortex import gate, native, packer
+from cortex import gate, native, packer, publisher
 from cortex.codec import codec_of
 from cortex.message import Array, Float32, Int8, UInt64, message
 from cortex.schema import schema_of
@@ -238,9 +239,15 @@ class Taken:
 
     def __init__(self):
         self.lock = threading.Lock()
-        self.sent, self.slow, self.retried = [], [], []
+        self.sent, self.slow, self.retried, self.flushed = [], [], [], 0
         self.gate = gate.make_gate(
-            codec_of(Sample), HEAD, self.lock, slowly=self.slowly, retry=self.retry, limit=1000
+            codec_of(Sample),
+            HEAD,
+            self.lock,
+            slowly=self.slowly,
+            retry=self.retry,
+            limit=1000,
+            flush=self.flush,
         )
         self.gate.sends = (self.send,)
         self.gate.refresh_ns = 2**62
@@ -253,6 +260,13 @@ class Taken:
     def slowly(self, value):
         assert not self.lock.locked()
         self.slow.append(value)
+        return True
+
+    def flush(self):
+        assert self.lock.locked()
+        self.flushed += 1
+        self.gate.records.clear()
+        self.gate.batch_bytes = 0
         return True
 
     def retry(self, frame, place):
@@ -270,6 +284,51 @@ def test_a_gate_sends_frames_and_counts_them():
     assert (taken.gate.sequence, taken.gate.bytes) == (3, sum(map(len, taken.sent)) - 3 * 64)
     assert not taken.slow
     assert not taken.lock.locked()
+
+
+def test_a_gate_adds_to_a_batch_that_has_begun():
+    """The first record of a batch is put in by Python; a full batch is flushed."""
+    taken, flat = Taken(), flat_of(Sample, HEAD)
+    first = flat.record(sample(0), 1, 1000)
+    taken.gate.records, taken.gate.batch_start_ns = [first], time.monotonic_ns() + 10**12
+    for k in range(1, publisher.BATCH_COUNT - 1):
+        assert taken.gate(sample(k)) is True
+    records = taken.gate.records
+    assert [len(record) for record in records] == [len(first)] * (publisher.BATCH_COUNT - 1)
+    assert taken.gate.batch_bytes == len(first) * (publisher.BATCH_COUNT - 2)
+    frame = bytes(64) + b"".join(records)
+    assert flat.records(frame, len(records)) == [sample(k) for k in range(len(records))]
+    assert taken.flushed == 0
+    assert taken.gate(sample(63)) is True
+    assert (taken.flushed, taken.sent, taken.slow) == (1, [], [])
+    taken.gate.records.append(first)
+    taken.gate.batch_start_ns = time.monotonic_ns() - publisher.BATCH_NS
+    taken.gate(sample())
+    assert taken.flushed == 2
+    taken.gate.records.append(first)
+    taken.gate.batch_start_ns = time.monotonic_ns() + 10**12
+    taken.gate.batch_bytes = publisher.BATCH_BYTES - 100
+    taken.gate(sample())
+    assert taken.flushed == 3
+
+
+@pytest.mark.parametrize("damage", ["short", "long", "reserved", "count", "body"])
+def test_batches_that_are_not_as_they_should_be(damage):
+    flat = flat_of(Sample, HEAD)
+    records = [flat.record(sample(k), 1, 1000) for k in range(3)]
+    frame, count = bytes(64) + b"".join(records), 3
+    assert flat.records(frame, count) == [sample(k) for k in range(3)]
+    if damage == "short":
+        frame = frame[:-8]
+    elif damage == "long":
+        frame += bytes(8)
+    elif damage == "reserved":
+        frame = frame[: 64 + 20] + b"x" + frame[64 + 21 :]
+    elif damage == "count":
+        count = 4
+    else:
+        frame = frame[: 64 + 24 + 8] + b"\xff" * 16 + frame[64 + 24 + 24 :]
+    assert flat.records(frame, count) is None
 
 
 def test_what_goes_the_long_way():
