@@ -307,7 +307,7 @@ def test_a_gate_adds_to_a_batch_that_has_begun():
     assert taken.flushed == 2
     taken.gate.records.append(first)
     taken.gate.batch_start_ns = time.monotonic_ns() + 10**12
-    taken.gate.batch_bytes = publisher.BATCH_BYTES - 100
+    taken.gate.batch_bytes = publisher.BATCH_BYTES - 50
     taken.gate(sample())
     assert taken.flushed == 3
 
