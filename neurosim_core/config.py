@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from neurosim_core.control import Se3Config
 from neurosim_core.live import LinkConfig, LiveConfig
+from neurosim_core.mistakes import explain, suggestion
 from neurosim_core.render.renderer import RenderConfig, RendererName
 from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
@@ -59,14 +59,10 @@ class VehicleConfig(Settings):
         try:
             self.airframe()
         except ValidationError as error:
-            reasons = [
-                f"unknown parameter, known: {_known_beside(item['loc'])}"
-                if item["type"] == "extra_forbidden"
-                else f"{item['msg'].removeprefix('Value error, ')}, got {_shorten(item['input'])}"
-                for item in error.errors()
-            ]
-            keys = [".".join(("parameters", *map(str, item["loc"]))) for item in error.errors()]
-            raise ValueError("; ".join(f"{k}: {r}" for k, r in zip(keys, reasons, strict=True))) from None
+            lines = explain(MultirotorConfig, error)
+            whole = any(not item["loc"] for item in error.errors())
+            before = "parameters: " if whole else "parameters."
+            raise ValueError("; ".join(f"{before}{line}" for line in lines)) from None
         return self
 
     def airframe(self) -> MultirotorConfig:
@@ -156,7 +152,7 @@ class SimulationConfig(Settings):
     """What flies it."""
     sensors: Sensors = Field(default_factory=_default_sensors)
     """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
-    exist."""
+    exist, nor does one that is null, as in --set sensors.depth=null."""
     vehicles: Annotated[dict[Name, FleetMember], Field(min_length=1)] = Field(
         default_factory=lambda: {"drone": FleetMember()}
     )
@@ -249,6 +245,7 @@ def load_config(
             the default set are changed, and new ones added to it.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
+    A sensor or body that is null is left out: {"sensors.depth": None}.
 
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
@@ -258,16 +255,18 @@ def load_config(
     raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
     patches = [_nest(key, value) for key, value in (overrides or {}).items()]
     if "sensors" not in raw and any("sensors" in patch for patch in patches):
-        raw["sensors"] = {name: sensor.model_dump() for name, sensor in _default_sensors().items()}
+        # pixels are ideal where nothing is said of them, which leaves a preset free to say it
+        sensors = _default_sensors()
+        raw["sensors"] = {name: sensor.model_dump(exclude={"pixel"}) for name, sensor in sensors.items()}
     for patch in patches:
         raw = _merge(raw, patch)
     if isinstance(source, str | Path):
         raw = _beside(raw, Path(source).resolve().parent)
-    raw = _with_default_kinds(raw)
+    raw = _without_nulls(_with_default_kinds(raw))
     try:
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
-        lines = [f"  {line}" for line in _explain(error)]
+        lines = [f"  {line}" for line in _explain(error, raw)]
         raise ConfigError("\n".join([f"{origin} is not a valid configuration:", *lines])) from None
 
 
@@ -347,86 +346,26 @@ def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
-def _explain(error: ValidationError) -> Iterator[str]:
-    """One line for each mistake: path of the key, value, what is allowed."""
-    for item in error.errors():
-        path = [str(part) for part in item["loc"]]
-        model, keys = _model_at(SimulationConfig, item["loc"])
-        shown = ".".join(keys)
-        if item["type"] == "extra_forbidden":
-            known = sorted(model.model_fields) if model else []
-            close = difflib.get_close_matches(path[-1], known, n=1)
-            hint = f"did you mean {close[0]!r}? " if close else ""
-            yield f"{shown}: unknown key; {hint}known: {', '.join(known)}"
-        elif item["type"] == "missing":
-            yield f"{shown}: required, and not given"
-        elif item["type"] == "union_tag_not_found":
-            yield f"{shown}.kind: required, and not given"
-        elif item["type"] == "union_tag_invalid":
-            context = item["ctx"]
-            yield f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}"
+def _without_nulls(raw: dict[str, Any]) -> dict[str, Any]:
+    """Leave out sensors and bodies that are null."""
+    for key in ("sensors", "bodies"):
+        if isinstance(raw.get(key), Mapping):
+            raw = {**raw, key: {name: item for name, item in raw[key].items() if item is not None}}
+    return raw
+
+
+def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
+    """Say of each mistake what is wrong; also where a key belongs, and which sensor may have been meant."""
+    for line in explain(SimulationConfig, error):
+        path, _, reason = line.partition(": ")
+        group, _, name = path.rpartition(".")
+        if group == "vehicle" and reason.startswith("unknown key") and name in MultirotorConfig.model_fields:
+            yield f"{path}: this is one of the parameters: vehicle.parameters.{name}"
+        elif name == "kind" and group.startswith("sensors.") and reason.startswith("required"):
+            others = [str(key) for key in raw["sensors"] if f"sensors.{key}" != group]
+            yield f"{line}; {suggestion(group.removeprefix('sensors.'), others)}".rstrip("; ")
         else:
-            message = item["msg"].removeprefix("Value error, ")
-            got = "" if item["type"] == "value_error" else f", got {_shorten(item['input'])}"
-            yield f"{shown}: {message}{got}" if shown else message
-
-
-def _shorten(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _model_at(
-    model: type[BaseModel] | None, loc: tuple[int | str, ...]
-) -> tuple[type[BaseModel] | None, list[str]]:
-    """Follow an error location to the innermost model; return it and the keys as the user wrote them."""
-    keys: list[str] = []
-    annotation: Any = model
-    for index, part in enumerate(loc):
-        members = list(_models_in(annotation))
-        tagged = [m for m in members if _tag(m) == part]
-        if len(members) > 1 and tagged:  # the tag of a discriminated union: not a key
-            annotation = tagged[0]
-            continue
-        owner = members[0] if len(members) == 1 else None
-        if owner is not None and part in owner.model_fields:
-            annotation = owner.model_fields[str(part)].annotation
-        elif owner is not None and index < len(loc) - 1:
-            annotation = None
-        elif owner is None:
-            annotation = _value_type(annotation)
-        keys.append(str(part))
-    members = list(_models_in(annotation))
-    return (members[0] if len(members) == 1 else None), keys
-
-
-def _known_beside(loc: tuple[int | str, ...]) -> str:
-    """Return the parameters that a vehicle has where an unknown one was found."""
-    model, _ = _model_at(MultirotorConfig, loc[:-1])
-    return ", ".join(model.model_fields) if model is not None else "none"
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    elif getattr(annotation, "__origin__", None) is not dict:
-        for argument in get_args(annotation):
-            yield from _models_in(argument)
-
-
-def _value_type(annotation: Any) -> Any:
-    """Type of the values of a dict annotation."""
-    arguments = get_args(annotation)
-    return (
-        arguments[1]
-        if getattr(annotation, "__origin__", None) is dict and len(arguments) == 2
-        else annotation
-    )
-
-
-def _tag(model: type[BaseModel]) -> str | None:
-    kind = model.model_fields.get("kind")
-    return None if kind is None else kind.default
+            yield line
 
 
 def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:

@@ -62,7 +62,7 @@ WRONG = [
     ({"scene": {"kind": "apartment", "romms": 4}}, ["scene.romms", "unknown key", "'rooms'"]),
     ({"vehicle": {"preset": "zeppelin"}}, ["zeppelin", "crazyflie", "hummingbird", "racer"]),
     ({"vehicle": {"parameters": {"mass_kg": 0.0}}}, ["vehicle: parameters.mass_kg", "greater than 0", "0.0"]),
-    ({"vehicle": {"parameters": {"mass": 1.0}}}, ["parameters.mass", "unknown parameter", "mass_kg"]),
+    ({"vehicle": {"parameters": {"mass": 1.0}}}, ["parameters.mass", "unknown key", "'mass_kg'"]),
     ({"renderer": "opengl"}, ["renderer", "opengl", "pyrender"]),
     ({"control": {"gains": {"position_gain_per_s2": -1}}}, ["control.gains.position_gain_per_s2", "-1"]),
     (
@@ -82,6 +82,93 @@ WRONG = [
     ({"sensors": {"collision": {"kind": "rgb"}}}, ["sensors", "collision", "taken"]),
     ({"sensors": {"x": {"kind": "sonar"}}}, ["sensors.x.kind", "sonar", "event_camera"]),
 ]
+
+
+SAID = [
+    (
+        {"parameters": {"rotor_thrust_scale": [1, 1]}},
+        "parameters: rotor_thrust_scale must have one entry for each of 4 rotors, or none, got 2",
+    ),
+    (
+        {"parameters": {"gusts": {"start_s": 1}}},
+        "parameters.gusts: must be a list, such as [{velocity_m_s: ..., start_s: ...}], got {'start_s': 1}",
+    ),
+    (
+        {"parameters": {"ground": {"foot_position_m": [[0, 0]]}}},
+        "parameters.ground.foot_position_m.0: must be a list of 3 numbers, such as [1, 2, 3], got [0, 0]",
+    ),
+    (
+        {"parameters": {"wind_m_s": 3}},
+        "parameters.wind_m_s: must be a list of 3 numbers, such as [1, 2, 3], got 3",
+    ),
+    (
+        {"parameters": {"ground": 0}},
+        "parameters.ground: must be keys with values, such as {height_m: 0, "
+        "foot_position_m: ...}, or null, got 0",
+    ),
+]
+
+
+@pytest.mark.parametrize(("vehicle", "said"), SAID)
+def test_parameters_are_explained_as_they_are_written(vehicle: dict[str, Any], said: str):
+    """One line, without the values of all other parameters and without names of classes."""
+    with pytest.raises(ConfigError) as error:
+        load_config({"vehicle": vehicle})
+    assert str(error.value).splitlines()[1:] == [f"  vehicle: {said}"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (
+            "sensors: {e: {kind: event_camera, pixel: {threshold_spread: {on: 0.1}}}}",
+            "sensors.e.pixel.threshold_spread: a key is on, yes or true, which YAML reads as true; "
+            "known: minimum, sigma_off, sigma_on",
+        ),
+        (
+            "sensors: {e: {kind: event_camera, pixel: {leak: 0.1}}}",
+            "sensors.e.pixel.leak: must be keys with values, such as {rate_hz: 0.1, spread_decades: 0.1}, "
+            "or null, got 0.1",
+        ),
+        (
+            "sensors: {events: {kind: event_camera}, event: {lens: {width: 9}}}",
+            "sensors.event.kind: required, and not given; did you mean 'events'?",
+        ),
+        (
+            "vehicle: {wind_m_s: [3, 0, 0]}",
+            "vehicle.wind_m_s: this is one of the parameters: vehicle.parameters.wind_m_s",
+        ),
+        (
+            "vehicle: {parameters: {wind: 3}}",
+            "vehicle: parameters.wind: unknown key; did you mean 'wind_m_s'? known:",
+        ),
+        (
+            "bodies: {1ball: {shape: {kind: sphere}}}",
+            "bodies.1ball: a name is a letter, then letters, digits and _, got '1ball'",
+        ),
+        (
+            "bodies: {ball: {shape: {kind: sphere}, motion: {sway: {freq: 1}}}}",
+            "bodies.ball.motion.sway.freq: unknown key; did you mean 'frequency_hz'?",
+        ),
+        (
+            "path: {kind: waypoints, points_m: [[1, 2, 3]]}",
+            "path.points_m: must have at least 2 items, got [[1, 2, 3]]",
+        ),
+        (
+            "path: {kind: waypoints, points_m: 3}",
+            "path.points_m: must be a list of lists of 3 numbers, got 3",
+        ),
+        ("scene: {kind: mesh, file: 3}", "scene.file: must be the name of a file, got 3"),
+        ("sensors: {imu: 3}", "sensors.imu: must be keys with values, such as {kind: event_camera or rgb"),
+        ("no: 3", "a key is off, no or false, which YAML reads as false; known: bodies,"),
+        ("3: 3", "keys must be text, got 3; known: bodies,"),
+    ],
+)
+def test_mistakes_are_told_in_the_words_of_the_file(settings: str, said: str):
+    with pytest.raises(ConfigError) as error:
+        load_config(yaml.safe_load(settings))
+    (line,) = str(error.value).splitlines()[1:]
+    assert line.startswith(f"  {said}")
 
 
 @pytest.mark.parametrize(
@@ -106,6 +193,26 @@ def test_overrides_win_and_may_be_dotted(tmp_path):
     config = load_config(file, overrides={"scene.seed": 5, "duration_s": 2.0})
     assert (config.duration_s, config.scene.seed) == (2.0, 5)
     assert load_config(file, overrides={"scene": {"kind": "mesh", "file": "/a.glb"}}).scene.kind == "mesh"
+
+
+def test_a_preset_counts_for_the_default_sensors():
+    """The default set gives way to it: `neurosim run --set sensors.events.pixel.preset=davis346`."""
+    expected = load_config({"sensors": {"events": {"kind": "event_camera", "pixel": {"preset": "davis346"}}}})
+    for overrides in (
+        {"sensors.events.pixel.preset": "davis346"},
+        {"sensors.events.pixel": {"preset": "davis346"}},
+    ):
+        config = load_config(overrides=overrides)
+        assert config.sensors["events"] == expected.sensors["events"]
+        assert config.sensors["events"].pixel.leak is not None
+        assert config.sensors.keys() == load_config().sensors.keys()
+
+
+def test_null_leaves_sensors_and_bodies_out():
+    config = load_config(overrides={"sensors.depth": None, "sensors.rgb": None})
+    assert list(config.sensors) == ["events", "imu", "odometry"]
+    bodies = {"ball": {"shape": {"kind": "sphere"}}, "crate": {"shape": {"kind": "box"}}}
+    assert list(load_config({"bodies": bodies}, overrides={"bodies.ball": None}).bodies) == ["crate"]
 
 
 def test_overrides_change_the_default_sensors(tmp_path):

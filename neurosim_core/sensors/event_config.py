@@ -154,7 +154,8 @@ class EventCameraConfig(Settings):
     preset: str | None = None
     """A sensor whose settings these are, unless given here: dvs128, davis240c, davis346, gen3, gen4, imx636,
     v2e_clean, v2e_noisy, voltmeter_dvs240 or voltmeter_dvs346 (sources in event_presets.py). Single keys win,
-    and null turns a group off: {preset: davis346, leak: {rate_hz: 0.2}, shot_noise: null}."""
+    and null turns a group off: {preset: davis346, leak: {rate_hz: 0.2}, shot_noise: null}. In a file that
+    lists every key, take out those that the preset is to give."""
     threshold_on: float = Field(default=0.2, ge=1e-3, le=100.0)
     """Rise of log radiance (natural logarithm) that fires an event of polarity 1."""
     threshold_off: float = Field(default=0.2, ge=1e-3, le=100.0)

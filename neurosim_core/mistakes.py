@@ -1,0 +1,193 @@
+"""Mistakes in settings, in the words of those who write them: keys and values as they are in YAML."""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+_GROUP = frozenset({"model_type", "model_attributes_type", "dict_type", "dataclass_type"})
+_LIST = frozenset({"tuple_type", "list_type"})
+_SHOWN_MAX = 80
+
+
+def explain(model: type[BaseModel], error: ValidationError) -> list[str]:
+    """Return one line for each mistake: path of the key, what is allowed, and the value.
+
+    Args:
+        model: What was to be made.
+        error: Why it could not be.
+    """
+    items = error.errors()
+    # a list of which an item is wrong is also said to be too short, and one that is too short to lack items
+    inner = {item["loc"][:k] for item in items for k in range(len(item["loc"]))}
+    lines = [
+        _line(model, item) for item in items if not (item["type"] == "too_short" and item["loc"] in inner)
+    ]
+    return list(dict.fromkeys(lines))
+
+
+def suggestion(wrong: str, known: list[str]) -> str:
+    """Return "did you mean ...? " for a key that is not known; nothing if none is like it."""
+    close = difflib.get_close_matches(wrong, known, n=1) or [
+        key for key in known if key.startswith(wrong) or wrong.startswith(key)
+    ]
+    return f"did you mean {close[0]!r}? " if close else ""
+
+
+def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
+    kind, loc, value = item["type"], item["loc"], item["input"]
+    if kind == "missing" and isinstance(loc[-1], int):  # of a list of so many numbers
+        loc, kind = loc[:-1], "tuple_type"
+    annotation, keys = _follow(model, loc)
+    shown = ".".join(keys)
+    if kind == "extra_forbidden":
+        owner = _model_of(_follow(model, loc[:-1])[0])
+        known = sorted(owner.model_fields) if owner else []
+        return f"{shown}: unknown key; {suggestion(str(loc[-1]), known)}known: {', '.join(known)}"
+    if kind == "invalid_key":
+        return _unreadable_key(_follow(model, loc[:-1]), value)
+    if kind == "missing":
+        return f"{shown}: required, and not given"
+    if kind == "union_tag_not_found":
+        return f"{shown}.kind: required, and not given"
+    if kind == "union_tag_invalid":
+        context = item["ctx"]
+        return f"{shown}.kind: must be one of {context['expected_tags']}, got {context['tag']!r}"
+    if kind == "value_error":
+        reason = item["msg"].removeprefix("Value error, ")
+        return f"{shown}: {reason}" if shown else reason
+    got = f", got {_shorten(value)}"
+    if loc and loc[-1] == "[key]":
+        return f"{'.'.join(keys[:-1])}: a name is a letter, then letters, digits and _{got}"
+    if kind in _LIST or kind in _GROUP:
+        return f"{shown}: must be {_wanted(annotation)}{got}"
+    if kind == "too_short":
+        least = item["ctx"]["min_length"]
+        return f"{shown}: must have at least {least} item{'s' * (least > 1)}{got}"
+    if kind == "path_type":
+        return f"{shown}: must be the name of a file{got}"
+    reason = item["msg"].partition(", unable to")[0].partition(", got")[0]
+    return f"{shown}: {reason}{got}" if shown else f"{reason}{got}"
+
+
+def _unreadable_key(found: tuple[Any, list[str]], key: Any) -> str:
+    """Say what to do about a key that YAML does not read as text."""
+    annotation, keys = found
+    owner = _model_of(annotation)
+    where = f"{'.'.join(keys)}: " if keys else ""
+    known = f"; known: {', '.join(sorted(owner.model_fields))}" if owner else ""
+    if isinstance(key, bool):
+        words = "on, yes or true" if key else "off, no or false"
+        return f"{where}a key is {words}, which YAML reads as {str(key).lower()}{known}"
+    return f"{where}keys must be text, got {_shorten(key)}{known}"
+
+
+def _shorten(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN_MAX else text[: _SHOWN_MAX - 3] + "..."
+
+
+def _follow(model: type[BaseModel], loc: tuple[int | str, ...]) -> tuple[Any, list[str]]:
+    """Follow the place of a mistake; return the type that is wanted there and the keys as they were written.
+
+    The type is None where there is none.
+    """
+    keys: list[str] = []
+    annotation: Any = model
+    for part in loc:
+        members = [a for a in _alternatives(annotation) if _is_model(a)]
+        tagged = [m for m in members if _tag(m) == part]
+        if len(members) > 1 and tagged:  # the tag of a discriminated union: not a key
+            annotation = tagged[0]
+            continue
+        keys.append(str(part))
+        owner = members[0] if len(members) == 1 else None
+        if owner is not None:
+            field = owner.model_fields.get(str(part))
+            annotation = None if field is None else field.annotation
+        else:
+            annotation = _item_type(annotation, part)
+    return annotation, keys
+
+
+def _item_type(annotation: Any, part: int | str) -> Any:
+    """Return the type of an item of a dict or a list; None if it is neither."""
+    for choice in _alternatives(annotation):
+        arguments = get_args(choice)
+        if get_origin(choice) is dict:
+            return arguments[1]
+        if get_origin(choice) is list or arguments[-1:] == (Ellipsis,):
+            return arguments[0]
+        if get_origin(choice) is tuple and isinstance(part, int) and part < len(arguments):
+            return arguments[part]
+    return None
+
+
+def _alternatives(annotation: Any) -> Iterator[Any]:
+    """Yield the types that a value may be of."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        yield from _alternatives(get_args(annotation)[0])
+    elif origin in (Union, types.UnionType):
+        for choice in get_args(annotation):
+            yield from _alternatives(choice)
+    else:
+        yield annotation
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _model_of(annotation: Any) -> type[BaseModel] | None:
+    """Return the one group that a value may be; None if there is none, or several."""
+    members = [choice for choice in _alternatives(annotation) if _is_model(choice)]
+    return members[0] if len(members) == 1 else None
+
+
+def _tag(model: type[BaseModel]) -> str | None:
+    kind = model.model_fields.get("kind")
+    return None if kind is None else kind.default
+
+
+def _wanted(annotation: Any) -> str:
+    """Say what a value must be, as it is written in YAML."""
+    choices = [choice for choice in _alternatives(annotation) if choice is not type(None)]
+    kinds = [_tag(choice) for choice in choices if _is_model(choice)]
+    if len(kinds) > 1:
+        return "keys with values, such as {kind: " + " or ".join(str(kind) for kind in kinds) + "}"
+    texts = dict.fromkeys(_described(choice) for choice in choices)
+    null = ["null"] if type(None) in _alternatives(annotation) else []
+    return ", or ".join([*texts, *null])
+
+
+def _described(choice: Any) -> str:
+    arguments = get_args(choice)
+    if _is_model(choice):
+        return f"keys with values, such as {_example(choice)}"
+    if get_origin(choice) is dict:
+        return "names with what they stand for, such as {name: ...}"
+    if get_origin(choice) is tuple and arguments[-1:] != (Ellipsis,):
+        some = ", ".join(str(k + 1) for k in range(len(arguments)))
+        return f"a list of {len(arguments)} numbers, such as [{some}]"
+    if get_origin(choice) in (tuple, list):
+        (inner,) = (a for a in _alternatives(arguments[0]) if a is not type(None))
+        if _is_model(inner):
+            return f"a list, such as [{_example(inner)}]"
+        size = len(get_args(inner))
+        return f"a list of lists of {size} numbers" if get_origin(inner) is tuple else "a list of numbers"
+    return getattr(choice, "__name__", "something else")
+
+
+def _example(model: type[BaseModel]) -> str:
+    """Return the first keys of a group with their defaults."""
+    shown = []
+    for name, field in list(model.model_fields.items())[:2]:
+        plain = isinstance(field.default, bool | int | float | str)
+        number = f"{field.default:g}" if isinstance(field.default, float) else field.default
+        shown.append(f"{name}: {number if plain else '...'}")
+    return "{" + ", ".join(shown) + "}"
