@@ -14,13 +14,14 @@ import resource
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 if TYPE_CHECKING:
+    from neurosim_core.packets import Packet
     from neurosim_core.simulation import Model, State
 
 LIBRARIES = {
@@ -63,10 +64,8 @@ class Probe:
     """Libraries (of `LIBRARIES`) that were imported."""
     embree: bool
     """Embree's library was loaded."""
-    step_count: int
-    """Steps of the integration in the part of the flight that was timed."""
-    step_s: float
-    """CPU time of all threads per step of the integration, in flight, all sensors included [s]."""
+    flight_s: list[float]
+    """CPU time of all threads per simulated second in flight, all sensors included; each repetition [s]."""
     setup_s: float
     """CPU time from the settings to the first step [s]."""
 
@@ -154,12 +153,13 @@ def _is_picture(shape: tuple[int, ...], picture_shapes: set[tuple[int, int]]) ->
     )
 
 
-def probe(config: dict[str, Any], seconds: float) -> Probe:
+def probe(config: dict[str, Any], seconds: float, repetitions: int) -> Probe:
     """Fly, and return what was counted; for a process that does nothing else.
 
     Args:
         config: Settings.
         seconds: Simulated time that is measured, after as much that is not [s].
+        repetitions: How often the flight is timed; the first is counted as well.
     """
     lenses = [sensor["lens"] for sensor in config["sensors"].values() if "lens" in sensor]
     counts = watch(
@@ -168,42 +168,61 @@ def probe(config: dict[str, Any], seconds: float) -> Probe:
     begin = time.process_time()  # whatever else runs on the machine does not count
 
     from neurosim_core.config import load_config
-    from neurosim_core.simulation import make_model, make_state, run_model
+    from neurosim_core.simulation import make_model, make_state
 
     model = make_model(load_config({**config, "duration_s": 2.0 * seconds}))
     state = make_state(model)
     setup_s = time.process_time() - begin
     arrays = counts.allocation_count, counts.allocated_bytes
-    packets = run_model(model, state)
-    half_ns = int(1e9 * seconds)
-    for _ in itertools.takewhile(lambda _: state.stamp_ns < half_ns, packets):
-        pass
-    launched, allocated, steps = counts.launches.copy(), counts.allocation_count, state.counts["steps"]
-    stamp_ns, begin = state.stamp_ns, time.process_time()
-    for _ in packets:
-        pass
-    flown_s, elapsed_s = 1e-9 * (state.stamp_ns - stamp_ns), time.process_time() - begin
-    in_flight = counts.launches - launched
-    steps = state.counts["steps"] - steps
+    packets = _first_half(model, state, seconds)
+    launched, allocated = counts.launches.copy(), counts.allocation_count
+    flown_s, elapsed_s = _second_half(state, packets)
+    in_flight, allocated = counts.launches - launched, counts.allocation_count - allocated
+    launch_count = sum(counts.launches.values())
+    pictures = counts.picture_count, counts.picture_bytes
+    resident_bytes = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    flights = [elapsed_s / flown_s]
+    for _ in range(repetitions - 1):
+        again = make_state(model)
+        flown_s, elapsed_s = _second_half(again, _first_half(model, again, seconds))
+        flights.append(elapsed_s / flown_s)
     return Probe(
         terms=_terms(model, state),
         kernels=sorted(in_flight),
         shader_functions=_shader_functions(counts),
-        launch_count=sum(counts.launches.values()),
+        launch_count=launch_count,
         launches_per_s=sum(in_flight.values()) / flown_s,
         array_count=arrays[0],
         array_bytes=arrays[1],
-        picture_count=counts.picture_count,
-        picture_bytes=counts.picture_bytes,
+        picture_count=pictures[0],
+        picture_bytes=pictures[1],
         texture_bytes=_texture_bytes(model),
-        flight_allocations_per_s=(counts.allocation_count - allocated) / flown_s,
-        resident_bytes=1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        flight_allocations_per_s=allocated / flown_s,
+        resident_bytes=resident_bytes,
         libraries=[name for names in LIBRARIES.values() for name in names if name in sys.modules],
         embree=_embree_loaded(),
-        step_count=steps,
-        step_s=elapsed_s / steps,
+        flight_s=flights,
         setup_s=setup_s,
     )
+
+
+def _first_half(model: Model, state: State, seconds: float) -> Iterator[Packet]:
+    """Fly for some seconds; return what flies on."""
+    from neurosim_core.simulation import run_model
+
+    packets = run_model(model, state)
+    half_ns = int(1e9 * seconds)
+    for _ in itertools.takewhile(lambda _: state.stamp_ns < half_ns, packets):
+        pass
+    return packets
+
+
+def _second_half(state: State, packets: Iterator[Packet]) -> tuple[float, float]:
+    """Fly to the end; return the simulated time and the CPU time of all threads that it took [s]."""
+    stamp_ns, begin = state.stamp_ns, time.process_time()
+    for _ in packets:
+        pass
+    return 1e-9 * (state.stamp_ns - stamp_ns), time.process_time() - begin
 
 
 def _terms(model: Model, state: State) -> dict[str, list[str]]:
@@ -243,7 +262,7 @@ def main() -> int:
     """Answer the request on the standard input; return the exit status."""
     wp.config.log_level = wp.LOG_WARNING
     request = json.load(sys.stdin)
-    print(json.dumps(asdict(probe(request["config"], request["seconds"]))))
+    print(json.dumps(asdict(probe(**request))))
     return 0
 
 

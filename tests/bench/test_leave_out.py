@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -12,11 +13,14 @@ import pytest
 from neurosim_core.bench.leave_out import (
     _cases,
     dynamics_differences,
+    imu_difference,
     leave_out_chapter,
     measure_leave_out,
+    pixel_difference,
     plain_room,
     radiance_difference,
     run_probe,
+    textured_room,
 )
 from neurosim_core.bench.report import write_report
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
@@ -37,10 +41,37 @@ def test_an_imu_alone_allocates_no_image(result):
 
 
 def test_an_imu_alone_imports_no_library_for_scenes(result):
-    imu = result.probes["imu"]
-    assert imu.libraries == ["scipy"]
-    assert not imu.embree
-    assert not [name for name in imu.kernels if "raycast" in name or "scan" in name]
+    for name in ("imu", "imu-file"):
+        imu = result.probes[name]
+        assert imu.libraries == ["scipy"]
+        assert not imu.embree
+        assert not [name for name in imu.kernels if "raycast" in name or "scan" in name]
+    assert "PIL" in result.probes["all-file"].libraries  # to look at the same file
+    assert result.probes["all-file"].texture_bytes == 64 * 64 * 3
+
+
+@pytest.mark.parametrize(
+    ("case", "change", "index"),
+    [
+        ("imu-file", {"libraries": ["scipy", "PIL"]}, 1),
+        ("imu", {"embree": True}, 1),
+        ("all-file", {"libraries": ["scipy"], "embree": False}, 1),  # a scene that takes none shows nothing
+        ("imu-file", {"texture_bytes": 12}, 0),
+        ("events", {"terms": {"events": ["rgb"]}}, 2),
+        ("events-plain", {"shader_functions": ["sample_texture"]}, 3),
+        ("events", {"shader_functions": []}, 3),
+    ],
+)
+def test_bars_can_be_missed(result, case, change, index):
+    probes = {**result.probes, case: dataclasses.replace(result.probes[case], **change)}
+    bars = leave_out_chapter(dataclasses.replace(result, probes=probes)).bars
+    assert [bar.met for bar in bars] == [k != index for k in range(5)]
+
+
+def test_unequal_kernels_are_missed(result):
+    off = dataclasses.replace(result.differences[0], largest=2e-12)
+    bars = leave_out_chapter(dataclasses.replace(result, differences=(*result.differences, off))).bars
+    assert [bar.met for bar in bars] == [True, True, True, True, False]
 
 
 def test_events_alone_compute_no_rgb(result):
@@ -69,9 +100,12 @@ def test_everything_is_everything(result):
 
 def test_reduced_kernels_equal_full_ones():
     """1e-12 in float64; a vehicle that is tossed about for a second."""
-    for difference in dynamics_differences():
+    for difference in (*dynamics_differences(), imu_difference()):
         assert difference.largest <= 1e-12, difference
     assert radiance_difference().largest == 0.0
+    pixels = pixel_difference()
+    assert pixels.largest == 0.0
+    assert "spread, low_pass, refractory, leak, spontaneous" in pixels.full
 
 
 def test_bars_and_files(result, tmp_path):
@@ -97,12 +131,21 @@ def test_the_room_is_closed_and_plain(tmp_path):
     area = 0.5 * np.linalg.norm(np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]), axis=1).sum()
     assert area == pytest.approx(2 * (8 * 6 + 8 * 3 + 6 * 3), rel=1e-5)
     assert all(material.texture is None for material in scene.materials)
+    file.write_text(textured_room())
+    textured = load_mesh_scene(MeshSceneConfig(file=file))
+    np.testing.assert_array_equal(textured.vertices[textured.faces], scene.vertices[scene.faces])
+    corner = textured.uv[textured.faces].astype(float)
+    edge = corner[:, 1:] - corner[:, :1]
+    assert np.abs(np.linalg.det(edge)).min() > 1.0  # no wall has a smeared picture
+    assert np.unique(textured.materials[0].texture.srgb).tolist() == [95, 255]
 
 
 def test_the_full_set_of_cases(tmp_path):
-    cases = {case.name: case for case in _cases(tmp_path / "room.gltf", quick=False)}
-    assert list(cases) == ["imu", "events-plain", "events", "pictures", "sensors", "all-plain", "all"]
-    assert {case.full for case in cases.values()} == {"all", "all-plain"}
+    cases = {case.name: case for case in _cases(tmp_path / "a.gltf", tmp_path / "b.gltf", quick=False)}
+    names = ["imu", "imu-file", "events-plain", "events", "pictures", "sensors"]
+    assert list(cases) == [*names, "all-plain", "all-file", "all"]
+    for case in cases.values():
+        assert cases[case.full].config["scene"] == case.config["scene"]
 
 
 COUNTING = """
