@@ -1,10 +1,14 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,no-untyped-call,call-overload,untyped-decorator"
-"""Error against renders for a stream of events: fixed rates, adaptive sampling, and the naive scheme.
+"""Error against run time for a stream of events: fixed rates, adaptive sampling, and the naive scheme.
 
 One flight is flown once, and rendered at 100 kHz. The events of all these renders are the reference. Every
 candidate is given some of the same renders: each tick of a slower clock, or the ticks that adaptive sampling
-asks for. So candidates differ in which instants they see and in nothing else, and the cost of a candidate is
-its number of renders.
+asks for. So candidates differ in which instants they see and in nothing else.
+
+The cost of a candidate is its number of renders, which says something about every machine, and the time that
+choosing and rendering them takes here. Both are measured in the same run: the choice is timed when it is
+made, and the renders of each candidate are timed once more by themselves. What the flight and the pixels cost
+is not in it, as it is the same for all.
 
 The naive scheme is what many simulators do: a pixel that has changed by a threshold since its last event
 fires one event, stamped at the frame, and takes its new log radiance as reference.
@@ -17,6 +21,7 @@ alignment behind the distance of Victor and Purpura; see `spike_distance`.
 
 import itertools
 import math
+import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -54,7 +59,9 @@ FIXED_HZ = (250.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0)
 ADAPTIVE_PX = (2.0, 1.0, 0.5, 0.35, 0.2, 0.1)
 _CHUNK = 128
 """Renders that are shown to all candidates at once."""
-_BINS_US = np.unique(np.round(np.geomspace(1.0, 1e4, 33)))
+_TIMED_MAX = 1000
+"""Renders of a candidate that are timed, evenly spread over the flight."""
+_BINS_US = np.geomspace(10.0, 1e4, 25)
 """Edges of the histogram of timing errors [us]; what is less than the first is in the first bin."""
 
 
@@ -69,7 +76,10 @@ class Score:
     slow_render_count: int
     """Those before the manoeuvre."""
     choice_s: float
-    """Time that it took to choose the renders among the ticks of the reference [s]."""
+    """Time that it took to choose the renders among the ticks of the reference [s]: CPU time of all threads
+    on a CPU, wall clock on CUDA; 0 for a fixed rate."""
+    render_s: float
+    """Time of all its renders [s], measured likewise, on some of them."""
     event_count: int
     missing_count: int
     spurious_count: int
@@ -84,6 +94,11 @@ class Score:
     histogram: tuple[int, ...]
     """Events matched by timing error."""
 
+    @property
+    def run_s(self) -> float:
+        """Time of choosing and rendering [s]."""
+        return self.choice_s + self.render_s
+
 
 @dataclass(frozen=True, kw_only=True)
 class EventStudy:
@@ -91,6 +106,8 @@ class EventStudy:
 
     quick: bool
     scene: str
+    scene_file: Path | None
+    """None: generated."""
     device: str
     width: int
     height: int
@@ -99,13 +116,16 @@ class EventStudy:
     reference_hz: float
     reference_count: int
     """Events of the reference."""
-    render_ms: float
-    """Time of one render, by the reference [ms]."""
     scores: tuple[Score, ...]
 
     def of(self, scheme: Scheme) -> list[Score]:
         """Return the scores of a scheme, the one with the fewest renders first."""
         return sorted((s for s in self.scores if s.scheme == scheme), key=lambda s: s.render_count)
+
+    @property
+    def clock(self) -> str:
+        """What run times are, in words."""
+        return "wall-clock time" if wp.get_device(self.device).is_cuda else "CPU time of all threads"
 
     def error(self, score: Score) -> float:
         """Return the distance to the reference for each of its events."""
@@ -120,6 +140,7 @@ class _Candidate:
     setting: float
     ticks: NDArray[np.int64]
     choice_s: float = 0.0
+    render_s: float = 0.0
     sensor: Any = None
     """`EventCamera` or `_NaiveCamera`."""
     parts: list[Events] = field(default_factory=list)
@@ -247,7 +268,8 @@ def measure_events(
     )
     tell("choose the renders of adaptive sampling")
     candidates = list(_candidates(flown, arrays, sensor, quick=quick))
-    render_s = _show(flown, arrays, sensor, [reference, *candidates], tell)
+    _time_renders(flown, arrays, sensor, candidates, tell)
+    _show(flown, arrays, sensor, [reference, *candidates], tell)
     right = make_trains(*reference.events(), width=columns)
     scores = []
     for candidate in candidates:
@@ -256,6 +278,7 @@ def measure_events(
     return EventStudy(
         quick=quick,
         scene=flown.model.scene.name,
+        scene_file=scene,
         device=flown.model.device,
         width=columns,
         height=lens.height,
@@ -263,7 +286,6 @@ def measure_events(
         duration_s=flown.model.config.duration_s,
         reference_hz=flown.rate.rate_hz,
         reference_count=len(right.t_us),
-        render_ms=1e3 * render_s / len(flown.stamps_ns),
         scores=tuple(scores),
     )
 
@@ -276,32 +298,99 @@ def _candidates(
         ticks = _ticks(flown, Rate(rate_hz))
         yield _Candidate(scheme="fixed", setting=rate_hz, ticks=ticks)
         yield _Candidate(scheme="naive", setting=rate_hz, ticks=ticks)
+    _make_rule(flown, arrays, sensor, 1.0).choose(flown.trace.states, range(1), [0], [True])  # compiles
     forced = np.zeros(len(flown.stamps_ns), dtype=bool)
     forced[_ticks(flown, sensor.packets)] = True
     forced[-1] = True
     stamps_ns, must = flown.stamps_ns.tolist(), forced.tolist()
     for limit_px in ADAPTIVE_PX[1:] if quick else ADAPTIVE_PX:
-        rule = DisplacementRule(
-            arrays,
-            sensor.lens,
-            max_displacement_px=limit_px,
-            rate=flown.rate,
-            p_BC=wp.vec3d(*sensor.mount.position_m),
-            q_BC=wp.quatd(*sensor.mount.optical_quaternion()),
-        )
-        begin = time.perf_counter()
+        rule = _make_rule(flown, arrays, sensor, limit_px)
+        begin_s = _busy_s(flown.model.device)
         chosen = rule.choose(flown.trace.states, range(len(stamps_ns)), stamps_ns, must)
         yield _Candidate(
             scheme="adaptive",
             setting=limit_px,
             ticks=np.array(chosen),
-            choice_s=time.perf_counter() - begin,
+            choice_s=_busy_s(flown.model.device) - begin_s,
         )
+
+
+def _make_rule(
+    flown: Flown, arrays: SceneArrays, sensor: EventSensorConfig, limit_px: float
+) -> DisplacementRule:
+    return DisplacementRule(
+        arrays,
+        sensor.lens,
+        max_displacement_px=limit_px,
+        rate=flown.rate,
+        p_BC=wp.vec3d(*sensor.mount.position_m),
+        q_BC=wp.quatd(*sensor.mount.optical_quaternion()),
+    )
+
+
+def _busy_s(device: str) -> float:
+    """Return a time of which differences count [s]: of all threads; on CUDA the wall clock, when idle."""
+    if wp.get_device(device).is_cpu:
+        return time.process_time()
+    wp.synchronize_device(device)
+    return time.perf_counter()
 
 
 def _ticks(flown: Flown, rate: Rate) -> NDArray[np.int64]:
     """Return the ticks of the reference at which a slower clock ticks."""
     return np.flatnonzero([rate.has_tick(stamp_ns) for stamp_ns in flown.stamps_ns.tolist()])
+
+
+class _Eye:
+    """Renders ticks of a flight."""
+
+    def __init__(self, flown: Flown, arrays: SceneArrays, sensor: EventSensorConfig) -> None:
+        self._flown = flown
+        self._device = device = flown.model.device
+        self._mount = {
+            "p_BC": wp.vec3d(*sensor.mount.position_m),
+            "q_BC": wp.quatd(*sensor.mount.optical_quaternion()),
+        }
+        self._renderer = make_renderer(arrays, sensor.lens, outputs=["log_radiance"], instant_count=_CHUNK)
+        self._p_WC = wp.zeros(_CHUNK, dtype=wp.vec3, device=device)
+        self._q_WC = wp.zeros(_CHUNK, dtype=wp.quat, device=device)
+        self._no_image = wp.full(_CHUNK, value=-1, dtype=int, device=device)
+        self.frames = self._renderer.log_radiance
+
+    def look(self, ticks: NDArray[np.int64]) -> None:
+        """Render at most `_CHUNK` ticks into `frames`."""
+        self._flown.trace.camera_poses(
+            wp.array(ticks.astype(np.int32), dtype=int, device=self._device),
+            count=len(ticks),
+            **self._mount,
+            p_WC=self._p_WC,
+            q_WC=self._q_WC,
+        )
+        self._renderer.render(self._p_WC, self._q_WC, self._no_image, instant_count=len(ticks))
+
+
+def _time_renders(
+    flown: Flown,
+    arrays: SceneArrays,
+    sensor: EventSensorConfig,
+    candidates: Sequence[_Candidate],
+    tell: Callable[[str], None],
+) -> None:
+    """Measure what the renders of each candidate take; equal ticks are timed once."""
+    eye = _Eye(flown, arrays, sensor)
+    eye.look(np.arange(1))  # compiles
+    known: dict[bytes, float] = {}
+    for candidate in candidates:
+        key = candidate.ticks.tobytes()
+        if key not in known:
+            tell(f"time the renders of {candidate.scheme} {candidate.setting:g}")
+            some = candidate.ticks[:: -(-len(candidate.ticks) // _TIMED_MAX)]
+            begin_s = _busy_s(flown.model.device)
+            for begin in range(0, len(some), _CHUNK):
+                eye.look(some[begin : begin + _CHUNK])
+            taken_s = _busy_s(flown.model.device) - begin_s
+            known[key] = taken_s * len(candidate.ticks) / len(some)
+        candidate.render_s = known[key]
 
 
 def _show(
@@ -310,44 +399,28 @@ def _show(
     sensor: EventSensorConfig,
     candidates: Sequence[_Candidate],
     tell: Callable[[str], None],
-) -> float:
-    """Render all ticks, and show each candidate its own; return the time that rendering took [s]."""
+) -> None:
+    """Render all ticks, and show each candidate its own."""
     device = flown.model.device
     lens = sensor.lens
-    renderer = make_renderer(arrays, lens, outputs=["log_radiance"], instant_count=_CHUNK)
-    frames, picked = renderer.log_radiance, wp.empty_like(renderer.log_radiance)
+    eye = _Eye(flown, arrays, sensor)
+    frames, picked = eye.frames, wp.empty_like(eye.frames)
     for candidate in candidates:
         candidate.sensor = (
             _NaiveCamera(sensor, device)
             if candidate.scheme == "naive"
             else EventCamera(sensor.pixel, width=lens.width, height=lens.height, device=device, on_host=True)
         )
-    p_WC = wp.zeros(_CHUNK, dtype=wp.vec3, device=device)
-    q_WC = wp.zeros(_CHUNK, dtype=wp.quat, device=device)
-    no_image = wp.full(_CHUNK, value=-1, dtype=int, device=device)
-    render_s = 0.0
     count = len(flown.stamps_ns)
     for begin in range(0, count, _CHUNK):
         if begin % (_CHUNK * 32) == 0:
             tell(f"render {begin:,} of {count:,}")
         ticks = np.arange(begin, min(begin + _CHUNK, count))
-        start = time.perf_counter()
-        flown.trace.camera_poses(
-            wp.array(ticks.astype(np.int32), dtype=int, device=device),
-            count=len(ticks),
-            p_BC=wp.vec3d(*sensor.mount.position_m),
-            q_BC=wp.quatd(*sensor.mount.optical_quaternion()),
-            p_WC=p_WC,
-            q_WC=q_WC,
-        )
-        renderer.render(p_WC, q_WC, no_image, instant_count=len(ticks))
-        wp.synchronize_device(device)
-        render_s += time.perf_counter() - start
+        eye.look(ticks)
         for candidate in candidates:
             low, high = np.searchsorted(candidate.ticks, [begin, begin + len(ticks)])
             if high > low:
                 _see(candidate, frames, picked, candidate.ticks[low:high] - begin, flown.stamps_ns, begin)
-    return render_s
 
 
 def _see(
@@ -400,6 +473,7 @@ def _score(candidate: _Candidate, right: Trains, flown: Flown, width: int) -> Sc
         render_count=len(candidate.ticks),
         slow_render_count=int(slow.sum()),
         choice_s=candidate.choice_s,
+        render_s=candidate.render_s,
         event_count=len(trains.t_us),
         missing_count=aligned.missing_count,
         spurious_count=aligned.spurious_count,
@@ -407,12 +481,14 @@ def _score(candidate: _Candidate, right: Trains, flown: Flown, width: int) -> Sc
         median_us=float(median),
         high_us=float(high),
         worst_us=float(worst),
-        histogram=tuple(np.histogram(np.maximum(shifts, 1.0), bins=_BINS_US)[0].tolist()),
+        histogram=tuple(np.histogram(np.maximum(shifts, _BINS_US[0]), bins=_BINS_US)[0].tolist()),
     )
 
 
-def renders_saved(study: EventStudy, error: Callable[[Score], float]) -> dict[float, float]:
-    """Return how many times as many renders the best fixed rate needs for the error of adaptive sampling.
+def saving(
+    study: EventStudy, error: Callable[[Score], float], cost: Callable[[Score], float]
+) -> dict[float, float]:
+    """Return how many times as much the best fixed rate costs for the error of adaptive sampling.
 
     Between two rates the curve is interpolated in logarithms. Candidates that are better than the fastest
     rate or worse than the slowest are left out.
@@ -420,33 +496,40 @@ def renders_saved(study: EventStudy, error: Callable[[Score], float]) -> dict[fl
     Args:
         study: What was measured.
         error: What counts as the error of a score.
+        cost: What counts as its cost.
 
     Returns:
         Factor by displacement [px].
     """
     fixed = sorted(study.of("fixed"), key=error)
-    errors, renders = np.log([error(s) for s in fixed]), np.log([s.render_count for s in fixed])
+    errors, costs = np.log([error(s) for s in fixed]), np.log([cost(s) for s in fixed])
     return {
-        s.setting: float(np.exp(np.interp(np.log(error(s)), errors, renders)) / s.render_count)
+        s.setting: float(np.exp(np.interp(np.log(error(s)), errors, costs)) / cost(s))
         for s in study.of("adaptive")
         if errors[0] <= np.log(error(s)) <= errors[-1]
     }
 
 
-def timing_gain(study: EventStudy) -> dict[float, float]:
-    """Return how many times larger the median timing error of the naive scheme is for as many renders.
+def timing_gain(study: EventStudy, ours: Scheme, error_us: Callable[[Score], float]) -> dict[float, float]:
+    """Return how many times larger the timing error of the naive scheme is for as many renders.
 
-    The adaptive curve is interpolated in logarithms; rates beyond it are left out.
+    Our curve is interpolated in logarithms; rates beyond it are left out.
+
+    Args:
+        study: What was measured.
+        ours: Fixed: at the same rate, thus of the same renders. Adaptive: of as many renders.
+        error_us: Which timing error of a score [us]; less than 1 counts as 1, the resolution of stamps.
 
     Returns:
         Factor by rate of the naive scheme [Hz].
     """
-    ours = study.of("adaptive")
-    renders, errors = np.log([s.render_count for s in ours]), np.log([max(s.median_us, 1.0) for s in ours])
+    curve = study.of(ours)
+    renders = np.log([s.render_count for s in curve])
+    errors = np.log([max(error_us(s), 1.0) for s in curve])
     return {
-        s.setting: float(s.median_us / np.exp(np.interp(np.log(s.render_count), renders, errors)))
+        s.setting: float(error_us(s) / np.exp(np.interp(np.log(s.render_count), renders, errors)))
         for s in study.of("naive")
-        if renders[0] <= np.log(s.render_count) <= renders[-1]
+        if len(renders) and renders[0] <= np.log(s.render_count) <= renders[-1]
     }
 
 
@@ -455,22 +538,54 @@ def falls(study: EventStudy, scheme: Scheme) -> bool:
     return all(a.distance > b.distance for a, b in itertools.pairwise(study.of(scheme)))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Answer:
+    """What a study says about adaptive sampling and about the naive scheme: factors, by setting."""
+
+    renders: dict[float, float]
+    """Renders of a fixed rate against adaptive, for the same distance."""
+    renders_by_count: dict[float, float]
+    """The same, for as many missing and spurious events."""
+    time: dict[float, float]
+    """Run time of a fixed rate against adaptive, for the same distance."""
+    naive: dict[tuple[Scheme, str], dict[float, float]]
+    """Timing error of the naive scheme against ours, by our scheme and the measure of the error."""
+
+
+def _answer(study: EventStudy) -> _Answer:
+    measures: dict[str, Callable[[Score], float]] = {
+        "median": lambda s: s.median_us,
+        "90 %": lambda s: s.high_us,
+    }
+    ours: tuple[Scheme, ...] = ("adaptive", "fixed")
+    return _Answer(
+        renders=saving(study, study.error, lambda s: s.render_count),
+        renders_by_count=saving(
+            study, lambda s: s.missing_count + s.spurious_count, lambda s: s.render_count
+        ),
+        time=saving(study, study.error, lambda s: s.run_s),
+        naive={
+            (scheme, name): timing_gain(study, scheme, error_us)
+            for scheme in ours
+            for name, error_us in measures.items()
+        },
+    )
+
+
 def events_chapter(study: EventStudy) -> Chapter:
     """Return what a study says, for the report."""
-    saved = renders_saved(study, study.error)
-    saved_events = renders_saved(study, lambda s: s.missing_count + s.spurious_count)
-    gain = timing_gain(study)
+    answer = _answer(study)
     return Chapter(
         name="events",
-        title="Events: error against renders",
-        summary=_summary(study, saved, saved_events, gain),
-        command="neurosim bench events" + (" --quick" if study.quick else ""),
-        bars=_bars(study, saved, saved_events, gain),
-        tables=[_table(study)],
+        title="Events: error against run time",
+        summary=_summary(study, answer),
+        command=_command(study),
+        bars=_bars(study, answer),
+        tables=[_table(study, answer)],
         plots=[
             Plot(
                 name="events-error",
-                title="Error of the event stream against the number of renders",
+                title="Error of the event stream against renders and run time",
                 draw=lambda figure: _draw_error(study, figure),
             ),
             Plot(
@@ -482,28 +597,40 @@ def events_chapter(study: EventStudy) -> Chapter:
     )
 
 
-def _bars(
-    study: EventStudy, saved: dict[float, float], saved_events: dict[float, float], gain: dict[float, float]
-) -> list[Bar]:
+def _command(study: EventStudy) -> str:
+    """Return what measures the same again, whatever the defaults of a machine are."""
+    words = ["neurosim bench events", *(["--quick"] if study.quick else [])]
+    if study.scene_file is not None:
+        words.append(f"--scene {shlex.quote(str(study.scene_file))}")
+    return " ".join([*words, f"--device {study.device} --width {study.width} --height {study.height}"])
+
+
+def _bars(study: EventStudy, answer: _Answer) -> list[Bar]:
     """Return what was promised, and what came of it."""
     both = [scheme for scheme in ("fixed", "adaptive") if falls(study, scheme)]
     small = " (quick: too small to judge)" if study.quick else ""
+    judged = answer.naive["adaptive", "median"]
     return [
         Bar(
-            text="For the same error adaptive sampling needs at most half the renders of the best fixed "
-            "rate.",
-            measured=f"{_span(saved)} times fewer by the spike-train distance, {_span(saved_events)} by "
-            f"missing and spurious events{small}",
-            met=None if study.quick or not saved else min(saved.values()) >= 2.0,
+            text="For the same error adaptive sampling needs at most half the renders of the best fixed rate",
+            measured=f"by the spike-train distance {_span(answer.renders)} times fewer"
+            f"{_left_out(study, answer.renders)}; by missing and spurious events "
+            f"{_span(answer.renders_by_count)} times fewer{_left_out(study, answer.renders_by_count)}"
+            f"{small}",
+            met=None if study.quick or not answer.renders else min(answer.renders.values()) >= 2.0,
         ),
         Bar(
             text="At the same number of renders the timing error of the naive scheme is at least 5 times "
-            "ours.",
-            measured=f"{_span(gain)} times (median){small}",
-            met=None if study.quick or not gain else min(gain.values()) >= 5.0,
+            "ours: judged by the median of matched events, naive at a fixed rate against adaptive sampling",
+            measured=f"{_span(judged)} times, at {_rates(judged)}; by what 90 % are below "
+            f"{_span(answer.naive['adaptive', '90 %'])} times. Against our own pixels at the same fixed "
+            f"rate, {_rates(answer.naive['fixed', 'median'])}: median "
+            f"{_span(answer.naive['fixed', 'median'])}, 90 % {_span(answer.naive['fixed', '90 %'])} times"
+            f"{small}",
+            met=None if study.quick or not judged else min(judged.values()) >= 5.0,
         ),
         Bar(
-            text="The error falls monotonically with the number of renders.",
+            text="The error falls monotonically with the number of renders",
             measured=f"it does for {' and '.join(both) or 'none'}",
             met=len(both) == 2,
         ),
@@ -513,17 +640,33 @@ def _bars(
 def _span(factors: dict[float, float]) -> str:
     if not factors:
         return "?"
-    low, high = min(factors.values()), max(factors.values())
-    return f"{low:.2g}" if low == high else f"{low:.2g} to {high:.2g}"
+    low, high = (f"{bound(factors.values()):.2g}" for bound in (min, max))
+    return low if low == high else f"{low} to {high}"
 
 
-def _summary(
-    study: EventStudy, saved: dict[float, float], saved_events: dict[float, float], gain: dict[float, float]
-) -> str:
+def _rates(factors: dict[float, float]) -> str:
+    """Name the rates of some factors."""
+    if not factors:
+        return "no rate"
+    low, high = (f"{bound(factors):g}" for bound in (min, max))
+    return f"{low} Hz" if low == high else f"{low} to {high} Hz"
+
+
+def _left_out(study: EventStudy, factors: dict[float, float]) -> str:
+    """Name the displacements that have no factor."""
+    left = [f"{s.setting:g}" for s in study.of("adaptive") if s.setting not in factors]
+    return f" (left out, as no fixed rate here is as bad or as good: {', '.join(left)} px)" if left else ""
+
+
+def _summary(study: EventStudy, answer: _Answer) -> str:
     """Return the answer in words."""
-    tick_count = study.duration_s * study.reference_hz
-    choosing_us = max((s.choice_s * 1e6 / tick_count for s in study.of("adaptive")), default=0.0)
-    finest = study.of("adaptive")[-1]
+    finest = study.of("adaptive")[-1:]
+    missing = (
+        f"At {finest[0].setting:g} px {finest[0].missing_count / study.reference_count:.1%} of the "
+        "events are missing: details that pass a pixel between two renders."
+        if finest
+        else ""
+    )
     return "\n\n".join(
         [
             f"A vehicle creeps through *{study.scene}* for {SLOW_SHARE * study.duration_s:.2g} s, dodges "
@@ -531,15 +674,14 @@ def _summary(
             f"once and rendered at {study.reference_hz / 1e3:g} kHz, {study.width} x {study.height} pixels, "
             f"{study.samples_per_pixel} rays each, on {study.device}. The {study.reference_count:,} events "
             "are the reference; candidates see some of the same renders.",
-            f"For the same spike-train distance adaptive sampling needs {_span(saved)} times fewer renders "
-            f"than a fixed rate, for as many missing and spurious events {_span(saved_events)} times fewer. "
-            f"With as many renders the naive scheme stamps events {_span(gain)} times worse (median). At "
-            f"{finest.setting:g} px {finest.missing_count / study.reference_count:.1%} of the events are "
-            "missing: details that pass a pixel between two renders. To choose costs at most "
-            f"{choosing_us:.2g} us for each tick of the clock, a render {study.render_ms * 1e3:.3g} us.",
-            "Adaptive sampling bounds how far things move between two renders, not the time: where the "
-            "vehicle is slow, events are off by as much of a pixel, which is more microseconds. It pays on "
-            "flights with slow and fast parts, such as this one; at an even speed a fixed rate is as good.",
+            f"For the same spike-train distance adaptive sampling needs {_span(answer.renders)} times fewer "
+            f"renders than a fixed rate, and {_span(answer.time)} times less {study.clock} to choose and "
+            f"render them; for as many missing and spurious events it needs {_span(answer.renders_by_count)} "
+            f"times fewer renders. {missing}",
+            _choosing(study, answer),
+            f"With as many renders as adaptive sampling the naive scheme stamps events "
+            f"{_span(answer.naive['adaptive', 'median'])} times worse (median of those matched); at the same "
+            f"fixed rate {_span(answer.naive['fixed', 'median'])} times worse than our pixels.",
             f"Distance: Victor and Purpura (1996), q = {COST_PER_S:g}/s, of each pixel and polarity, summed, "
             "and divided by the events of the reference. Its alignment matches events at most "
             f"{2e3 / COST_PER_S:g} ms apart.",
@@ -547,7 +689,34 @@ def _summary(
     )
 
 
-def _table(study: EventStudy) -> Table:
+def _choosing(study: EventStudy, answer: _Answer) -> str:
+    """Say what the choice costs, and where it does not pay."""
+    ours = study.of("adaptive")
+    if not ours:
+        return "Adaptive sampling was not measured."
+    tick_count = round(study.duration_s * study.reference_hz) + 1
+    each_us = [1e6 * s.choice_s / tick_count for s in ours]
+    shares = [s.choice_s / s.render_s for s in ours]
+    render_ms = 1e3 * sum(s.render_s for s in ours) / sum(s.render_count for s in ours)
+    worse = sorted((px for px, factor in answer.time.items() if factor < 1.0), reverse=True)
+    verdict = (
+        f"At {', '.join(f'{px:g}' for px in worse)} px it does not pay here: a fixed rate of the same error "
+        "takes less time."
+        if worse
+        else "Choosing included, no setting that can be compared takes longer than a fixed rate here."
+    )
+    return (
+        f"To choose takes {min(each_us):.2g} to {max(each_us):.2g} us for each tick of the clock that is "
+        f"chosen from, here the {study.reference_hz / 1e3:g} kHz of the reference, which adds "
+        f"{min(shares):.0%} to {max(shares):.0%} to the time of rendering ({render_ms:.3g} ms a render). "
+        f"{verdict} It pays less the cheaper a render is (few pixels, few rays, a fast GPU), the finer the "
+        "clock, and the more packets end, as their ends are always rendered. It does not pay at an even "
+        "speed: adaptive sampling bounds how far things move between two renders, not the time; where the "
+        "vehicle is slow, events are off by as much of a pixel, which is more microseconds."
+    )
+
+
+def _table(study: EventStudy, answer: _Answer) -> Table:
     total = study.reference_count
     rows = [
         {
@@ -555,6 +724,9 @@ def _table(study: EventStudy) -> Table:
             "setting": s.setting,
             "renders": s.render_count,
             "slow": s.slow_render_count,
+            "choice": s.choice_s,
+            "render": s.render_s,
+            "run": s.run_s,
             "count": 100.0 * (s.event_count / total - 1.0),
             "missing": 100.0 * s.missing_count / total,
             "spurious": 100.0 * s.spurious_count / total,
@@ -562,6 +734,8 @@ def _table(study: EventStudy) -> Table:
             "median": s.median_us,
             "high": s.high_us,
             "worst": s.worst_us,
+            "fewer": answer.renders.get(s.setting) if s.scheme == "adaptive" else None,
+            "faster": answer.time.get(s.setting) if s.scheme == "adaptive" else None,
         }
         for scheme in ("fixed", "adaptive", "naive")
         for s in study.of(scheme)
@@ -574,6 +748,9 @@ def _table(study: EventStudy) -> Table:
             "setting": "Hz or px",
             "renders": "renders",
             "slow": "of these before the manoeuvre",
+            "choice": "choosing [s]",
+            "render": "rendering [s]",
+            "run": "both [s]",
             "count": "events more or fewer [%]",
             "missing": "missing [%]",
             "spurious": "spurious [%]",
@@ -581,10 +758,15 @@ def _table(study: EventStudy) -> Table:
             "median": "timing error, median [us]",
             "high": "90 % [us]",
             "worst": "largest [us]",
+            "fewer": "renders of a fixed rate / of this",
+            "faster": "time of a fixed rate / of this",
         },
         rows=rows,
         note="Timing errors are those of matched events, without sign; they are below the window by "
-        "definition. Adaptive sampling also renders the ends of packets, 100 a second.",
+        f"definition. Seconds are {study.clock}, of at most {_TIMED_MAX:,} renders of each candidate, scaled "
+        "to all. The last two columns compare with the fixed rate of the same distance, between two rates by "
+        "interpolation; unknown where no fixed rate is as bad or as good. Adaptive sampling also renders "
+        "the ends of packets, 100 a second.",
     )
 
 
@@ -597,21 +779,34 @@ _STYLE: dict[Scheme, tuple[str, str, str]] = {
 
 
 def _draw_error(study: EventStudy, figure: "Figure") -> None:
-    left, right = figure.subplots(1, 2)
+    """Draw the distance against renders and against run time, and the timing error against renders."""
+    panels = figure.subplots(1, 3)
     for scheme, (color, marker, label) in _STYLE.items():
         scores = study.of(scheme)
-        renders = [s.render_count for s in scores]
         style = {"color": color, "marker": marker, "label": label}
-        left.plot(renders, [study.error(s) for s in scores], **style)
-        right.plot(renders, [max(s.median_us, 1.0) for s in scores], **style)
-        for score in scores if scheme != "naive" else ():
-            text = f"{score.setting:g} px" if scheme == "adaptive" else f"{score.setting / 1e3:g} kHz"
-            place = (score.render_count, study.error(score))
-            offset, side = ((-5, -9), "right") if scheme == "adaptive" else ((5, 4), "left")
-            left.annotate(text, place, fontsize=7, textcoords="offset points", xytext=offset, ha=side)
-    left.set(xscale="log", yscale="log", xlabel="renders", ylabel="spike-train distance per event")
-    right.set(xscale="log", yscale="log", xlabel="renders", ylabel="median timing error [us]")
-    left.legend()
+        renders, run_s = [s.render_count for s in scores], [s.run_s for s in scores]
+        errors, medians_us = [study.error(s) for s in scores], [max(s.median_us, 1.0) for s in scores]
+        for axes, costs, values in zip(
+            panels, (renders, run_s, renders), (errors, errors, medians_us), strict=True
+        ):
+            axes.plot(costs, values, **style)
+            if scheme != "naive":
+                _name_points(axes, scores, costs, values)
+    panels[0].set(xlabel="renders", ylabel="spike-train distance per event")
+    panels[1].set(xlabel=f"choosing and rendering [s]\n({study.clock})", ylabel=panels[0].get_ylabel())
+    panels[2].set(xlabel="renders", ylabel="median timing error [us]")
+    for axes in panels:
+        axes.set(xscale="log", yscale="log")
+        axes.margins(x=0.15)
+        axes.legend(loc="lower left", fontsize=8)
+
+
+def _name_points(axes: Any, scores: Sequence[Score], costs: Sequence[float], values: Sequence[float]) -> None:
+    """Write the settings beside the points of a curve."""
+    for score, place in zip(scores, zip(costs, values, strict=True), strict=True):
+        text = f"{score.setting:g} px" if score.scheme == "adaptive" else f"{score.setting / 1e3:g} kHz"
+        offset, side = ((-5, -9), "right") if score.scheme == "adaptive" else ((5, 4), "left")
+        axes.annotate(text, place, fontsize=7, textcoords="offset points", xytext=offset, ha=side)
 
 
 def _draw_timing(study: EventStudy, figure: "Figure") -> None:
