@@ -6,11 +6,12 @@ What measures is imported when it is asked for: this module costs next to nothin
 from __future__ import annotations
 
 import argparse
+import shlex
 import signal
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -55,6 +56,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def _add_study(parser: argparse.ArgumentParser, study: Study) -> None:
     _add_out(parser, study.name)
     _add_quick(parser)
+    _add_strict(parser)
     _add_options(parser, study.options)
     parser.set_defaults(command=lambda arguments: _bench_study(study, arguments))
 
@@ -66,6 +68,7 @@ def _add_all(parser: argparse.ArgumentParser) -> None:
     )
     _add_out(parser, "report")
     _add_quick(parser)
+    _add_strict(parser)
     _add_options(parser, frozenset().union(*(study.options for study in STUDIES)))
     parser.set_defaults(command=_bench_all)
 
@@ -73,6 +76,15 @@ def _add_all(parser: argparse.ArgumentParser) -> None:
 def _add_quick(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick", action="store_true", help="a small version, to see what it looks like; figures are rough"
+    )
+
+
+def _add_strict(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with status 1 if a bar is missed; otherwise the last line says how many are, and the "
+        "status is 0",
     )
 
 
@@ -251,7 +263,8 @@ STUDIES: Sequence[Study] = (
         name="events",
         help="error against run time of the events of a flight",
         description="Render a flight at fixed rates and as often as its motion asks for, and compare the "
-        "events with those of a far higher rate.",
+        "events with those of a far higher rate. By default 64x48 pixels on a CPU, which takes about "
+        "6 minutes on two cores, and 346x260 on CUDA.",
         chapter=_events,
         options=frozenset({"scene", "device", "width", "height"}),
     ),
@@ -286,8 +299,9 @@ def _bench_study(study: Study, arguments: argparse.Namespace) -> int:
 
     console = Console()
     with handle_signals(signal.default_int_handler):
-        _write([_measure(study, arguments, console)], arguments.out, console)
-    return 0
+        chapters = [_measure(study, arguments, console)]
+        _write(chapters, arguments.out, console)
+    return _judge(chapters, console, strict=arguments.strict)
 
 
 def _bench_all(arguments: argparse.Namespace) -> int:
@@ -303,13 +317,27 @@ def _bench_all(arguments: argparse.Namespace) -> int:
                 try:
                     chapter = _measure(study, arguments, console, prefix=prefix)
                 except Exception as error:  # whatever it is, it is told, and the other studies go on
-                    chapter, status = _failed(study, error, console, quick=arguments.quick), 1
+                    chapter, status = _failed(study, error, arguments, console), 1
                 chapters.append(chapter)
         except KeyboardInterrupt:
             status = 130
     if chapters:
         _write(chapters, arguments.out, console)
+        status = status or _judge(chapters, console, strict=arguments.strict)
     return status
+
+
+def _judge(chapters: Sequence[Chapter], console: Console, *, strict: bool) -> int:
+    """Say how many bars are met; return the exit status."""
+    verdicts = [bar.met for chapter in chapters for bar in chapter.bars]
+    missed = verdicts.count(False)
+    said = [f"{missed} missed", f"{verdicts.count(True)} met"]
+    if unknown := verdicts.count(None):
+        said.append(f"{unknown} not measured here")
+    console.print(
+        f"bars: {', '.join(said)}", style="bold red" if missed else None, markup=False, highlight=False
+    )
+    return int(strict and missed > 0)
 
 
 def _measure(study: Study, arguments: argparse.Namespace, console: Console, *, prefix: str = "") -> Chapter:
@@ -321,6 +349,7 @@ def _measure(study: Study, arguments: argparse.Namespace, console: Console, *, p
         chapter = study.chapter(
             _options(study, arguments), lambda what: status.update(f"{prefix}{study.name}: {what}")
         )
+    chapter = replace(chapter, command=_command(chapter.command, _options(study, arguments)))
     print_chapter(chapter, console)
     console.print(f"{study.name} took {time.perf_counter() - begin:.0f} s\n", style="dim", highlight=False)
     return chapter
@@ -332,7 +361,19 @@ def _options(study: Study, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"quick": arguments.quick, **{name: value for name, value in given.items() if value is not None}}
 
 
-def _failed(study: Study, error: Exception, console: Console, *, quick: bool) -> Chapter:
+def _command(said: str, options: Mapping[str, Any]) -> str:
+    """Return a chapter's command with the options that were given and that it does not say itself."""
+    words = shlex.split(said)
+    for name, value in sorted(options.items()):
+        option = f"--{name}"
+        if name == "quick":
+            words += [option] if value and option not in words else []
+        elif option not in words:
+            words += [option, str(value)]
+    return shlex.join(words)
+
+
+def _failed(study: Study, error: Exception, arguments: argparse.Namespace, console: Console) -> Chapter:
     """Say why something could not be measured, and return a chapter of that."""
     from neurosim_core.bench.report import Bar, Chapter
 
@@ -343,7 +384,7 @@ def _failed(study: Study, error: Exception, console: Console, *, quick: bool) ->
         name=study.name,
         title=f"{study.name}: failed",
         summary=f"**This could not be measured.** {study.description}\n\n```\n{trace}```",
-        command=f"neurosim bench {study.name}{' --quick' if quick else ''}",
+        command=_command(f"neurosim bench {study.name}", _options(study, arguments)),
         bars=[Bar(text="it can be measured", measured=reason, met=False)],
     )
 

@@ -74,6 +74,7 @@ def test_every_question_has_help(name, capsys):
         folder = "report" if name == "all" else name
         assert f"--out DIR where to leave files (./{folder})" in said
         assert "--quick" in said
+        assert "--strict exit with status 1 if a bar is missed" in said
 
 
 def test_help_is_fast():
@@ -98,6 +99,57 @@ def test_one_report_of_all(studies, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "met one is good: very" in said
     assert re.search(r"left in .*report.html", " ".join(said.split()))
+
+
+def missed(name):
+    def measure(options, progress):
+        bars = [Bar(text="it is", measured="not", met=False), Bar(text="it was", measured="?", met=None)]
+        return replace(chapter_of(name, options["quick"]), bars=bars)
+
+    return Study(name=name, help="", description="", chapter=measure)
+
+
+@pytest.mark.parametrize("what", ["low", "all"])
+def test_bars_that_are_missed_are_counted_and_fail_only_where_asked(what, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(commands, "STUDIES", (missed("low"),))
+    assert cli.main(["bench", what, "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "bars: 1 missed, 0 met, 1 not measured here"
+    assert cli.main(["bench", what, "--strict", "--out", str(tmp_path)]) == 1
+    assert "**This could not" not in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+def test_strict_is_content_where_all_bars_are_met(studies, tmp_path, capsys):
+    studies("one", "two")
+    assert cli.main(["bench", "all", "--strict", "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "bars: 0 missed, 2 met"
+
+
+def test_a_chapter_says_with_which_options_it_was_measured(monkeypatch, tmp_path):
+    """Those that it names itself are not said twice; names of files are quoted for a shell."""
+
+    def study(name, said):
+        def measure(_options, _progress):
+            return replace(chapter_of(name, True), command=f"neurosim bench {name}{said}")
+
+        options = frozenset({"device", "scene", "width"})
+        return Study(name=name, help="", description="", chapter=measure, options=options)
+
+    def fails(name):
+        return replace(study(name, ""), chapter=fail)
+
+    monkeypatch.setattr(
+        commands,
+        "STUDIES",
+        (study("one", ""), study("two", " --quick --device cpu --width 64"), fails("bad")),
+    )
+    given = ["--quick", "--device", "cpu", "--scene", "my house.glb"]
+    assert cli.main(["bench", "all", *given, "--out", str(tmp_path)]) == 1
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert re.findall(r"^`(neurosim .*)`$", text, re.M) == [
+        "neurosim bench one --device cpu --quick --scene 'my house.glb'",
+        "neurosim bench two --quick --device cpu --width 64 --scene 'my house.glb'",
+        "neurosim bench bad --device cpu --quick --scene 'my house.glb'",
+    ]
 
 
 def test_what_fails_is_told_and_the_others_go_on(studies, tmp_path, capsys):
