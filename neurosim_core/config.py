@@ -49,7 +49,8 @@ class VehicleConfig(Settings):
     """rkmk4: fixed steps, and adaptive ones for intervals that these cannot resolve. dormand_prince: adaptive
     steps only."""
     collision_radius_m: Annotated[float, Field(gt=0.0)] = 0.2
-    """Radius of the sphere around the vehicle that must not touch the scene [m]."""
+    """Radius of the sphere around the vehicle that must not touch the scene [m]. Where `parameters.ground`
+    is set, the sphere shrinks near that plane to end 1 cm above it: to land is no collision."""
     on_collision: Literal["end", "report"] = "end"
     """end: the run stops at the first touch; report: it flies on, through things, and yields Collision
     packets."""

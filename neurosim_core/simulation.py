@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
@@ -798,8 +799,13 @@ def _fly(
                 imu.measure(place)
         if closed_loop and boundary.control:
             state.controller.update(state.vehicle.arrays)
+    ground = state.vehicle.config.ground
     state.trace.check_room(
-        model.free_space.arrays, slot, len(stretch), radius_m=model.config.vehicle.collision_radius_m
+        model.free_space.arrays,
+        slot,
+        len(stretch),
+        radius_m=model.config.vehicle.collision_radius_m,
+        ground_height_m=-math.inf if ground is None else ground.height_m,
     )
     state.trace.fetch(slot, len(stretch))
     for copy in itertools.chain.from_iterable(state.imu_copies.values()):

@@ -1,6 +1,7 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type"
 """The states of the vehicles at the boundaries of batches, on the device until a batch is read back."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -111,7 +112,7 @@ class Trace:
         self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
         self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance, self.redone)]
         self._recording: tuple[Any, Any] = (None, None)
-        self._room_checks: dict[tuple[int, int, float], tuple[DistanceField, wp.Launch]] = {}
+        self._room_checks: dict[tuple[int, int, float, float], tuple[DistanceField, wp.Launch]] = {}
         self._pose_launches: dict[tuple[int, int, int, int], tuple[Any, wp.Launch]] = {}
 
     def record(self, arrays: Any, slot: int) -> None:
@@ -145,7 +146,15 @@ class Trace:
         launch.set_param_at_index(_SLOT_PARAMETER, slot)
         launch.launch()
 
-    def check_room(self, field: DistanceField, first: int, count: int, *, radius_m: float) -> None:
+    def check_room(
+        self,
+        field: DistanceField,
+        first: int,
+        count: int,
+        *,
+        radius_m: float,
+        ground_height_m: float = -math.inf,
+    ) -> None:
         """Write how much room vehicle 0 has in some slots to `clearance`; see `freespace.check_collision`.
 
         Args:
@@ -153,8 +162,9 @@ class Trace:
             first: First slot.
             count: Number of slots, at least one.
             radius_m: Of the vehicle [m].
+            ground_height_m: z of the plane that it may land on [m]; -inf: none.
         """
-        key = (first, count, radius_m)
+        key = (first, count, radius_m, ground_height_m)
         if key not in self._room_checks or self._room_checks[key][0] is not field:
             stride = self.states.strides[0]
             positions: Any = wp.array(
@@ -165,7 +175,9 @@ class Trace:
                 device=self.states.device,
             )
             room = self.clearance[first : first + count]
-            launch = collision_check(field, positions, room, radius_m=radius_m)
+            launch = collision_check(
+                field, positions, room, radius_m=radius_m, ground_height_m=ground_height_m
+            )
             if len(self._room_checks) >= _LAUNCHES_MAX:
                 self._room_checks.clear()
             self._room_checks[key] = (field, launch)

@@ -159,12 +159,16 @@ def _mesh_distances(
     distance_out[sample] = mesh_distance(mesh, points[sample], reach)
 
 
+_GROUND_SLACK_M = wp.constant(wp.float32(0.01))  # how far a floor may be above the plane meant by it
+
+
 @wp.kernel
 def _check_collision(
     # Model:
     field: DistanceField,
     radius_m: float,
     exact_below: float,
+    ground_height_m: wp.float64,
     # In:
     position: wp.array[wp.vec3d],
     # Out:
@@ -173,10 +177,18 @@ def _check_collision(
     vehicle = wp.tid()
     p = position[vehicle]
     point = wp.vec3(float(p[0]), float(p[1]), float(p[2]))
-    clearance_out[vehicle] = scene_distance(field, point, exact_below) - radius_m
+    radius = wp.min(radius_m, float(p[2] - ground_height_m) - _GROUND_SLACK_M)
+    clearance_out[vehicle] = scene_distance(field, point, exact_below) - radius
 
 
-def check_collision(field: DistanceField, position: Any, clearance: Any, *, radius_m: float) -> None:
+def check_collision(
+    field: DistanceField,
+    position: Any,
+    clearance: Any,
+    *,
+    radius_m: float,
+    ground_height_m: float = -math.inf,
+) -> None:
     """Write how much room spheres have around them; launches one kernel, allocates and reads back nothing.
 
     Args:
@@ -187,16 +199,25 @@ def check_collision(field: DistanceField, position: Any, clearance: Any, *, radi
             it touches. Exact (to float32 rounding) below one voxel, and a lower bound, above one voxel,
             elsewhere.
         radius_m: Of the spheres [m].
+        ground_height_m: z of a plane that may be landed on [m]: a sphere that would reach it is taken as one
+            that ends 1 cm above it. -inf: none.
     """
-    collision_check(field, position, clearance, radius_m=radius_m).launch()
+    collision_check(field, position, clearance, radius_m=radius_m, ground_height_m=ground_height_m).launch()
 
 
-def collision_check(field: DistanceField, position: Any, clearance: Any, *, radius_m: float) -> wp.Launch:
+def collision_check(
+    field: DistanceField,
+    position: Any,
+    clearance: Any,
+    *,
+    radius_m: float,
+    ground_height_m: float = -math.inf,
+) -> wp.Launch:
     """Return `check_collision` as a launch that can be made again and again; arguments as there."""
     launch: wp.Launch = wp.launch(
         _check_collision,
         dim=position.shape[0],
-        inputs=[field, radius_m, radius_m + field.voxel, position, clearance],
+        inputs=[field, radius_m, radius_m + field.voxel, ground_height_m, position, clearance],
         device=position.device,
         record_cmd=True,
     )

@@ -24,7 +24,7 @@ from neurosim_core.settings import Settings
 
 
 class GroundConfig(Settings):
-    """A horizontal plane that the vehicle can stand on."""
+    """A horizontal plane that the vehicle can stand on; to touch it is no collision."""
 
     height_m: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """z of the plane in W [m]."""

@@ -8,6 +8,8 @@ from multirotor_oracle import NO_AERO, angle, rotation_matrix, solve
 from pydantic import ValidationError
 from scipy.optimize import brentq
 
+from neurosim_core import load_config, simulation
+from neurosim_core.packets import Collision, Odometry
 from neurosim_core.vehicle import GroundConfig, Multirotor, MultirotorConfig, MultirotorState, preset
 
 MS = 1_000_000
@@ -204,6 +206,54 @@ def test_one_that_stands_does_not_touch_one_that_flies(device):
         single.step(np.full(4, 300.0), 30 * MS)
         for together, alone in zip(batch.state, single.state, strict=True):
             assert np.array_equal(together[index], alone[0])
+
+
+# In a run, with all other settings at their defaults
+
+
+def start_run(**start) -> tuple[simulation.Model, simulation.State]:
+    settings = {
+        "device": "cpu",
+        "duration_s": 6.0,
+        "scene": {"kind": "apartment", "rooms": 1},
+        "vehicle": {"parameters": {"ground": {"height_m": 0.0}}},
+        "path": {"kind": "hover"},
+        "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
+    }
+    model = simulation.make_model(load_config(settings))
+    return model, simulation.make_state(model, start=simulation.StartState(**start))
+
+
+def fly_run(model, state, speed_rad_s: float, until_s: float) -> list:
+    packets = []
+    while state.stamp_ns < until_s * 1e9 and not state.ended:
+        packets += simulation.step(model, state, np.full(4, speed_rad_s), mode="motor_speeds")
+    return packets
+
+
+def test_a_run_lands_rests_and_takes_off():
+    """From hover to the floor, motors off: feet carry the weight, and it is no collision."""
+    model, state = start_run()
+    packets = fly_run(model, state, 0.0, 3.0)
+    assert not any(isinstance(packet, Collision) for packet in packets)
+    assert state.stamp_ns == 3_000 * MS
+    rest = [packet for packet in packets if isinstance(packet, Odometry)][-1]
+    sunk = MASS * GRAVITY / (4.0 * GroundConfig().stiffness_n_m)
+    foot_m = HUMMINGBIRD.rotor_position_m[0][2] - 0.05
+    assert rest.position[2] == pytest.approx(-foot_m - sunk, abs=1e-5)
+    assert np.linalg.norm(rest.velocity) < 1e-3
+    hover = HUMMINGBIRD.hover_rotor_speed_rad_s
+    packets = fly_run(model, state, 1.1 * hover, 4.0)
+    assert not any(isinstance(packet, Collision) for packet in packets)
+    assert packets[-1].position[2] > 0.4
+
+
+def test_walls_still_end_a_run_with_a_ground():
+    model, state = start_run(velocity=(5.0, 0.0, 0.0))
+    packets = fly_run(model, state, HUMMINGBIRD.hover_rotor_speed_rad_s, 5.0)
+    assert isinstance(packets[-1], Collision)
+    assert packets[-1].position[2] > 0.3
+    assert state.ended
 
 
 def test_high_above_the_ground_nothing_changes(device):
