@@ -19,6 +19,7 @@ from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
 from neurosim_core.scene.bodies import BodyConfig, make_bodies
 from neurosim_core.scene.scene import Material, Scene
+from neurosim_core.sensors import displacement
 from neurosim_core.sensors.displacement import DisplacementRule
 
 RATE = Rate(1000.0)
@@ -242,6 +243,23 @@ def test_the_choice_does_not_depend_on_how_a_flight_is_cut(arrays, cuts):
     whole = choose(make_rule(arrays), states, forced={77})
     assert choose(make_rule(arrays), states, cuts=sorted(cuts), forced={77}) == whole
     assert 20 < len(whole) < 120
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["still", "body"])
+def test_the_choice_does_not_depend_on_what_a_cpu_does_at_once(arrays, moving, monkeypatch):
+    """Blocks of ticks, ticks that are compared ahead, and threads are a matter of cost."""
+    if moving:
+        arrays = with_body(size_m=(0.3, 0.2, 0.02), position_m=(0.1, 0.0, 1.0), spin_rad_s=(0.0, 0.0, 3.0))
+    states = flight(300, v_W=(0.3, -0.2, 0.5), w_B=(0.2, 0.4, -0.1))
+    found = []
+    for block, ahead_min, split_min in ((128, 2, 1 << 14), (300, 300, 1), (64, 1, 1), (7, 16, 1 << 14)):
+        monkeypatch.setattr(displacement, "_BLOCK_ON_CPU", block)
+        monkeypatch.setattr(displacement, "_AHEAD_MIN", ahead_min)
+        monkeypatch.setattr(displacement, "_SPLIT_MIN", split_min)
+        rule = make_rule(arrays)
+        found.append((choose(rule, states, forced={77, 78}), rule.coarse_count))
+    assert found.count(found[0]) == len(found)
+    assert 20 < len(found[0][0]) < 200
 
 
 def test_the_bound_holds_for_every_pixel_of_a_cluttered_scene():
