@@ -295,51 +295,37 @@ class Publisher(Generic[T]):
         if not reader.request.strict:
             pipe.offer(frame)
             return True
-        backoff = Backoff(reader.timeout_s)
-        blocked = False
-        try:
-            while True:
-                try:
-                    pipe.send(frame)
-                except zmq.Again:
-                    pass
-                else:
-                    reader.late = False
-                    return True
-                if reader.late:
-                    return False
-                if not blocked:
-                    blocked = True
-                    self._block()
-                self._lock.release()
-                try:
-                    more = backoff.wait()
-                finally:
-                    self._lock.acquire()
-                self._check_open()
-                self._outlets.refresh()
-                if reader.key not in self._readers:
-                    return True
-                if not more:
-                    if not self._timeouts:
-                        self._outlets.note(
-                            f"{self.topic}: a reliable subscriber was too late and lost a message"
-                        )
-                    reader.late = True
-                    return False
-        finally:
-            if blocked:
-                self._blocked = False
+
+        def send() -> bool:
+            try:
+                pipe.send(frame)
+            except zmq.Again:
+                return reader.key not in self._readers  # it has left
+            return True
+
+        reader.late = not send() and (reader.late or not self._await_room(send, reader.timeout_s))
+        return not reader.late
 
     def _send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
         """Send, waiting for the slowest reliable reader; the lock is held, and let go while sleeping."""
-        if outlet.try_send(frame, flags):
+
+        def send() -> bool:
+            return outlet.try_send(frame, flags)
+
+        readers = [r for r in self._readers.values() if r.outlet is outlet and r.pipe is None]
+        if send() or self._await_room(send, max((r.timeout_s for r in readers), default=0.0)):
             return True
-        strict = [r.timeout_s for r in self._readers.values() if r.outlet is outlet]
-        backoff = Backoff(max(strict, default=0.0))
+        self._late[outlet] = self._gate.sequence
+        self._route()
+        outlet.send_anyway(frame, flags)
+        return False
+
+    def _await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
+        """Try to send until it works, or for so long; the lock is held, and let go while sleeping."""
+        backoff = Backoff(timeout_s)
         self._block()
         try:
-            while not outlet.try_send(frame, flags):
+            while not send():
                 self._lock.release()
                 try:
                     more = backoff.wait()
@@ -352,9 +338,6 @@ class Publisher(Generic[T]):
                         self._outlets.note(
                             f"{self.topic}: a reliable subscriber was too late and lost a message"
                         )
-                    self._late[outlet] = self._gate.sequence
-                    self._route()
-                    outlet.send_anyway(frame, flags)
                     return False
         finally:
             self._blocked = False
