@@ -85,6 +85,27 @@ def model() -> Model:
     return make_model(load_config(SETTINGS))
 
 
+@pytest.fixture(scope="module")
+def rough() -> Model:
+    """Gusty air over a ground that is never touched, and a noisy camera that leaves out ticks."""
+    return make_model(
+        load_config(
+            SETTINGS,
+            overrides={
+                "vehicle.integrator": "dormand_prince",
+                "vehicle.parameters": {
+                    "turbulence": {"wind_20ft_m_s": 15.4},
+                    "gusts": [{"velocity_m_s": [1.0, 0.5, 0.0], "start_s": 0.05, "rise_s": 0.1}],
+                    "ground": {"height_m": 0.0, "rotor_radius_m": 0.1},
+                },
+                "sensors.events.pixel": {"preset": "v2e_noisy", "refractory_s": 1e-3},
+                "sensors.events.sampling_rate_hz": 2000,
+                "sensors.events.max_displacement_px": 0.5,
+            },
+        )
+    )
+
+
 def changed(model: Model, **overrides: Any) -> Model:
     """The same world under other settings."""
     return dataclasses.replace(model, config=load_config(SETTINGS, overrides=overrides))
@@ -241,6 +262,22 @@ def test_two_processes_fly_as_one(model, shared_runtime, tmp_path):
         assert content(listener.packets(expected)) == content(expected)
         said = [path.read_text() for path in sorted(tmp_path.glob("*.txt"))]
         assert [process.wait(SOON_S) for process in processes] == [0, 0], said
+
+
+def test_rough_air_and_a_noisy_camera_fly_as_in_one_process(rough, shared_runtime):
+    """Turbulence, gusts, ground, adaptive steps, an adaptive camera and every noise of a preset."""
+    state = make_state(rough)
+    expected = list(run_model(rough, state))
+    assert {"gusts", "turbulence", "ground"} <= set(state.vehicle.terms)
+    noisy = state.casts[0].events["events"].camera.terms
+    assert noisy == ("spread", "low_pass", "refractory", "leak", "spontaneous")
+    assert state.counts["ticks left out"] > 100
+    assert sum(len(p.t) for p in expected if p.sensor == "events") > 1000
+    with serving(rough) as result, Node("controller") as node:
+        listener = Listener(node)
+        with piloting(node, rough):
+            assert result() == 0
+        assert content(listener.packets(expected)) == content(expected)
 
 
 @contextlib.contextmanager
