@@ -78,7 +78,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="how numbers become light: srgb, bt709, linear, pq, ... (default: auto)",
     )
     parser.add_argument(
-        "--dark-floor", type=float, metavar="L", help="added before the logarithm; white is 1 (default: auto)"
+        "--dark-floor",
+        type=float,
+        metavar="L",
+        help="added before the logarithm; white is 1 (default: 0.001, or what it takes for a step of the "
+        "stored numbers to be half a threshold at most)",
     )
     parser.add_argument("--seed", type=int, help="seed of the noise of the pixels")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
@@ -97,6 +101,10 @@ def _convert(arguments: argparse.Namespace) -> int:
     from neurosim_core.signals import stop_at_signals
 
     config = read_config(arguments)
+    if arguments.out.suffix.lower() not in (".h5", ".hdf5") and not arguments.out.is_dir():
+        raise ValueError(
+            f"events are written as HDF5: {arguments.out.with_suffix('.h5')}, not {arguments.out}"
+        )
     console = Console()
     stop = threading.Event()
     columns = [
@@ -105,7 +113,7 @@ def _convert(arguments: argparse.Namespace) -> int:
         TextColumn("{task.fields[count]}"),
         TimeRemainingColumn(),
     ]
-    with stop_at_signals(stop), Progress(*columns, console=console) as progress:
+    with stop_at_signals(stop), Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("converting", total=None, count="")
 
         def on_start(source: Description) -> None:
@@ -140,19 +148,21 @@ def read_config(arguments: argparse.Namespace) -> ConversionConfig:
     from pydantic import ValidationError
 
     from neurosim_core.convert.convert import ConversionConfig
+    from neurosim_core.mistakes import explain
 
     given = {key: getattr(arguments, option) for option, key in _OPTIONS.items()}
     settings = {key: value for key, value in given.items() if value is not None}
+    more = read_settings(arguments.settings)
+    for option, key in _OPTIONS.items():
+        if key in settings and key in more:
+            raise ValueError(f"{key} is given twice: --{option.replace('_', '-')} and --set {key}=...")
+    settings |= more
+    if "time_unit" in settings and "timestamps" not in settings:
+        raise ValueError("--time-unit is that of --timestamps, which are not given")
     try:
-        return ConversionConfig.model_validate(_nested({**settings, **read_settings(arguments.settings)}))
+        return ConversionConfig.model_validate(_nested(settings))
     except ValidationError as error:
-        lines = (_explain(item) for item in error.errors())
-        raise ValueError("; ".join(lines)) from None
-
-
-def _explain(item: Mapping[str, Any]) -> str:
-    key = ".".join(map(str, item["loc"]))
-    return f"{key}: {item['msg'].removeprefix('Value error, ')}, got {item['input']!r}"
+        raise ValueError("; ".join(explain(ConversionConfig, error))) from None
 
 
 def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -187,6 +197,8 @@ def print_conversion(conversion: Conversion, out: Path, console: Console) -> Non
 
 
 def _facts(c: Conversion) -> list[tuple[str, str]]:
+    from neurosim_core.sensors.event_config import describe_pixel
+
     source, duration_s = c.source, 1e-9 * c.duration_ns
     whole = (c.crop.width, c.crop.height) == (source.width, source.height)
     part = "" if whole else f", of which {c.crop}"
@@ -199,7 +211,7 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
     return [
         ("source", f"{source.name}: {source.width}x{source.height}{part}; {source.light}"),
         ("frames", f"{c.frame_count:,} in {duration_s:.3f} s, {intervals}"),
-        ("sensor", f"{c.width}x{c.height}, threshold {c.threshold:g}, dark floor {c.dark_floor:g}"),
+        ("sensor", f"{c.width}x{c.height}, {describe_pixel(c.pixel)}, dark floor {c.dark_floor:g}"),
         (
             "events",
             f"{c.event_count:,} ({event_rate:.2f} M/s, {on_share:.0%} brighter), {c.dropped_count:,} dropped",
@@ -212,10 +224,11 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
 def _sampling(c: Conversion) -> str:
     if math.isnan(c.halved_loss) or math.isnan(c.burst_share):
         return "events between frames are interpolated; nothing moves"
+    slow = c.halved_loss > _HALVED_LOSS_MAX or c.burst_share > _BURST_SHARE_MAX
     return (
-        "events between frames are interpolated; without every second frame "
-        f"{max(c.halved_loss, 0.0):.0%} of them would be missing, and {c.burst_share:.0%} of the pixels that "
-        "fire in an interval do so four times or more"
+        f"{'too slow' if slow else 'fast enough'} for this motion: without every second frame "
+        f"{max(c.halved_loss, 0.0):.0%} of the events would be missing; {c.burst_share:.0%} of the pixels "
+        "that fire between two frames do so four times or more"
     )
 
 

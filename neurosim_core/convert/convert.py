@@ -45,6 +45,8 @@ SENSOR = "events"
 BURST_COUNT = 4
 """So many events of a pixel between two frames are many."""
 
+_STAMP_MAX_NS = 1 << 62
+_OTHER_UNIT = "are the times in another unit? --time-unit says which"
 _STACK_BYTES = 64_000_000
 _STACK_FRAMES_MAX = 32
 _CODE_STEP_MAX = 0.5
@@ -85,7 +87,7 @@ class ConversionConfig(Settings):
     @classmethod
     def _transfer_is_known(cls, name: str) -> str:
         if name not in ("auto", *TRANSFERS):
-            raise ValueError(f"transfer must be one of auto, {', '.join(TRANSFERS)}")
+            raise ValueError(f"must be one of auto, {', '.join(TRANSFERS)}, got {name!r}")
         return name
 
 
@@ -105,6 +107,8 @@ class Conversion:
     """Largest change of log radiance by one step of the stored numbers."""
     threshold: float
     """The smaller of the two thresholds, in log radiance."""
+    pixel: EventCameraConfig
+    """The law of the pixels."""
     frame_count: int
     duration_ns: int
     """From the first frame to the last."""
@@ -171,7 +175,8 @@ def convert_video(
     """Write the events of a video or a folder of pictures as the HDF5 file that `neurosim run` writes.
 
     Times count from the first frame. There is one packet of events for each interval between two frames.
-    What was converted stays in the file if there is an error or `stopped` says so, marked as not complete.
+    What was converted stays in the file if `stopped` says so, or if there is an error later than in the first
+    frames; after an error the file is marked as not complete.
 
     Args:
         path: A video of any kind that FFmpeg reads, or a folder of pictures.
@@ -210,10 +215,12 @@ def convert_video(
     stacks = _ahead(_stacks(source, plan))
     first = next(stacks)
     tally = _Tally()
+    _require_near(camera, source.description, tally, first)
     writer = FlightWriter(out, _header(source.description, config, plan, first))
-    complete = False
+    complete = closed = False
     try:
         for stack in itertools.chain([first], stacks):
+            _require_near(camera, source.description, tally, stack)
             packets = _see(camera, stack)
             for events in packets:
                 writer.write(events)
@@ -225,12 +232,16 @@ def convert_video(
                 break
         else:
             complete = True
+        closed = True
     finally:
         stacks.close()
-        writer.close(complete=complete)
+        writer.close(complete=closed)
+        if tally.frame_count == 0:
+            out.unlink()
     return tally.conversion(
         source.description,
         plan,
+        config.pixel,
         halved_loss=every_second.loss,
         wall_s=time.perf_counter() - begin,
         complete=complete,
@@ -364,6 +375,11 @@ def _in_order(source: Source, slow_motion: Fraction) -> Iterator[Frame]:
                 f" {source.description.name} is at {here_s:.9g} s, after {before_s:.9g} s;"
                 " --fps gives other times"
             )
+        if stamp_ns > _STAMP_MAX_NS:
+            raise ValueError(
+                f"frame {number} of {source.description.name} is {stamp_ns / NS_PER_S:.6g} s after the first:"
+                f" {_OTHER_UNIT}"
+            )
         last_ns = stamp_ns
         yield Frame(stamp_ns, frame.luminance)
 
@@ -379,6 +395,19 @@ def _see(camera: EventCamera, stack: _Stack) -> list[Events]:
     frames: Any = wp.array(log, dtype=wp.float32, device=camera.device, copy=False)
     camera.feed_device(frames, ends)
     return camera.collect_windows(ends)
+
+
+def _require_near(camera: EventCamera, source: Description, tally: _Tally, stack: _Stack) -> None:
+    """Raise ValueError if a stack reaches further than the camera can tell times apart."""
+    spans_ns = stack.stamps_ns - tally.end_ns
+    if spans_ns[-1] < camera.span_max_ns:
+        return
+    row = int(np.argmax(spans_ns >= camera.span_max_ns))
+    limit_s = camera.span_max_ns / NS_PER_S
+    raise ValueError(
+        f"frame {tally.frame_count + row} of {source.name} is {spans_ns[row] / NS_PER_S:.6g} s after frame"
+        f" {max(tally.frame_count - 1, 0)}, at most {limit_s:.4g} s are allowed: {_OTHER_UNIT}"
+    )
 
 
 class _EverySecond:
@@ -442,7 +471,14 @@ class _Tally:
             self._burst_count += int(np.count_nonzero(of_pixel >= BURST_COUNT))
 
     def conversion(
-        self, source: Description, plan: _Plan, *, halved_loss: float, wall_s: float, complete: bool
+        self,
+        source: Description,
+        plan: _Plan,
+        pixel: EventCameraConfig,
+        *,
+        halved_loss: float,
+        wall_s: float,
+        complete: bool,
     ) -> Conversion:
         return Conversion(
             source=source,
@@ -452,6 +488,7 @@ class _Tally:
             dark_floor=plan.dark_floor,
             code_step=plan.code_step,
             threshold=plan.threshold,
+            pixel=pixel,
             frame_count=self.frame_count,
             duration_ns=self.end_ns,
             interval_min_ns=self._intervals_ns[0],
@@ -480,7 +517,7 @@ def _header(source: Description, config: ConversionConfig, plan: _Plan, first: _
     rate_hz = (len(first.stamps_ns) - 1) * NS_PER_S / int(first.stamps_ns[-1])
     return FlightHeader(
         config_yaml=yaml.safe_dump(
-            {"conversion": {**seen, **config.model_dump(mode="json")}}, sort_keys=False
+            {"conversion": {**config.model_dump(mode="json"), **seen}}, sort_keys=False
         ),
         seed=config.seed,
         version=__version__,

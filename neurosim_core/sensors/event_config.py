@@ -145,6 +145,20 @@ class ReadoutConfig(Settings):
         return self
 
 
+def describe_pixel(pixel: EventCameraConfig) -> str:
+    """Return preset, thresholds and everything that departs from the ideal, by the keys that set it."""
+    parts = [] if pixel.preset is None else [pixel.preset]
+    if pixel.stochastic is not None:
+        parts.append(f"steps of about {1.0 / pixel.stochastic.k1:.3g}" if pixel.stochastic.k1 else "no steps")
+    else:
+        parts.append(f"thresholds {pixel.threshold_on:g} on, {pixel.threshold_off:g} off")
+    groups = ("threshold_spread", "low_pass", "leak", "shot_noise", "hot_pixels", "stochastic", "readout")
+    present = [name for name in groups if getattr(pixel, name) is not None]
+    if pixel.refractory_s > 0.0:
+        present.append("refractory_s")
+    return ", ".join([*parts, *(present or ["ideal"])])
+
+
 class EventCameraConfig(Settings):
     """An event camera, by default ideal: the same two thresholds in every pixel, no noise, no dead time.
 

@@ -205,6 +205,11 @@ class EventCamera:
         return self._require_reset()
 
     @property
+    def span_max_ns(self) -> int:
+        """How far frames may lie after the end of the last window [ns]; less with more pixels."""
+        return NS_PER_US << (63 - self._time_shift)
+
+    @property
     def window_start_ns(self) -> int:
         """Start of the window that is open [ns]."""
         return self._window_start_ns
@@ -297,8 +302,9 @@ class EventCamera:
             )
         if stamps[0] <= self._fed_ns:
             raise ValueError(f"stamps_ns must be later than {self._fed_ns}, got {stamps[0]}")
-        if (span_us := int(stamps[-1]) // NS_PER_US - self._origin_us) >> (63 - self._time_shift):
-            limit_s = (1 << (63 - self._time_shift)) / 1e6
+        span_us = int(stamps[-1]) // NS_PER_US - self._origin_us
+        if span_us * NS_PER_US >= self.span_max_ns:
+            limit_s = self.span_max_ns / 1e9
             raise ValueError(
                 f"stamps_ns must be within {limit_s:g} s of the last window, got {span_us / 1e6:g} s"
             )

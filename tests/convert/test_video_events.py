@@ -220,11 +220,65 @@ def test_bad_videos_are_refused_in_words(tmp_path):
         ValueError, match=r"increase by at least 1 us.* frame 1 of f is at 5e-07 s, after 0 s"
     ):
         convert(folder, tmp_path / "e.h5", fps=1e6, slow_motion=2.0)
-    with pytest.raises(ValueError, match="transfer must be one of auto, srgb"):
+    with pytest.raises(ValueError, match=r"must be one of auto, srgb.* got 'log'"):
         ConversionConfig(transfer="log")
     with pytest.raises(ValueError, match="size preset needs a preset"):
         convert(folder, tmp_path / "e.h5", fps=10.0, size="preset")
     assert not (tmp_path / "e.h5").exists()
+
+
+def test_times_in_another_unit_leave_nothing_behind(tmp_path):
+    """Microseconds that are read as seconds; the next try needs no --overwrite."""
+    folder = write_folder(tmp_path / "f", moving_pictures(3))
+    for last, said in (
+        ("9e8", r"frame 2 of f is 9e\+08 s after frame 0, at most"),
+        ("1e11", "after the first"),
+    ):
+        (tmp_path / "t.txt").write_text(f"0\n33333\n{last}")
+        with pytest.raises(ValueError, match=f"{said}.* --time-unit says which"):
+            convert(folder, tmp_path / "e.h5", timestamps=str(tmp_path / "t.txt"))
+        assert not (tmp_path / "e.h5").exists()
+
+
+def test_who_stops_it_keeps_a_whole_file(tmp_path):
+    folder = write_folder(tmp_path / "f", moving_pictures(6))
+    config = ConversionConfig(fps=10.0)
+    found = convert_video(
+        folder, tmp_path / "e.h5", config, device="cpu", stack_length=2, stopped=lambda: True
+    )
+    assert (found.complete, found.frame_count) == (False, 2)
+    with Flight(tmp_path / "e.h5") as flight:
+        assert flight.clean
+        assert flight.packet_count("events") == 1
+
+
+def test_the_file_has_what_was_decided(tmp_path):
+    """The dark floor that was chosen, and the part of the picture that was taken; again it is the same."""
+    folder = write_folder(tmp_path / "f", moving_pictures(5, width=40, height=30))
+    found, events = convert(folder, tmp_path / "a.h5", fps=10.0, size="16x16")
+    with Flight(tmp_path / "a.h5") as flight:
+        settings = yaml.safe_load(flight.header.config_yaml)["conversion"]
+    assert settings["dark_floor"] == found.dark_floor > 0.0
+    assert settings["crop"] == str(found.crop) == "30x30+5+0"
+    again = ConversionConfig(**{key: settings[key] for key in ConversionConfig.model_fields})
+    convert_video(folder, tmp_path / "b.h5", again, device="cpu")
+    assert same_events(events_of(tmp_path / "b.h5"), events)
+
+
+def test_the_summary_says_what_the_pixels_are(tmp_path, capsys):
+    folder = write_folder(tmp_path / "f", moving_pictures(3))
+    for preset, said in (
+        (
+            "davis346",
+            "davis346, thresholds 0.1337 on, 0.2029 off, threshold_spread, leak, readout, dark floor",
+        ),
+        ("voltmeter_dvs346", "voltmeter_dvs346, steps of about 0.19, stochastic, dark floor"),
+    ):
+        line = ["convert", str(folder), str(tmp_path / f"{preset}.h5"), "--fps", "10", "--preset", preset]
+        assert cli.main([*line, "--device", "cpu"]) == 0
+        assert said in " ".join(capsys.readouterr().out.split())
+    assert cli.main(["convert", str(folder), str(tmp_path / "e.txt"), "--fps", "10"]) == 1
+    assert f"events are written as HDF5: {tmp_path / 'e.h5'}" in capsys.readouterr().err
 
 
 def test_what_was_converted_before_a_bad_frame_is_kept(tmp_path):
@@ -279,7 +333,21 @@ def test_the_command_replaces_nothing_unless_told_to(tmp_path, capsys):
     ("given", "said"),
     [
         (["--preset", "dvs"], "pixel: unknown preset 'dvs', known: dvs128"),
-        (["--set", "pixel.threshold=1"], "pixel.threshold: Extra inputs are not permitted, got 1"),
+        (
+            ["--set", "pixel.threshold=1"],
+            "pixel.threshold: unknown key; did you mean 'threshold_on'? known: ",
+        ),
+        (
+            ["--set", "pixel.leak.rate=1"],
+            "pixel.leak.rate: unknown key; did you mean 'rate_hz'? known: rate_hz",
+        ),
+        (["--set", "pixel.leak=1"], "pixel.leak: must be keys with values, such as {rate_hz: 0.1"),
+        (["--transfer", "log"], "neurosim: transfer: must be one of auto, srgb"),
+        (["--time-unit", "us"], "--time-unit is that of --timestamps, which are not given"),
+        (
+            ["--dark-floor", "0.1", "--set", "dark_floor=0.2"],
+            "dark_floor is given twice: --dark-floor and --set",
+        ),
         (["--slow-motion", "0"], "slow_motion: Input should be greater than 0, got 0.0"),
         (["--set", "seed.x=1", "--seed", "3"], "seed.x: seed is 3, and has no keys"),
         (["--size", "9x9000"], "size must be at most the 24x10 pixels there are (pictures are made smaller"),
