@@ -24,7 +24,7 @@ from neurosim_core.vehicle.surroundings import Surroundings
 
 GUARD_ABSOLUTE = 1e-3
 """Guard: largest embedded error estimate of one step at rest [m/s, rad/s]."""
-GUARD_RELATIVE = 1e-2
+GUARD_RELATIVE = 2e-3
 """Guard: largest embedded error estimate of one step as a share of speed and body rate."""
 GUARD_CONTACT = 1e4
 """How many times tighter the guard is while a foot is in the ground: forces have kinks there."""

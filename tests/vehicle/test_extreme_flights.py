@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from multirotor_oracle import NO_AERO, angle, solve
 
-from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorState, preset
+from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 HOLD_NS = 10_000_000
 STORM = {"wind_m_s": (100.0, 0.0, 0.0), "parasitic_drag_kg_m": (5e-3, 5e-3, 1e-2)}
@@ -38,7 +38,7 @@ def about_hover(vehicle: Multirotor, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("mass_kg", "redone"), [(3e-2, 0), (3e-3, 0), (3e-4, 1), (3e-5, 1), (3e-6, 1)], ids=str
+    ("mass_kg", "redone"), [(3e-2, 0), (3e-3, 1), (3e-4, 1), (3e-5, 1), (3e-6, 1)], ids=str
 )
 def test_light_vehicles_in_a_storm(mass_kg, redone, device):
     """Blown from rest to 100 m/s, in up to a microsecond: only the first hold is beyond fixed steps."""
@@ -47,6 +47,66 @@ def test_light_vehicles_in_a_storm(mass_kg, redone, device):
     assert position < 1e-5
     assert attitude < 1e-6
     assert vehicle.effort.redone_count.tolist() == [redone]
+
+
+def tightly(config: MultirotorConfig, device: str) -> Multirotor:
+    """The same in adaptive steps alone, far below what is asked; against the oracle in `test_adaptive`."""
+    return Multirotor(config, device=device, integrator="dormand_prince", rtol=1e-12, atol=1e-14)
+
+
+def silent_error(config: MultirotorConfig, device: str) -> tuple[float, int]:
+    """Largest position error over 5 holds [m], and how many of them were redone."""
+    vehicle, exact = Multirotor(config, device=device), tightly(config, device)
+    error = 0.0
+    for command in about_hover(vehicle, 5):
+        for craft in (vehicle, exact):
+            craft.step(command, HOLD_NS)
+        error = max(error, float(np.linalg.norm(vehicle.state.position - exact.state.position)))
+    return error, int(vehicle.effort.redone_count[0])
+
+
+@pytest.mark.parametrize("airframe", ["crazyflie", "hummingbird"])
+def test_no_mass_between_is_silently_off(airframe, device):
+    """Fixed steps are worst just above the mass at which the guard trips, so the masses lie 3 % apart."""
+    errors, counts = [], []
+    for mass_kg in np.geomspace(3e-6, 0.5, 400):
+        error, redone = silent_error(preset(airframe, mass_kg=mass_kg, **STORM), device)
+        errors.append(error)
+        counts.append(redone)
+    assert max(errors) < 5e-6
+    assert counts[0] > 0
+    assert counts[-1] == 0
+
+
+@pytest.mark.parametrize("airframe", ["crazyflie", "hummingbird"])
+def test_just_above_the_mass_that_trips_the_guard(airframe, device):
+    """Found by bisection, and flown against the oracle."""
+    trips_kg, passes_kg = 1e-4, 0.5
+    while passes_kg > 1.0001 * trips_kg:
+        mass_kg = float(np.sqrt(trips_kg * passes_kg))
+        vehicle = Multirotor(preset(airframe, mass_kg=mass_kg, **STORM), device=device)
+        vehicle.step(about_hover(vehicle, 1)[0], HOLD_NS)
+        if vehicle.effort.redone_count[0] > 0:
+            trips_kg = mass_kg
+        else:
+            passes_kg = mass_kg
+    for mass_kg, redone in ((trips_kg, 1), (passes_kg, 0)):
+        vehicle = Multirotor(preset(airframe, mass_kg=mass_kg, **STORM), device=device)
+        position, attitude = largest_errors(vehicle, about_hover(vehicle, 5))
+        assert vehicle.effort.redone_count[0] == redone
+        assert position < 5e-6
+        assert attitude < 1e-6
+
+
+@pytest.mark.parametrize("parameter", ["inertia", "lag"])
+def test_no_inertia_nor_lag_between_is_silently_off(parameter, device):
+    inertia = np.array(preset("crazyflie").inertia_kg_m2)
+    for share in np.geomspace(1e-6, 1.0, 150):
+        if parameter == "inertia":
+            config = preset("crazyflie", inertia_kg_m2=tuple(map(tuple, (share * inertia).tolist())))
+        else:
+            config = preset("hummingbird", motor_time_constant_s=0.1 * share)
+        assert silent_error(config, device)[0] < (1e-6 if parameter == "inertia" else 1e-8)
 
 
 def test_next_to_no_inertia(device):
