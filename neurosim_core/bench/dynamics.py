@@ -20,12 +20,14 @@ from neurosim_core.bench.dynamics_extremes import (
     measure_trials,
     motor,
 )
+from neurosim_core.bench.dynamics_inputs import measure_inputs
 from neurosim_core.bench.dynamics_long import (
     STAMPS_S,
     STEP_S,
     Drift,
     measure_formats,
     measure_hover,
+    measure_spinning_hover,
     measure_top,
 )
 from neurosim_core.bench.dynamics_methods import (
@@ -42,6 +44,7 @@ from neurosim_core.bench.dynamics_precision import STEPS_S, TOLERANCES, Sample, 
 from neurosim_core.bench.dynamics_reference import FreeTop, make_reference
 from neurosim_core.bench.dynamics_result import DynamicsResult, Extreme, PeerSample, SolvedFlight, StiffMotor
 from neurosim_core.bench.dynamics_scenes import SCENES, flight_errors
+from neurosim_core.bench.dynamics_sweep import AT_ONCE, SWEEPS, Sweep, measure_sweep
 from neurosim_core.bench.dynamics_throughput import (
     WAYS,
     Pruning,
@@ -77,6 +80,8 @@ class Extent:
     """CPU time that RotorPy gets for a stiff or extreme flight [s]."""
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     """Which extreme flights."""
+    sweep_count: int = 200
+    """Flights of each sweep; twice as many at random."""
     check_extremes: bool = True
     """Check the references of stiff and extreme flights with a second solver."""
     hover_stamps_s: tuple[int, ...] = STAMPS_S
@@ -96,6 +101,7 @@ QUICK = Extent(
     peer_repetitions=1,
     time_constants_s=(1e-1, 1e-3, 1e-4, 1e-6, 0.0),
     stiff_peer_cpu_s=0.0,
+    sweep_count=25,
     check_extremes=False,
     hover_stamps_s=(1, 10, 100, 3600),
     top_stamps_s=(1, 10, 100, 600),
@@ -134,6 +140,8 @@ def measure_dynamics(
         motors=_motors(extent, say),
         extremes=extremes,
         refusals=refusals,
+        sweeps=_sweeps(extent, say),
+        answers=measure_inputs(),
         drifts=_drifts(extent, say),
         throughputs=_throughputs(extent, say),
         prunings=_prunings(extent, say),
@@ -250,11 +258,20 @@ def _extremes(extent: Extent, say: Progress) -> tuple[tuple[Extreme, ...], tuple
     return tuple(extremes), tuple(refusals)
 
 
+def _sweeps(extent: Extent, say: Progress) -> tuple[Sweep, ...]:
+    sweeps = []
+    for name in (*SWEEPS, AT_ONCE):
+        say(name)
+        sweeps.append(measure_sweep(name, extent.sweep_count * (2 if name == AT_ONCE else 1)))
+    return tuple(sweeps)
+
+
 def _drifts(extent: Extent, say: Progress) -> tuple[Drift, ...]:
     drifts = []
     for method, setting in ((RKMK4, STEP_S), (DORMAND_PRINCE, 1e-6)):
         say(f"long hover with {method.name}")
         drifts.append(measure_hover(method, setting, extent.hover_stamps_s))
+        drifts.append(measure_spinning_hover(method, setting, extent.hover_stamps_s))
     tops = ((EULER, STEP_S), (MIDPOINT, STEP_S), (RK4, STEP_S), (RKMK4, STEP_S), (DORMAND_PRINCE, 1e-10))
     for method, setting in tops:
         say(f"free top with {method.name}")

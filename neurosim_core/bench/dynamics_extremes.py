@@ -109,6 +109,27 @@ def motor(time_constant_s: float) -> Flight:
     return _flight("motor", preset("hummingbird", motor_time_constant_s=time_constant_s))
 
 
+def several(seed: int) -> Flight:
+    """Return a vehicle with all that is extreme at once, drawn in equal ratios, the seed deciding which.
+
+    Mass 3 mg to 0.5 kg, wind 1 to 100 m/s, motors 1 us to 0.1 s, inertia 1e-4 to 1 times its own, drag 0.1 to
+    10 times a hummingbird's.
+    """
+    rng = np.random.default_rng(seed)
+    name = ("crazyflie", "hummingbird")[seed % 2]
+    drag = 10.0 ** rng.uniform(-1.0, 1.0) * np.array(preset("hummingbird").parasitic_drag_kg_m)
+    inertia = 10.0 ** rng.uniform(-4.0, 0.0) * np.array(preset(name).inertia_kg_m2)
+    config = preset(
+        name,
+        mass_kg=10.0 ** rng.uniform(-5.5, -0.3),
+        wind_m_s=(10.0 ** rng.uniform(0.0, 2.0), 0.0, 0.0),
+        motor_time_constant_s=10.0 ** rng.uniform(-6.0, -1.0),
+        inertia_kg_m2=tuple(map(tuple, inertia.tolist())),
+        parasitic_drag_kg_m=tuple(drag.tolist()),
+    )
+    return _flight("several", config)
+
+
 def _flight(name: str, config: MultirotorConfig, **start: object) -> Flight:
     commands = random_commands(config, _COUNT, share=0.1, seed=7)
     return Flight(name=name, config=config, start=at_rest(config, **start), commands=commands)
@@ -122,11 +143,16 @@ CASES = (
         )
         for label, mass_kg in (
             ("30 g", 3e-2),
+            ("5.3 g", 5.3e-3),
             ("3 g", 3e-3),
             ("0.3 g", 3e-4),
             ("30 mg", 3e-5),
             ("3 mg", 3e-6),
         )
+    ),
+    Case(
+        name="mass 9.5 g, the same with a hummingbird's rotors",
+        make=functools.partial(light, "hummingbird", 9.5e-3),
     ),
     Case(
         name="mass 3 mg, the same with a hummingbird's rotors",

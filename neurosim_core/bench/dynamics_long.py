@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-call,attr-defined"
-"""An hour of hover, of a free top and of a spin: what drifts and how far; float64 against float32."""
+"""An hour of hover, still and turning, and of a free top: what drifts; float64 against float32."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Drift:
     """How far one method has drifted at each stamp; NaN where it was lost."""
 
     run: str
-    """hover, free top or spin."""
+    """hover, spinning hover, free top or spin."""
     method: str
     stamps_s: tuple[int, ...]
     """[s]."""
@@ -81,6 +81,35 @@ def measure_hover(method: Method, setting: float, stamps_s: Sequence[int]) -> Dr
         cpu_s=cpu_s,
         failure=failure,
     )
+
+
+def measure_spinning_hover(method: Method, setting: float, stamps_s: Sequence[int]) -> Drift:
+    """Hover while turning about the vertical at 29 rad/s, without drag, which would slow the turn.
+
+    No fixed point: attitude and the forces in W are rounded anew in each step. In closed form the body stays
+    where it is and turns evenly.
+    """
+    without = {"rotor_drag_kg": 0.0, "rotor_inflow_kg": 0.0, "translational_lift_kg_m": 0.0}
+    config = preset("hummingbird", parasitic_drag_kg_m=(0.0, 0.0, 0.0), **without)
+    start = at_rest(config, body_rate=np.array([0.0, 0.0, _SPIN_RAD_S]))
+    states, cpu_s, failure = _run(method, setting, config, start, stamps_s)
+    return Drift(
+        run="spinning hover",
+        method=method.name,
+        stamps_s=tuple(stamps_s),
+        position_m=tuple(float(np.linalg.norm(s.position)) for s in states),
+        attitude_rad=tuple(
+            float(attitude_errors(s.orientation, _turned(stamp_s)))
+            for stamp_s, s in zip(stamps_s, states, strict=True)
+        ),
+        cpu_s=cpu_s,
+        failure=failure,
+    )
+
+
+def _turned(stamp_s: int) -> Array:
+    half = 0.5 * math.remainder(_SPIN_RAD_S * stamp_s, 2.0 * math.tau)
+    return np.array([0.0, 0.0, math.sin(half), math.cos(half)])
 
 
 def measure_top(method: Method, setting: float, stamps_s: Sequence[int], top: FreeTop) -> Drift:
@@ -182,8 +211,7 @@ def _measure_format(scalar: Any, dtype: Any, step_s: float, stamps_s: Sequence[i
             launch.launch()
         stamp_s = end_s
         distances.append(float(np.linalg.norm(position.numpy()[0].astype(np.float64))))
-        half = 0.5 * math.remainder(_SPIN_RAD_S * end_s, 2.0 * math.tau)
-        exact = np.array([0.0, 0.0, math.sin(half), math.cos(half)])
+        exact = _turned(end_s)
         q = orientation.numpy()[0].astype(np.float64)
         angles.append(float(attitude_errors(q / np.linalg.norm(q), exact)))
     return Drift(

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from neurosim_core.bench.dynamics_extremes import Refusal, Trial
+from neurosim_core.bench.dynamics_inputs import Answer
 from neurosim_core.bench.dynamics_long import Drift
 from neurosim_core.bench.dynamics_precision import OrderFit, Sample
 from neurosim_core.bench.dynamics_reference import Reference
 from neurosim_core.bench.dynamics_scenes import Errors, Flight
+from neurosim_core.bench.dynamics_sweep import Sweep
 from neurosim_core.bench.dynamics_throughput import Pruning, Throughput
 
 
@@ -69,6 +71,8 @@ class DynamicsResult:
     motors: tuple[StiffMotor, ...]
     extremes: tuple[Extreme, ...]
     refusals: tuple[Refusal, ...]
+    sweeps: tuple[Sweep, ...]
+    answers: tuple[Answer, ...]
     drifts: tuple[Drift, ...]
     throughputs: tuple[Throughput, ...]
     prunings: tuple[Pruning, ...]

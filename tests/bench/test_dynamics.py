@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 from neurosim_core.bench import rotorpy_peer
@@ -12,6 +13,7 @@ from neurosim_core.bench.chapter import cell, cells
 from neurosim_core.bench.dynamics import QUICK, dynamics_chapter, measure_dynamics
 from neurosim_core.bench.dynamics_methods import DORMAND_PRINCE, EULER, FIXED_STEP, MIDPOINT, RK4, RKMK4
 from neurosim_core.bench.dynamics_result import DynamicsResult
+from neurosim_core.bench.dynamics_sweep import AT_ONCE, SWEEPS
 from neurosim_core.bench.figures import draw_plot
 
 SMALL = dataclasses.replace(
@@ -27,6 +29,7 @@ SMALL = dataclasses.replace(
         "inertia 1:10:100, 200 rad/s",
         "pitch through 90 degrees at 20 rad/s",
     ),
+    sweep_count=12,
     hover_stamps_s=(1, 10),
     top_stamps_s=(1, 10),
     formats_stamps_s=(1, 10),
@@ -116,6 +119,9 @@ def test_extremes_and_refusals(result):
 def test_long_runs(result):
     by_run = {(d.run, d.method): d for d in result.drifts}
     assert by_run["hover", RKMK4.name].position_m[-1] < 1e-10
+    turning = by_run["spinning hover", RKMK4.name]
+    assert 0.0 < turning.position_m[-1] < 1e-10  # no fixed point: rounding moves it
+    assert turning.attitude_rad[-1] < 1e-9
     top = by_run["free top", RKMK4.name]
     assert top.attitude_rad[-1] < 3e-8  # 7.5e-9 after 10 s
     assert top.energy[-1] < 1e-9
@@ -164,7 +170,7 @@ def test_tables_name_only_columns_that_they_have(chapter):
 
 def test_bars_are_judged_by_what_was_measured(chapter, result):
     verdicts = {bar.text: bar for bar in chapter.bars}
-    assert len(verdicts) == 10
+    assert len(verdicts) == 12
     flip = verdicts["flip at 1 ms: position error <= 1e-10 m"]
     assert flip.met
     assert cell(result.sample("flip", RKMK4.name, 1e-3).errors.position_m) in flip.measured
@@ -172,6 +178,48 @@ def test_bars_are_judged_by_what_was_measured(chapter, result):
     assert not hover.met  # it was not an hour
     extremes = next(bar for text, bar in verdicts.items() if "extreme" in text)
     assert "inertia 1:10:100" in extremes.measured
+
+
+def test_sweeps_are_fine_and_judged(chapter, result):
+    rows = {row["sweep"]: row for row in table(chapter, "dynamics-sweep").rows}
+    assert [*rows] == [*SWEEPS, AT_ONCE]
+    for sweep in result.sweeps:
+        assert len(sweep.values) == SMALL.sweep_count * (2 if sweep.name == AT_ONCE else 1)
+        assert rows[sweep.name]["worst_m"] == np.nanmax(sweep.position_m)
+        if sweep.name != AT_ONCE:
+            assert sweep.position_m.max() < 1e-5
+    masses = result.sweeps[0]
+    assert masses.redone[0] > 0  # both sides of the guard
+    assert masses.redone[-1] == 0
+    for spoilt in (2e-5, np.nan):
+        position_m = masses.position_m.copy()
+        position_m[3] = spoilt
+        sweeps = (dataclasses.replace(masses, position_m=position_m), *result.sweeps[1:])
+        worse = dynamics_chapter(dataclasses.replace(result, sweeps=sweeps))
+        bar = next(bar for bar in worse.bars if "fine steps" in bar.text)
+        assert bar.met is False
+        assert cell(float(masses.values[3])) in bar.measured
+
+
+def test_inputs_that_mean_nothing_are_refused(chapter, result):
+    rows = table(chapter, "dynamics-inputs").rows
+    assert len(rows) == len(result.answers) > 60
+    assert {row["error"] for row in rows} == {"ValidationError", "ValueError", "TypeError", "DynamicsError"}
+    assert all(row["message"] for row in rows)
+    accepted = dataclasses.replace(result.answers[0], error="", message="")
+    worse = dynamics_chapter(dataclasses.replace(result, answers=(accepted, *result.answers[1:])))
+    bar = next(bar for bar in worse.bars if "typed errors" in bar.text and "negative" in bar.text)
+    assert bar.met is False
+    assert accepted.input in bar.measured
+
+
+def test_the_least_gain_of_leaving_terms_out_is_judged(result):
+    first, *rest = result.prunings
+    slow = dataclasses.replace(first, reduced_per_s=1.4 * first.full_per_s)
+    worse = dynamics_chapter(dataclasses.replace(result, prunings=(slow, *rest)))
+    bar = next(bar for bar in worse.bars if "unused terms" in bar.text)
+    assert bar.met is False
+    assert bar.measured.startswith("1.40 x")
 
 
 def test_a_bad_measurement_misses_its_bar(result):
