@@ -264,7 +264,7 @@ STUDIES: Sequence[Study] = (
         help="error against run time of the events of a flight",
         description="Render a flight at fixed rates and as often as its motion asks for, and compare the "
         "events with those of a far higher rate. By default 64x48 pixels on a CPU, which takes about "
-        "6 minutes on two cores, and 346x260 on CUDA.",
+        "5 minutes on two cores, and 346x260 on CUDA.",
         chapter=_events,
         options=frozenset({"scene", "device", "width", "height"}),
     ),

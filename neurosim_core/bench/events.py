@@ -125,7 +125,7 @@ class EventStudy:
     @property
     def clock(self) -> str:
         """What run times are, in words."""
-        return "wall-clock time" if wp.get_device(self.device).is_cuda else "CPU time of all threads"
+        return "wall-clock time" if wp.get_device(self.device).is_cuda else "CPU time"
 
     def error(self, score: Score) -> float:
         """Return the distance to the reference for each of its events."""
@@ -707,7 +707,8 @@ def _choosing(study: EventStudy, answer: _Answer) -> str:
     )
     return (
         f"To choose takes {min(each_us):.2g} to {max(each_us):.2g} us for each tick of the clock that is "
-        f"chosen from, here the {study.reference_hz / 1e3:g} kHz of the reference, which adds "
+        f"chosen from, here the {study.reference_hz / 1e3:g} kHz of the reference (a clock of 1 kHz "
+        "has far fewer), which adds "
         f"{min(shares):.0%} to {max(shares):.0%} to the time of rendering ({render_ms:.3g} ms a render). "
         f"{verdict} It pays less the cheaper a render is (few pixels, few rays, a fast GPU), the finer the "
         "clock, and the more packets end, as their ends are always rendered. It does not pay at an even "
@@ -763,10 +764,10 @@ def _table(study: EventStudy, answer: _Answer) -> Table:
         },
         rows=rows,
         note="Timing errors are those of matched events, without sign; they are below the window by "
-        f"definition. Seconds are {study.clock}, of at most {_TIMED_MAX:,} renders of each candidate, scaled "
-        "to all. The last two columns compare with the fixed rate of the same distance, between two rates by "
-        "interpolation; unknown where no fixed rate is as bad or as good. Adaptive sampling also renders "
-        "the ends of packets, 100 a second.",
+        f"definition. Seconds are {study.clock} (on a CPU that of all threads), of at most {_TIMED_MAX:,} "
+        "renders of each candidate, scaled to all. The last two columns compare with the fixed rate of the "
+        "same distance, between two rates by interpolation; unknown where no fixed rate is as bad or as "
+        "good. Adaptive sampling also renders the ends of packets, 100 a second.",
     )
 
 
@@ -819,5 +820,9 @@ def _draw_timing(study: EventStudy, figure: "Figure") -> None:
         axes.stairs(
             share, edges, color=color, label=f"{label}, {score.render_count:,} renders", linewidth=1.8
         )
-    axes.set(xscale="log", xlabel="timing error [us]", ylabel="share of the reference's events [% per bin]")
+    axes.set(
+        xscale="log",
+        xlabel="timing error [us], in the first bin all that is less",
+        ylabel="share of the reference's events [% per bin]",
+    )
     axes.legend()
