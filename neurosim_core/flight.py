@@ -23,7 +23,8 @@ from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
-from neurosim_core.sensors.rig import Cast
+from neurosim_core.sensors.event_config import describe_pixel
+from neurosim_core.sensors.rig import Cast, EventSensorConfig
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.simulation import Model, State, load_scene, make_model, make_state, run_model
 from neurosim_core.vehicle import DynamicsError
@@ -42,6 +43,8 @@ class Report:
 
     setup_s: float = 0.0
     """Wall-clock time until the first packet [s]."""
+    setup_wall_s: dict[str, float] = field(default_factory=dict)
+    """What of `State.wall_s` had passed by then."""
     flight_s: float = 0.0
     """Wall-clock time of the flight, recording included [s]."""
     simulated_ns: int = 0
@@ -108,6 +111,7 @@ def fly(
         packets = run_model(model, state)
         first = next(packets, None)  # builds all kernels; there is none without sensors
     report.setup_s = time.perf_counter() - begin
+    report.setup_wall_s = dict(state.wall_s)
     _print_plan(console, model)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
@@ -309,8 +313,9 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
         f"{simulated_s:.3f} s in {report.flight_s:.1f} s: real-time factor {report.real_time_factor:.2f} "
         f"(and {report.setup_s:.1f} s of set-up)",
     )
-    redone = f" ({counts['redone intervals']:,} intervals redone)" if counts["redone intervals"] else ""
-    facts.add_row("steps", f"{counts['steps']:,} of the dynamics{redone}, {counts['commands']:,} commands")
+    facts.add_row("steps", _describe_steps(model, counts))
+    if model.bodies:
+        facts.add_row("bodies", ", ".join(body.name for body in model.bodies))
     if model.casts:
         casts = "; ".join(_describe_cast(cast) for cast in model.casts)
         facts.add_row("renders", f"{counts['renders']:,} ({casts})")
@@ -327,6 +332,9 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
     facts.add_row("collisions", f"{_describe_collisions(report)}{ending}")
     for name, terms in _terms(model, state).items():
         facts.add_row(f"compiled {name}", ", ".join(terms) or "nothing optional")
+    for name, sensor in model.config.sensors.items():
+        if isinstance(sensor, EventSensorConfig):
+            facts.add_row(f"pixels of {name}", describe_pixel(sensor.pixel))
     console.print()
     console.print(facts, highlight=False)
 
@@ -334,9 +342,11 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
     spent.add_column("time went to", min_width=24)
     spent.add_column("s", justify="right")
     spent.add_column("share", justify="right")
-    inside = dict(state.wall_s)
+    setup = {f"set-up: {phase}": seconds for phase, seconds in model.setup_s.items()}
+    setup["set-up: kernels, first packet"] = max(0.0, report.setup_s - sum(setup.values()))
+    inside = {phase: seconds - report.setup_wall_s.get(phase, 0.0) for phase, seconds in state.wall_s.items()}
     inside["recording and drawing"] = max(0.0, report.flight_s - sum(inside.values()))
-    rows = [*((f"set-up: {k}", v) for k, v in model.setup_s.items()), *inside.items()]
+    rows = [*setup.items(), *inside.items()]
     total = sum(seconds for _, seconds in rows)
     for name, seconds in rows:
         spent.add_row(name, f"{seconds:.2f}", f"{100 * seconds / total:.0f} %")
@@ -347,6 +357,17 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
         console.print(f"[yellow]interrupted at {simulated_s:.3f} s; what was flown is kept[/]")
     left = ", ".join(sorted(path.name for path in folder.iterdir() if path.is_file()))
     console.print(f"{folder}/: {left}", highlight=False, soft_wrap=True)
+
+
+def _describe_steps(model: Model, counts: Mapping[str, int]) -> str:
+    """Say how the dynamics were integrated."""
+    vehicle, commands = model.config.vehicle, f"{counts['commands']:,} commands"
+    if vehicle.integrator != "rkmk4":
+        return f"adaptive, of {vehicle.integrator}; {commands}"
+    redone = counts["redone intervals"]
+    more = f"; {redone:,} intervals were too rough for that, and redone in adaptive steps" if redone else ""
+    steps = f"rkmk4, at most {1e3 * vehicle.max_step_s:g} ms{more}"
+    return f"{counts['steps']:,} of the dynamics ({steps}), {commands}"
 
 
 def _describe_cast(cast: Cast) -> str:
@@ -381,6 +402,4 @@ def _terms(model: Model, state: State) -> dict[str, tuple[str, ...]]:
     terms |= {name: imu.terms for name, imu in state.imus.items()}
     for cast in model.casts:
         terms[", ".join(cast.names)] = (*sorted(cast.outputs), *model.render_terms)
-    for cast_state in state.casts:
-        terms |= {f"pixels of {name}": seen.camera.terms for name, seen in cast_state.events.items()}
     return terms
