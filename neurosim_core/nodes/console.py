@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -124,8 +124,21 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str
     return news
 
 
-def print_end(console: Console, last: SimulatorStatus | None, record: Path | None) -> None:
-    """Say what has been simulated since the last reset."""
+def print_end(
+    console: Console,
+    last: SimulatorStatus | None,
+    record: Path | None,
+    *,
+    redone: Mapping[str, int] | None = None,
+) -> None:
+    """Say what has been simulated since the last reset.
+
+    Args:
+        console: Where to.
+        last: The last status; None: nothing was simulated.
+        record: The folder that it was recorded to; None: it was not.
+        redone: Intervals that fixed steps could not resolve, by the name of the vehicle.
+    """
     if last is None:
         return
     taken = sum(vehicle.command_count for vehicle in last.vehicles)
@@ -138,6 +151,13 @@ def print_end(console: Console, last: SimulatorStatus | None, record: Path | Non
         highlight=False,
         soft_wrap=True,
     )
+    for name, count in (redone or {}).items():
+        if count:
+            console.print(
+                f"{name}: {count:,} intervals were too rough for fixed steps, and redone in adaptive ones",
+                highlight=False,
+                soft_wrap=True,
+            )
     if last.mode == "streaming":
         dropped = sum(sensor.dropped_count for sensor in last.sensors)
         console.print(

@@ -470,5 +470,6 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
             with StatusLine(console) as line:
                 simulator.board.on_status = line.show
                 code = simulator.run(stop)
-            print_end(console, line.last, record)
+            redone = {craft.name: craft.state.counts["redone intervals"] for craft in simulator.crafts}
+            print_end(console, line.last, record, redone=redone)
     return 130 if stop.is_set() else code

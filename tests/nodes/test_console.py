@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from cortex.messages import SimulatorStatus, VehicleStatus
-from neurosim_core.nodes.console import StatusLine, changes
+from neurosim_core.nodes.console import StatusLine, changes, print_end
 
 
 def vehicle(**changed: Any) -> VehicleStatus:
@@ -92,3 +92,12 @@ def test_a_machine_that_is_too_slow_is_told_once():
     for step in range(20):
         line.show(status(real_time_factor=0.3, step_count=100 + step, real_time_factor_wanted=0.0))
     assert text.getvalue().count("this machine manages") == 2
+
+
+def test_the_end_tells_of_intervals_that_were_redone():
+    """Of vehicles that had some."""
+    text = io.StringIO()
+    print_end(Console(file=text, width=200), status(), None, redone={"red": 0, "blue": 1234})
+    lines = text.getvalue().splitlines()
+    assert "blue: 1,234 intervals were too rough for fixed steps, and redone in adaptive ones" in lines
+    assert not any("red:" in line for line in lines)
