@@ -82,8 +82,10 @@ def _summary(result: DynamicsResult) -> str:
 
 
 def _peer_sentence(result: DynamicsResult) -> str:
-    ratio, _ = _peer_ratio(result)
-    return "" if ratio is None else f", {ratio:,.0f} times as many as RotorPy {result.rotorpy} (RK45)"
+    ratio, theirs = _peer_ratio(result)
+    if ratio is None or theirs is None:
+        return ""
+    return f", {ratio:,.0f} times as many as RotorPy {result.rotorpy} (RK45)" + _called_alike(result, theirs)
 
 
 def _hours(seconds: int) -> str:

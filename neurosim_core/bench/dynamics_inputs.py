@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from neurosim_core.vehicle import (
     DynamicsError,
-    GroundConfig,
-    GustConfig,
     Multirotor,
-    TurbulenceConfig,
     preset,
 )
 
@@ -61,51 +60,54 @@ def _ask(name: str, give: Callable[[], object]) -> Answer:
     return Answer(input=name, error="", message="")
 
 
-def _inputs() -> Iterator[tuple[str, Callable[[], object]]]:
+Question = tuple[str, Callable[[], object]]
+"""What is given, in words, and how."""
+
+
+def _inputs() -> Iterator[Question]:
+    def made(**parameters: Any) -> Callable[[], object]:
+        return functools.partial(preset, "hummingbird", **parameters)
+
     for name in _SCALARS:
         for bad in (_NAN, _INF, -1.0):
-            yield f"{name}: {bad:g}", lambda name=name, bad=bad: preset("hummingbird", **{name: bad})
+            yield f"{name}: {bad:g}", made(**{name: bad})
     for bad in (_NAN, _INF, -1.0, 0.0):
         inertia = tuple(map(tuple, np.diag(np.full(3, bad)).tolist()))
-        yield f"inertia_kg_m2: {bad:g}", lambda inertia=inertia: preset("hummingbird", inertia_kg_m2=inertia)
-    yield "mass_kg: 0", lambda: preset("hummingbird", mass_kg=0.0)
+        yield f"inertia_kg_m2: {bad:g}", made(inertia_kg_m2=inertia)
+    yield "mass_kg: 0", made(mass_kg=0.0)
     for bad in (_NAN, _INF):
-        yield f"wind_m_s: {bad:g}", lambda bad=bad: preset("hummingbird", wind_m_s=(bad, 0.0, 0.0))
-        yield f"drag: {bad:g}", lambda bad=bad: preset("hummingbird", parasitic_drag_kg_m=(bad, 0.0, 0.0))
-    yield from _surroundings()
+        yield f"wind_m_s: {bad:g}", made(wind_m_s=(bad, 0.0, 0.0))
+    for bad in (_NAN, _INF, -1.0):
+        yield f"parasitic_drag_kg_m: {bad:g}", made(parasitic_drag_kg_m=(bad, 0.0, 0.0))
+        gust = {"velocity_m_s": (1.0, 0.0, 0.0), "start_s": 0.0, "rise_s": bad}
+        yield f"gusts.rise_s: {bad:g}", made(gusts=(gust,))
+        yield f"turbulence.wind_20ft_m_s: {bad:g}", made(turbulence={"wind_20ft_m_s": bad})
+        yield f"ground.stiffness_n_m: {bad:g}", made(ground={"stiffness_n_m": bad})
     yield from _states()
 
 
-def _surroundings() -> Iterator[tuple[str, Callable[[], object]]]:
-    for bad in (_NAN, _INF, -1.0):
-        yield (
-            f"gusts.rise_s: {bad:g}",
-            lambda bad=bad: GustConfig(velocity_m_s=(1.0, 0.0, 0.0), start_s=0.0, rise_s=bad),
-        )
-        yield f"turbulence.wind_20ft_m_s: {bad:g}", lambda bad=bad: TurbulenceConfig(wind_20ft_m_s=bad)
-        yield f"ground.stiffness_n_m: {bad:g}", lambda bad=bad: GroundConfig(stiffness_n_m=bad)
-
-
-def _states() -> Iterator[tuple[str, Callable[[], object]]]:
+def _states() -> Iterator[Question]:
     vehicle = Multirotor(preset("hummingbird"))
     widths = {"position": 3, "velocity": 3, "orientation": 4, "body_rate": 3, "rotor_speed": 4}
     for name, width in widths.items():
         for bad in (_NAN, _INF):
-            row = np.full(width, bad)
-            yield f"reset({name}): {bad:g}", lambda name=name, row=row: vehicle.reset(**{name: row})
-    yield "reset(orientation): 0", lambda: vehicle.reset(orientation=np.zeros(4))
-    yield "reset(rotor_speed): -1", lambda: vehicle.reset(rotor_speed=np.full(4, -1.0))
+            row: Any = {name: np.full(width, bad)}
+            yield f"reset({name}): {bad:g}", functools.partial(vehicle.reset, **row)
+    yield "reset(orientation): 0", functools.partial(vehicle.reset, orientation=np.zeros(4))
+    yield "reset(rotor_speed): -1", functools.partial(vehicle.reset, rotor_speed=np.full(4, -1.0))
     for bad in (_NAN, _INF):
-        yield f"step(command): {bad:g}", lambda bad=bad: vehicle.step(np.full(4, bad), _MS)
+        yield f"step(command): {bad:g}", functools.partial(vehicle.step, np.full(4, bad), _MS)
     for duration in (0, -1, 0.5):
-        yield f"step(duration_ns): {duration:g}", lambda duration=duration: vehicle.step(np.ones(4), duration)
+        step: Any = vehicle.step
+        yield f"step(duration_ns): {duration:g}", functools.partial(step, np.ones(4), duration)
     yield "a NaN among commands on the device", _nan_on_the_device
     yield "a velocity of 1e150 m/s", _beyond_all_speeds
 
 
 def _nan_on_the_device() -> None:
     vehicle = Multirotor(preset("hummingbird"))
-    vehicle.arrays.rotor_speed_command.assign(np.full((1, 4), _NAN))
+    commands: Any = vehicle.arrays.rotor_speed_command
+    commands.assign(np.full((1, 4), _NAN))
     vehicle.advance(_MS)
     vehicle.check()
 

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-call"
 """Extreme flights between those of the table: one parameter in fine steps, and all of them at random.
 
 What fixed steps do silently wrong is worst just before the guard trips, which no round number hits.

@@ -159,7 +159,7 @@ def _mesh_distances(
     distance_out[sample] = mesh_distance(mesh, points[sample], reach)
 
 
-_GROUND_SLACK_M = wp.constant(wp.float32(0.01))  # how far a floor may be above the plane meant by it
+_GROUND_SLACK_M = 0.01  # how far a floor may be above the plane meant by it
 
 
 @wp.kernel
