@@ -29,8 +29,8 @@ function of time. The corners of the bounding boxes of bodies count as well, whe
 not, if the box overlaps the picture and the corner is no further outside of it than the picture is large.
 
 It pays where a flight has slow and fast parts, as renders follow the speed. At an even speed it does not: in
-the generated apartment at 0.54 m/s, 96x72 pixels and 0.1 to 0.2 px, a fixed rate of the same error needed 3 to
-7 % fewer renders, and 14 to 18 % less CPU time. What a render costs should be more than what the choice
+the generated apartment at 0.54 m/s, 96x72 pixels and 0.1 to 0.2 px, a fixed rate of the same error needed
+3 to 7 % fewer renders, and 14 to 18 % less CPU time. What a render costs should be more than what the choice
 costs for the ticks between two renders: on a fast GPU and a small picture a fixed rate may be cheaper.
 
 Limit: an object of the scene that no ray hits is not seen to move. It is narrower than the spacing, and it
