@@ -41,8 +41,9 @@ class VehicleConfig(Settings):
     """Name of the airframe: crazyflie, hummingbird or racer."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Parameters to change, by name (see `MultirotorConfig`), of the airframe, such as {mass_kg: 0.6}, and of
-    what it flies in: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5}],
-    turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}."""
+    what it flies in: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5,
+    hold_s: 2}], turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}. A gust without
+    hold_s stays for good."""
     max_step_s: Annotated[float, Field(gt=0.0, le=0.1)] = 0.001
     """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
     integrator: Integrator = "rkmk4"

@@ -626,10 +626,10 @@ def _draw(result: LeaveOutResult, figure: Figure) -> None:
         ("Warp arrays [MiB]", [probe.array_bytes / 2**20 for _, probe in _rows(result)]),
     )
     for axes, color, (label, values) in zip(panels, COLORS, figures, strict=False):
-        bars = axes.barh(np.arange(len(titles)), values, color=color)
-        axes.bar_label(
-            bars, [f"{value:,.3g}" if value < 1e3 else f"{value:,.0f}" for value in values], padding=3
-        )
+        axes.plot(values, np.arange(len(titles)), "o", color=color)  # on a log axis, bars have no length
+        for row, value in enumerate(values):
+            text = f"{value:,.3g}" if value < 1e3 else f"{value:,.0f}"
+            axes.annotate(text, (value, row), (8, 0), textcoords="offset points", va="center")
         axes.set(xscale="log", xlabel=label, xlim=(0.5 * min(values), 8.0 * max(values)))
         axes.grid(visible=False, axis="y")
     panels[0].set_yticks(np.arange(len(titles)), titles)
