@@ -6,6 +6,7 @@ What fixed steps do silently wrong is worst just before the guard trips, which n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -48,13 +49,13 @@ class Sweep:
 
 
 def measure_sweep(name: str, count: int) -> Sweep:
-    """Fly a sweep of `count` flights."""
+    """Fly a sweep of `count` flights, and of those on both sides of the guard's edge, if it has one."""
     if name == AT_ONCE:
         values = np.arange(count, dtype=np.float64)
         flights = [several(seed) for seed in range(count)]
     else:
         make, first, last = SWEEPS[name]
-        values = np.geomspace(first, last, count)
+        values = _with_edge(make, np.geomspace(first, last, count))
         flights = [make(float(value)) for value in values]
     measured = [silent_error(flight) for flight in flights]
     return Sweep(
@@ -63,6 +64,22 @@ def measure_sweep(name: str, count: int) -> Sweep:
         position_m=np.array([error for error, _ in measured]),
         redone=np.array([redone for _, redone in measured]),
     )
+
+
+def _with_edge(make: Callable[[float], Flight], values: Array) -> Array:
+    """Add the values on both sides of the guard's edge, where the last redone flight meets the next."""
+    redone = [silent_error(make(float(value)))[1] > 0 for value in values]
+    edges = [i for i in range(len(values) - 1) if redone[i] and not redone[i + 1]]
+    if not edges:
+        return values
+    trips, passes = float(values[edges[-1]]), float(values[edges[-1] + 1])
+    while passes > 1.001 * trips:
+        middle = math.sqrt(trips * passes)
+        if silent_error(make(middle))[1] > 0:
+            trips = middle
+        else:
+            passes = middle
+    return np.sort(np.append(values, (trips, passes)))
 
 
 def silent_error(flight: Flight) -> tuple[float, int]:
