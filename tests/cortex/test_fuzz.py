@@ -33,7 +33,7 @@ def test_random_bytes_as_any_type(schema, data):
 @given(any_message(), st.data())
 def test_mutated_bodies_of_any_type(value, data):
     codec = codec_of(type(value))
-    body = bytearray(codec.encode(value, 2**20))
+    body = bytearray(codec.encode(value, 2**30))
     for _ in range(data.draw(st.integers(1, 3))):
         if body:
             place = data.draw(st.integers(0, len(body) - 1))
