@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import zmq
 
 from cortex.codec import Codec
-from cortex.native import NativeGate, make_flat
-from cortex.raw import RawMessage
+from cortex.native import NativeGate
+from cortex.packer import flat_of
 
 monotonic_ns = time.monotonic_ns
 
@@ -80,7 +80,7 @@ def make_gate(
         limit: Most bytes of a body that is sent so.
         flush: Called with the lock held when a batch is full; sends it.
     """
-    flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
+    flat = flat_of(codec, head)
     if flat is None:
         return LongGate(slowly)
     gate: Any = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit, flush)

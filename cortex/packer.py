@@ -34,9 +34,14 @@ class Reader(NamedTuple):
     """The messages of a batch's frame with so many records; None: not as it should be."""
 
 
+def flat_of(codec: Codec, head: bytes) -> Any:
+    """Return what packs and reads one publisher's messages in C; None: Python does."""
+    return None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
+
+
 def make_record_packer(codec: Codec, head: bytes) -> PackRecord:
     """Build what packs the messages of one publisher as records of batches."""
-    flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
+    flat = flat_of(codec, head)
     return _no_record if flat is None else flat.record
 
 
@@ -51,7 +56,7 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
         codec: Of its type.
         head: What these frames begin with: the first 24 bytes of the header.
     """
-    flat = None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
+    flat = flat_of(codec, head)
     if flat is not None:
         return Reader(flat.read, flat.drain, None if codec.fixed_size is None else flat.gather, flat.records)
     decode, unpack = codec.decode, REST.unpack_from

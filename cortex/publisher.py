@@ -498,13 +498,13 @@ class Publisher(Generic[T]):
         """Work out where messages go, when readers or what is sent have changed."""
         readers = self._readers.values()
         outlets = {reader.outlet for reader in readers if reader.pipe is None}
-        pipes = [reader for reader in readers if reader.pipe is not None]
-        lossy = [reader.pipe.offer for reader in pipes if reader.pipe and not reader.request.strict]
+        pipes = [(reader, reader.pipe) for reader in readers if reader.pipe is not None]
+        lossy = [pipe.offer for reader, pipe in pipes if not reader.request.strict]
         sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
         self._lossy_sends = (*sends, *lossy)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
-        self._strict_pipes = tuple(reader for reader in pipes if reader.request.strict)
-        strict = [reader.pipe.send for reader in self._strict_pipes if reader.pipe]
+        self._strict_pipes = tuple(reader for reader, _ in pipes if reader.request.strict)
+        strict = [pipe.send for reader, pipe in pipes if reader.request.strict]
         usual = self._plain and not self._was_large and not self._late
         waiting: list[Callable[..., Any]] = [outlet.send for outlet in self._strict_outlets]
         self._gate.sends = (*self._lossy_sends, *waiting, *strict) if usual else ()
