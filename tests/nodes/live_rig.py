@@ -167,11 +167,11 @@ class LiveRig:
         return found[0]
 
 
-def drain(subscriber: Subscriber[Any], timeout_s: float = 0.2) -> list[Any]:
-    """Everything that has arrived, and what comes until nothing does for a while."""
-    messages = []
+def drain(subscriber: Subscriber[Any], timeout_s: float = 0.2, *, least: int = 0) -> list[Any]:
+    """Everything that has arrived, and what comes until nothing does for a while; `least` is waited for."""
+    messages: list[Any] = []
     while True:
         try:
-            messages.append(subscriber.recv(timeout_s))
+            messages.append(subscriber.recv(SOON_S if len(messages) < least else timeout_s))
         except TimeoutError:
             return messages

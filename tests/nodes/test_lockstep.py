@@ -21,6 +21,7 @@ from cortex import Closed, Node, reliable
 from cortex.messages import Events, Imu, MotorCommand, Odometry, Reset, RotorSpeeds, SimulatorReply
 from neurosim_core.config import load_config, to_yaml
 from neurosim_core.control import PathFollower
+from neurosim_core.nodes import controller
 from neurosim_core.nodes.controller import PathPilot
 from neurosim_core.nodes.simulator import Simulator
 from neurosim_core.nodes.topics import COMMANDS, command_topic, stream_topic
@@ -77,6 +78,12 @@ BLUE = {
 STREAMS = {"events": Events, "imu": Imu, "odometry": Odometry}
 Law = Callable[[Any], np.ndarray]
 """A controller: from odometry (a packet or a message) to a setpoint."""
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rotor speeds that are on their way come, however busy the machine: without them the bits differ."""
+    monkeypatch.setitem(controller._PATIENCE_S, "lockstep", SOON_S)
 
 
 @pytest.fixture(scope="module")
