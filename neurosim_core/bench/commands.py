@@ -106,8 +106,12 @@ def _add_options(parser: argparse.ArgumentParser, options: frozenset[str]) -> No
 def _add_step(parser: argparse.ArgumentParser) -> None:
     _add_view(parser, width=640, height=480, camera="event camera")
     parser.add_argument("--instants", type=int, default=16, metavar="K", help="renders per launch")
+    parser.add_argument("--steps", type=int, default=1600, metavar="N", help="steps per repetition (of five)")
     parser.add_argument(
-        "--steps", type=int, default=1600, metavar="N", help="renders per repetition (of five)"
+        "--max-displacement",
+        type=float,
+        metavar="PX",
+        help="render only so often that nothing moves further between two renders (default: at every step)",
     )
     parser.set_defaults(command=_bench_step)
 
@@ -411,6 +415,7 @@ def _bench_step(arguments: argparse.Namespace) -> int:
         height=arguments.height,
         instants=arguments.instants,
         step_count=arguments.steps,
+        max_displacement_px=arguments.max_displacement,
     )
     print_steps(times, Console())
     return 0

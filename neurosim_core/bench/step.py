@@ -1,4 +1,7 @@
-"""Whole steps a second: physics, control, render, event scan, packets read back, one render per step."""
+"""Whole steps a second: physics, control, render, event scan, packets read back, one render per step.
+
+An adaptive camera is rendered at some of the steps only; the others are flown and count as well.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from rich.table import Table
 
 from neurosim_core.config import load_config
 from neurosim_core.packets import Events, Packet
-from neurosim_core.simulation import State, make_model, make_state, run_model
+from neurosim_core.simulation import Model, State, make_model, make_state, run_model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +32,12 @@ class StepTimes:
     width: int
     height: int
     instants: int
+    rate_hz: float
+    """Steps per simulated second [Hz]."""
     steps_per_s: tuple[float, ...]
     """Whole steps a second, one figure for each repetition; each flies past another part of the scene."""
+    renders_per_step: float
+    """1 unless the camera is adaptive."""
     events_per_step: float
     phases_us: dict[str, float]
     """Host time by phase, per step [us]; on CUDA work is queued, and waited for where it is read back."""
@@ -45,6 +52,48 @@ class StepTimes:
         """Steps of all repetitions over their time [1/s]."""
         return float(1.0 / np.mean(1.0 / np.array(self.steps_per_s)))
 
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated time over run time, in the median."""
+        return self.median / self.rate_hz
+
+
+def flight_settings(
+    *,
+    width: int,
+    height: int,
+    rate_hz: float,
+    instants: int,
+    duration_s: float,
+    device: str = "auto",
+    scene: Path | None = None,
+    lighting: str = "baked",
+    max_displacement_px: float | None = None,
+) -> dict[str, Any]:
+    """Return the settings of a flight with one event camera and nothing else; arguments as `measure_steps`.
+
+    Its packets end with the launches.
+    """
+    settings: dict[str, Any] = {
+        "duration_s": duration_s,
+        "device": device,
+        "instants_per_launch": instants,
+        "vehicle": {"on_collision": "report"},
+        "render": {"lighting": {"mode": lighting}},
+        "sensors": {
+            "events": {
+                "kind": "event_camera",
+                "lens": {"width": width, "height": height, "horizontal_fov_rad": 1.5},
+                "sampling_rate_hz": rate_hz,
+                "packet_rate_hz": rate_hz / instants,
+                "max_displacement_px": max_displacement_px,
+            }
+        },
+    }
+    if scene is not None:
+        settings["scene"] = {"kind": "mesh", "file": str(scene.resolve())}
+    return settings
+
 
 def measure_steps(
     *,
@@ -57,6 +106,7 @@ def measure_steps(
     step_count: int = 1600,
     repetitions: int = 5,
     lighting: str = "baked",
+    max_displacement_px: float | None = None,
 ) -> StepTimes:
     """Fly with one event camera and nothing else, and time it.
 
@@ -65,40 +115,62 @@ def measure_steps(
         device: Where to compute.
         width: Columns of the event camera [px].
         height: Rows of the event camera [px].
-        rate_hz: Renders per simulated second [Hz].
+        rate_hz: Steps per simulated second [Hz].
         instants: Renders per launch.
-        step_count: Renders per repetition.
+        step_count: Steps per repetition.
         repetitions: How often to measure; the flight goes on from one to the next.
         lighting: `baked` or `unshadowed`.
+        max_displacement_px: Render only so often that nothing moves further between two renders [px]; None:
+            at every step.
     """
     warm_up = max(step_count // 2, 16 * instants)
-    lens = {"width": width, "height": height, "horizontal_fov_rad": 1.5}
-    settings: dict[str, Any] = {
-        "duration_s": (warm_up + repetitions * step_count + 10 * (repetitions + 1) * instants) / rate_hz,
-        "device": device,
-        "instants_per_launch": instants,
-        "vehicle": {"on_collision": "report"},
-        "render": {"lighting": {"mode": lighting}},
-        "sensors": {
-            "events": {
-                "kind": "event_camera",
-                "lens": lens,
-                "sampling_rate_hz": rate_hz,
-                "packet_rate_hz": rate_hz / instants,
-            }
-        },
-    }
-    if scene is not None:
-        settings["scene"] = {"kind": "mesh", "file": str(scene.resolve())}
-    model = make_model(load_config(settings))
+    flown = warm_up + repetitions * step_count + 10 * (repetitions + 1) * instants
+    settings = flight_settings(
+        width=width,
+        height=height,
+        rate_hz=rate_hz,
+        instants=instants,
+        duration_s=flown / rate_hz,
+        device=device,
+        scene=scene,
+        lighting=lighting,
+        max_displacement_px=max_displacement_px,
+    )
+    return time_steps(
+        make_model(load_config(settings)),
+        warm_up_count=warm_up,
+        step_count=step_count,
+        repetitions=repetitions,
+    )
+
+
+def time_steps(
+    model: Model,
+    *,
+    warm_up_count: int,
+    step_count: int,
+    repetitions: int,
+    repetition_s: float = float("inf"),
+) -> StepTimes:
+    """Fly a model of `flight_settings` and time it.
+
+    Args:
+        model: With one event camera and nothing else; its run is long enough.
+        warm_up_count: Steps before the first repetition.
+        step_count: Steps per repetition.
+        repetitions: How often to measure.
+        repetition_s: A repetition ends after this time [s], even if it has taken fewer steps.
+    """
+    (cast,) = model.casts
     state = make_state(model)
     packets = run_model(model, state)
-    _fly(packets, state, warm_up)  # kernels, buffers and graphs
+    _fly(packets, state, warm_up_count, repetition_s)  # kernels, buffers and graphs
     state.wall_s.clear()
+    renders = state.counts["renders"]
     rates, events, steps = [], 0, 0
     for _ in range(repetitions):
         begin = time.perf_counter()
-        flown, seen = _fly(packets, state, step_count)
+        flown, seen = _fly(packets, state, step_count, repetition_s)
         rates.append(flown / (time.perf_counter() - begin))
         events += seen
         steps += flown
@@ -106,23 +178,33 @@ def measure_steps(
         device=str(wp.get_device(model.device).name or platform.processor()),
         scene=model.scene.name,
         triangles=len(model.scene.faces),
-        width=width,
-        height=height,
-        instants=instants,
+        width=cast.lens.width,
+        height=cast.lens.height,
+        instants=model.config.instants_per_launch,
+        rate_hz=cast.rate.rate_hz,
         steps_per_s=tuple(rates),
+        renders_per_step=(state.counts["renders"] - renders) / steps,
         events_per_step=events / steps,
         phases_us={name: 1e6 * seconds / steps for name, seconds in state.wall_s.items()},
     )
 
 
-def _fly(packets: Iterator[Packet], state: State, step_count: int) -> tuple[int, int]:
-    """Take packets, one for each batch, until enough renders have been read; return renders and events."""
-    begin, events = state.counts["renders"], 0
-    while state.counts["renders"] - begin < step_count:
+def _fly(
+    packets: Iterator[Packet], state: State, step_count: int, seconds_max: float = float("inf")
+) -> tuple[int, int]:
+    """Take packets, one for each batch, until enough steps have been read; return steps and events."""
+    begin, events = _steps(state), 0
+    end_s = time.perf_counter() + seconds_max
+    while _steps(state) - begin < step_count and (_steps(state) == begin or time.perf_counter() < end_s):
         packet = next(packets)
         assert isinstance(packet, Events)
         events += len(packet.numpy().t)
-    return state.counts["renders"] - begin, events
+    return _steps(state) - begin, events
+
+
+def _steps(state: State) -> int:
+    """Return how many ticks of the camera were read, rendered or not."""
+    return state.counts["renders"] + state.counts["ticks left out"]
 
 
 def print_steps(times: StepTimes, console: Console) -> None:
@@ -137,6 +219,9 @@ def print_steps(times: StepTimes, console: Console) -> None:
         f"{times.median:,.0f} /s (median of {len(rates)}, {min(rates):,.0f} to {max(rates):,.0f};"
         f" overall {times.overall:,.0f})",
     )
+    table.add_row("real-time factor", f"{times.real_time_factor:.3g} at {times.rate_hz:g} steps per second")
+    if times.renders_per_step < 1.0:
+        table.add_row("renders", f"{times.renders_per_step:.3g} per step")
     table.add_row("events", f"{times.events_per_step:,.0f} per step")
     table.add_row("host time", ", ".join(f"{k} {v:.1f} us" for k, v in times.phases_us.items()))
     console.print(table, highlight=False)
