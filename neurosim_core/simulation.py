@@ -229,11 +229,17 @@ def load_scene(config: ApartmentConfig | MeshSceneConfig, *, pictures: bool = Tr
     return load_mesh_scene(config, pictures=pictures)
 
 
-def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | None = None) -> Model:
+def make_model(
+    config: SimulationConfig,
+    *,
+    scene: Scene | None = None,
+    on_phase: Callable[[str], None] | None = None,
+) -> Model:
     """Load or generate the scene, plan the path and decide what has to be computed.
 
     Args:
         config: What to fly; one vehicle.
+        scene: Where to fly, in place of what `config` says; None: as it says.
         on_phase: Told the name of each part of the work when it begins.
 
     Raises:
@@ -244,11 +250,33 @@ def make_model(config: SimulationConfig, *, on_phase: Callable[[str], None] | No
         raise ValueError(
             f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
         )
-    return next(iter(make_fleet(config, on_phase=on_phase).values()))
+    return next(iter(make_fleet(config, scene=scene, on_phase=on_phase).values()))
+
+
+def refit(model: Model, config: SimulationConfig) -> Model:
+    """Return a model with other sensors, rates and launches on the same path in the same scene and light.
+
+    Args:
+        model: What was made before.
+        config: Its scene, path, vehicle, device and renderer are those of `model`, or are not looked at.
+    """
+    return _make_member(
+        config,
+        model.device,
+        model.scene,
+        model.bodies,
+        model.free_space,
+        model.path,
+        model.scene_on_device,
+        model.setup_s,
+    )
 
 
 def make_fleet(
-    config: SimulationConfig, *, on_phase: Callable[[str], None] | None = None
+    config: SimulationConfig,
+    *,
+    scene: Scene | None = None,
+    on_phase: Callable[[str], None] | None = None,
 ) -> dict[str, Model]:
     """Return a model for each vehicle by name; they share the scene, its free space and its light.
 
@@ -265,7 +293,7 @@ def make_fleet(
     with phase("scene"):
         members = {name: config.of(name) for name in config.vehicles}
         seeing = any(plan_casts(member.sensors) for member in members.values())
-        scene = load_scene(config.scene, pictures=seeing)
+        scene = load_scene(config.scene, pictures=seeing) if scene is None else scene
         bodies = make_bodies(config.bodies) if seeing else ()
     with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
