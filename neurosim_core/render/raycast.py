@@ -52,6 +52,12 @@ class Terms(NamedTuple):
     """With `finest_level`: as they are stored, not interpolated."""
     bodies: bool = False
     """Bodies move through the scene."""
+    worlds: bool = False
+    """Instants are those of many worlds, which may look or not (`WorldData`)."""
+    world_scenes: bool = False
+    """Worlds are in different scenes."""
+    world_lenses: bool = False
+    """Worlds look through different lenses."""
 
 
 @wp.struct
@@ -89,6 +95,22 @@ class SceneData:
     mip_bias: float
     dark_floor: float
     exposure: float
+
+
+@wp.struct
+class WorldData:
+    """Who looks, where worlds are rendered together; instants are [world, K], in this order in all arrays."""
+
+    stride: int
+    """K: room for instants of each world."""
+    active: wp.array[int]
+    """1: this world is rendered, 0: its pictures stay as they are, shape [world]."""
+    scenes: wp.array[SceneData]
+    """`Terms.world_scenes`: all scenes there are."""
+    scene: wp.array[int]
+    """`Terms.world_scenes`: which of them a world is in, shape [world]."""
+    lens: wp.array[int]
+    """`Terms.world_lenses`: rays of which lens, of those that follow each other in a layer, shape [world]."""
 
 
 @wp.struct
@@ -132,6 +154,9 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     supersampled = terms.supersampled
     with_geometry = with_depth or with_normal or with_instance
     with_bodies = terms.bodies
+    worlds = terms.worlds
+    world_scenes = terms.world_scenes
+    world_lenses = terms.world_lenses
 
     @wp.func
     def surface_albedo(scene: SceneData, spread_rad: float, facing: float, hit: Hit) -> wp.vec3:
@@ -351,6 +376,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         q_WC: wp.array[wp.quat],
         image_slot: wp.array[int],
         bodies: BodyData,
+        world_data: WorldData,
         # Out:
         log_radiance_out: wp.array3d[float],
         rgb_out: wp.array4d[wp.uint8],
@@ -364,6 +390,19 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         instant = block % instant_count  # a tile of all instants, then the next: they see the same triangles
         tile = block // instant_count
         tile_columns = (width + 7) // 8
+        world = int(0)
+        first_ray = int(0)
+        if wp.static(worlds):  # all tiles of a world, then the next world
+            tile_count = tile_columns * ((height + 7) // 8)
+            world = tile // tile_count
+            tile -= world * tile_count
+            instant += world * world_data.stride
+            if world_data.active[world] == 0:
+                return
+        if wp.static(world_scenes):
+            scene = world_data.scenes[world_data.scene[world]]
+        if wp.static(world_lenses):
+            first_ray = world_data.lens[world] * width * height
         col = (tile % tile_columns) * 8 + in_tile % 8
         row = (tile // tile_columns) * 8 + in_tile // 8
         if col >= width or row >= height:
@@ -376,7 +415,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     return
         origin = p_WC[instant]
         q = q_WC[instant]
-        pixel = row * width + col
+        pixel = first_ray + row * width + col
         radiance = wp.vec3(0.0)
         for layer in range(rays.shape[0]):
             if wp.static(supersampled):
@@ -425,6 +464,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         q_WC: wp.array[wp.quat],
         image_slot: wp.array[int],
         bodies: BodyData,
+        world_data: WorldData,
         # Out:
         log_radiance_out: wp.array3d[float],
         rgb_out: wp.array4d[wp.uint8],
@@ -439,6 +479,19 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         instant = block % instant_count
         tile = block // instant_count
         tile_columns = (width + 7) // 8
+        world = int(0)
+        first_ray = int(0)
+        if wp.static(worlds):
+            tile_count = tile_columns * ((height + 7) // 8)
+            world = tile // tile_count
+            tile -= world * tile_count
+            instant += world * world_data.stride
+            if world_data.active[world] == 0:
+                return
+        if wp.static(world_scenes):
+            scene = world_data.scenes[world_data.scene[world]]
+        if wp.static(world_lenses):
+            first_ray = world_data.lens[world] * width * height
         left = (tile % tile_columns) * 8 + (in_tile % 2) * 4
         top = (tile // tile_columns) * 8 + (in_tile // 2) * 4
         if left >= width or top >= height:
@@ -466,7 +519,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     continue
             for y in range(rows):
                 for x in range(columns):
-                    ray_C = rays[layer, (top + y) * width + left + x]
+                    ray_C = rays[layer, first_ray + (top + y) * width + left + x]
                     ray[4 * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
             cast_packet(
                 scene.embree_intersect, scene.embree_scene, origin, ray, _FAR_M, face, t, u, v, normal
@@ -474,7 +527,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             for y in range(rows):
                 for x in range(columns):
                     lane = 4 * y + x
-                    ray_C = rays[layer, (top + y) * width + left + x]
+                    ray_C = rays[layer, first_ray + (top + y) * width + left + x]
                     hit = Hit()
                     hit.face = face[lane]
                     hit.t = t[lane]

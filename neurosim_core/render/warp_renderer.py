@@ -31,7 +31,7 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.raycast import TILE, SceneData, Terms, raycast_kernel
+from neurosim_core.render.raycast import TILE, SceneData, Terms, WorldData, raycast_kernel
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
@@ -300,6 +300,7 @@ class WarpRenderer:
         device = arrays.device
         self._rays = wp.array(rays, dtype=wp.vec4, device=device)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
+        self._world_data = WorldData()
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
@@ -352,6 +353,7 @@ class WarpRenderer:
                 q_WC,
                 image_slot,
                 self._body_data,
+                self._world_data,
             ],
             outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
             device=self._arrays.device,

@@ -91,7 +91,7 @@ _DRAW_BITS = wp.constant(wp.int64(12))
 
 
 @wp.struct
-class _Model:
+class PixelModel:
     """Parameters as the kernel reads them, times in ns; arrays of absent terms are empty."""
 
     threshold_on: wp.float64
@@ -155,7 +155,7 @@ class _Pixel:
 
 
 @wp.func
-def _digital(model: _Model, sample: wp.float32) -> wp.float64:
+def _digital(model: PixelModel, sample: wp.float32) -> wp.float64:
     """Return light in units of white / 255."""
     light = _FULL_SCALE / model.white_radiance * wp.exp(wp.float64(sample))
     return wp.clamp(light, _FAINTEST, _BRIGHTEST)
@@ -170,13 +170,15 @@ def _wait_ns(rate: wp.float64, uniform: wp.float64) -> wp.int64:
 
 
 @wp.func
-def _spontaneous(model: _Model, index: wp.int32, state: _Pixel) -> wp.vec2d:
+def _spontaneous(model: PixelModel, index: wp.int32, state: _Pixel) -> wp.vec2d:
     """Return two uniform numbers for the wait for a noise event and for what becomes of it."""
     return uniform2(random_bits(model.seed, model.spontaneous_stream, wp.int64(state.noise_count), index))
 
 
 @wp.func
-def _noise_polarity(model: _Model, state: _Pixel, log_radiance: wp.float64, uniform: wp.float64) -> wp.int32:
+def _noise_polarity(
+    model: PixelModel, state: _Pixel, log_radiance: wp.float64, uniform: wp.float64
+) -> wp.int32:
     """Return the polarity of a noise event that may be; -1: at this light it is none."""
     place = uniform * (state.shot_rate + state.hot_rate)
     if place < state.hot_rate:
@@ -190,8 +192,11 @@ def _noise_polarity(model: _Model, state: _Pixel, log_radiance: wp.float64, unif
 
 
 @functools.cache
-def make_scan(terms: frozenset[str]) -> Any:
-    """Return the kernel that scans pixels with only the given `TERMS`."""
+def make_pixel_scan(terms: frozenset[str]) -> Any:
+    """Return the function that takes a pixel with only the given `TERMS` over a stack of frames.
+
+    Its parameters are those of the kernel of `make_scan`, with the pixel in place of the range of pixels.
+    """
     if unknown := terms - set(TERMS):
         raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
     spread = "spread" in terms
@@ -209,7 +214,7 @@ def make_scan(terms: frozenset[str]) -> Any:
         return quiet_range(state.reference, state.up - state.fold, state.down, state.on, state.off)
 
     @wp.func
-    def next_noise(model: _Model, pixel: wp.int32, state: _Pixel) -> _Pixel:
+    def next_noise(model: PixelModel, pixel: wp.int32, state: _Pixel) -> _Pixel:
         state.noise_count += 1
         wait = _wait_ns(state.shot_rate + state.hot_rate, _spontaneous(model, pixel, state)[0])
         state.next_ns = wp.min(state.next_ns + wait, _NEVER)
@@ -229,7 +234,7 @@ def make_scan(terms: frozenset[str]) -> Any:
 
     @wp.func
     def react(
-        model: _Model,
+        model: PixelModel,
         pixel: wp.int32,
         row: wp.int32,
         place: wp.int64,
@@ -330,13 +335,202 @@ def make_scan(terms: frozenset[str]) -> Any:
                 quiet = range_of(state)
         return state
 
+    @wp.func
+    def scan_pixel(
+        model: PixelModel,
+        width: wp.int32,
+        row_shift: wp.int32,
+        time_shift: wp.int32,
+        pixel: wp.int32,
+        log_radiance: wp.array2d[wp.float32],
+        stamps: wp.array[wp.int64],
+        since_reset_ns: wp.int64,
+        frame_count: wp.int32,
+        row_limit: wp.array[wp.int32],
+        base: wp.array[wp.float32],
+        last: wp.array[wp.float32],
+        crossed: wp.array[wp.vec2i],
+        before: Memory,
+        tabulate: wp.bool,
+        last_out: wp.array[wp.float32],
+        crossed_out: wp.array[wp.vec2i],
+        after: Memory,
+        keys_out: wp.array[wp.int64],
+        counters_out: wp.array[wp.int64],
+        table_out: wp.array2d[wp.int32],
+    ):
+        """Take one pixel from its state before a stack to that after it."""
+        row = pixel // width
+        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+        state = _Pixel()
+        state.on = model.threshold_on
+        state.off = model.threshold_off
+        if wp.static(spread):
+            state.on = model.thresholds[pixel][0]
+            state.off = model.thresholds[pixel][1]
+        if wp.static(stochastic):
+            state.on = state.on / model.threshold_on
+            state.off = state.off / model.threshold_off
+            state.voltage = before.voltage[pixel]
+        state.reference = wp.float64(base[pixel])
+        if wp.static(resets):
+            state.reference = before.reference[pixel]
+        state.up = crossed[pixel][0]
+        state.down = crossed[pixel][1]
+        state.held_ns = -_ONE
+        if wp.static(refractory):
+            state.held_ns = before.held_ns[pixel]
+        if wp.static(spontaneous):
+            state.next_ns = before.next_ns[pixel]
+            state.noise_count = before.noise_count[pixel]
+            state.shot_rate = model.rates[pixel][0]
+            state.hot_rate = model.rates[pixel][1]
+        filtered = _ZERO
+        if wp.static(low_pass):
+            filtered = before.filtered[pixel]
+        sample_before = last[pixel]
+        dn_end = _ZERO
+        if wp.static(stochastic):
+            dn_end = _digital(model, sample_before)
+        invalid_count = wp.int32(0)
+        invalid_first = wp.int32(0)
+        quiet = range_of(state)
+
+        for frame in range(frame_count):
+            sample = log_radiance[frame, pixel]
+            if wp.abs(sample) <= LIMIT:
+                start_ns = stamps[frame]
+                since_ns = start_ns + since_reset_ns
+                span_ns = wp.float64(stamps[frame + 1] - start_ns)
+                light = wp.float64(sample_before)
+                light_slope = (wp.float64(sample) - light) / span_ns
+                leaked = _ZERO
+                leak_slope = _ZERO
+                if wp.static(leak):
+                    cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
+                    whole = wp.floor(cycles)
+                    leaked = (cycles - whole) * state.on
+                    leak_slope = model.leak[pixel][0] * state.on
+                    if wp.int32(whole) != state.fold:
+                        state.fold = wp.int32(whole)
+                        quiet = range_of(state)
+                drift = _ZERO
+                deviation = _ZERO
+                if wp.static(stochastic):
+                    dn_begin = dn_end
+                    dn_end = _digital(model, sample)
+                    dn = (dn_begin + dn_end) / _TWO
+                    drift = model.k1 * wp.log((dn_end + model.k2) / (dn_begin + model.k2)) / span_ns
+                    drift += model.k4 + model.k5 * dn
+                    deviation = model.k3 * wp.sqrt(dn) / (dn + model.k2) + model.k6
+
+                pieces = wp.int32(1)
+                if wp.static(low_pass):
+                    rise = wp.abs(wp.float64(sample) - light)
+                    pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
+                for piece in range(pieces):
+                    signal = Signal()
+                    signal.begin = span_ns * (wp.float64(piece) / wp.float64(pieces))
+                    signal.end = span_ns * (wp.float64(piece + 1) / wp.float64(pieces))
+                    busy = wp.bool(True)
+                    if wp.static(low_pass):
+                        length_ns = signal.end - signal.begin
+                        light_begin = light + light_slope * signal.begin
+                        middle = light_begin + light_slope * length_ns / _TWO
+                        share = (wp.exp(middle) + model.dark_radiance) / (
+                            model.white_radiance + model.dark_radiance
+                        )
+                        signal.tau = _ONE / (model.corner_per_ns * wp.clamp(share, _DARKEST, _ONE))
+                        decay = filtered - light_begin + light_slope * signal.tau
+                        gain = wp.exp(-length_ns / signal.tau) - _ONE
+                        signal.start = filtered + leaked + leak_slope * signal.begin
+                        signal.slope = light_slope + leak_slope
+                        signal.decay = decay
+                        filtered += light_slope * length_ns + decay * gain
+                        signal.last = filtered + leaked + leak_slope * signal.end
+                        steepness = signal.slope - decay / signal.tau
+                        turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
+                        busy = turns or reached(signal.last, quiet) >= 0
+                        if wp.static(refractory):
+                            busy = busy or state.held_ns >= _ZERO
+                        if wp.static(spontaneous):
+                            busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
+                    elif wp.static(not stochastic):
+                        signal.start = light + leaked
+                        signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
+                        busy = reached(signal.last, quiet) >= 0
+                        if wp.static(refractory):
+                            busy = busy or state.held_ns >= _ZERO
+                        if wp.static(spontaneous):
+                            busy = busy or wp.float64(state.next_ns - since_ns) <= span_ns
+                    if busy:
+                        state = react(
+                            model,
+                            pixel,
+                            row,
+                            place,
+                            time_shift,
+                            signal,
+                            drift,
+                            deviation,
+                            light,
+                            light_slope,
+                            start_ns,
+                            since_ns,
+                            frame,
+                            row_limit[frame],
+                            tabulate,
+                            state,
+                            quiet,
+                            table_out,
+                            keys_out,
+                            counters_out,
+                        )
+                        quiet = range_of(state)
+                if wp.static(refractory):  # noqa: SIM102
+                    if state.held_ns >= _ZERO:
+                        state.held_ns = wp.max(state.held_ns - span_ns, _ZERO)
+                sample_before = sample
+            else:
+                if invalid_count == 0:
+                    invalid_first = frame
+                invalid_count += 1
+
+        if not tabulate:
+            last_out[pixel] = sample_before
+            crossed_out[pixel] = wp.vec2i(state.up, state.down)
+            if wp.static(resets):
+                after.reference[pixel] = state.reference
+            if wp.static(low_pass):
+                after.filtered[pixel] = filtered
+            if wp.static(refractory):
+                after.held_ns[pixel] = state.held_ns
+            if wp.static(spontaneous):
+                after.next_ns[pixel] = state.next_ns
+                after.noise_count[pixel] = state.noise_count
+            if wp.static(stochastic):
+                after.voltage[pixel] = state.voltage
+            if invalid_count > 0:
+                pixel_count = base.shape[0]
+                flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
+                wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
+                wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+
+    return scan_pixel
+
+
+@functools.cache
+def make_scan(terms: frozenset[str]) -> Any:
+    """Return the kernel that scans pixels with only the given `TERMS`."""
+    scan_pixel = make_pixel_scan(terms)
+
     @wp.kernel(
         module=wp.get_module("neurosim_core.sensors.event_noise." + ("_".join(sorted(terms)) or "ideal")),
         enable_backward=False,
     )
     def scan(
         # Model:
-        model: _Model,
+        model: PixelModel,
         width: wp.int32,
         row_shift: wp.int32,
         time_shift: wp.int32,
@@ -365,161 +559,29 @@ def make_scan(terms: frozenset[str]) -> Any:
         pixel = first_pixel + wp.tid()
         write_key(OPEN, wp.int64(0), keys_out, counters_out)
         if pixel < end_pixel:
-            row = pixel // width
-            place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
-            state = _Pixel()
-            state.on = model.threshold_on
-            state.off = model.threshold_off
-            if wp.static(spread):
-                state.on = model.thresholds[pixel][0]
-                state.off = model.thresholds[pixel][1]
-            if wp.static(stochastic):
-                state.on = state.on / model.threshold_on
-                state.off = state.off / model.threshold_off
-                state.voltage = before.voltage[pixel]
-            state.reference = wp.float64(base[pixel])
-            if wp.static(resets):
-                state.reference = before.reference[pixel]
-            state.up = crossed[pixel][0]
-            state.down = crossed[pixel][1]
-            state.held_ns = -_ONE
-            if wp.static(refractory):
-                state.held_ns = before.held_ns[pixel]
-            if wp.static(spontaneous):
-                state.next_ns = before.next_ns[pixel]
-                state.noise_count = before.noise_count[pixel]
-                state.shot_rate = model.rates[pixel][0]
-                state.hot_rate = model.rates[pixel][1]
-            filtered = _ZERO
-            if wp.static(low_pass):
-                filtered = before.filtered[pixel]
-            sample_before = last[pixel]
-            dn_end = _ZERO
-            if wp.static(stochastic):
-                dn_end = _digital(model, sample_before)
-            invalid_count = wp.int32(0)
-            invalid_first = wp.int32(0)
-            quiet = range_of(state)
-
-            for frame in range(frame_count):
-                sample = log_radiance[frame, pixel]
-                if wp.abs(sample) <= LIMIT:
-                    start_ns = stamps[frame]
-                    since_ns = start_ns + since_reset_ns
-                    span_ns = wp.float64(stamps[frame + 1] - start_ns)
-                    light = wp.float64(sample_before)
-                    light_slope = (wp.float64(sample) - light) / span_ns
-                    leaked = _ZERO
-                    leak_slope = _ZERO
-                    if wp.static(leak):
-                        cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
-                        whole = wp.floor(cycles)
-                        leaked = (cycles - whole) * state.on
-                        leak_slope = model.leak[pixel][0] * state.on
-                        if wp.int32(whole) != state.fold:
-                            state.fold = wp.int32(whole)
-                            quiet = range_of(state)
-                    drift = _ZERO
-                    deviation = _ZERO
-                    if wp.static(stochastic):
-                        dn_begin = dn_end
-                        dn_end = _digital(model, sample)
-                        dn = (dn_begin + dn_end) / _TWO
-                        drift = model.k1 * wp.log((dn_end + model.k2) / (dn_begin + model.k2)) / span_ns
-                        drift += model.k4 + model.k5 * dn
-                        deviation = model.k3 * wp.sqrt(dn) / (dn + model.k2) + model.k6
-
-                    pieces = wp.int32(1)
-                    if wp.static(low_pass):
-                        rise = wp.abs(wp.float64(sample) - light)
-                        pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
-                    for piece in range(pieces):
-                        signal = Signal()
-                        signal.begin = span_ns * (wp.float64(piece) / wp.float64(pieces))
-                        signal.end = span_ns * (wp.float64(piece + 1) / wp.float64(pieces))
-                        busy = wp.bool(True)
-                        if wp.static(low_pass):
-                            length_ns = signal.end - signal.begin
-                            light_begin = light + light_slope * signal.begin
-                            middle = light_begin + light_slope * length_ns / _TWO
-                            share = (wp.exp(middle) + model.dark_radiance) / (
-                                model.white_radiance + model.dark_radiance
-                            )
-                            signal.tau = _ONE / (model.corner_per_ns * wp.clamp(share, _DARKEST, _ONE))
-                            decay = filtered - light_begin + light_slope * signal.tau
-                            gain = wp.exp(-length_ns / signal.tau) - _ONE
-                            signal.start = filtered + leaked + leak_slope * signal.begin
-                            signal.slope = light_slope + leak_slope
-                            signal.decay = decay
-                            filtered += light_slope * length_ns + decay * gain
-                            signal.last = filtered + leaked + leak_slope * signal.end
-                            steepness = signal.slope - decay / signal.tau
-                            turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
-                            busy = turns or reached(signal.last, quiet) >= 0
-                            if wp.static(refractory):
-                                busy = busy or state.held_ns >= _ZERO
-                            if wp.static(spontaneous):
-                                busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
-                        elif wp.static(not stochastic):
-                            signal.start = light + leaked
-                            signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
-                            busy = reached(signal.last, quiet) >= 0
-                            if wp.static(refractory):
-                                busy = busy or state.held_ns >= _ZERO
-                            if wp.static(spontaneous):
-                                busy = busy or wp.float64(state.next_ns - since_ns) <= span_ns
-                        if busy:
-                            state = react(
-                                model,
-                                pixel,
-                                row,
-                                place,
-                                time_shift,
-                                signal,
-                                drift,
-                                deviation,
-                                light,
-                                light_slope,
-                                start_ns,
-                                since_ns,
-                                frame,
-                                row_limit[frame],
-                                tabulate,
-                                state,
-                                quiet,
-                                table_out,
-                                keys_out,
-                                counters_out,
-                            )
-                            quiet = range_of(state)
-                    if wp.static(refractory):  # noqa: SIM102
-                        if state.held_ns >= _ZERO:
-                            state.held_ns = wp.max(state.held_ns - span_ns, _ZERO)
-                    sample_before = sample
-                else:
-                    if invalid_count == 0:
-                        invalid_first = frame
-                    invalid_count += 1
-
-            if not tabulate:
-                last_out[pixel] = sample_before
-                crossed_out[pixel] = wp.vec2i(state.up, state.down)
-                if wp.static(resets):
-                    after.reference[pixel] = state.reference
-                if wp.static(low_pass):
-                    after.filtered[pixel] = filtered
-                if wp.static(refractory):
-                    after.held_ns[pixel] = state.held_ns
-                if wp.static(spontaneous):
-                    after.next_ns[pixel] = state.next_ns
-                    after.noise_count[pixel] = state.noise_count
-                if wp.static(stochastic):
-                    after.voltage[pixel] = state.voltage
-                if invalid_count > 0:
-                    pixel_count = base.shape[0]
-                    flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
-                    wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
-                    wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+            scan_pixel(
+                model,
+                width,
+                row_shift,
+                time_shift,
+                pixel,
+                log_radiance,
+                stamps,
+                since_reset_ns,
+                frame_count,
+                row_limit,
+                base,
+                last,
+                crossed,
+                before,
+                tabulate,
+                last_out,
+                crossed_out,
+                after,
+                keys_out,
+                counters_out,
+                table_out,
+            )
         write_key(CLOSE, wp.int64(0), keys_out, counters_out)
 
     return scan
@@ -585,18 +647,16 @@ def _draw_rates(
     rate_out[pixel] = wp.vec2d(shot, wp.where(hot, hot_per_ns, _ZERO))
 
 
-@wp.kernel
-def _begin(
-    # Model:
-    model: _Model,
+@wp.func
+def begin_pixel(
+    model: PixelModel,
     phase_stream: wp.uint32,
     random_phase: wp.bool,
-    # In:
     base: wp.array[wp.float32],
-    # Out:
+    pixel: wp.int32,
     memory_out: Memory,
 ) -> None:
-    pixel = wp.tid()
+    """Let a pixel begin anew at what it sees now."""
     value = wp.float64(base[pixel])
     if memory_out.reference.shape[0] > 0:
         memory_out.reference[pixel] = value
@@ -616,6 +676,21 @@ def _begin(
             if model.thresholds.shape[0] > 0:
                 voltage *= model.thresholds[pixel][0] / model.threshold_on
         memory_out.voltage[pixel] = voltage
+
+
+@wp.kernel
+def _begin(
+    # Model:
+    model: PixelModel,
+    phase_stream: wp.uint32,
+    random_phase: wp.bool,
+    # In:
+    base: wp.array[wp.float32],
+    # Out:
+    memory_out: Memory,
+) -> None:
+    pixel = wp.tid()
+    begin_pixel(model, phase_stream, random_phase, base, pixel, memory_out)
 
 
 def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
@@ -685,19 +760,18 @@ class PixelNoise:
         """Begin anew in slot 0 of the ring, at what the pixels see at a stamp, shape [pixel]."""
         self._reset_ns = stamp_ns
         self._model.seed = _mix(self._seed, stamp_ns)
-        stochastic = self._config.stochastic
         wp.launch(
             _begin,
             dim=self._pixel_count,
-            inputs=[
-                self._model,
-                self._stream("phase"),
-                stochastic is not None and stochastic.random_phase,
-                base,
-            ],
+            inputs=[self._model, *self.phase(), base],
             outputs=[self._ring[0]],
             device=self._device,
         )
+
+    def phase(self) -> tuple[int, bool]:
+        """Return the stream of random phases, and whether voltages begin at one."""
+        stochastic = self._config.stochastic
+        return self._stream("phase"), stochastic is not None and stochastic.random_phase
 
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset an origin of time lies [ns]."""
@@ -732,7 +806,7 @@ class PixelNoise:
 
     def _make_model(self) -> Any:
         config = self._config
-        model = _Model()
+        model = PixelModel()
         model.threshold_on = config.threshold_on
         model.threshold_off = config.threshold_off
         model.white_radiance = config.white_radiance

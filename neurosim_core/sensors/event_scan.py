@@ -327,6 +327,92 @@ def walk(
     return state
 
 
+@wp.func
+def scan_pixel(
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    width: wp.int32,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    pixel: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    stamps: wp.array[wp.int64],
+    frame_count: wp.int32,
+    lead: wp.array[wp.int32],
+    row_limit: wp.array[wp.int32],
+    base: wp.array[wp.float32],
+    last: wp.array[wp.float32],
+    crossed: wp.array[wp.vec2i],
+    tabulate: wp.bool,
+    last_out: wp.array[wp.float32],
+    crossed_out: wp.array[wp.vec2i],
+    keys_out: wp.array[wp.int64],
+    counters_out: wp.array[wp.int64],
+    table_out: wp.array2d[wp.int32],
+) -> None:
+    """Take one pixel from its state before a stack to that after it; parameters as for `scan`."""
+    state = Pixel()
+    before = crossed[pixel]
+    state.up = before[0]
+    state.down = before[1]
+    if lead[pixel] == frame_count:
+        state.last = log_radiance[frame_count - 1, pixel]
+    else:
+        state.last = last[pixel]
+        row = pixel // width
+        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+        state = walk(
+            tabulate,
+            pixel,
+            row,
+            place,
+            base[pixel],
+            state,
+            threshold_on,
+            threshold_off,
+            time_shift,
+            log_radiance,
+            stamps,
+            frame_count,
+            lead[pixel],
+            row_limit,
+            table_out,
+            keys_out,
+            counters_out,
+        )
+    if not tabulate:
+        last_out[pixel] = state.last
+        crossed_out[pixel] = wp.vec2i(state.up, state.down)
+        if state.invalid_count > 0:
+            pixel_count = base.shape[0]
+            flat = wp.int64(state.invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
+            wp.atomic_add(counters_out, 1, wp.int64(state.invalid_count))
+            wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+
+
+@wp.func
+def screen_tile(
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    begin: wp.int32,
+    end: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    frame_count: wp.int32,
+    base: wp.array[wp.float32],
+    crossed: wp.array[wp.vec2i],
+    low_out: wp.array[wp.float32],
+    high_out: wp.array[wp.float32],
+    lead_out: wp.array[wp.int32],
+) -> None:
+    """Count the leading quiet frames of the pixels [begin, end), at most 256; parameters as for `screen`."""
+    for pixel in range(begin, end):
+        before = crossed[pixel]
+        quiet = quiet_range(wp.float64(base[pixel]), before[0], before[1], threshold_on, threshold_off)
+        low_out[pixel] = quiet[0]
+        high_out[pixel] = quiet[1]
+    _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)
+
+
 @wp.kernel
 def screen(
     # Model:
@@ -363,13 +449,19 @@ def screen(
         lead_out: Quiet frames, shape [pixel].
     """
     begin = first_pixel + wp.tid() * TILE_SIZE
-    end = wp.min(begin + TILE_SIZE, end_pixel)
-    for pixel in range(begin, end):
-        before = crossed[pixel]
-        quiet = quiet_range(wp.float64(base[pixel]), before[0], before[1], threshold_on, threshold_off)
-        low_out[pixel] = quiet[0]
-        high_out[pixel] = quiet[1]
-    _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)
+    screen_tile(
+        threshold_on,
+        threshold_off,
+        begin,
+        wp.min(begin + TILE_SIZE, end_pixel),
+        log_radiance,
+        frame_count,
+        base,
+        crossed,
+        low_out,
+        high_out,
+        lead_out,
+    )
 
 
 @wp.kernel
@@ -428,43 +520,28 @@ def scan(
     pixel = first_pixel + wp.tid()
     write_key(OPEN, wp.int64(0), keys_out, counters_out)
     if pixel < end_pixel:
-        state = Pixel()
-        before = crossed[pixel]
-        state.up = before[0]
-        state.down = before[1]
-        if lead[pixel] == frame_count:
-            state.last = log_radiance[frame_count - 1, pixel]
-        else:
-            state.last = last[pixel]
-            row = pixel // width
-            place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
-            state = walk(
-                tabulate,
-                pixel,
-                row,
-                place,
-                base[pixel],
-                state,
-                threshold_on,
-                threshold_off,
-                time_shift,
-                log_radiance,
-                stamps,
-                frame_count,
-                lead[pixel],
-                row_limit,
-                table_out,
-                keys_out,
-                counters_out,
-            )
-        if not tabulate:
-            last_out[pixel] = state.last
-            crossed_out[pixel] = wp.vec2i(state.up, state.down)
-            if state.invalid_count > 0:
-                pixel_count = base.shape[0]
-                flat = wp.int64(state.invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
-                wp.atomic_add(counters_out, 1, wp.int64(state.invalid_count))
-                wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+        scan_pixel(
+            threshold_on,
+            threshold_off,
+            width,
+            row_shift,
+            time_shift,
+            pixel,
+            log_radiance,
+            stamps,
+            frame_count,
+            lead,
+            row_limit,
+            base,
+            last,
+            crossed,
+            tabulate,
+            last_out,
+            crossed_out,
+            keys_out,
+            counters_out,
+            table_out,
+        )
     write_key(CLOSE, wp.int64(0), keys_out, counters_out)
 
 

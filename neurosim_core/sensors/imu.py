@@ -114,9 +114,29 @@ def _normal6(seed: wp.uint64, stream: wp.uint32, step: wp.int64, element: wp.int
     return vec6d(a[0], a[1], b[0], b[1], c[0], c[1])
 
 
+@wp.kernel(enable_backward=False)
+def _reset_some(
+    # In:
+    mask: wp.array[wp.int32],
+    # Out:
+    sample_out: wp.array[wp.int64],
+    walk_bias_out: wp.array[vec6d],
+):
+    vehicle = wp.tid()
+    if mask[vehicle] != 0:
+        sample_out[vehicle] = wp.int64(0)
+        if walk_bias_out.shape[0] > 0:
+            walk_bias_out[vehicle] = vec6d()
+
+
 @functools.cache
-def make_kernel(terms: frozenset[str]) -> Any:
-    """Return the kernel that computes only the given errors."""
+def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
+    """Return the kernel that computes only the given errors.
+
+    Args:
+        terms: Some of `TERMS`.
+        own_seeds: Each vehicle has the errors of a vehicle that flies alone with a seed of its own.
+    """
     white = "white" in terms
     walk = "walk" in terms
     instability = "instability" in terms
@@ -124,7 +144,11 @@ def make_kernel(terms: frozenset[str]) -> Any:
     quantisation = "quantisation" in terms
 
     @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.imu." + ("_".join(sorted(terms)) or "exact")),
+        module=wp.get_module(
+            "neurosim_core.sensors.imu."
+            + ("_".join(sorted(terms)) or "exact")
+            + (".own_seeds" if own_seeds else "")
+        ),
         enable_backward=False,
     )
     def measure(
@@ -136,6 +160,7 @@ def make_kernel(terms: frozenset[str]) -> Any:
         acceleration: wp.array[wp.vec3d],
         angular_acceleration: wp.array[wp.vec3d],
         slot: wp.int32,
+        seeds: wp.array[wp.uint64],
         # In/out:
         sample: wp.array[wp.int64],
         walk_bias: wp.array[vec6d],
@@ -154,19 +179,22 @@ def make_kernel(terms: frozenset[str]) -> Any:
         rate = wp.quat_rotate(model.q_SB, w)
         reading = vec6d(force[0], force[1], force[2], rate[0], rate[1], rate[2])
 
+        seed = model.seed
+        element = vehicle
+        if wp.static(own_seeds):
+            seed = seeds[vehicle]
+            element = 0
         k = sample[vehicle]
         if wp.static(walk):
             if k > wp.int64(0):
-                walk_bias[vehicle] += wp.cw_mul(
-                    model.walk, _normal6(model.seed, model.walk_stream, k, vehicle)
-                )
+                walk_bias[vehicle] += wp.cw_mul(model.walk, _normal6(seed, model.walk_stream, k, element))
             reading += walk_bias[vehicle]
         if wp.static(instability):
             process_count = processes.shape[1]  # no constant: unrolled, it compiles four times as long
             for process in range(process_count):
                 drive = wp.cw_mul(
                     model.instability,
-                    _normal6(model.seed, model.instability_stream, k, vehicle * process_count + process),
+                    _normal6(seed, model.instability_stream, k, element * process_count + process),
                 )
                 value = drive  # stationary from the first sample on
                 if k > wp.int64(0):
@@ -176,7 +204,7 @@ def make_kernel(terms: frozenset[str]) -> Any:
                 processes[vehicle, process] = value
                 reading += value
         if wp.static(white):
-            reading += wp.cw_mul(model.white, _normal6(model.seed, model.white_stream, k, vehicle))
+            reading += wp.cw_mul(model.white, _normal6(seed, model.white_stream, k, element))
         for axis in range(6):
             if wp.static(saturation):
                 reading[axis] = wp.clamp(reading[axis], -model.limit[axis], model.limit[axis])
@@ -206,6 +234,8 @@ class Imu:
         name: Name of the sensor; two sensors of one run with different names have independent noise.
         slot_count: Samples that the output arrays hold.
         terms: The errors to compile in, some of `TERMS`; by default those that the configuration asks for.
+        seeds: A seed for each vehicle, device array of uint64, shape [vehicle], in place of `seed`: its
+            errors are then those of a vehicle that flies alone with that seed.
 
     Attributes:
         specific_force: Output in S [m/s^2], device array of vec3d, shape [slot, vehicle].
@@ -222,6 +252,7 @@ class Imu:
         name: str = "imu",
         slot_count: int = 1,
         terms: Sequence[str] | None = None,
+        seeds: Any = None,
     ) -> None:
         if slot_count < 1:
             raise ValueError(f"slot_count must be >= 1, got {slot_count}")
@@ -242,7 +273,7 @@ class Imu:
         )
         arrays = vehicle.arrays
         self._launch = wp.launch(
-            make_kernel(frozenset(self.terms)),
+            make_kernel(frozenset(self.terms), own_seeds=seeds is not None),
             dim=count,
             inputs=[
                 _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, seed=seed, name=name),
@@ -251,6 +282,7 @@ class Imu:
                 arrays.acceleration,
                 arrays.angular_acceleration,
                 0,
+                seeds,
             ],
             outputs=[self._sample, self._walk_bias, self._processes, self.specific_force, self.angular_rate],
             device=device,
@@ -258,10 +290,24 @@ class Imu:
             record_cmd=True,
         )
 
-    def reset(self) -> None:
-        """Start again at sample 0: the noise of the next samples is that of a new IMU."""
-        self._sample.zero_()
-        self._walk_bias.zero_()
+    def reset(self, mask: Any = None) -> None:
+        """Start again at sample 0: the noise of the next samples is that of a new IMU.
+
+        Args:
+            mask: Only of vehicles where it is not 0, device array of int32, shape [vehicle]; one launch, no
+                waiting. None: of all.
+        """
+        if mask is None:
+            self._sample.zero_()
+            self._walk_bias.zero_()
+        else:
+            wp.launch(
+                _reset_some,
+                dim=mask.shape[0],
+                inputs=[mask],
+                outputs=[self._sample, self._walk_bias],
+                device=mask.device,
+            )
 
     def measure(self, slot: int = 0) -> None:
         """Write the next sample of every vehicle, at its current state, into a slot of the output arrays."""

@@ -258,8 +258,10 @@ def make_kernels(terms: frozenset[str], *, adaptive: bool = False) -> Kernels:
         around: Surroundings,
         # In:
         position: wp.array[wp.vec3d],
+        mask: wp.array[wp.int32],
     ):
         vehicle = wp.tid()
-        start_turbulence(around.wind, vehicle, position[vehicle])
+        if mask.shape[0] == 0 or mask[vehicle] != 0:
+            start_turbulence(around.wind, vehicle, position[vehicle])
 
     return Kernels(advance, accelerate, begin if turbulence else None)

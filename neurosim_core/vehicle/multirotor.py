@@ -311,6 +311,8 @@ class Multirotor:
         atol: What is added to that [m, m/s, rad, rad/s].
         evaluation_count_max: The most evaluations of the right-hand side for one interval of one vehicle.
         seed: Of the turbulence, 0 <= seed < 2^64; each vehicle of the batch has its own, by its index.
+        seeds: A seed for each vehicle, device array of uint64, shape [N], in place of `seed`: its turbulence
+            is then that of a vehicle that flies alone with that seed.
 
     Raises:
         TypeError: What counts is not an integer.
@@ -330,6 +332,7 @@ class Multirotor:
         atol: float = 1e-8,
         evaluation_count_max: int = 100_000,
         seed: int = 0,
+        seeds: Any = None,
     ) -> None:
         _check_integer("count", count, 1, 2**31 - 1)
         _check_integer("max_step_ns", max_step_ns, 1, _STEP_MAX_NS)
@@ -383,12 +386,13 @@ class Multirotor:
             seed=seed,
             count=count,
             device=self.device,
+            seeds=seeds,
         )
         self._ground = make_ground(config.ground, config.rotor_position_m, self.device)
         self._batch = _struct(Batch, **vars(self.arrays))
         self._begin: wp.Launch | None = None
         if self._kernels.begin is not None:
-            self._begin = self._record(self._kernels.begin, self._surroundings(), self.arrays.position)
+            self._begin = self._record(self._kernels.begin, self._surroundings(), self.arrays.position, None)
         self._launches: dict[int, wp.Launch] = {}
         self._acceleration_launch: wp.Launch | None = None
         self._own_lags: wp.array2d[Any] | None = None
@@ -487,6 +491,21 @@ class Multirotor:
             launch = self._record_advance(duration_ns)
         launch.launch()
         self._stamp_ns += duration_ns
+
+    def begin(self, mask: Any) -> None:
+        """Draw the turbulence at time 0 of some vehicles, whose state was set in `arrays`; device form.
+
+        Args:
+            mask: Not 0 where it is drawn, device array of int32, shape [N].
+        """
+        if self._kernels.begin is not None:
+            wp.launch(
+                self._kernels.begin,
+                dim=self.count,
+                inputs=[self._surroundings(), self.arrays.position, mask],
+                device=self.device,
+                block_dim=_BLOCK_DIM,
+            )
 
     def accelerate(self) -> None:
         """Evaluate `arrays.acceleration` and `.angular_acceleration` at the current state; device form."""

@@ -101,6 +101,7 @@ class Wind:
 
     gusts: wp.array(dtype=Gust)
     seed: wp.uint64
+    seeds: wp.array(dtype=wp.uint64)  # of each vehicle as if it flew alone, [N]; empty: `seed` is that of all
     tick_ns: wp.int64
     sigma_w: wp.float64
     along: wp.vec3d  # horizontal direction of the mean wind
@@ -122,6 +123,7 @@ def make_wind(
     seed: int,
     count: int,
     device: Any,
+    seeds: Any = None,
 ) -> Wind:
     """Allocate what gusts and turbulence need, for a number of vehicles; nothing for what there is not.
 
@@ -134,6 +136,8 @@ def make_wind(
         seed: Of the turbulence.
         count: Number of vehicles.
         device: Warp device.
+        seeds: Of each vehicle, as if it flew alone, device array of uint64, shape [N]; None: `seed` is that
+            of all, which differ by their index.
     """
     wind = Wind()
     if gusts:
@@ -151,6 +155,8 @@ def make_wind(
         horizontal = math.hypot(wind_m_s[0], wind_m_s[1])
         along = (wind_m_s[0] / horizontal, wind_m_s[1] / horizontal) if horizontal > 0.0 else (1.0, 0.0)
         wind.seed = seed
+        if seeds is not None:
+            wind.seeds = seeds
         wind.tick_ns = to_ns(turbulence.sample_s)
         wind.sigma_w = sigma_w
         wind.along = wp.vec3d(*along, 0.0)
@@ -220,6 +226,8 @@ def _next_along(z: wp.float64, theta: wp.float64, noise: wp.float64) -> wp.float
 
 @wp.func
 def _noise(wind: Wind, vehicle: wp.int32, tick: wp.int64, axis: wp.int32) -> wp.vec2d:
+    if wind.seeds.shape[0] > 0:
+        return normal2(random_bits(wind.seeds[vehicle], _STREAM, tick, axis))
     return normal2(random_bits(wind.seed, _STREAM, tick, wp.int32(3) * vehicle + axis))
 
 
