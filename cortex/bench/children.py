@@ -22,6 +22,8 @@ from types import TracebackType
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1
+_LAST_WORDS = frozenset({"result", "closed"})
+"""Reports after which a child may end."""
 _ALARM_S = 5
 """So long after its deadline a child ends itself, should nobody be left to kill it."""
 
@@ -91,6 +93,7 @@ class Child:
         self._deadline = time.monotonic() + deadline_s
         self._status: int | None = None
         self._reports: deque[Report] = deque()
+        self._is_done = False
         parent = os.getpid()
         with warnings.catch_warnings():
             warnings.simplefilter(
@@ -124,7 +127,8 @@ class Child:
             if time.monotonic() > self._deadline:
                 raise ChildFailed(f"deadline passed before {event!r}")
             for child in beside:
-                child._read(0.0, event)
+                if not child._is_done:  # it may have ended well before what we wait for is said
+                    child._read(0.0, event)
             self._read(0.05 if beside else 1.0, event)
 
     def _read(self, timeout_s: float, event: str) -> None:
@@ -137,6 +141,7 @@ class Child:
         if report is not None and report["event"] == "failed":
             raise ChildFailed(str(report["text"]))
         if report is not None:
+            self._is_done = report["event"] in _LAST_WORDS
             self._reports.append(report)
 
     def tell(self, event: str, **values: Any) -> None:

@@ -155,6 +155,15 @@ def _echoes(channel: Channel, _job: None) -> None:
     channel.tell("told", heard=channel.wait(5.0))
 
 
+def _closes(channel: Channel, _job: None) -> None:
+    channel.tell("closed")
+
+
+def _is_slow(channel: Channel, _job: None) -> None:
+    time.sleep(0.3)
+    channel.tell("result", rate=1.0)
+
+
 def gone(pid: int) -> bool:
     """Return whether a process has ended (a zombie has)."""
     try:
@@ -179,6 +188,21 @@ def test_child_that_is_killed_is_noticed(tmp_path: Path):
     child = Child(_dies, None, log=tmp_path / "log", deadline_s=5.0)
     with child, pytest.raises(ChildFailed, match="died before 'ready'"):
         child.expect("ready")
+
+
+def test_child_may_end_before_the_one_that_is_waited_for(tmp_path: Path):
+    """A server that was told to end is gone before its client has said what it measured."""
+    slow = Child(_is_slow, None, log=tmp_path / "log", deadline_s=20.0)
+    with slow, Child(_closes, None, log=tmp_path / "log", deadline_s=20.0) as server:
+        assert slow.expect("result", beside=[server])["rate"] == 1.0
+        server.expect("closed")
+
+
+def test_child_beside_that_dies_is_noticed(tmp_path: Path):
+    slow = Child(_is_slow, None, log=tmp_path / "log", deadline_s=20.0)
+    with slow, Child(_dies, None, log=tmp_path / "log", deadline_s=20.0) as server:
+        with pytest.raises(ChildFailed, match="died before 'result'"):
+            slow.expect("result", beside=[server])
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
