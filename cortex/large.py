@@ -42,6 +42,8 @@ RING_BYTES_MAX = 2 << 30
 PRIVATE_BYTES = 64 << 20
 """Most memory outside rings that waits to be sent."""
 RINGS_ALIVE = 4
+RINGS_KEPT = 8
+"""Rings with those that are written no more, but not yet read by a reliable reader."""
 PIPES_MAX = 2
 """A publisher writes each pipe itself; of further readers ZeroMQ takes care, in a thread of its own."""
 RETRY_S = 5.0
@@ -190,16 +192,21 @@ class LargeSender:
             rings = tuple(_place_of(ring) for ring in self._rings[-RINGS_ALIVE:])
         return answer_frame(reader.key, AttachAnswer(sequence, reader.column, rings, latched))
 
-    def acquire(self, size: int, sequence: int, *, exact: bool) -> Slot | None:
+    @staticmethod
+    def _private(size: int) -> Slot:
+        return Slot(np.empty(HEADER_SIZE + size, np.uint8)[HEADER_SIZE:], None, 0)
+
+    def acquire(self, size: int, sequence: int, *, exact: bool, spare: bool = False) -> Slot | None:
         """Find memory for a message; the caller holds the lock.
 
         Args:
             size: Bytes that will be written at most.
             sequence: What the next message will have, for readers that are told of a new ring.
             exact: Whether all messages have this size, so that nothing is kept for growth.
+            spare: Whether private memory serves a reliable reader where every slot is taken.
 
         Returns:
-            None if every slot is taken (by loans that were not published).
+            None if every slot is taken.
         """
         if self._pins:
             self._prune()
@@ -207,9 +214,12 @@ class LargeSender:
         if ring is None or ring.slot_bytes < size or ring.slots < self._slots_wanted:
             ring = self._ring_for(size, sequence, exact=exact)
             if ring is None:
-                return Slot(np.empty(HEADER_SIZE + size, np.uint8)[HEADER_SIZE:], None, 0)
+                return self._private(size)
         index = ring.acquire()
-        return None if index < 0 else Slot(ring.buffer(index), ring, index)
+        if index >= 0:
+            return Slot(ring.buffer(index), ring, index)
+        # Others hold every slot (a reader joined, and the shares shrank): it travels without one.
+        return self._private(size) if spare and self._has_strict else None
 
     def renew(self, slot: Slot, size: int, sequence: int) -> Slot | None:
         """Move a message out of a ring that readers were told to forget; the caller holds the lock.
@@ -437,9 +447,14 @@ class LargeSender:
     def _pinned(self, ring: Ring, *, strict: bool) -> int:
         return sum(pin.ring is ring and pin.strict is strict for pin in self._pins)
 
+    def _is_awaited(self, ring: Ring) -> bool:
+        """Whether a reliable reader holds slots of a ring, messages on their way to it included."""
+        return any(strict and ring.outstanding(column) for column, _, _, strict in self._grants)
+
     def _ring_for(self, size: int, sequence: int, *, exact: bool) -> Ring | None:
         current, wanted, page = self._ring, self._slots_wanted, mmap.PAGESIZE
-        if time.monotonic() < self._unavailable_until_s:
+        crowded = len(self._rings) >= RINGS_KEPT and self._is_awaited(self._rings[0])
+        if crowded or time.monotonic() < self._unavailable_until_s:
             return current if current is not None and current.slot_bytes >= size else None
         slot_bytes = size if exact else size + size // 4
         if current is not None:
@@ -461,7 +476,8 @@ class LargeSender:
         self._ring_count += 1
         self._rings.append(ring)
         for old in self._rings[:-RINGS_ALIVE]:
-            if not old.in_writing:  # not while a loan lies there
+            # Not while a loan lies there, or what a reliable reader has not read; `prune` closes it then.
+            if not old.in_writing and not self._is_awaited(old):
                 self._rings.remove(old)
                 old.close()
         self._plan()

@@ -20,7 +20,7 @@ from cortex.pipe import Offer
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
-from cortex.shm import RingView, ShmUnavailable
+from cortex.shm import RingGone, RingView, ShmUnavailable
 from cortex.stats import SubscriberCounters
 from cortex.wire import (
     ATTACH,
@@ -53,6 +53,8 @@ BLOCK_MS = 20
 JUMP_MAX = 1 << 32
 """A sequence that is further ahead than this is not believed: after it every other would count as seen."""
 _NUMBERS = re.compile(r"[0-9a-f]{6,}|\d+")
+RINGS_MAX = 8
+"""Most rings of one publisher that are kept mapped."""
 WHOLE_BATCH = -1
 make = tuple.__new__
 """Makes a named tuple in half of the time that its own constructor takes."""
@@ -116,6 +118,10 @@ class Link:
         }
         self._large_head, self._slot_head, self.batch_head = list(self._handlers)[:3]
         self._rings: dict[int, RingView] = {}
+        self._newest_ring = -1
+        """The highest number of a ring that was mapped."""
+        self._given_up = 0
+        """The publisher writes to no ring of a lower number any more."""
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
@@ -362,10 +368,8 @@ class Link:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
         if answer.column is not None:
-            if answer.rings and self._open_ring(max(answer.rings)) is None:
+            if answer.rings and not self._take_rings(answer.rings):
                 return []
-            for number in self._rings.keys() - {place.ring for place in answer.rings}:
-                self._rings.pop(number).close()
             if self._large_subscribed:
                 self.socket.unsubscribe(self._large_head)
                 self._large_subscribed = False
@@ -396,22 +400,53 @@ class Link:
         """Descriptors that become readable when something may have come."""
         return (self._socket_fd,) if self._offer is None else (self._socket_fd, self._offer.fd)
 
-    def _open_ring(self, place: RingPlace) -> RingView | None:
-        """Map a ring that the publisher has told us of; without it, go on without shared memory."""
-        if self._column is None or place.ring in self._rings:
-            return self._rings.get(place.ring)
-        try:
-            view = RingView(self.source, *place, self._column)
-        except ShmUnavailable as error:
-            self._do_without_shared_memory(error)
-            return None
-        self._rings[place.ring] = view
+    def _take_rings(self, places: tuple[RingPlace, ...]) -> bool:
+        """Map the newest ring that is announced, and forget those that are given up.
+
+        An announcement comes through the socket, descriptors through a pipe: what it says may be old news.
+
+        Returns:
+            False if there is no shared memory from now on.
+        """
+        self._given_up = max(self._given_up, min(places).ring)
+        newest = max(places)
+        if newest.ring > self._newest_ring:
+            try:
+                self._map_ring(newest)
+            except RingGone:
+                pass  # replaced meanwhile: descriptors say which ring there is
+            except ShmUnavailable as error:
+                self._do_without_shared_memory(error)
+                return False
+        self._forget_rings(self._newest_ring)
+        return True
+
+    def _map_ring(self, place: RingPlace) -> RingView:
+        assert self._column is not None
+        view = self._rings[place.ring] = RingView(self.source, *place, self._column)
+        self._newest_ring = max(self._newest_ring, place.ring)
         return view
 
+    def _open_ring(self, place: RingPlace) -> RingView | None:
+        """Map the ring of a descriptor; where that cannot be done, go on without shared memory."""
+        try:
+            return self._map_ring(place)
+        except ShmUnavailable as error:
+            # The lease of a message keeps its ring; that of one that was left out may be gone.
+            if not isinstance(error, RingGone) or place.ring >= self._newest_ring:
+                self._do_without_shared_memory(error)
+            return None
+
     def _forget_rings(self, newest: int) -> None:
-        """Unmap older rings that nobody looks at; one that is needed after all is mapped again."""
+        """Unmap older rings that are not in use; one that is needed after all is mapped again.
+
+        Of a ring that the publisher has given up only messages on their way are waited for: those in use
+        become private copies.
+        """
         for number, view in list(self._rings.items()):
-            if number < newest and view.idle:
+            surplus = len(self._rings) > RINGS_MAX  # whoever lets us wait for so many sends us nonsense
+            given_up = number < self._given_up and not view.is_awaited
+            if number < newest and (surplus or given_up or view.idle):
                 del self._rings[number]
                 view.close()
 
@@ -427,6 +462,7 @@ class Link:
     def _do_without_shared_memory(self, error: ShmUnavailable) -> None:
         logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, error)
         self._close_rings()  # before the publisher can learn that our column is free
+        self._newest_ring = -1
         if self._piped:
             self._use_socket()
         if not self._large_subscribed:

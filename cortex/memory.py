@@ -5,6 +5,7 @@ The layout is section 6 of WIRE.md; `cortex.shm` has the rules by which it is us
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import logging
 import mmap
@@ -38,6 +39,10 @@ _FENCE = threading.Lock()
 
 class ShmUnavailable(OSError):
     """This memory cannot be made or cannot be trusted; messages can still be sent through a socket."""
+
+
+class RingGone(ShmUnavailable):
+    """The publisher's descriptors can be seen, but this one is closed, or something else by now."""
 
 
 class Layout(NamedTuple):
@@ -110,6 +115,7 @@ def open_ring_memory(
         Its head up to the slots, to read and write, and the whole of it, to read.
 
     Raises:
+        RingGone: The publisher, which can be reached, has no such memory any more.
         ShmUnavailable: It cannot be reached from here, or is something else, or could change its size.
     """
     _check_platform()
@@ -130,10 +136,11 @@ def open_ring_memory(
         head = Head(own, layout.slots, mmap.MAP_SHARED)
         flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
         return head, mmap.mmap(own, layout.total, flags, mmap.PROT_READ)
-    except ShmUnavailable:
-        raise
     except OSError as error:
-        raise ShmUnavailable(error.errno, f"{path}: {error.strerror}") from error
+        other = isinstance(error, ShmUnavailable)  # what is there is not what it was
+        gone = (other or error.errno == errno.ENOENT) and os.access(f"/proc/{pid}/fd", os.R_OK | os.X_OK)
+        kind = RingGone if gone else ShmUnavailable
+        raise (kind(str(error)) if other else kind(error.errno, f"{path}: {error.strerror}")) from error
     finally:
         if own >= 0:
             os.close(own)

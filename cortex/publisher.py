@@ -171,13 +171,13 @@ class Publisher(Generic[T]):
             if not self._was_large:
                 return self._publish_inline(prepared, stamp_ns, now_ns)
             ours = self._large_lock.acquire(blocking=False)
-            slot = self._acquire_slot(prepared.size) if ours else None
+            slot = self._acquire_slot(prepared.size, spare=True) if ours else None
         finally:
             self._lock.release()
         if not ours:
             self._large_lock.acquire()
             with self._lock:
-                slot = self._acquire_slot(prepared.size)
+                slot = self._acquire_slot(prepared.size, spare=True)
         try:
             if slot is None:
                 return False
@@ -394,9 +394,10 @@ class Publisher(Generic[T]):
         with self._lock:
             return self._flush()
 
-    def _acquire_slot(self, size: int) -> Slot | None:
-        """Find memory for a large message; both locks are held."""
-        slot = self._large.acquire(size, self._gate.sequence, exact=self.codec.fixed_size is not None)
+    def _acquire_slot(self, size: int, *, spare: bool = False) -> Slot | None:
+        """Find memory for a large message, as `LargeSender.acquire`; both locks are held."""
+        exact = self.codec.fixed_size is not None
+        slot = self._large.acquire(size, self._gate.sequence, exact=exact, spare=spare)
         if slot is None:
             self._flush()
             self._gate.sequence += 1

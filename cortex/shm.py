@@ -33,6 +33,7 @@ from cortex.memory import (
     SLOTS_MAX,
     STORES_IN_ORDER,
     Head,
+    RingGone,
     ShmUnavailable,
     address_of,
     create_ring_memory,
@@ -43,7 +44,7 @@ from cortex.memory import (
     open_ring_memory,
 )
 
-__all__ = ["Ring", "RingView", "ShmUnavailable"]
+__all__ = ["Ring", "RingGone", "RingView", "ShmUnavailable"]
 
 _log = logging.getLogger(__name__)
 
@@ -306,6 +307,7 @@ class RingView:
         column: The reader's column in the lease table.
 
     Raises:
+        RingGone: The publisher has no such ring any more.
         ShmUnavailable: The memory cannot be reached from here or is not what these arguments say.
     """
 
@@ -398,8 +400,13 @@ class RingView:
 
     @property
     def idle(self) -> bool:
-        """Whether no array that looks at a slot is alive."""
-        return not self._in_use()
+        """Whether this reader holds no slot: no array is alive, and no granted message on its way."""
+        return 1 not in self._own.tobytes()
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether a granted message has not been delivered yet."""
+        return self._own.tobytes().count(1) > len(self._in_use())
 
     def close(self) -> None:
         """Give all leases back and let go of the memory.
@@ -413,14 +420,17 @@ class RingView:
         head, self._head = self._head, None
         if head is None:
             return
-        in_use = self._in_use()
+        in_use, leased = self._in_use(), self._own.tobytes()
         try:
             first = address_of(self._memory)
             for slot in in_use:
                 make_private(first + slot * self.slot_bytes, self.slot_bytes, mmap.PROT_READ)
         except OSError as error:
             _log.warning("ring %d: messages in use cannot be copied and will change: %s", self.ring_id, error)
-        self._own[:] = bytes(self.slots)
+        slot = leased.find(1)
+        while slot >= 0:  # no other byte: the publisher may be granting a slot at this moment
+            self._own[slot] = 0
+            slot = leased.find(1, slot + 1)
         self._table = self._own = self._headers = self._memory = memoryview(b"")
         self._delivered = []
         if in_use:

@@ -281,7 +281,7 @@ def test_a_latched_message_that_is_none_is_rejected(runtime):
 
 def test_rings_that_cannot_be_mapped_are_done_without(feed):
     """Memory that is not what the answer says: the link asks for the messages through the socket."""
-    bad = answer_frame(feed.key, AttachAnswer(0, 3, (RingPlace(9, 4, 4096, 1, 0),), b""))
+    bad = answer_frame(feed.key, AttachAnswer(0, 3, (RingPlace(9, 4, 4096, 2**31 - 2, 0),), b""))
     feed.socket.send(bad)
     assert feed.drain() == []
     key = wait_for(feed._attach)

@@ -124,7 +124,8 @@ class RingModel(RuleBasedStateMachine):
     def counts_agree(self) -> None:
         for column in range(3):
             assert self.ring.outstanding(column) == len(self.holds(column))
-            assert self.readers[column].idle is not bool(self.views[column])
+            assert self.readers[column].idle is not bool(self.holds(column))
+            assert self.readers[column].is_awaited is (len(self.holds(column)) > len(self.views[column]))
         assert self.ring.idle is not bool(self.pins or any(map(self.holds, range(3))))
 
     @invariant()

@@ -265,14 +265,14 @@ class Link {
     column_ = answer.column;
     if (column_ != wire::no_column) {
       try {
-        for (const auto& place : answer.rings) {
-          if (rings_.count(place.ring) == 0) {
-            rings_.emplace(place.ring, std::make_shared<RingView>(source_, place, column_));
-          }
-        }
+        // The newest: a descriptor tells of an older one, and the publisher may have let go of that.
+        if (!answer.rings.empty()) map_ring(answer.rings.back());
       } catch (const ShmUnavailable& error) {
-        go_without_memory(error.what());
-        return;
+        const std::string descriptors = "/proc/" + std::to_string(answer.rings.back().pid) + "/fd";
+        if (::access(descriptors.c_str(), R_OK | X_OK) != 0) {
+          go_without_memory(error.what());
+          return;
+        }  // it was replaced before we came: the next descriptor says by what
       }
       while (rings_.size() > wire::rings_alive) rings_.erase(rings_.begin());  // leases keep their ring alive
       if (large_subscribed_) {
@@ -287,6 +287,12 @@ class Link {
     if (!answer.latched.empty()) latched(answer.latched, queue);
     known_ = true;
     expected_ = answer.sequence;
+  }
+
+  void map_ring(const wire::RingPlace& place) {
+    if (rings_.count(place.ring) == 0) {
+      rings_.emplace(place.ring, std::make_shared<RingView>(source_, place, column_));
+    }
   }
 
   void latched(Span<const std::uint8_t> frame, std::deque<Item>& queue) {
