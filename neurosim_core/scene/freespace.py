@@ -162,6 +162,16 @@ def _mesh_distances(
 _GROUND_SLACK_M = 0.01  # how far a floor may be above the plane meant by it
 
 
+@wp.func
+def room_around(
+    field: DistanceField, radius_m: float, exact_below: float, ground_height_m: wp.float64, p: wp.vec3d
+) -> float:
+    """Return how much room a sphere has around it [m]; see `check_collision`."""
+    point = wp.vec3(float(p[0]), float(p[1]), float(p[2]))
+    radius = wp.min(radius_m, float(p[2] - ground_height_m) - _GROUND_SLACK_M)
+    return scene_distance(field, point, exact_below) - radius
+
+
 @wp.kernel
 def _check_collision(
     # Model:
@@ -175,10 +185,7 @@ def _check_collision(
     clearance_out: wp.array[wp.float32],
 ) -> None:
     vehicle = wp.tid()
-    p = position[vehicle]
-    point = wp.vec3(float(p[0]), float(p[1]), float(p[2]))
-    radius = wp.min(radius_m, float(p[2] - ground_height_m) - _GROUND_SLACK_M)
-    clearance_out[vehicle] = scene_distance(field, point, exact_below) - radius
+    clearance_out[vehicle] = room_around(field, radius_m, exact_below, ground_height_m, position[vehicle])
 
 
 def check_collision(

@@ -758,8 +758,7 @@ class PixelNoise:
 
     def reset(self, base: wp.array[wp.float32], stamp_ns: int) -> None:
         """Begin anew in slot 0 of the ring, at what the pixels see at a stamp, shape [pixel]."""
-        self._reset_ns = stamp_ns
-        self._model.seed = _mix(self._seed, stamp_ns)
+        self.set_reset(stamp_ns)
         wp.launch(
             _begin,
             dim=self._pixel_count,
@@ -767,6 +766,16 @@ class PixelNoise:
             outputs=[self._ring[0]],
             device=self._device,
         )
+
+    def set_reset(self, stamp_ns: int) -> None:
+        """Let the noise that follows be that after a reset at a stamp."""
+        self._reset_ns = stamp_ns
+        self._model.seed = _mix(self._seed, stamp_ns)
+
+    @property
+    def model(self) -> Any:
+        """Return what the scan reads of pixels that stays, a `PixelModel`."""
+        return self._model
 
     def phase(self) -> tuple[int, bool]:
         """Return the stream of random phases, and whether voltages begin at one."""

@@ -135,7 +135,8 @@ def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
 
     Args:
         terms: Some of `TERMS`.
-        own_seeds: Each vehicle has the errors of a vehicle that flies alone with a seed of its own.
+        own_seeds: Each vehicle has the errors of a vehicle that flies alone with a seed of its own, and is
+            measured or not.
     """
     white = "white" in terms
     walk = "walk" in terms
@@ -161,6 +162,7 @@ def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
         angular_acceleration: wp.array[wp.vec3d],
         slot: wp.int32,
         seeds: wp.array[wp.uint64],
+        active: wp.array[wp.int32],
         # In/out:
         sample: wp.array[wp.int64],
         walk_bias: wp.array[vec6d],
@@ -182,6 +184,8 @@ def make_kernel(terms: frozenset[str], *, own_seeds: bool = False) -> Any:
         seed = model.seed
         element = vehicle
         if wp.static(own_seeds):
+            if active[vehicle] == 0:
+                return
             seed = seeds[vehicle]
             element = 0
         k = sample[vehicle]
@@ -236,6 +240,7 @@ class Imu:
         terms: The errors to compile in, some of `TERMS`; by default those that the configuration asks for.
         seeds: A seed for each vehicle, device array of uint64, shape [vehicle], in place of `seed`: its
             errors are then those of a vehicle that flies alone with that seed.
+        active: With `seeds`: 0 where a vehicle is not measured, device array of int32, shape [vehicle].
 
     Attributes:
         specific_force: Output in S [m/s^2], device array of vec3d, shape [slot, vehicle].
@@ -253,6 +258,7 @@ class Imu:
         slot_count: int = 1,
         terms: Sequence[str] | None = None,
         seeds: Any = None,
+        active: Any = None,
     ) -> None:
         if slot_count < 1:
             raise ValueError(f"slot_count must be >= 1, got {slot_count}")
@@ -283,6 +289,7 @@ class Imu:
                 arrays.angular_acceleration,
                 0,
                 seeds,
+                active,
             ],
             outputs=[self._sample, self._walk_bias, self._processes, self.specific_force, self.angular_rate],
             device=device,

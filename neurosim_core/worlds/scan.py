@@ -2,8 +2,8 @@
 # mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment,no-untyped-def,valid-type"
 """Kernels of the events of many worlds: the scan of all their pixels, and their keys in order.
 
-The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise`: their functions get the arrays of
-one world. Every world has keys and counters of its own, and no block of threads takes pixels of two, so a
+The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise`: their functions get the arrays
+of one world. Every world has keys and counters of its own, and no block of threads takes pixels of two, so a
 block finds room for its events in its world with one atomic operation. Nothing here depends on other worlds.
 
 Keys are sorted within each world, by one block each: how many there are is known only to the device, and a

@@ -1,0 +1,128 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+"""The scenes that worlds are in: one for all, or several, which kernels find by index."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.render.raycast import SceneData, Terms
+from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.scene.freespace import DistanceField
+from neurosim_core.simulation import Model, make_model
+
+SceneSource = str | Path | Mapping[str, Any]
+"""A settings file, of which the scene counts; a mesh file; or settings of a scene."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneTable:
+    """The scenes of all worlds, on the device."""
+
+    models: tuple[Model, ...]
+    """One for each scene: its free space, the path in it, its light."""
+    scene_of_world: tuple[int, ...]
+    """Which scene a world is in."""
+    fields: wp.array[Any]
+    """Distance to each scene, array of `DistanceField`, shape [scene]."""
+    scene: wp.array[int]
+    """`scene_of_world` on the device, shape [world]."""
+    data: wp.array[Any] | None
+    """Arrays of each scene, array of `SceneData`, shape [scene]; None: there is one, or no camera."""
+    terms: Terms | None
+    """What some scene needs in the kernel of the renderer; None: there is no camera."""
+
+    @property
+    def model(self) -> Model:
+        """The model of the first scene; what does not depend on the scene is the same in all."""
+        return self.models[0]
+
+    @property
+    def first(self) -> SceneArrays | None:
+        """The first scene as the renderer has it; None: there is no camera."""
+        arrays = self.model.scene_on_device
+        return arrays if isinstance(arrays, SceneArrays) else None
+
+
+def make_scene_table(
+    config: SimulationConfig,
+    *,
+    count: int,
+    scenes: Sequence[SceneSource] | None = None,
+    scene_of_world: ArrayLike | None = None,
+) -> SceneTable:
+    """Load the scenes and bring them to the device.
+
+    Args:
+        config: What to fly; its scene counts where no others are given.
+        count: Number of worlds.
+        scenes: The scenes.
+        scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
+
+    Raises:
+        ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
+            move and there are several scenes.
+    """
+    if config.renderer != "warp":
+        raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer!r}")
+    if scenes is not None and not scenes:
+        raise ValueError("scenes must name one scene at least, got none")
+    if scenes is not None and len(scenes) > 1 and config.bodies:
+        raise ValueError(
+            f"bodies move in one scene only, got {len(scenes)} scenes and {', '.join(config.bodies)}"
+        )
+    models = tuple(make_model(_in_scene(config, source)) for source in scenes or [None])
+    turns = np.arange(count) % len(models)
+    chosen = np.asarray(turns if scene_of_world is None else scene_of_world)
+    if chosen.shape != (count,) or not np.issubdtype(chosen.dtype, np.integer):
+        raise ValueError(f"scene_of_world must be integers of shape [{count}], got {list(chosen.shape)}")
+    if chosen.min() < 0 or chosen.max() >= len(models):
+        raise ValueError(
+            f"scene_of_world must be in [0, {len(models) - 1}], got {chosen.min()} to {chosen.max()}"
+        )
+    device = models[0].device
+    arrays = [m.scene_on_device for m in models if isinstance(m.scene_on_device, SceneArrays)]
+    terms = None
+    if arrays:
+        terms = Terms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
+        # walks that rays share change nothing but the speed, and are for one camera
+        terms = terms._replace(worlds=True, world_scenes=len(arrays) > 1, walked=False, by_tile=False)
+    return SceneTable(
+        models=models,
+        scene_of_world=tuple(int(scene) for scene in chosen),
+        fields=wp.array([m.free_space.arrays for m in models], dtype=DistanceField, device=device),
+        scene=wp.array(chosen.astype(np.int32), dtype=int, device=device),
+        data=wp.array([_completed(a) for a in arrays], dtype=SceneData, device=device)
+        if len(arrays) > 1
+        else None,
+        terms=terms,
+    )
+
+
+def _in_scene(config: SimulationConfig, source: SceneSource | None) -> SimulationConfig:
+    if source is None:
+        return config
+    if isinstance(source, Mapping):
+        scene = load_config({"scene": dict(source)}).scene
+    elif str(source).endswith((".yaml", ".yml")):
+        scene = load_config(source).scene
+    else:
+        scene = load_config({"scene": {"kind": "mesh", "file": str(Path(source).resolve())}}).scene
+    return config.model_copy(update={"scene": scene})
+
+
+def _completed(arrays: SceneArrays) -> SceneData:
+    """Return the arrays of a scene with what a kernel for textured scenes reads of one that is not."""
+    data = arrays.data
+    if not arrays.terms.textured:
+        materials = arrays.data.base_color.shape[0]
+        data.material_texture = wp.zeros(materials, dtype=wp.vec2i, device=arrays.device)
+        data.face_lod = wp.zeros(1, dtype=float, device=arrays.device)
+    return data

@@ -1,0 +1,401 @@
+"""World i of a batch is the ordinary simulation with its seed and its commands, to the byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from world_rig import RIG, assert_same, commands_of, fly_alone, room, scene_of, settings, snapshot
+
+import neurosim_core as ns
+from neurosim_core.packets import Collision
+from neurosim_core.render import launch
+from neurosim_core.simulation import StartState
+from neurosim_core.vehicle.status import STATUS_TERMS
+from neurosim_core.worlds import make_worlds, world_events
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    return room(tmp_path_factory.mktemp("plain") / "room.glb")
+
+
+@pytest.fixture(scope="module")
+def textured(tmp_path_factory) -> Path:
+    return room(tmp_path_factory.mktemp("textured") / "room.glb", textured=True)
+
+
+def record(worlds: Any, commands: np.ndarray, *, mode: str = "rates", **start: Any) -> list[list[dict]]:
+    """Fly from a reset on; return what each world yields, [step][world], with the reset first."""
+    steps = [worlds.reset(**start)]
+    seen = [[snapshot(steps[0], world) for world in range(worlds.count)]]
+    for command in commands:
+        observation = worlds.step(command, mode=mode)
+        seen.append([snapshot(observation, world) for world in range(worlds.count)])
+    return seen
+
+
+def event_count(seen: list[list[dict]], name: str = "front") -> int:
+    return sum(len(world[name][0]) for step in seen for world in step)
+
+
+@pytest.mark.parametrize("mode", ["rates", "attitude", "position", "velocity", "motor_speeds"])
+def test_each_world_is_a_single_simulation(mode, plain):
+    """Events, pictures, IMU with noise and states, for commands of every level."""
+    commands = commands_of(mode, 8, 3)
+    seen = record(make_worlds(settings(plain), count=3), commands, mode=mode)
+    assert event_count(seen) > 1000
+    for world in range(3):
+        alone = fly_alone(settings(plain, seed=7 + world), commands[:, world], mode=mode)
+        for step, packets in enumerate(alone):
+            assert_same(seen[step][world], packets)
+
+
+def test_places_of_their_own(plain):
+    """Each vehicle begins where it is told."""
+    position = np.array([[1.0, 0.5, 1.0], [-1.5, -0.5, 2.0]])
+    orientation = np.array([[0.0, 0.0, 1.0, 2.0], [0.1, 0.2, 0.3, 0.4]])
+    commands = commands_of("rates", 4, 2)
+    worlds = make_worlds(settings(plain), count=2, seeds=[3, 11])
+    seen = record(worlds, commands, position=position, orientation=orientation, velocity=[1.0, 0.0, 0.0])
+    for world, seed in enumerate((3, 11)):
+        start = StartState(position=position[world], orientation=orientation[world], velocity=[1.0, 0.0, 0.0])
+        alone = fly_alone(settings(plain, seed=seed), commands[:, world], start=start)
+        for step, packets in enumerate(alone):
+            assert_same(seen[step][world], packets)
+
+
+def test_scenes_of_their_own(plain, textured):
+    """Worlds in two scenes, of which one has textures, are what they are alone."""
+    commands = commands_of("rates", 6, 3)
+    worlds = make_worlds(
+        settings(plain), count=3, scenes=[scene_of(plain), scene_of(textured)], scene_of_world=[1, 0, 1]
+    )
+    seen = record(worlds, commands)
+    pictures = [seen[0][world]["rgb"] for world in range(3)]
+    assert not np.array_equal(pictures[0], pictures[1])
+    assert np.array_equal(pictures[0], pictures[2])
+    for world, path in enumerate((textured, plain, textured)):
+        alone = fly_alone(settings(path, seed=7 + world), commands[:, world])
+        for step, packets in enumerate(alone):
+            assert_same(seen[step][world], packets)
+
+
+NOISE = {
+    "threshold_spread": {"sigma_on": 0.02, "sigma_off": 0.02},
+    "low_pass": {"cutoff_hz": 200.0},
+    "refractory_s": 5e-4,
+    "leak": {"rate_hz": 5.0},
+    "shot_noise": {"rate_hz": 20.0},
+    "hot_pixels": {"fraction": 0.01},
+}
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_pixels_and_lenses_of_their_own(noisy, plain):
+    """Thresholds, noise and field of view that differ from world to world."""
+    pixel = {"threshold_on": 0.12, "threshold_off": 0.1, **(NOISE if noisy else {})}
+    rig = {"front": {**RIG["front"], "pixel": pixel}, "imu": RIG["imu"]}
+    given = {
+        "front.threshold_on": [0.1, 0.2, 0.15],
+        "front.threshold_off": [0.3, 0.1, 0.1],
+        "front.lens.horizontal_fov_rad": [1.2, 1.5, 1.2],
+    }
+    if noisy:
+        given |= {"front.refractory_s": [1e-3, 0.0, 2e-3], "front.shot_noise.rate_hz": [1.0, 100.0, 30.0]}
+    commands = commands_of("rates", 6, 3)
+    config = settings(plain, sensors=rig)
+    seen = record(make_worlds(config, count=3, parameters=given), commands)
+    assert event_count(seen) > 500
+    for world in range(3):
+        own = {key.replace("front.", "sensors.front."): values[world] for key, values in given.items()}
+        own = {
+            key if ".lens." in key else key.replace("front.", "front.pixel."): value
+            for key, value in own.items()
+        }
+        overrides = {**own, "seed": 7 + world}
+        alone = fly_alone(config, commands[:, world], overrides=overrides)
+        for step, packets in enumerate(alone):
+            assert_same(seen[step][world], packets)
+
+
+def test_what_moves_by_itself(plain):
+    """Bodies that pass, gusts and turbulence: by the clock and the seed of each world."""
+    ball = {
+        "shape": {"kind": "sphere", "radius_m": 0.3},
+        "motion": {"position_m": [1.5, -1.0, 1.5], "velocity_m_s": [0.0, 8.0, 0.0]},
+    }
+    turbulence = {"parameters": {"turbulence": {"wind_20ft_m_s": 15.0}}, "on_collision": "report"}
+    rig = {"front": RIG["front"], "odometry": RIG["odometry"]}
+    config = settings(plain, sensors=rig, bodies={"ball": ball}, vehicle=turbulence)
+    commands = commands_of("position", 6, 2)
+    worlds = make_worlds(config, count=2)
+    for episode in range(2):  # the second begins with all that the first has left
+        seen = record(worlds, commands, mode="position")
+        assert event_count(seen) > 100, episode
+        for world in range(2):
+            alone = fly_alone({**config, "seed": 7 + world}, commands[:, world], mode="position")
+            for step, packets in enumerate(alone):
+                assert_same(seen[step][world], packets)
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_a_world_that_is_reset_alone(on_device, plain):
+    """It begins like a fresh simulation, and the others do not notice."""
+    rig = {**RIG, "front": {**RIG["front"], "pixel": {"threshold_on": 0.12, **NOISE}}}
+    rig["rgb"] = {**RIG["rgb"], "rate_hz": 100}
+    config = settings(plain, sensors=rig, vehicle={"on_collision": "report"})
+    commands = commands_of("rates", 7, 3)
+    worlds = make_worlds(config, count=3)
+    seen = record(worlds, commands[:3])
+    mask: Any = np.array([0, 1, 0], dtype=np.uint8)
+    worlds.reset(mask=wp.array(mask, dtype=wp.uint8, device="cpu") if on_device else mask.astype(bool))
+    first = snapshot(worlds.reset(mask=mask), 1)  # again: nothing is left of the one before
+    for command in commands[3:]:
+        observation = worlds.step(command)
+        seen.append([snapshot(observation, world) for world in range(3)])
+    for world in range(3):
+        alone = fly_alone({**config, "seed": 7 + world}, commands[3 * (world == 1) :, world])
+        after = [first, *(step[world] for step in seen[4:])] if world == 1 else [s[world] for s in seen]
+        for step, packets in enumerate(alone):
+            assert_same(after[step], packets)
+    assert worlds.reset(mask=mask).clock_ns.numpy().tolist() == [70_000_000, 0, 70_000_000]
+
+
+def test_new_seeds(plain):
+    """After a reset with other seeds everything random is that of these seeds."""
+    rig = {**RIG, "front": {**RIG["front"], "pixel": {"threshold_on": 0.12, **NOISE}}}
+    config = settings(plain, sensors=rig)
+    commands = commands_of("rates", 3, 2)
+    worlds = make_worlds(config, count=2)
+    before = record(worlds, commands)
+    again = record(worlds, commands, seed=[40, 2])
+    same = record(worlds, commands, seed=7)
+    assert event_count(before) == event_count(same) != event_count(again)
+    for world, seed in enumerate((40, 2)):
+        alone = fly_alone({**config, "seed": seed}, commands[:, world])
+        for step, packets in enumerate(alone):
+            assert_same(again[step][world], packets)
+
+
+def test_more_events_than_fit(plain):
+    """Of each render the rows from the top that fit are kept, as a single camera does; losses are counted."""
+    capacity = 80
+    commands = commands_of("rates", 6, 2)
+    seen = record(make_worlds(settings(plain), count=2, event_capacity=capacity), commands)
+    lost = [[step[world]["dropped"]["front"] for step in seen] for world in range(2)]
+    assert all(sum(counts) > 0 for counts in lost)
+    overrides = {"sensors.front.pixel.event_count_max": capacity // 4}
+    for world in range(2):
+        limited = fly_alone(settings(plain, seed=7 + world), commands[:, world], overrides=overrides)
+        free = fly_alone(settings(plain, seed=7 + world), commands[:, world])
+        for step, counts in enumerate(lost[world]):
+            assert len(seen[step][world]["front"][0]) <= capacity
+            assert_same(seen[step][world], limited[step] if counts else free[step])
+
+
+def test_a_collision_holds_one_world(plain):
+    """It is told and held where it touched; the other flies on as if alone."""
+    config = settings(plain, vehicle={"on_collision": "end"})
+    commands = np.zeros((30, 2, 4))
+    commands[:, 0] = [0.0, 6.0, 0.0, 0.0]  # to the left, where the wall is
+    seen = record(make_worlds(config, count=2), commands, mode="velocity", velocity=[[0, 7, 0], [0, 0, 0]])
+    collided = [step[0]["collided"] for step in seen]
+    touch = collided.index(1)
+    assert 5 < touch < 30
+    assert all(collided[touch:])
+    assert not any(step[1]["collided"] or step[1]["status"] for step in seen)
+    assert STATUS_TERMS[seen[-1][0]["status"]] == "collision"
+    for step in seen[touch:]:
+        for value, held in zip(step[0]["state"], seen[touch][0]["state"], strict=True):
+            np.testing.assert_array_equal(value, held)
+    start = StartState(velocity=[0.0, 7.0, 0.0])
+    alone = fly_alone(config, commands[:, 0], mode="velocity", start=start)
+    assert len(alone) == touch + 1
+    (hit,) = [packet for packet in alone[-1] if isinstance(packet, Collision)]
+    np.testing.assert_array_equal(seen[touch][0]["state"][0], hit.position)
+    for step, packets in enumerate(alone[:-1]):
+        assert_same(seen[step][0], packets)
+    other = fly_alone({**config, "seed": 8}, commands[:, 1], mode="velocity")
+    for step, packets in enumerate(other):
+        assert_same(seen[step][1], packets)
+
+
+def test_touches_are_reported_while_they_last(plain):
+    config = settings(plain, vehicle={"on_collision": "report"})
+    worlds = make_worlds(config, count=2)
+    worlds.reset(position=[[0.0, 1.7, 1.5], [0.0, 0.0, 1.5]], velocity=[0.0, 6.0, 0.0])
+    told = [worlds.step(None).collided.numpy().tolist() for _ in range(14)]
+    assert [told[0], told[3], told[13]] == [[0, 0], [1, 0], [0, 0]]  # at 6 m/s it touches from 1.8 to 2.2 m
+
+
+def test_a_motion_that_cannot_be_integrated_holds_one_world(plain):
+    """A command that is no number, on the device, where nobody looks at it."""
+    rig = {"front": RIG["front"]}
+    worlds = make_worlds(settings(plain, sensors=rig), count=2)
+    worlds.reset()
+    commands = commands_of("rates", 3, 2)
+    commands[1, 0, 0] = np.nan
+    for command in commands:
+        observation = worlds.step(wp.array(command, dtype=wp.float64, device="cpu"))
+    assert [STATUS_TERMS[code] for code in observation.status.numpy()] == ["rotor_speed_command", "ok"]
+    assert observation.state.stamp_ns.numpy().tolist() == [10_000_000, 30_000_000]
+    assert not observation.collided.numpy().any()
+    assert not worlds.reset().status.numpy().any()
+
+
+def test_neither_batch_nor_threads_change_a_byte(plain, monkeypatch):
+    """Four worlds together are two and two, on one core or three."""
+    rig = {"front": RIG["front"], "rgb": RIG["rgb"], "imu": RIG["imu"]}
+    commands = commands_of("rates", 4, 4)
+    together = record(make_worlds(settings(plain, sensors=rig), count=4), commands)
+    for cores in (1, 3):
+        for module in (launch, world_events):
+            monkeypatch.setattr(module, "core_count", lambda cores=cores: cores)
+        for first in (0, 2):
+            half = make_worlds(settings(plain, sensors=rig), count=2, seeds=[7 + first, 8 + first])
+            apart = record(half, commands[:, first : first + 2])
+            for step, worlds in enumerate(apart):
+                for index, seen in enumerate(worlds):
+                    for name in ("front", "imu", "state"):
+                        for a, b in zip(seen[name], together[step][first + index][name], strict=True):
+                            np.testing.assert_array_equal(a, b)
+
+
+def test_events_that_are_not_sorted(plain):
+    """They are the same, of each world together."""
+    commands = commands_of("rates", 4, 2)
+    rig = {"front": RIG["front"]}
+    ordered = record(make_worlds(settings(plain, sensors=rig), count=2), commands)
+    loose = record(make_worlds(settings(plain, sensors=rig), count=2, sorted=False), commands)
+    for a, b in zip(ordered, loose, strict=True):
+        for world in range(2):
+            t, x, y, polarity = b[world]["front"]
+            order = np.lexsort((polarity, x, y, t))
+            for column, expected in zip((t, x, y, polarity), a[world]["front"], strict=True):
+                np.testing.assert_array_equal(column[order], expected)
+
+
+def test_results_are_tensors_without_a_copy(plain):
+    """PyTorch sees the memory that the next step writes to; commands may be tensors."""
+    torch = pytest.importorskip("torch")
+    rig = {name: RIG[name] for name in ("front", "rgb", "imu")}
+    worlds = make_worlds(settings(plain, sensors=rig), count=2)
+    observation = worlds.reset()
+    pictures = torch.from_dlpack(observation.images["rgb"])
+    position = torch.from_dlpack(observation.state.position)
+    assert (pictures.shape, pictures.dtype) == ((2, 28, 36, 3), torch.uint8)
+    assert (position.shape, position.dtype) == ((2, 3), torch.float64)
+    before = position.clone()
+    commands = torch.tensor([[6.0, 0.0, 2.0, 0.0], [9.0, 0.0, 0.0, 0.0]], dtype=torch.float32)
+    for _ in range(4):
+        observation = worlds.step(commands)
+    assert pictures.data_ptr() == observation.images["rgb"].ptr
+    assert (position[:, 2] != before[:, 2]).all()
+    assert torch.from_dlpack(observation.imu["imu"].specific_force).shape == (2, 2, 3)
+    counts = torch.from_dlpack(observation.events["front"].counts)
+    offsets = torch.from_dlpack(observation.events["front"].offsets)
+    assert torch.equal(torch.diff(offsets), counts)
+    assert counts.sum() > 0
+    alone = make_worlds(settings(plain, sensors=rig), count=2)
+    alone.reset()
+    for _ in range(4):
+        other = alone.step(wp.array(commands.numpy(), dtype=wp.float32, device="cpu"))
+    np.testing.assert_array_equal(position.numpy(), other.state.position.numpy())
+
+
+def test_a_step_allocates_nothing(plain):
+    """Of the device, once every pattern has been flown: what a graph of it needs."""
+    worlds = make_worlds(settings(plain), count=2)
+    worlds.reset()
+    commands = commands_of("rates", 8, 2)
+    for command in commands[:4]:
+        worlds.step(command)
+    made = []
+    original = wp.array.__init__
+
+    def counted(self: Any, *args: Any, **kwargs: Any) -> None:
+        if kwargs.get("ptr") is None:
+            made.append(kwargs)
+        original(self, *args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp.array, "__init__", counted)
+        for command in commands[4:]:
+            worlds.step(command)
+    assert made == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "arguments", "message"),
+    [
+        ({}, {"count": 0}, r"count must be in \[1, 4096\], got 0"),
+        ({"renderer": "synthetic"}, {}, "renderer 'warp', got 'synthetic'"),
+        ({}, {"parameters": {"front.threshold_on": [0.1]}}, r"shape \[2\], got \[1\]"),
+        ({}, {"parameters": {"front.threshold_on": [0.1, -1.0]}}, "'front' in world 1: pixel.threshold_on"),
+        ({}, {"parameters": {"back.threshold_on": [0.1, 0.1]}}, "known: front, rgb"),
+        ({}, {"parameters": {"front.sampling_rate_hz": [1, 2]}}, "worlds cannot differ in"),
+        ({}, {"parameters": {"front.lens.width": [36, 40]}}, "pictures of one size"),
+        ({}, {"parameters": {"front.lens.horizontal_fov_rad": [1.0, 1.5]}}, "'front' and 'depth' share"),
+        ({}, {"scene_of_world": [0, 1]}, r"scene_of_world must be in \[0, 0\], got 0 to 1"),
+        ({}, {"seeds": [1, 2, 3]}, r"shape \[2\]"),
+        ({}, {"event_capacity": 0}, "event_capacity"),
+        ({"vehicles": {"a": {}, "b": {}}}, {}, "one vehicle, got a, b"),
+        ({"control": {"rate_hz": 120}}, {}, "rate_hz must divide control.rate_hz = 120"),
+    ],
+)
+def test_what_is_refused(changes, arguments, message, plain):
+    with pytest.raises(ValueError, match=message):
+        make_worlds(settings(plain, **changes), **{"count": 2, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("front", "message"),
+    [({"max_displacement_px": 1.0}, "single runs"), ({"pixel": {"readout": {}}}, "readout of 'front'")],
+)
+def test_cameras_that_are_refused(front, message, plain):
+    rig = {"front": {**RIG["front"], **front}}
+    with pytest.raises(ValueError, match=message):
+        make_worlds(settings(plain, sensors=rig), count=2)
+
+
+def test_wrong_calls(plain):
+    worlds = make_worlds(settings(plain), count=2)
+    with pytest.raises(RuntimeError, match=r"reset\(\) must be called"):
+        worlds.step()
+    with pytest.raises(ValueError, match="the first reset is of all"):
+        worlds.reset(mask=[True, False])
+    worlds.reset()
+    with pytest.raises(ValueError, match=r"mode 'rates' takes rows"):
+        worlds.step(np.zeros((3, 4)))
+    with pytest.raises(ValueError, match=r"commands must have shape \[2, 4\], got \[2, 3\]"):
+        worlds.step(wp.zeros((2, 3), dtype=wp.float64, device="cpu"))
+    with pytest.raises(ValueError, match="commands must be float32 or float64"):
+        worlds.step(wp.zeros((2, 4), dtype=wp.int32, device="cpu"))
+    with pytest.raises(ValueError, match=r"orientation must not be 0"):
+        worlds.reset(orientation=[0.0, 0.0, 0.0, 0.0])
+    worlds.step(np.zeros(4))
+    with pytest.raises(ValueError, match="tick together every 20000000 ns, and it is 10000000 ns"):
+        worlds.reset(mask=np.array([True, False]))  # rgb takes a picture every other step
+    with pytest.raises(ValueError, match="seed: new seeds"):
+        worlds.reset(mask=np.array([True, False]), seed=3)
+    worlds.step(np.zeros(4))
+    worlds.reset(mask=np.array([True, False]))
+    assert worlds.width == {"motor_speeds": 4, "rates": 4}
+
+
+def test_a_flight_without_cameras(plain):
+    """States and IMU alone."""
+    config = ns.load_config(settings(plain, sensors={"imu": RIG["imu"], "odometry": RIG["odometry"]}))
+    commands = commands_of("rates", 5, 2)
+    seen = record(make_worlds(config, count=2), commands)
+    for world in range(2):
+        alone = fly_alone(
+            settings(plain, seed=7 + world, sensors={"imu": RIG["imu"], "odometry": RIG["odometry"]}),
+            commands[:, world],
+        )
+        for step, packets in enumerate(alone):
+            assert_same(seen[step][world], packets)
