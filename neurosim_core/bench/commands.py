@@ -38,6 +38,8 @@ class Study:
     """Measures under options, such as quick, and returns the answer."""
     options: frozenset[str] = frozenset()
     """What it takes besides `quick`, some of scene, device, width and height."""
+    then: str = ""
+    """Study of that device that follows where a device is named; its options are taken as well."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -57,7 +59,9 @@ def _add_study(parser: argparse.ArgumentParser, study: Study) -> None:
     _add_out(parser, study.name)
     _add_quick(parser)
     _add_strict(parser)
-    _add_options(parser, study.options)
+    _add_options(
+        parser, frozenset().union(study.options, *(s.options for s in STUDIES if s.name == study.then))
+    )
     parser.set_defaults(command=lambda arguments: _bench_study(study, arguments))
 
 
@@ -249,6 +253,12 @@ def _render(options: Mapping[str, Any], progress: Progress) -> Chapter:
     return render_chapter(measure_render(**options, progress=progress))
 
 
+def _throughput(options: Mapping[str, Any], progress: Progress) -> Chapter:
+    from neurosim_core.bench.throughput import measure_throughput, throughput_chapter
+
+    return throughput_chapter(measure_throughput(**options, progress=progress))
+
+
 def _leave_out(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.leave_out import leave_out_chapter, measure_leave_out
 
@@ -284,9 +294,20 @@ STUDIES: Sequence[Study] = (
         name="render",
         help="error against run time of rendering, and false events from aliasing",
         description="Render with several settings of sampling and filtering, against many samples a pixel; "
-        "then pan slowly over a fine checkerboard and count false events.",
+        "then pan slowly over a fine checkerboard and count false events. Where --device names one, measure "
+        "as well how fast it is (`neurosim bench throughput`, which flies in --scene).",
         chapter=_render,
         options=frozenset({"device"}),
+        then="throughput",
+    ),
+    Study(
+        name="throughput",
+        help="whole steps a second, where their time goes, and what the device could do",
+        description="Fly with an event camera of several sizes, exactly and adaptively, in scenes of up to "
+        "two million triangles; split the time of a step; measure its parts alone beside the ceilings of the "
+        "device and a naive event camera. Two to five minutes.",
+        chapter=_throughput,
+        options=frozenset({"scene", "device"}),
     ),
     Study(
         name="leave-out",
@@ -303,9 +324,15 @@ def _bench_study(study: Study, arguments: argparse.Namespace) -> int:
 
     console = Console()
     with handle_signals(signal.default_int_handler):
-        chapters = [_measure(study, arguments, console)]
+        chapters = [_measure(part, arguments, console) for part in _parts(study, arguments)]
         _write(chapters, arguments.out, console)
     return _judge(chapters, console, strict=arguments.strict)
+
+
+def _parts(study: Study, arguments: argparse.Namespace) -> list[Study]:
+    """Return a study, and what follows it where a device is named."""
+    named = study.then if getattr(arguments, "device", None) else ""
+    return [study, *(other for other in STUDIES if other.name == named)]
 
 
 def _bench_all(arguments: argparse.Namespace) -> int:
