@@ -33,12 +33,25 @@ class LightingConfig(Settings):
     """Radius of the lights [m]: softens shadows, and distances are taken as at least this."""
 
 
+class WalkConfig(Settings):
+    """How rays of a tile of 8 x 8 pixels share their walks through the tree; changes speed, not results."""
+
+    instants: int = Field(default=16, ge=1, le=256)
+    """Consecutive instants of a launch that share a walk. More are cheaper as long as the camera turns by
+    less than a few tiles within them."""
+    face_count_max: int = Field(default=256, ge=1, le=4096)
+    """The most triangles that a walk may list: of a tile with more each ray walks by itself."""
+
+
 class RenderConfig(Settings):
     """How pictures are computed, the same for all cameras of a run."""
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
     """Who finds what rays hit on a CPU device. `embree`: Embree, in packets of rays, several times faster.
-    `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded."""
+    `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp with a `shared_walk`."""
+    shared_walk: WalkConfig | None = None
+    """The rays of a tile of pixels share one walk through Warp's tree over several instants, instead of one
+    for each ray: the same pictures and events to the last bit, sooner. null: each ray walks by itself."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
@@ -56,6 +69,12 @@ class RenderConfig(Settings):
     """How textures are read. `trilinear`: averaged over the footprint of the ray (mip-mapped). `bilinear`: at
     full resolution, interpolated between texels; `nearest`: at full resolution, the nearest texel. The latter
     two alias, which event cameras see as events that no sensor gives."""
+
+    @model_validator(mode="after")
+    def _walks_are_in_the_tree_of_warp(self) -> RenderConfig:
+        if self.shared_walk is not None and self.cpu_traversal == "embree":
+            raise ValueError("shared_walk is for Warp's tree: cpu_traversal must be auto or warp, got embree")
+        return self
 
     @model_validator(mode="after")
     def _bias_has_levels(self) -> RenderConfig:

@@ -6,7 +6,8 @@
 
 One traversal per ray answers everything. A thread is a pixel of an instant; blocks of 64 threads are tiles of
 8 x 8 pixels, so that their rays walk the same nodes of the tree. With Embree a thread is a packet of 4 x 4
-pixels, four of them a tile. What a specialisation does not need is not in its code.
+pixels, four of them a tile. With shared walks (`tile_walk.py`) a block finds together what its rays hit, and
+on a CPU a thread is a whole tile. What a specialisation does not need is not in its code.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -20,13 +21,11 @@ import warp as wp
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
+from neurosim_core.render.tile_walk import ASK, TILE, WalkData, find_face, find_faces, meet_face
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
 """Everything that a cast can answer."""
-
-TILE = 8
-"""Width and height of the tile of a block [px]."""
 
 _COSINE_MIN = wp.constant(0.05)
 _FAR_M = wp.constant(1.0e9)
@@ -58,6 +57,10 @@ class Terms(NamedTuple):
     """Worlds are in different scenes."""
     world_lenses: bool = False
     """Worlds look through different lenses."""
+    walked: bool = False
+    """Rays of a tile share a walk through the tree (`tile_walk`), a block of 64 threads at a time."""
+    by_tile: bool = False
+    """With `walked`: on a CPU, a thread for each tile."""
 
 
 @wp.struct
@@ -157,6 +160,35 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     worlds = terms.worlds
     world_scenes = terms.world_scenes
     world_lenses = terms.world_lenses
+    walked = terms.walked
+
+    @wp.func
+    def meet_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
+        query = wp.mesh_query_ray(scene.mesh, origin, ray, _FAR_M)
+        hit = Hit()
+        hit.face = wp.where(query.result, query.face, -1)
+        hit.t = query.t
+        hit.u = query.u
+        hit.v = query.v
+        hit.normal = query.normal
+        return hit
+
+    @wp.func
+    def meet_listed(scene: SceneData, origin: wp.vec3, ray: wp.vec3, face: int) -> Hit:
+        # `face`: what a walk found that the ray hits, -1: nothing, ASK: it does not tell.
+        hit = Hit()
+        hit.face = -1
+        if face >= 0:
+            met = meet_face(scene.mesh, face, origin, ray)
+            if met[0] >= 0.0:
+                hit.face = face
+                hit.t = met[0]
+                hit.u = met[1]
+                hit.v = met[2]
+                hit.normal = wp.mesh_eval_face_normal(scene.mesh, face)
+        if face == ASK or (face >= 0 and hit.face < 0):
+            hit = meet_scene(scene, origin, ray)
+        return hit
 
     @wp.func
     def surface_albedo(scene: SceneData, spread_rad: float, facing: float, hit: Hit) -> wp.vec3:
@@ -377,6 +409,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         image_slot: wp.array[int],
         bodies: BodyData,
         world_data: WorldData,
+        walk_data: WalkData,
         # Out:
         log_radiance_out: wp.array3d[float],
         rgb_out: wp.array4d[wp.uint8],
@@ -405,8 +438,13 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             first_ray = world_data.lens[world] * width * height
         col = (tile % tile_columns) * 8 + in_tile % 8
         row = (tile // tile_columns) * 8 + in_tile // 8
-        if col >= width or row >= height:
-            return
+        outside = col >= width or row >= height
+        if wp.static(not walked):
+            if outside:
+                return
+        else:  # what the block does together, all threads do
+            col = wp.min(col, width - 1)
+            row = wp.min(row, height - 1)
         slot = int(-1)
         if wp.static(with_images):
             slot = image_slot[instant]
@@ -424,13 +462,27 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     continue
             ray_C = rays[layer, pixel]
             ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-            query = wp.mesh_query_ray(scene.mesh, origin, ray, _FAR_M)
-            hit = Hit()
-            hit.face = wp.where(query.result, query.face, -1)
-            hit.t = query.t
-            hit.u = query.u
-            hit.v = query.v
-            hit.normal = query.normal
+            if wp.static(walked):
+                walk = instant // walk_data.instants
+                face = find_face(
+                    scene.mesh,
+                    walk_data.faces,
+                    (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
+                    walk_data.count[walk, tile],
+                    walk_data.reach[walk, tile],
+                    _FAR_M,
+                    walk_data.bounds[tile],
+                    wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
+                    wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
+                    wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
+                    origin,
+                    ray,
+                )
+                if outside:
+                    continue
+                hit = meet_listed(scene, origin, ray, face)
+            else:
+                hit = meet_scene(scene, origin, ray)
             body = int(-1)
             if wp.static(with_bodies):
                 hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
@@ -443,12 +495,18 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                         scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
                     )
         if wp.static(with_radiance):
-            write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
+            if wp.static(not walked) or not outside:
+                write_radiance(
+                    scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out
+                )
 
-    if not terms.embree:
+    if not (terms.embree or terms.by_tile):
         return raycast
 
-    cast_packet = packet_caster(terms.embree)
+    side = TILE if terms.by_tile else 4
+    lanes = side * side
+    packets = (TILE // side) ** 2  # of a tile
+    cast_packet = packet_caster(terms.embree) if terms.embree else None
 
     @wp.kernel(module="unique", enable_backward=False)
     def raycast_packets(
@@ -465,6 +523,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         image_slot: wp.array[int],
         bodies: BodyData,
         world_data: WorldData,
+        walk_data: WalkData,
         # Out:
         log_radiance_out: wp.array3d[float],
         rgb_out: wp.array4d[wp.uint8],
@@ -474,8 +533,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     ) -> None:
         # A packet is the same pixels in every launch: the last bit of a hit may depend on the other rays.
         index = first + wp.tid()
-        in_tile = index % 4
-        block = index // 4
+        in_tile = index % packets
+        block = index // packets
         instant = block % instant_count
         tile = block // instant_count
         tile_columns = (width + 7) // 8
@@ -492,8 +551,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             scene = world_data.scenes[world_data.scene[world]]
         if wp.static(world_lenses):
             first_ray = world_data.lens[world] * width * height
-        left = (tile % tile_columns) * 8 + (in_tile % 2) * 4
-        top = (tile // tile_columns) * 8 + (in_tile // 2) * 4
+        left = (tile % tile_columns) * 8 + (in_tile % 2) * side
+        top = (tile // tile_columns) * 8 + (in_tile // 2) * side
         if left >= width or top >= height:
             return
         slot = int(-1)
@@ -504,15 +563,15 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     return
         origin = p_WC[instant]
         q = q_WC[instant]
-        ray = wp.zeros(shape=(16,), dtype=wp.vec3)
-        face = wp.zeros(shape=(16,), dtype=int)
-        t = wp.zeros(shape=(16,), dtype=float)
-        u = wp.zeros(shape=(16,), dtype=float)
-        v = wp.zeros(shape=(16,), dtype=float)
-        normal = wp.zeros(shape=(16,), dtype=wp.vec3)
-        radiance = wp.zeros(shape=(16,), dtype=wp.vec3)
-        columns = wp.min(width - left, 4)
-        rows = wp.min(height - top, 4)
+        ray = wp.zeros(shape=(lanes,), dtype=wp.vec3)
+        face = wp.zeros(shape=(lanes,), dtype=int)
+        t = wp.zeros(shape=(lanes,), dtype=float)
+        u = wp.zeros(shape=(lanes,), dtype=float)
+        v = wp.zeros(shape=(lanes,), dtype=float)
+        normal = wp.zeros(shape=(lanes,), dtype=wp.vec3)
+        radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
+        columns = wp.min(width - left, side)
+        rows = wp.min(height - top, side)
         for layer in range(rays.shape[0]):
             if wp.static(supersampled):
                 if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
@@ -520,20 +579,41 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             for y in range(rows):
                 for x in range(columns):
                     ray_C = rays[layer, first_ray + (top + y) * width + left + x]
-                    ray[4 * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-            cast_packet(
-                scene.embree_intersect, scene.embree_scene, origin, ray, _FAR_M, face, t, u, v, normal
-            )
+                    ray[side * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            if wp.static(walked):
+                walk = instant // walk_data.instants
+                find_faces(
+                    scene.mesh,
+                    walk_data.faces,
+                    (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
+                    walk_data.count[walk, tile],
+                    walk_data.reach[walk, tile],
+                    _FAR_M,
+                    walk_data.bounds[tile],
+                    wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
+                    wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
+                    wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
+                    origin,
+                    ray,
+                    face,
+                )
+            else:
+                cast_packet(
+                    scene.embree_intersect, scene.embree_scene, origin, ray, _FAR_M, face, t, u, v, normal
+                )
             for y in range(rows):
                 for x in range(columns):
-                    lane = 4 * y + x
+                    lane = side * y + x
                     ray_C = rays[layer, first_ray + (top + y) * width + left + x]
-                    hit = Hit()
-                    hit.face = face[lane]
-                    hit.t = t[lane]
-                    hit.u = u[lane]
-                    hit.v = v[lane]
-                    hit.normal = wp.normalize(normal[lane])
+                    if wp.static(walked):
+                        hit = meet_listed(scene, origin, ray[lane], face[lane])
+                    else:
+                        hit = Hit()
+                        hit.face = face[lane]
+                        hit.t = t[lane]
+                        hit.u = u[lane]
+                        hit.v = v[lane]
+                        hit.normal = wp.normalize(normal[lane])
                     body = int(-1)
                     if wp.static(with_bodies):
                         hit, body = meet_bodies(
@@ -563,7 +643,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                 for x in range(columns):
                     write_radiance(
                         scene,
-                        radiance[4 * y + x],
+                        radiance[side * y + x],
                         rays.shape[0],
                         instant,
                         slot,
@@ -598,8 +678,10 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     that no part of the scene hides from it (all lamps, where the scene itself is unshadowed).
 
     Raises:
-        ValueError: If an output is unknown or none is asked for.
+        ValueError: If an output is unknown or none is asked for, or worlds are asked to share walks.
     """
+    if terms.walked and terms.worlds:
+        raise ValueError("rays of several worlds do not share walks: render.shared_walk must be null")
     unknown = sorted(set(outputs) - set(OUTPUTS))
     if unknown or not outputs:
         raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")

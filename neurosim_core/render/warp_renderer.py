@@ -31,7 +31,8 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.raycast import TILE, SceneData, Terms, WorldData, raycast_kernel
+from neurosim_core.render.raycast import SceneData, Terms, WorldData, raycast_kernel
+from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
@@ -105,6 +106,8 @@ def upload_scene(
         finest_level=textured and config.texture_filter != "trilinear",
         nearest_texel=textured and config.texture_filter == "nearest",
         bodies=bool(bodies),
+        walked=config.shared_walk is not None,
+        by_tile=config.shared_walk is not None and wp.get_device(device).is_cpu,
     )
     start = time.perf_counter()
     light: NDArray[np.float32] | None = None
@@ -189,7 +192,7 @@ def upload_scene(
 
 def _embree_width(config: RenderConfig, device: str) -> int:
     """Return how many rays Embree casts at once, 0 if Warp casts them."""
-    if config.cpu_traversal == "warp" or not wp.get_device(device).is_cpu:
+    if config.cpu_traversal == "warp" or config.shared_walk or not wp.get_device(device).is_cpu:
         return 0
     try:
         return packet_width()
@@ -237,7 +240,7 @@ def auto_exposure(mesh: RefinedMesh, light: NDArray[np.float32], albedo: NDArray
     return float(min(_MIDDLE_GREY / np.exp(np.average(np.log(luma), weights=area)), _BRIGHT / bright))
 
 
-def _ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
+def ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
     """Return rays through the centres of pixels and, for several samples, through points spread over them.
 
     The points are a lattice: along rows and along columns each n-th of a pixel has one of the n.
@@ -288,19 +291,33 @@ class WarpRenderer:
             thread_count: Threads on a CPU device; all cores if None.
 
         Raises:
-            ValueError: If an output is unknown or none is asked for.
+            ValueError: If an output is unknown or none is asked for, or rays that share a walk do not look
+                forward.
         """
         self._kernel = raycast_kernel(outputs, arrays.terms)
         self._arrays = arrays
         self._width, self._height = lens.width, lens.height
         self._thread_count = thread_count
         tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
-        self._instant_threads = tiles * TILE * TILE // (PACKET if arrays.terms.embree else 1)
-        rays = _ray_layers(lens, arrays.config.samples_per_pixel)
+        rays_together = TILE * TILE if arrays.terms.by_tile else PACKET if arrays.terms.embree else 1
+        self._instant_threads = tiles * TILE * TILE // rays_together
+        rays = ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
         self._rays = wp.array(rays, dtype=wp.vec4, device=device)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
         self._world_data = WorldData()
+        self._walk = None
+        if arrays.config.shared_walk is not None:
+            self._walk = TileWalk(
+                arrays.mesh,
+                rays,
+                width=lens.width,
+                height=lens.height,
+                extent_m=float(np.abs(arrays.scene.bounds_m).max()),
+                config=arrays.config.shared_walk,
+                instant_count=instant_count,
+                thread_count=thread_count,
+            )
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
@@ -340,6 +357,8 @@ class WarpRenderer:
             place_camera(
                 self._arrays.bodies, bodies, p_WC, q_WC, instant_count=instant_count, data=self._body_data
             )
+        if self._walk is not None:
+            self._walk.launch(self._rays, p_WC, q_WC, instant_count=instant_count)
         launch_split(
             self._kernel,
             dim=instant_count * self._instant_threads,
@@ -354,6 +373,7 @@ class WarpRenderer:
                 image_slot,
                 self._body_data,
                 self._world_data,
+                WalkData() if self._walk is None else self._walk.data,
             ],
             outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
             device=self._arrays.device,
