@@ -192,7 +192,7 @@ def test_topics_and_nodes_are_listed(make_node: MakeNode) -> None:
 
 
 def whole_info(topic: str, **options: int) -> tuple[int, str, str]:
-    """Return what `cortex info --once` prints when every node has answered in time: a busy machine may not."""
+    """Return what `cortex info --once` prints when all nodes have answered; a busy machine may need more."""
     answers = (cortex("info", topic, "--once", **options) for _ in range(10))
     return next(answer for answer in answers if "did not answer" not in answer[1])
 
