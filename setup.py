@@ -5,6 +5,12 @@ from setuptools import Extension, setup
 
 setup(
     ext_modules=[
-        Extension("cortex._native", ["cortex/_native.c"], include_dirs=[numpy.get_include()], optional=True),
+        Extension(
+            "cortex._native",
+            ["cortex/_construct.c", "cortex/_native.c", "cortex/_ring.c"],
+            depends=["cortex/_native.h", "cortex/_ring.h"],
+            include_dirs=[numpy.get_include()],
+            optional=True,
+        ),
     ]
 )

@@ -7,8 +7,9 @@
 
    The layout is that of WIRE.md, section 5.1; all numbers are little-endian, as is every machine we build for. */
 
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "_native.h"
+#include "_ring.h"
+
 #include <errno.h>
 #include <poll.h>
 #include <stddef.h>
@@ -18,6 +19,7 @@
 #include <unistd.h>
 #include <structmember.h>
 
+#define PY_ARRAY_UNIQUE_SYMBOL cortex_numpy
 #define NPY_NO_DEPRECATED_API NPY_1_19_API_VERSION
 #define NPY_TARGET_VERSION NPY_1_19_API_VERSION
 #include <numpy/arrayobject.h>
@@ -718,24 +720,19 @@ static int take_array(Flat *flat, Field *field, PyObject *dtype, PyObject *shape
 
 static int take_field(Flat *flat, PyObject *row) {
     Field *field = &flat->fields[flat->count];
-    const char *name;
     int kind, code;
     Py_ssize_t offset;
     unsigned int head;
-    PyObject *dtype, *shape, *names;
-    if (!PyArg_ParseTuple(row, "siCnOOOI", &name, &kind, &code, &offset, &dtype, &shape, &names, &head)) return 0;
-    PyObject *descriptor = PyDict_GetItemString(flat->cls->tp_dict, name);
-    if (descriptor == NULL || !Py_IS_TYPE(descriptor, &PyMemberDescr_Type)
-        || ((PyMemberDescrObject *)descriptor)->d_member->type != T_OBJECT_EX) {
-        PyErr_Format(PyExc_TypeError, "%s.%s is no slot", flat->cls->tp_name, name);
-        return 0;
-    }
+    PyObject *name, *dtype, *shape, *names;
+    if (!PyArg_ParseTuple(row, "UiCnOOOI", &name, &kind, &code, &offset, &dtype, &shape, &names, &head)) return 0;
+    const Py_ssize_t slot = slot_of(flat->cls, name);
+    if (slot < 0) return 0;
     if (kind < NUMBER || kind > BYTES || (kind == NUMBER && !strchr("bhiqBHIQfd", code)) || offset < 0
         || offset >= flat->block) {
-        PyErr_Format(PyExc_ValueError, "%s.%s: kind %d, code %c, offset %zd", flat->cls->tp_name, name, kind, code, offset);
+        PyErr_Format(PyExc_ValueError, "%s.%U: kind %d, code %c, offset %zd", flat->cls->tp_name, name, kind, code, offset);
         return 0;
     }
-    field->slot = ((PyMemberDescrObject *)descriptor)->d_member->offset;
+    field->slot = slot;
     field->kind = (Kind)kind;
     field->code = (char)code;
     field->offset = offset;
@@ -1331,6 +1328,10 @@ PyMODINIT_FUNC PyInit__native(void) {
             Py_DECREF(module);
             return NULL;
         }
+    }
+    if (add_construct(module) < 0 || add_ring(module) < 0) {
+        Py_DECREF(module);
+        return NULL;
     }
     return module;
 }

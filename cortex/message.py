@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, overload
 
 import numpy as np
 
+from cortex.compiled import native
 from cortex.schema import (
     ANY_DTYPE,
     ArrayType,
@@ -56,6 +57,7 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
+_HASTENED_FIELDS_MAX = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +145,7 @@ def _make_message(cls: type, name: str | None, scope: Mapping[str, Any]) -> type
                 f"{cls.__name__}.{key}: a mutable default would be shared; use field(default_factory=...)"
             )
     hints = _resolve_hints(cls, scope)
+    own_init = "__init__" in vars(cls)
     decorated: type[Any] = dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)(cls)
     names = tuple(field.name for field in dataclasses.fields(decorated))
     if "copy" in names:
@@ -160,7 +163,27 @@ def _make_message(cls: type, name: str | None, scope: Mapping[str, Any]) -> type
         bindings.append(bound)
     attach_schema(decorated, Schema(name or cls.__name__, tuple(fields)), tuple(bindings))
     finish_class(decorated, names, _plain_init(names))
+    if not own_init:
+        _hasten(decorated)
     return decorated
+
+
+def _hasten(cls: type[Any]) -> None:
+    """Let C do the work of a generated `__init__` that sets all fields from arguments, and nothing else."""
+    fields = dataclasses.fields(cls)
+    arguments = list(inspect.signature(cls.__init__).parameters.values())[1:]
+    plain = (
+        native is not None
+        and type(cls) is type
+        and not hasattr(cls, "__post_init__")
+        and cls.__new__ is object.__new__
+        and [argument.name for argument in arguments] == [field.name for field in fields]
+        and all(argument.kind is argument.POSITIONAL_OR_KEYWORD for argument in arguments)
+        and len(fields) <= _HASTENED_FIELDS_MAX
+    )
+    if plain:
+        defaults = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
+        native.hasten(cls, tuple(field.name for field in fields), defaults)
 
 
 def _plain_init(names: tuple[str, ...]) -> Callable[..., None]:

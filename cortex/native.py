@@ -1,14 +1,10 @@
-"""The short cuts of `_native.c`, where they were compiled; without them everything works, more slowly.
-
-`CORTEX_PURE_PYTHON=1` leaves them out, to compare or to find a fault.
-"""
+"""The short cuts of the C module for messages of numbers, strings and arrays, where there is one."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 from typing import Any
 
+from cortex.compiled import native
 from cortex.fast import describe_arrays
 from cortex.layout import (
     SCALAR_CODES,
@@ -18,18 +14,12 @@ from cortex.layout import (
 )
 from cortex.schema import ArrayType, FieldType, Schema
 
-_Flat: Any = None
-NativeGate: Any = None
+_Flat: Any = native and native.Flat
+NativeGate: Any = native and native.Gate
 """Sends small messages; see `gate.py`. There is one wherever `make_flat` returns something."""
-NativePipeWriter: Any = None
-NativePipeReader: Any = None
+NativePipeWriter: Any = native and native.PipeWriter
+NativePipeReader: Any = native and native.PipeReader
 """The ends of a pipe; see `pipe.py`."""
-if not os.environ.get("CORTEX_PURE_PYTHON"):
-    with contextlib.suppress(ImportError):  # there was no compiler when this was installed
-        from cortex import _native
-
-        _Flat, NativeGate = _native.Flat, _native.Gate
-        NativePipeWriter, NativePipeReader = _native.PipeWriter, _native.PipeReader
 _NUMBER, _BOOL, _FIXED, _VARIABLE, _STR, _BYTES = range(6)
 _RANK_MAX = 8
 _SHARED_MAX = 16

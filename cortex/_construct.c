@@ -1,0 +1,215 @@
+/* Making a message: what the `__init__` of its frozen dataclass does, without `object.__setattr__` for each field.
+
+   A class that `hasten` was called for is called through `construct`: it allocates the object and puts the arguments
+   into its slots. Whatever is not as usual (a value is missing, an argument is unknown or given twice, `__init__` or
+   `__new__` was replaced since) it leaves to the class's own `__init__`, which also knows what to say about it. A
+   subclass has its own `tp_vectorcall`, and so is not concerned. */
+
+#include "_native.h"
+
+#include <structmember.h>
+
+enum { ARGUMENTS_MAX = 64 };
+
+typedef struct {
+    PyObject *name; /* interned */
+    Py_ssize_t slot;
+    PyObject *value; /* its default, or NULL */
+} Argument;
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *init; /* the `__init__` that this does the work of */
+    Py_ssize_t count;
+    Argument *arguments;
+} Maker;
+
+static PyObject *maker_name, *init_name;
+static PyTypeObject MakerType;
+
+Py_ssize_t slot_of(PyTypeObject *cls, PyObject *name) {
+    PyObject *descriptor = PyObject_GetAttr((PyObject *)cls, name);
+    if (descriptor == NULL) return -1;
+    Py_ssize_t slot = -1;
+    if (Py_IS_TYPE(descriptor, &PyMemberDescr_Type)
+        && ((PyMemberDescrObject *)descriptor)->d_member->type == T_OBJECT_EX) {
+        slot = ((PyMemberDescrObject *)descriptor)->d_member->offset;
+    } else {
+        PyErr_Format(PyExc_TypeError, "%s.%U is no slot", cls->tp_name, name);
+    }
+    Py_DECREF(descriptor);
+    return slot;
+}
+
+/* The maker of a class if it still does what its `__init__` does, else NULL, with no error set; borrowed. */
+static const Maker *maker_of(PyTypeObject *cls) {
+    PyObject *maker = PyDict_GetItemWithError(cls->tp_dict, maker_name);
+    PyObject *init = PyDict_GetItemWithError(cls->tp_dict, init_name);
+    if (maker == NULL || !Py_IS_TYPE(maker, &MakerType) || init != ((Maker *)maker)->init
+        || cls->tp_new != PyBaseObject_Type.tp_new) {
+        PyErr_Clear();
+        return NULL;
+    }
+    return (const Maker *)maker;
+}
+
+/* Put each value where its argument belongs; 0 if they do not fit. Values are borrowed. */
+static int match(
+    const Maker *maker, PyObject *const *given, Py_ssize_t positional, PyObject *keywords, PyObject **values) {
+    if (positional > maker->count) return 0;
+    for (Py_ssize_t index = 0; index < positional; ++index) values[index] = given[index];
+    for (Py_ssize_t index = positional; index < maker->count; ++index) values[index] = NULL;
+    const Py_ssize_t named = keywords == NULL ? 0 : PyTuple_GET_SIZE(keywords);
+    Py_ssize_t next = positional; /* most name them in order */
+    for (Py_ssize_t number = 0; number < named; ++number) {
+        PyObject *name = PyTuple_GET_ITEM(keywords, number);
+        if (next >= maker->count || maker->arguments[next].name != name) {
+            for (next = 0; next < maker->count && maker->arguments[next].name != name; ++next) continue;
+        }
+        if (next == maker->count || values[next] != NULL) return 0;
+        values[next++] = given[positional + number];
+    }
+    for (Py_ssize_t index = positional; index < maker->count; ++index) {
+        if (values[index] == NULL) values[index] = maker->arguments[index].value;
+        if (values[index] == NULL) return 0;
+    }
+    return 1;
+}
+
+/* As the class's own `tp_call`. */
+static PyObject *call_slowly(PyTypeObject *cls, PyObject *const *given, Py_ssize_t positional, PyObject *keywords) {
+    PyObject *arguments = PyTuple_New(positional), *named = NULL, *made = NULL;
+    if (arguments == NULL) return NULL;
+    for (Py_ssize_t index = 0; index < positional; ++index) {
+        PyTuple_SET_ITEM(arguments, index, Py_NewRef(given[index]));
+    }
+    if (keywords != NULL) {
+        named = PyDict_New();
+        if (named == NULL) goto done;
+        for (Py_ssize_t number = 0; number < PyTuple_GET_SIZE(keywords); ++number) {
+            if (PyDict_SetItem(named, PyTuple_GET_ITEM(keywords, number), given[positional + number]) < 0) goto done;
+        }
+    }
+    made = PyType_Type.tp_call((PyObject *)cls, arguments, named);
+done:
+    Py_XDECREF(named);
+    Py_DECREF(arguments);
+    return made;
+}
+
+static PyObject *construct(PyObject *self, PyObject *const *given, size_t flags, PyObject *keywords) {
+    PyTypeObject *cls = (PyTypeObject *)self;
+    const Py_ssize_t positional = PyVectorcall_NARGS(flags);
+    PyObject *values[ARGUMENTS_MAX];
+    const Maker *maker = maker_of(cls);
+    if (maker == NULL || !match(maker, given, positional, keywords, values)) {
+        return call_slowly(cls, given, positional, keywords);
+    }
+    PyObject *message = cls->tp_alloc(cls, 0);
+    if (message == NULL) return NULL;
+    for (Py_ssize_t index = 0; index < maker->count; ++index) {
+        *(PyObject **)((char *)message + maker->arguments[index].slot) = Py_NewRef(values[index]);
+    }
+    return message;
+}
+
+static int maker_traverse(Maker *maker, visitproc visit, void *arg) {
+    Py_VISIT(maker->init);
+    for (Py_ssize_t index = 0; index < maker->count; ++index) Py_VISIT(maker->arguments[index].value);
+    return 0;
+}
+
+static int maker_clear(Maker *maker) {
+    Py_CLEAR(maker->init);
+    for (Py_ssize_t index = 0; index < maker->count; ++index) Py_CLEAR(maker->arguments[index].value);
+    return 0;
+}
+
+static void maker_dealloc(Maker *maker) {
+    PyObject_GC_UnTrack(maker);
+    maker_clear(maker);
+    for (Py_ssize_t index = 0; index < maker->count; ++index) Py_XDECREF(maker->arguments[index].name);
+    PyMem_Free(maker->arguments);
+    Py_TYPE(maker)->tp_free((PyObject *)maker);
+}
+
+static PyTypeObject MakerType = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "cortex._native.Maker",
+    .tp_doc = "What `hasten` knows of a class.",
+    .tp_basicsize = sizeof(Maker),
+    .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_DISALLOW_INSTANTIATION,
+    .tp_traverse = (traverseproc)maker_traverse,
+    .tp_clear = (inquiry)maker_clear,
+    .tp_dealloc = (destructor)maker_dealloc,
+};
+
+/* Add what is known of one argument; 0 with an error set if it is not as it should be. */
+static int take_argument(Maker *maker, PyTypeObject *cls, PyObject *name, PyObject *defaults) {
+    if (!PyUnicode_CheckExact(name)) {
+        PyErr_SetString(PyExc_TypeError, "names are strings");
+        return 0;
+    }
+    const Py_ssize_t slot = slot_of(cls, name);
+    if (slot < 0) return 0;
+    PyObject *value = PyDict_GetItemWithError(defaults, name);
+    if (value == NULL && PyErr_Occurred()) return 0;
+    Argument *argument = &maker->arguments[maker->count++];
+    argument->name = Py_NewRef(name);
+    PyUnicode_InternInPlace(&argument->name);
+    argument->slot = slot;
+    argument->value = Py_XNewRef(value);
+    return 1;
+}
+
+PyDoc_STRVAR(hasten_doc,
+"hasten($module, cls, names, defaults, /)\n--\n\n"
+"Let calls of a class fill its slots directly.\n\n"
+"Args:\n"
+"    cls: A class whose `__init__` puts each argument into the slot of its name, and does nothing else.\n"
+"    names: The arguments in order, at most 64.\n"
+"    defaults: Values of those that may be left out.\n");
+
+static PyObject *hasten(PyObject *module, PyObject *arguments) {
+    (void)module;
+    PyTypeObject *cls;
+    PyObject *names, *defaults;
+    if (!PyArg_ParseTuple(arguments, "O!O!O!", &PyType_Type, &cls, &PyTuple_Type, &names, &PyDict_Type, &defaults)) {
+        return NULL;
+    }
+    const Py_ssize_t count = PyTuple_GET_SIZE(names);
+    PyObject *init = PyDict_GetItemWithError(cls->tp_dict, init_name);
+    if (count > ARGUMENTS_MAX || init == NULL || !(cls->tp_flags & Py_TPFLAGS_HEAPTYPE)
+        || !Py_IS_TYPE(cls, &PyType_Type)) {
+        if (!PyErr_Occurred()) PyErr_Format(PyExc_TypeError, "%s cannot be hastened", cls->tp_name);
+        return NULL;
+    }
+    Maker *maker = PyObject_GC_New(Maker, &MakerType);
+    if (maker == NULL) return NULL;
+    maker->init = Py_NewRef(init);
+    maker->count = 0;
+    maker->arguments = PyMem_Calloc((size_t)count + 1, sizeof(Argument));
+    PyObject_GC_Track(maker);
+    int failed = maker->arguments == NULL;
+    if (failed) PyErr_NoMemory();
+    for (Py_ssize_t index = 0; !failed && index < count; ++index) {
+        failed = !take_argument(maker, cls, PyTuple_GET_ITEM(names, index), defaults);
+    }
+    failed = failed || PyObject_SetAttr((PyObject *)cls, maker_name, (PyObject *)maker) < 0;
+    Py_DECREF(maker);
+    if (failed) return NULL;
+    cls->tp_vectorcall = construct;
+    Py_RETURN_NONE;
+}
+
+static PyMethodDef functions[] = {
+    {"hasten", hasten, METH_VARARGS, hasten_doc},
+    {NULL, NULL, 0, NULL},
+};
+
+int add_construct(PyObject *module) {
+    maker_name = PyUnicode_InternFromString("__cortex_maker__");
+    init_name = PyUnicode_InternFromString("__init__");
+    if (maker_name == NULL || init_name == NULL || PyType_Ready(&MakerType) < 0) return -1;
+    return PyModule_AddFunctions(module, functions);
+}
