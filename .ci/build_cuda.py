@@ -23,10 +23,13 @@ from neurosim_core.control import MODES, make_controller
 from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import TERMS, make_scan
+from neurosim_core.sensors.imu import TERMS as IMU_TERMS
+from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.trajectory import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.integrator import make_kernels as make_flight
+from neurosim_core.worlds.scan import make_noisy_scan
 
 ARCHITECTURES = (80, 90)
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
@@ -63,12 +66,18 @@ def make_kernels() -> None:
         everything._replace(finest_level=True, nearest_texel=True),
         everything._replace(bodies=True),
         everything._replace(bodies=True, baked=False),
+        everything._replace(worlds=True, bodies=True),
+        everything._replace(worlds=True, world_scenes=True, world_lenses=True),
     ):
         raycast_kernel(OUTPUTS, terms)
     for moving in (False, True):
         rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
         make_scan(frozenset(pixel))
+    for pixel in (TERMS[:-1], TERMS):
+        make_noisy_scan(frozenset(pixel))
+    for errors in ((), IMU_TERMS):
+        make_imu(frozenset(errors), own_seeds=True)
     for adaptive in (False, True):
         make_flight(frozenset(VEHICLE_TERMS), adaptive=adaptive)
     for name in ("crazyflie", "hummingbird", "racer"):

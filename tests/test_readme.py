@@ -82,9 +82,9 @@ def test_the_run_command(tmp_path):
     assert (rates, packets) == (1601, 81 + 801)
 
 
-EXAMPLES = named("example", "python") | named(
-    "example", "python", (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
-)
+EXAMPLES = named("example", "python")
+for page in ("simulator.md", "worlds.md"):
+    EXAMPLES |= named("example", "python", (ROOT / "docs" / page).read_text(encoding="utf-8"))
 
 
 SETTINGS = named("settings", "yaml", (ROOT / "docs" / "sensors.md").read_text(encoding="utf-8"))

@@ -37,7 +37,7 @@ class Study:
     chapter: Callable[[Mapping[str, Any], Progress], Chapter]
     """Measures under options, such as quick, and returns the answer."""
     options: frozenset[str] = frozenset()
-    """What it takes besides `quick`, some of scene, device, width and height."""
+    """What it takes besides `quick`, some of scene, device, width, height, worlds and seconds."""
     then: str = ""
     """Study of that device that follows where a device is named; its options are taken as well."""
 
@@ -100,6 +100,14 @@ def _add_options(parser: argparse.ArgumentParser, options: frozenset[str]) -> No
         )
     if "device" in options:
         parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    if "worlds" in options:
+        parser.add_argument(
+            "--worlds", type=_counts, metavar="N,...", help="worlds (default: as the device can)"
+        )
+    if "seconds" in options:
+        parser.add_argument(
+            "--seconds", type=float, metavar="S", help="how long to step each number of worlds (default: 3)"
+        )
     for name, side in (("width", "columns"), ("height", "rows")):
         if name in options:
             parser.add_argument(
@@ -221,6 +229,14 @@ def _add_set(parser: argparse.ArgumentParser) -> None:
     add_set_option(parser, "any further setting by its dotted key, such as scene.rooms=2")
 
 
+def _counts(text: str) -> list[int]:
+    """Read whole numbers from 1 on that are separated by commas."""
+    numbers = _numbers(text)
+    if any(number < 1.0 or number != int(number) for number in numbers):
+        raise argparse.ArgumentTypeError(f"takes whole numbers from 1 on, got {text!r}")
+    return [int(number) for number in numbers]
+
+
 def _numbers(text: str) -> list[float]:
     """Read numbers that are separated by commas."""
     try:
@@ -257,6 +273,12 @@ def _throughput(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.throughput import measure_throughput, throughput_chapter
 
     return throughput_chapter(measure_throughput(**options, progress=progress))
+
+
+def _worlds(options: Mapping[str, Any], progress: Progress) -> Chapter:
+    from neurosim_core.bench.worlds import measure_worlds, worlds_chapter
+
+    return worlds_chapter(measure_worlds(**options, progress=progress))
 
 
 def _leave_out(options: Mapping[str, Any], progress: Progress) -> Chapter:
@@ -308,6 +330,14 @@ STUDIES: Sequence[Study] = (
         "device and a naive event camera. Two to five minutes.",
         chapter=_throughput,
         options=frozenset({"scene", "device"}),
+    ),
+    Study(
+        name="worlds",
+        help="many worlds stepped together for learning: renders a second of all",
+        description="Turn on the spot in many worlds with an event camera each, all on the device, and in "
+        "single simulations beside it. By default up to 128 worlds on a CPU, up to 4096 on CUDA.",
+        chapter=_worlds,
+        options=frozenset({"scene", "device", "width", "height", "worlds", "seconds"}),
     ),
     Study(
         name="leave-out",
@@ -400,7 +430,7 @@ def _command(said: str, options: Mapping[str, Any]) -> str:
         if name == "quick":
             words += [option] if value and option not in words else []
         elif option not in words:
-            words += [option, str(value)]
+            words += [option, ",".join(map(str, value)) if isinstance(value, list) else str(value)]
     return shlex.join(words)
 
 

@@ -16,7 +16,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.render.raycast import SceneData, Terms
 from neurosim_core.render.warp_renderer import SceneArrays
 from neurosim_core.scene.freespace import DistanceField
-from neurosim_core.simulation import Model, make_model
+from neurosim_core.simulation import Model, make_model, refit
 
 SceneSource = str | Path | Mapping[str, Any]
 """A settings file, of which the scene counts; a mesh file; or settings of a scene."""
@@ -56,6 +56,7 @@ def make_scene_table(
     *,
     count: int,
     scenes: Sequence[SceneSource] | None = None,
+    models: Sequence[Model] | None = None,
     scene_of_world: ArrayLike | None = None,
 ) -> SceneTable:
     """Load the scenes and bring them to the device.
@@ -64,6 +65,7 @@ def make_scene_table(
         config: What to fly; its scene counts where no others are given.
         count: Number of worlds.
         scenes: The scenes.
+        models: Scenes that were loaded before, in place of `scenes`.
         scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
 
     Raises:
@@ -72,32 +74,38 @@ def make_scene_table(
     """
     if config.renderer != "warp":
         raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer!r}")
-    if scenes is not None and not scenes:
-        raise ValueError("scenes must name one scene at least, got none")
-    if scenes is not None and len(scenes) > 1 and config.bodies:
+    if scenes is not None and models is not None:
+        raise ValueError("give scenes or models, not both")
+    if scenes == [] or models == []:
+        raise ValueError("scenes or models must name one scene at least, got none")
+    if len(scenes or models or ()) > 1 and config.bodies:
         raise ValueError(
-            f"bodies move in one scene only, got {len(scenes)} scenes and {', '.join(config.bodies)}"
+            f"bodies move in one scene only, got {len(scenes or models or ())} scenes and "
+            f"{', '.join(config.bodies)}"
         )
-    models = tuple(make_model(_in_scene(config, source)) for source in scenes or [None])
-    turns = np.arange(count) % len(models)
+    if models is not None:
+        made = tuple(refit(model, config) for model in models)
+    else:
+        made = tuple(make_model(_in_scene(config, source)) for source in scenes or [None])
+    turns = np.arange(count) % len(made)
     chosen = np.asarray(turns if scene_of_world is None else scene_of_world)
     if chosen.shape != (count,) or not np.issubdtype(chosen.dtype, np.integer):
         raise ValueError(f"scene_of_world must be integers of shape [{count}], got {list(chosen.shape)}")
-    if chosen.min() < 0 or chosen.max() >= len(models):
+    if chosen.min() < 0 or chosen.max() >= len(made):
         raise ValueError(
-            f"scene_of_world must be in [0, {len(models) - 1}], got {chosen.min()} to {chosen.max()}"
+            f"scene_of_world must be in [0, {len(made) - 1}], got {chosen.min()} to {chosen.max()}"
         )
-    device = models[0].device
-    arrays = [m.scene_on_device for m in models if isinstance(m.scene_on_device, SceneArrays)]
+    device = made[0].device
+    arrays = [m.scene_on_device for m in made if isinstance(m.scene_on_device, SceneArrays)]
     terms = None
     if arrays:
         terms = Terms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
         # walks that rays share change nothing but the speed, and are for one camera
         terms = terms._replace(worlds=True, world_scenes=len(arrays) > 1, walked=False, by_tile=False)
     return SceneTable(
-        models=models,
+        models=made,
         scene_of_world=tuple(int(scene) for scene in chosen),
-        fields=wp.array([m.free_space.arrays for m in models], dtype=DistanceField, device=device),
+        fields=wp.array([m.free_space.arrays for m in made], dtype=DistanceField, device=device),
         scene=wp.array(chosen.astype(np.int32), dtype=int, device=device),
         data=wp.array([_completed(a) for a in arrays], dtype=SceneData, device=device)
         if len(arrays) > 1

@@ -11,7 +11,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.schedule import Boundary, Schedule, boundaries
 
 _PATTERN_COUNT_MAX = 4096
-_COMMON_MAX_NS = 10**15
+_COMMON_MAX_NS = 10**13
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class Timetable:
         rates = [schedule.control, *schedule.samplers, *schedule.casts]
         rates += [rate for cameras in images for rate in cameras.values()]
         self.common_ns = _common_period_ns(rates)
-        """After this time all clocks tick together [ns]; 0: that takes more than ten days."""
+        """After this time all clocks tick together [ns]; 0: that takes hours."""
 
     def at(self, begin_ns: int) -> Pattern:
         """Return the period that begins at a tick of the control clock."""
@@ -118,7 +118,7 @@ class Timetable:
 
 
 def _common_period_ns(rates: list[Rate]) -> int:
-    """Return the shortest whole number of ns in which each clock makes a whole number of periods; 0: days."""
+    """Return the least whole number of ns in which each clock makes a whole number of periods; 0: hours."""
     common = Fraction(0)
     for rate in rates:
         period = Fraction(10**9) / Fraction(str(rate.rate_hz))

@@ -9,7 +9,8 @@ overwrites.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from neurosim_core.control import CommandMode, Controller, make_controller
 from neurosim_core.frames import as_rows
 from neurosim_core.sensors.imu import Imu
 from neurosim_core.sensors.rig import ImuSensorConfig
+from neurosim_core.simulation import Model
 from neurosim_core.streams import Graphs, HostInput, Milestone
 from neurosim_core.vehicle import Multirotor
 from neurosim_core.worlds import flight
@@ -259,32 +261,65 @@ class Worlds:
             ValueError: Commands on the host are of a wrong shape or not finite. Those on the device are not
                 looked at: a vehicle whose command is not finite is held (`Observation.status`).
         """
+        order, pattern, parity = self._plan(commands, mode)
+        self._graphs.run(
+            (order, pattern, parity),
+            lambda: [launch() for launch in self._phases(order, pattern, parity).values()],
+        )
+        return self._observe(pattern)
+
+    def time_step(self, commands: Any = None, mode: CommandMode = "rates") -> dict[str, float]:
+        """Do what `step` does part by part, and wait for the device after each; return what each took [s].
+
+        Arguments and errors as for `step`.
+        """
+        order, pattern, parity = self._plan(commands, mode)
+        wall_s = {}
+        wp.synchronize_device(self.device)
+        for name, launch in self._phases(order, pattern, parity).items():
+            begin = time.perf_counter()
+            launch()
+            wp.synchronize_device(self.device)
+            wall_s[name] = time.perf_counter() - begin
+        return wall_s
+
+    def _plan(self, commands: Any, mode: CommandMode) -> tuple[str | None, Pattern, int]:
+        """Take commands, and return what the next step is made of; the host's time moves on."""
         if self._now_ns is None:
             raise RuntimeError("reset() must be called before step()")
         order = None if commands is None else self._take_commands(commands, mode)
-        pattern = self._timetable.at(self._now_ns)
+        pattern, parity = self._timetable.at(self._now_ns), self._parity
         for cast, offsets_ns, names in zip(self._casts, pattern.offsets_ns, pattern.pictures, strict=True):
             cast.prepare(offsets_ns, picture=bool(names))
-        parity = self._parity
-        self._graphs.run((order, pattern, parity), lambda: self._launch_step(order, pattern, parity))
         self._parity = 1 - parity
         self._now_ns += pattern.duration_ns
         self.duration_ns = pattern.duration_ns
-        return self._observe(pattern)
+        return order, pattern, parity
 
-    def _launch_step(self, order: str | None, pattern: Pattern, parity: int) -> None:
-        """Launch all of a step; what a graph is made of."""
+    def _phases(self, order: str | None, pattern: Pattern, parity: int) -> dict[str, Callable[[], None]]:
+        """Return what launches the parts of a step, by name and in order."""
         arrays = self._vehicle.arrays
-        if order is not None and order != "motor_speeds":
-            self._pilots[order].update(arrays)
-        self._launch(flight.begin_period, [arrays.status], [self._collided])
-        self._fly(pattern)
-        for cast, offsets_ns, names in zip(self._casts, pattern.offsets_ns, pattern.pictures, strict=True):
-            if len(offsets_ns) > 1:
-                cast.render(len(offsets_ns) - 1, names, self._everybody)
-            for camera in cast.events.values():
-                camera.find(self._clock, offsets_ns, parity)
-        self._launch(flight.end_period, [pattern.duration_ns], [self._clock])
+
+        def fly() -> None:
+            if order is not None and order != "motor_speeds":
+                self._pilots[order].update(arrays)
+            self._launch(flight.begin_period, [arrays.status], [self._collided])
+            self._fly(pattern)
+
+        def render() -> None:
+            for cast, offsets_ns, names in zip(
+                self._casts, pattern.offsets_ns, pattern.pictures, strict=True
+            ):
+                if len(offsets_ns) > 1:
+                    cast.render(len(offsets_ns) - 1, names, self._everybody)
+
+        def find_events() -> None:
+            for cast, offsets_ns in zip(self._casts, pattern.offsets_ns, strict=True):
+                for camera in cast.events.values():
+                    camera.find(self._clock, offsets_ns, parity)
+            self._launch(flight.end_period, [pattern.duration_ns], [self._clock])
+
+        return {"flight": fly, "render": render, "events": find_events}
 
     def _fly(self, pattern: Pattern) -> None:
         """Move the vehicles from mark to mark, and note what is due there."""
@@ -512,6 +547,7 @@ def make_worlds(
     seeds: int | ArrayLike | None = None,
     parameters: Mapping[str, ArrayLike] | None = None,
     scenes: Sequence[SceneSource] | None = None,
+    models: Sequence[Model] | None = None,
     scene_of_world: ArrayLike | None = None,
     event_capacity: int | None = None,
     sorted: bool = True,
@@ -527,6 +563,7 @@ def make_worlds(
             dead time of event cameras ("front.threshold_on", "front.shot_noise.rate_hz") and lenses
             ("front.lens.horizontal_fov_rad").
         scenes: Scenes to be in: settings files, mesh files or settings; None: the configured one.
+        models: What `make_model` returned for each scene, in place of `scenes`: nothing is loaded twice.
         scene_of_world: Which of them each world is in, shape [N]; by default they take turns.
         event_capacity: Room for the events of one world and camera in one step; by default two for each
             pixel. What does not fit is counted (`WorldEvents.dropped`).
@@ -546,7 +583,7 @@ def make_worlds(
         chosen = chosen.model_copy(update={"device": device})
     if event_capacity is not None and not 1 <= event_capacity <= (2**31 - 1) // count:
         raise ValueError(f"event_capacity must be in [1, 2^31 / count), got {event_capacity}")
-    table = make_scene_table(chosen, count=count, scenes=scenes, scene_of_world=scene_of_world)
+    table = make_scene_table(chosen, count=count, scenes=scenes, models=models, scene_of_world=scene_of_world)
     return Worlds(
         chosen,
         table,

@@ -61,7 +61,7 @@ def test_periods_are_those_of_a_run(control, samplers, casts):
         ((100.0, 30.0), 100_000_000),
         ((333.0,), 10**9),
         ((29.97,), 10**11),
-        ((29.97013, 333.33123, 17.171717), 0),
+        ((29.97013, 333.33123, 17.171717, 100.0001), 0),
     ],
 )
 def test_when_all_clocks_tick_together(rates, common_ns):

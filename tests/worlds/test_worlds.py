@@ -181,20 +181,26 @@ def test_new_seeds(plain):
             assert_same(again[step][world], packets)
 
 
-def test_more_events_than_fit(plain):
+def test_more_events_than_fit(textured):
     """Of each render the rows from the top that fit are kept, as a single camera does; losses are counted."""
-    capacity = 80
+    capacity = 1500
+    rig = {"front": {**RIG["front"], "pixel": {"threshold_on": 0.03, "threshold_off": 0.03}}}
+    config = settings(textured, sensors=rig)
+    turning = {"body_rate": [0.0, 0.0, 3.0]}
     commands = commands_of("rates", 6, 2)
-    seen = record(make_worlds(settings(plain), count=2, event_capacity=capacity), commands)
+    commands[:, :, 3] = [[3.0, 0.0]] * 3 + [[0.0, 3.0]] * 3
+    seen = record(make_worlds(config, count=2, event_capacity=capacity), commands, **turning)
     lost = [[step[world]["dropped"]["front"] for step in seen] for world in range(2)]
-    assert all(sum(counts) > 0 for counts in lost)
+    assert all(0 < sum(count > 0 for count in counts) < 6 for counts in lost)
     overrides = {"sensors.front.pixel.event_count_max": capacity // 4}
     for world in range(2):
-        limited = fly_alone(settings(plain, seed=7 + world), commands[:, world], overrides=overrides)
-        free = fly_alone(settings(plain, seed=7 + world), commands[:, world])
-        for step, counts in enumerate(lost[world]):
+        own = {**config, "seed": 7 + world}
+        start = StartState(**turning)
+        limited = fly_alone(own, commands[:, world], overrides=overrides, start=start)
+        free = fly_alone(own, commands[:, world], start=start)
+        for step, count in enumerate(lost[world]):
             assert len(seen[step][world]["front"][0]) <= capacity
-            assert_same(seen[step][world], limited[step] if counts else free[step])
+            assert_same(seen[step][world], limited[step] if count else free[step])
 
 
 def test_a_collision_holds_one_world(plain):
