@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-call"
 """Many worlds stepped together against as many single simulations: renders, events and steps a second."""
 
 from __future__ import annotations

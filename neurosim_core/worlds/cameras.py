@@ -81,7 +81,7 @@ class WorldCast:
         lenses, chosen = lens_tables(cast, rigs)
         self._kernel = raycast_kernel(cast.outputs, terms._replace(world_lenses=len(lenses) > 1))
         rays = np.concatenate([ray_layers(lens, arrays.config.samples_per_pixel) for lens in lenses], axis=1)
-        self._rays = wp.array(rays, dtype=wp.vec4, device=device)
+        self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
         self._scene = arrays.data
         self._worlds = self._make_worlds(scenes, chosen if len(lenses) > 1 else None)
         self._p_BC = wp.vec3d(*cast.mount.position_m)
@@ -201,12 +201,13 @@ class WorldCast:
 
     def _make_bodies(self, bodies: Mapping[str, BodyConfig]) -> None:
         everywhere = self._count * self._stride if self._bodies is not None else 0
-        self._stamps = wp.zeros((everywhere, 1), dtype=wp.int64, device=self._device)
+        self._stamps: Any = wp.zeros((everywhere, 1), dtype=wp.int64, device=self._device)
         self._body_data = make_body_data(self._bodies, everywhere, self._device)
         if self._bodies is not None:
             self._motions = upload_motions(bodies, self._device)
             self._poses = make_body_poses(everywhere, len(bodies), self._device)
-            self._everywhere = wp.array(np.arange(everywhere, dtype=np.int32), dtype=int, device=self._device)
+            places = np.arange(everywhere, dtype=np.int32)
+            self._everywhere: Any = wp.array(places, dtype=int, device=self._device)
 
     def _make_pictures(self, cast: Cast, rig: Rig) -> None:
         rates = {name: rig[name].rate_hz for name in cast.image_cameras}

@@ -86,7 +86,8 @@ def make_scene_table(
     if models is not None:
         made = tuple(refit(model, config) for model in models)
     else:
-        made = tuple(make_model(_in_scene(config, source)) for source in scenes or [None])
+        configs = [config] if scenes is None else [_in_scene(config, source) for source in scenes]
+        made = tuple(make_model(each) for each in configs)
     turns = np.arange(count) % len(made)
     chosen = np.asarray(turns if scene_of_world is None else scene_of_world)
     if chosen.shape != (count,) or not np.issubdtype(chosen.dtype, np.integer):
@@ -114,9 +115,7 @@ def make_scene_table(
     )
 
 
-def _in_scene(config: SimulationConfig, source: SceneSource | None) -> SimulationConfig:
-    if source is None:
-        return config
+def _in_scene(config: SimulationConfig, source: SceneSource) -> SimulationConfig:
     if isinstance(source, Mapping):
         scene = load_config({"scene": dict(source)}).scene
     elif str(source).endswith((".yaml", ".yml")):

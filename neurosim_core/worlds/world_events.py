@@ -1,4 +1,4 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,index"
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,index,assignment"
 """One event camera in many worlds: frames of all worlds in, events of all worlds out, on the device."""
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class WorldEventCamera:
         seeds: Sequence[int],
         ordered: bool = True,
     ) -> None:
-        self.device = frames.device
+        self.device: Any = wp.get_device(frames.device)
         world_count, frame_count, pixel_count = frames.shape
         self._configs = list(configs)
         self._width, self._height, self._sensor = width, height, sensor
@@ -101,7 +101,7 @@ class WorldEventCamera:
         self._crossed = [self._empty((world_count, pixel_count), wp.vec2i) for _ in range(2)]
         self.terms = tuple(sorted({term for config in configs for term in terms_of(config)}))
         """What is computed beyond ideal pixels in some world: some of `event_noise.TERMS`."""
-        self._thresholds = wp.array(
+        self._thresholds: Any = wp.array(
             [(config.threshold_on, config.threshold_off) for config in configs],
             dtype=wp.vec2d,
             device=self.device,
@@ -153,8 +153,8 @@ class WorldEventCamera:
         ]
         for each in noise:
             each.set_reset(0)
-        models = wp.array([each.model for each in noise], dtype=PixelModel, device=self.device)
-        memories = [
+        models: Any = wp.array([each.model for each in noise], dtype=PixelModel, device=self.device)
+        memories: list[Any] = [
             wp.array([each.memory(slot) for each in noise], dtype=Memory, device=self.device)
             for slot in range(2)
         ]

@@ -127,7 +127,7 @@ class Worlds:
         images = tuple({n: Rate(config.sensors[n].rate_hz) for n in c.image_cameras} for c in model.casts)
         _check_image_rates(images, model.schedule.control)
         self._timetable = Timetable(model.schedule, images)
-        self._seeds = wp.array(np.array(self.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
+        self._seeds: Any = wp.array(np.array(self.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
         self._vehicle = Multirotor(
             model.airframe,
             count=count,
