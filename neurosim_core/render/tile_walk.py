@@ -242,10 +242,19 @@ _FACE_TEST = (
         vec3 n; float unused_too;
     };
     const Mesh mesh = mesh_get(id);
-    const vec3 border[4] = {x - bounds[0] * z, bounds[1] * z - x, y - bounds[2] * z, bounds[3] * z - y};
-    const vec3 corner[4] = {
-        normalize(bounds[0] * x + bounds[2] * y + z), normalize(bounds[1] * x + bounds[2] * y + z),
-        normalize(bounds[0] * x + bounds[3] * y + z), normalize(bounds[1] * x + bounds[3] * y + z)};
+#ifdef __CUDA_ARCH__
+    __shared__ vec3 border[4], corner[4];  // of the tile: planes through its sides, rays through its corners
+    const int lane = threadIdx.x, lanes = 64;
+    __syncthreads();
+#else
+    vec3 border[4], corner[4];
+    const int lane = 0, lanes = 1;
+#endif
+    for (int side = lane; side < 4; side += lanes) {
+        const float slope = bounds[side];
+        border[side] = (side % 2 ? -1.0f : 1.0f) * ((side < 2 ? x : y) - slope * z);
+        corner[side] = normalize(bounds[side % 2] * x + bounds[2 + side / 2] * y + z);
+    }
     auto prepare = [&](int face, Face& to) {
         const vec3 a = mesh.points[mesh.indices[3 * face]] - origin;
         const vec3 b = mesh.points[mesh.indices[3 * face + 1]] - origin;
@@ -320,14 +329,13 @@ _FIND_FACE = (
 #ifdef __CUDA_ARCH__
     __shared__ Face tested[64];
     __shared__ int tested_count;
-    const int thread = threadIdx.x;
-    for (int first = 0; first < count; first += 64) {
+    for (int first = 0; first < count; first += lanes) {
         __syncthreads();
-        if (thread == 0)
+        if (lane == 0)
             tested_count = 0;
         __syncthreads();
         Face face;
-        if (first + thread < count && prepare(faces.data[begin + first + thread], face))
+        if (first + lane < count && prepare(faces.data[begin + first + lane], face))
             tested[atomicAdd(&tested_count, 1)] = face;
         __syncthreads();
         for (int k = 0; k < tested_count; ++k)
@@ -347,19 +355,20 @@ _FIND_FACES = (
     + """
     float best[64] = {}, next[64] = {}, unsure[64] = {}, ray_x[64], ray_y[64], ray_z[64];
     int which[64];
-    for (int lane = 0; lane < 64; ++lane) {
-        which[lane] = ASK;
-        ray_x[lane] = rays.data[lane][0];
-        ray_y[lane] = rays.data[lane][1];
-        ray_z[lane] = rays.data[lane][2];
+    for (int pixel = 0; pixel < 64; ++pixel) {
+        which[pixel] = ASK;
+        ray_x[pixel] = rays.data[pixel][0];
+        ray_y[pixel] = rays.data[pixel][1];
+        ray_z[pixel] = rays.data[pixel][2];
     }
     for (int k = 0; k < count; ++k)
         if (Face face; prepare(faces.data[begin + k], face))
-            for (int lane = 0; lane < 64; ++lane)
-                test(face, ray_x[lane], ray_y[lane], ray_z[lane], best[lane], next[lane], unsure[lane],
-                     which[lane]);
-    for (int lane = 0; lane < 64; ++lane)
-        face_out.data[lane] = count < 0 ? ASK : decide(best[lane], next[lane], unsure[lane], which[lane]);
+            for (int pixel = 0; pixel < 64; ++pixel)
+                test(face, ray_x[pixel], ray_y[pixel], ray_z[pixel], best[pixel], next[pixel], unsure[pixel],
+                     which[pixel]);
+    for (int pixel = 0; pixel < 64; ++pixel)
+        face_out.data[pixel]
+            = count < 0 ? ASK : decide(best[pixel], next[pixel], unsure[pixel], which[pixel]);
 """
 )
 

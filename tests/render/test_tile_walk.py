@@ -1,0 +1,295 @@
+"""Rays that share a walk see what each ray sees that walks by itself, to the last bit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from render_scenes import LOOK_DOWN, LUMA, UNSHADOWED, box, plane, render, scene_of
+from scipy.spatial.transform import Rotation
+
+from neurosim_core import run
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.config import RenderConfig, WalkConfig
+from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
+from neurosim_core.render.tile_walk import TileWalk, tile_bounds
+from neurosim_core.render.warp_renderer import WarpRenderer, upload_scene
+from neurosim_core.scene.bodies import BodyConfig, body_poses, make_bodies, make_body_poses
+from neurosim_core.scene.scene import Material
+
+LENS = PinholeConfig(width=45, height=34, fx=40.0, fy=38.0, cx=21.0, cy=18.5)  # no multiples of a tile
+ALONE = UNSHADOWED.model_copy(update={"cpu_traversal": "warp"})
+
+
+def together(config=UNSHADOWED, **walk) -> RenderConfig:
+    return config.model_copy(update={"shared_walk": WalkConfig(**walk)})
+
+
+def by_block(arrays):
+    """The kernel of CUDA devices, which asks for one ray at a time on a CPU."""
+    return dataclasses.replace(arrays, terms=arrays.terms._replace(by_tile=False))
+
+
+def path(count, step_m=0.02, step_rad=0.01, start=(0.3, -0.2, 2.5)):
+    """Poses on the way down, turning."""
+    move = np.outer(np.arange(count), [step_m, -0.5 * step_m, -step_m]) + start
+    turns = Rotation.from_euler("xyz", np.outer(np.arange(count), [step_rad, -0.5 * step_rad, step_rad]))
+    return list(
+        zip(map(tuple, move), map(tuple, (turns * Rotation.from_quat(LOOK_DOWN)).as_quat()), strict=True)
+    )
+
+
+def soup(count, seed, size_m=0.4):
+    """Triangles all over the place: many layers, slivers, some seen from the side."""
+    rng = np.random.default_rng(seed)
+    middles = rng.uniform([-2.0, -2.0, -1.0], [2.0, 2.0, 1.5], (count, 1, 3))
+    corners = middles + rng.normal(0.0, size_m, (count, 3, 3)) * rng.uniform(0.01, 1.0, (count, 3, 1))
+    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), process=False)
+
+
+def assert_same(got, expected):
+    for name, image in expected.items():
+        np.testing.assert_array_equal(got[name], image, err_msg=name)
+
+
+def compare(scene, poses, device, *, config=UNSHADOWED, **walk):
+    """Render with and without shared walks, in both forms; return the former."""
+    alone = config.model_copy(update={"cpu_traversal": "warp"})
+    expected = render(scene, LENS, poses, outputs=OUTPUTS, config=alone, device=device)
+    arrays = upload_scene(scene, together(config, **walk), device)
+    for form in (arrays, by_block(arrays)):
+        assert_same(render(form, LENS, poses, outputs=OUTPUTS, device=device), expected)
+    return expected
+
+
+def lists_of(scene, poses, device, lens=LENS, **walk):
+    """A renderer that has seen the poses: its lists."""
+    arrays = upload_scene(scene, together(**walk), device)
+    renderer = WarpRenderer(arrays, lens, outputs=("log_radiance",), instant_count=len(poses))
+    arguments = [
+        wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.array([q for _, q in poses], np.float32), dtype=wp.quat, device=device),
+        wp.full(len(poses), -1, dtype=int, device=device),
+    ]
+    renderer.render(*arguments, instant_count=len(poses))
+    return renderer, arguments
+
+
+@pytest.mark.parametrize("instants", [1, 3, 16])
+@pytest.mark.parametrize("limit", [1, 12, 256])
+def test_same_bits_whatever_the_walks(device, instants, limit):
+    """Eleven instants, of which the last walk has what is left; lists that are long enough, and too long."""
+    compare(scene_of(plane(6.0), soup(120, 1)), path(11), device, instants=instants, face_count_max=limit)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_same_bits_in_a_soup(device, seed):
+    rng = np.random.default_rng(seed)
+    scene = scene_of(soup(400, seed, size_m=float(rng.choice([0.05, 0.3, 1.0]))))
+    compare(scene, path(6, 0.05, 0.03, start=tuple(rng.uniform(-1.0, 1.5, 3))), device)
+
+
+def test_same_bits_with_several_samples(device):
+    """The rays of the samples lie outside of those of the centres."""
+    config = UNSHADOWED.model_copy(update={"samples_per_pixel": 4})
+    compare(scene_of(plane(6.0), soup(120, 2)), path(4), device, config=config)
+
+
+def test_same_bits_where_rounding_decides(device):
+    """Rays along the edges of a grid, along planes, and two faces in one place: the tree says which it is."""
+    lens = PinholeConfig(width=32, height=32, fx=16.0, fy=16.0, cx=15.5, cy=15.5)  # a ray along the axis
+    steps = np.linspace(-2.0, 2.0, 33)  # at a height of 2 m every ray goes through a corner of the grid
+    x, y = np.meshgrid(steps, steps)
+    grid = trimesh.Trimesh(
+        np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3),
+        [
+            f
+            for r in range(32)
+            for c in range(32)
+            for k in [33 * r + c]
+            for f in ([k, k + 1, k + 34], [k, k + 34, k + 33])
+        ],
+        process=False,
+    )
+    wall = box((1e-3, 1.5, 1.0), (0.0, 0.0, 0.5))
+    scene = scene_of(
+        grid,
+        plane(1.0),
+        wall,
+        materials=tuple(
+            Material(name=n, base_color=(c, c, c)) for n, c in (("a", 0.2), ("b", 0.5), ("c", 0.9))
+        ),
+        part_material=(0, 1, 2),
+    )
+    poses = [((0.0, 0.0, 2.0), LOOK_DOWN), ((0.0, 0.0, 2.0), LOOK_DOWN), ((0.5, 0.0, 2.0), LOOK_DOWN)]
+    for q_WC in (
+        LOOK_DOWN,
+        tuple((Rotation.from_euler("x", 1.5707963) * Rotation.from_quat(LOOK_DOWN)).as_quat()),
+    ):
+        poses += [((0.0, -1.5, 0.25), q_WC), ((5e-4, -1.5, 1.0), q_WC)]
+    alone = upload_scene(scene, ALONE, device)
+    arrays = upload_scene(scene, together(instants=1), device)
+    expected = render(alone, lens, poses, outputs=OUTPUTS, device=device)
+    assert len(np.unique(expected["instance"][0])) == 3
+    for form in (arrays, by_block(arrays)):
+        assert_same(render(form, lens, poses, outputs=OUTPUTS, device=device), expected)
+
+
+def test_same_bits_beside_the_sky(device):
+    """Rays that hit nothing, in tiles with something and in tiles without."""
+    expected = compare(scene_of(box((0.3, 0.3, 0.3), (0.5, 0.2, 0.0))), path(5), device, instants=5)
+    assert 0.01 < np.isfinite(expected["depth"]).mean() < 0.5
+
+
+def test_same_bits_when_the_camera_whirls(device):
+    """Turned by a radian from one instant to the next, no frustum holds the rays: such tiles have no list."""
+    scene, poses = scene_of(soup(200, 5)), path(4, 0.0, 1.0, start=(0.0, 0.0, 0.0))
+    compare(scene, poses, device)
+    renderer, _ = lists_of(scene, poses, device)
+    assert (renderer._walk.data.count.numpy() == -1).all()
+
+
+def test_same_bits_with_moving_bodies(device):
+    motion = {"position_m": (0.3, -0.2, 1.0), "velocity_m_s": (5.0, 0.0, 0.0), "spin_rad_s": (0.0, 3.0, 9.0)}
+    configs = {
+        "ball": BodyConfig.model_validate({"shape": {"kind": "sphere", "radius_m": 0.3}, "motion": motion})
+    }
+    bodies, poses = make_bodies(configs), path(5)
+    p_WO, q_WO = body_poses(configs, np.arange(5) * 10_000_000)
+    where = make_body_poses(5, 1, device)
+    where.p_WO.assign(p_WO)
+    where.q_WO.assign(q_WO)
+    seen = []
+    for config in (ALONE, together()):
+        arrays = upload_scene(scene_of(plane(6.0), soup(60, 3)), config, device, bodies=bodies)
+        renderer = WarpRenderer(arrays, LENS, outputs=OUTPUTS, instant_count=5, image_count=5)
+        renderer.render(
+            wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device),
+            wp.array(np.array([q for _, q in poses], np.float32), dtype=wp.quat, device=device),
+            wp.array(np.arange(5, dtype=np.int32), dtype=int, device=device),
+            instant_count=5,
+            bodies=where,
+        )
+        seen.append({name: getattr(renderer, name).numpy().copy() for name in OUTPUTS})
+    assert (seen[0]["instance"] == 2).sum() > 100
+    assert_same(seen[1], seen[0])
+
+
+def test_threads_do_not_change_a_bit():
+    arrays = upload_scene(scene_of(plane(6.0), soup(120, 4)), together(instants=4), "cpu")
+    expected = render(arrays, LENS, path(6), outputs=OUTPUTS, thread_count=1)
+    for threads in (2, 3):
+        assert_same(render(arrays, LENS, path(6), outputs=OUTPUTS, thread_count=threads), expected)
+
+
+def test_lists_hold_what_rays_hit(device):
+    """Every triangle that a ray meets within the reach, hidden or not, by brute force in float64."""
+    part = soup(60, 6)
+    poses = path(6, 0.03, 0.02)
+    renderer, _ = lists_of(scene_of(part), poses, device, instants=6, face_count_max=64)
+    data = renderer._walk.data
+    count, reach = data.count.numpy()[0], data.reach.numpy()[0]
+    lists = data.faces.numpy().reshape(len(count), 64)
+    a, b, c = np.moveaxis(part.triangles.astype(np.float32).astype(np.float64), 1, 0)
+    missed = listed = 0
+    for p_WC, q_WC in poses:
+        rays = LENS.ray_table().astype(np.float64).reshape(-1, 3) @ Rotation.from_quat(q_WC).as_matrix().T
+        normal = np.cross(b - a, c - a)
+        with np.errstate(divide="ignore"):
+            t = ((a - p_WC) * normal).sum(axis=1) / (rays @ normal.T)
+        edges = [np.cross(e - p_WC, f - p_WC) for e, f in ((b, c), (c, a), (a, b))]
+        sides = np.stack([rays @ edge.T for edge in edges])
+        inside = ((sides > 0.0).all(axis=0) | (sides < 0.0).all(axis=0)) & (t > 0.0)
+        for pixel, face in zip(*np.nonzero(inside), strict=True):
+            tile = pixel // 45 // 8 * 6 + pixel % 45 // 8
+            if t[pixel, face] <= reach[tile]:
+                listed += 1
+                missed += face not in lists[tile, : count[tile]]
+    assert (count >= 0).all()
+    assert listed > 1000
+    assert missed == 0
+
+
+def test_lists_are_short_and_used(device):
+    """Without its lists a renderer that trusts them sees nothing; with them few rays have to ask the tree."""
+    lens = PinholeConfig(width=64, height=48, horizontal_fov_rad=1.2)
+    scene = scene_of(plane(30.0), soup(40, 7, size_m=0.2))
+    renderer, arguments = lists_of(scene, path(8, 0.005, 0.002), device, lens=lens)
+    seen = renderer.log_radiance.numpy().copy()
+    data = renderer._walk.data
+    count = data.count.numpy()
+    assert (count >= 0).all()
+    assert count.mean() < 15.0  # of 42 triangles
+    true_reach = data.reach.numpy().copy()
+
+    def look(reach):
+        """Render with what the lists are replaced by, not walking again."""
+        data.count.zero_()
+        data.reach.assign(np.broadcast_to(np.asarray(reach, np.float32), true_reach.shape))
+        renderer._walk.launch = lambda *_, **__: None
+        renderer.render(*arguments, instant_count=8)
+        return renderer.log_radiance.numpy().copy()
+
+    sky = np.log(np.array(scene.sky) @ LUMA + UNSHADOWED.dark_floor)
+    np.testing.assert_array_equal(look(true_reach), seen)  # empty lists of a finite reach tell nothing
+    assert (np.abs(look(1.0e9) - sky) < 1e-6).all()  # and of an infinite one, that there is only sky
+
+
+def test_bounds_hold_the_rays_of_a_tile():
+    rays = np.stack([LENS.ray_table(o).reshape(-1, 3) for o in ((0.5, 0.5), (0.1, 0.9))])
+    bounds = tile_bounds(rays, 45, 34)
+    assert bounds.shape == (6 * 5, 4)
+    slopes = (rays[..., :2] / rays[..., 2:]).reshape(2, 34, 45, 2)
+    part = slopes[:, 8:16, 40:45]
+    low_x, high_x, low_y, high_y = bounds[6 + 5]
+    for low, high, axis in ((low_x, high_x, 0), (low_y, high_y, 1)):
+        assert low < part[..., axis].min() < low + 5e-5
+        assert high - 5e-5 < part[..., axis].max() < high
+    with pytest.raises(ValueError, match="must look forward"):
+        tile_bounds(-rays, 45, 34)
+
+
+def test_events_of_a_flight_are_the_same():
+    settings = {
+        "duration_s": 0.04,
+        "device": "cpu",
+        "scene": {"kind": "apartment", "rooms": 1},
+        "sensors": {
+            "events": {
+                "kind": "event_camera",
+                "lens": {"width": 40, "height": 30, "horizontal_fov_rad": 1.5},
+                "sampling_rate_hz": 1000,
+                "packet_rate_hz": 50,
+            }
+        },
+    }
+    streams = []
+    for traversal in ({"cpu_traversal": "warp"}, {"shared_walk": {}}, {"shared_walk": {"instants": 5}}):
+        light = {"mode": "unshadowed"}
+        packets = list(run({**settings, "render": {"lighting": light, "exposure": 1.0, **traversal}}))
+        streams.append([np.concatenate(column) for column in zip(*(p.numpy() for p in packets), strict=True)])
+    assert len(streams[0][0]) > 50
+    for other in streams[1:]:
+        for mine, theirs in zip(streams[0], other, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+
+
+def test_what_does_not_go_together_is_refused():
+    with pytest.raises(ValueError, match="cpu_traversal must be auto or warp, got embree"):
+        RenderConfig(cpu_traversal="embree", shared_walk=WalkConfig())
+    terms = Terms(textured=False, emissive=False, baked=False, supersampled=False, walked=True, worlds=True)
+    for term in ("world_scenes", "world_lenses"):
+        with pytest.raises(ValueError, match="share walks where worlds have one scene and one lens"):
+            raycast_kernel(("log_radiance",), terms._replace(**{term: True}))
+
+
+def test_nothing_is_allocated_without(device):
+    arrays = upload_scene(scene_of(plane(1.0)), ALONE, device)
+    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=2)._walk is None
+    shared = upload_scene(scene_of(plane(1.0)), together(instants=2, face_count_max=8), device)
+    walk = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5)._walk
+    assert isinstance(walk, TileWalk)
+    assert walk.data.faces.shape == (3 * 30 * 8,)
