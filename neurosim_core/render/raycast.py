@@ -678,10 +678,10 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     that no part of the scene hides from it (all lamps, where the scene itself is unshadowed).
 
     Raises:
-        ValueError: If an output is unknown or none is asked for, or worlds are asked to share walks.
+        ValueError: If an output is unknown or none is asked for, or unlike worlds are to share walks.
     """
-    if terms.walked and terms.worlds:
-        raise ValueError("rays of several worlds do not share walks: render.shared_walk must be null")
+    if terms.walked and (terms.world_scenes or terms.world_lenses):
+        raise ValueError("rays share walks where worlds have one scene and one lens")
     unknown = sorted(set(outputs) - set(OUTPUTS))
     if unknown or not outputs:
         raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from neurosim_core.render.body_arrays import make_body_data, place_camera
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.raycast import WorldData, raycast_kernel
-from neurosim_core.render.tile_walk import TILE, WalkData
-from neurosim_core.render.warp_renderer import ray_layers
+from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
+from neurosim_core.render.warp_renderer import SceneArrays, ray_layers
 from neurosim_core.scene.bodies import BodyConfig, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig
 from neurosim_core.vehicle import Multirotor
@@ -71,18 +72,23 @@ class WorldCast:
         self._count = world_count
         self._stride = instant_count
         self._size = cast.lens.width, cast.lens.height
+        lenses, chosen = lens_tables(cast, rigs)
+        terms = terms._replace(world_lenses=len(lenses) > 1)
+        if terms.world_scenes or terms.world_lenses:  # walks change nothing but the speed
+            terms = terms._replace(walked=False, by_tile=False)
         tiles = -(-cast.lens.width // TILE) * -(-cast.lens.height // TILE)
-        self._instant_threads = tiles * TILE * TILE // (PACKET if terms.embree else 1)
+        rays_together = TILE * TILE if terms.by_tile else PACKET if terms.embree else 1
+        self._instant_threads = tiles * TILE * TILE // rays_together
         if world_count * instant_count * tiles * TILE * TILE > _THREAD_COUNT_MAX:
             raise ValueError(
                 f"{world_count} worlds of {instant_count} instants of {self._size[0]} x {self._size[1]} px "
                 "are more than 2^31 rays a step: take fewer worlds, or commands more often"
             )
-        lenses, chosen = lens_tables(cast, rigs)
-        self._kernel = raycast_kernel(cast.outputs, terms._replace(world_lenses=len(lenses) > 1))
+        self._kernel = raycast_kernel(cast.outputs, terms)
         rays = np.concatenate([ray_layers(lens, arrays.config.samples_per_pixel) for lens in lenses], axis=1)
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
         self._scene = arrays.data
+        self._walk = self._make_walk(arrays, rays) if terms.walked else None
         self._worlds = self._make_worlds(scenes, chosen if len(lenses) > 1 else None)
         self._p_BC = wp.vec3d(*cast.mount.position_m)
         self._q_BC = wp.quatd(*cast.mount.optical_quaternion())
@@ -121,6 +127,11 @@ class WorldCast:
             )
             for name in cast.event_cameras
         }
+
+    def begin(self, vehicle: Multirotor, clock_ns: Any) -> None:
+        """Note where the cameras are at stamp 0, for all instants: there is none without a pose."""
+        for instant in range(self._stride):
+            self.place(vehicle, clock_ns, instant, 0)
 
     def place(self, vehicle: Multirotor, clock_ns: Any, instant: int, offset_ns: int) -> None:
         """Note where the cameras are at an instant of a step, `offset_ns` after its begin; one launch."""
@@ -166,6 +177,8 @@ class WorldCast:
                 instant_count=everywhere,
                 data=self._body_data,
             )
+        if self._walk is not None:
+            self._walk.launch(self._rays, self._p_WC, self._q_WC, instant_count=self._count * self._stride)
         self._worlds.active = active
         launch_split(
             self._kernel,
@@ -180,7 +193,7 @@ class WorldCast:
                 self._slots_of(instant_count, bool(names)),
                 self._body_data,
                 self._worlds,
-                WalkData(),
+                WalkData() if self._walk is None else self._walk.data,
             ],
             outputs=[self._outputs["log_radiance"], self._outputs["rgb"], self._outputs["depth"], None, None],
             device=self._device,
@@ -198,6 +211,20 @@ class WorldCast:
         if lens is not None:
             worlds.lens = wp.array(lens, dtype=int, device=self._device)
         return worlds
+
+    def _make_walk(self, arrays: SceneArrays, rays: NDArray[np.float32]) -> TileWalk:
+        """Return walks that the instants of a tile share in each world."""
+        shared = arrays.config.shared_walk
+        assert shared is not None
+        return TileWalk(
+            arrays.mesh,
+            rays,
+            width=self._size[0],
+            height=self._size[1],
+            extent_m=float(np.abs(arrays.scene.bounds_m).max()),
+            config=shared.model_copy(update={"instants": self._stride}),
+            instant_count=self._count * self._stride,
+        )
 
     def _make_bodies(self, bodies: Mapping[str, BodyConfig]) -> None:
         everywhere = self._count * self._stride if self._bodies is not None else 0

@@ -101,8 +101,7 @@ def make_scene_table(
     terms = None
     if arrays:
         terms = Terms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
-        # walks that rays share change nothing but the speed, and are for one camera
-        terms = terms._replace(worlds=True, world_scenes=len(arrays) > 1, walked=False, by_tile=False)
+        terms = terms._replace(worlds=True, world_scenes=len(arrays) > 1)
     return SceneTable(
         models=made,
         scene_of_world=tuple(int(scene) for scene in chosen),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -11,6 +12,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.schedule import Boundary, Schedule, boundaries
 
 _PATTERN_COUNT_MAX = 4096
+_KIND_COUNT_MAX = 64
 _COMMON_MAX_NS = 10**13
 
 
@@ -79,9 +81,20 @@ class Timetable:
         )
 
     def instant_count_max(self) -> int:
-        """Return a bound on the instants of any cast in a period."""
+        """Return the most instants of any cast in a period; a bound where periods are of many kinds."""
         period_s = 1.0 / self._schedule.control.rate_hz
+        if 0 < self.common_ns <= _KIND_COUNT_MAX * 1e9 * period_s:
+            counts = [len(offsets_ns) - 1 for kind in self._kinds() for offsets_ns in kind.offsets_ns]
+            return max([1, *counts])
         return max((int(period_s * rate.rate_hz) + 2 for rate in self._schedule.casts), default=1)
+
+    def _kinds(self) -> Iterator[Pattern]:
+        """Yield the patterns of all periods until all clocks tick together."""
+        now_ns = 0
+        while now_ns < self.common_ns:
+            pattern = self.at(now_ns)
+            yield pattern
+            now_ns += pattern.duration_ns
 
     def sample_count_max(self) -> int:
         """Return a bound on the samples of any sampler in a period."""

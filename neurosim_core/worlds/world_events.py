@@ -19,6 +19,9 @@ from neurosim_core.sensors.event_scan import SUB_BITS, TILE_SIZE
 from neurosim_core.worlds import scan
 
 _BLOCK_SIZE = 256
+_SORT_BLOCK_SIZE = 1024
+"""Threads that sort the events of a world, where there may be many."""
+_MANY_EVENTS = 8192
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -240,10 +243,11 @@ class WorldEventCamera:
     def _sort(self) -> None:
         world_count = self._base.shape[0]
         if self.device.is_cuda:
+            block = _SORT_BLOCK_SIZE if self._capacity > _MANY_EVENTS else _BLOCK_SIZE
             wp.launch(
                 scan.sort_keys,
-                dim=(world_count, _BLOCK_SIZE),
-                block_dim=_BLOCK_SIZE,
+                dim=(world_count, block),
+                block_dim=block,
                 inputs=[self._stack.counters, self._stack.keys],
                 device=self.device,
             )

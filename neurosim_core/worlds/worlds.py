@@ -232,6 +232,7 @@ class Worlds:
         self._fly(pattern)
         for cast, names in zip(self._casts, pattern.pictures, strict=True):
             cast.prepare((0, 0), picture=bool(names))
+            cast.begin(self._vehicle, self._clock)
             cast.render(1, names, self._mask)
             for camera in cast.events.values():
                 camera.begin(self._mask, self._parity)

@@ -122,6 +122,20 @@ def test_pixels_and_lenses_of_their_own(noisy, plain):
             assert_same(seen[step][world], packets)
 
 
+def test_walks_that_rays_share(textured):
+    """The instants of a tile share a walk through the tree in each world, which changes nothing."""
+    rig = {"front": RIG["front"], "rgb": RIG["rgb"]}
+    walking = {"lighting": {"mode": "unshadowed"}, "shared_walk": {}}
+    commands = commands_of("rates", 4, 2)
+    worlds = make_worlds(settings(textured, sensors=rig, render=walking), count=2)
+    seen = record(worlds, commands)
+    for world in range(2):
+        for render in (walking, {"lighting": {"mode": "unshadowed"}, "cpu_traversal": "warp"}):
+            config = settings(textured, seed=7 + world, sensors=rig, render=render)
+            for step, packets in enumerate(fly_alone(config, commands[:, world])):
+                assert_same(seen[step][world], packets)
+
+
 def test_what_moves_by_itself(plain):
     """Bodies that pass, gusts and turbulence: by the clock and the seed of each world."""
     ball = {
