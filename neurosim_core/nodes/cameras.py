@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from neurosim_core.packets import Packet
+from neurosim_core.priority import give_way, sparing
 from neurosim_core.schedule import batch_end_ns
 from neurosim_core.sensors.cast import is_due
 from neurosim_core.simulation import Batch, Model, State, free_lanes, see, skip
@@ -18,6 +19,8 @@ _LAG_PERIODS = (2, 100)
 """Bounds of how far cameras may be behind, in control periods."""
 _SPARE_PERIODS = 32
 """Further periods that are flown while one picture takes too long, where frames are left out."""
+_SPARED_CORES = 1
+"""Left to the threads that must be in time, as long as no picture waits for the one before it."""
 GIVE_UP_S = 0.5
 """How long the batch in work may take when nobody waits for more [s]."""
 
@@ -199,6 +202,7 @@ class Cameras:
         return self._changed.wait_for(lambda: self._work is None, timeout_s)
 
     def _run(self) -> None:
+        give_way()
         while True:
             with self._changed:
                 self._work = None
@@ -208,7 +212,9 @@ class Cameras:
                 if self._closed or self._failure is not None:
                     return
                 job = self._work = self._jobs.popleft()
-            self._try(job)
+                behind = any(map(_shows_anything, self._jobs))
+            with sparing(0 if behind else _SPARED_CORES):
+                self._try(job)
 
     def _try(self, job: Job) -> None:
         try:

@@ -15,6 +15,8 @@ from typing import Any
 
 import warp as wp
 
+from neurosim_core.priority import niceness, spared_count
+
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
 
@@ -26,7 +28,8 @@ def core_count() -> int:
 
 
 @cache
-def _pool(thread_count: int) -> ThreadPoolExecutor:
+def _pool(thread_count: int, niceness: int) -> ThreadPoolExecutor:
+    """Return the threads for those who launch at a priority: threads inherit it from who starts them."""
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
 
 
@@ -50,9 +53,9 @@ def launch_split(
         inputs: Parameters after the first.
         outputs: Parameters after the inputs.
         device: Where to launch.
-        thread_count: Threads of the pool; all cores if None.
+        thread_count: Threads of the pool; all cores if None, less those that `priority.sparing` leaves.
     """
-    threads = thread_count or core_count()
+    threads = thread_count or max(1, core_count() - spared_count())
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64
     if not wp.get_device(device).is_cpu or threads == 1 or slice_size >= dim:
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=64)
@@ -65,5 +68,5 @@ def launch_split(
             kernel, dim=size, inputs=[first, *inputs], outputs=list(outputs), device=device, block_dim=64
         )
 
-    for _ in _pool(threads).map(run, range(0, dim, slice_size)):
+    for _ in _pool(threads, niceness()).map(run, range(0, dim, slice_size)):
         pass

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
+from neurosim_core.priority import spared_count
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
@@ -499,8 +500,10 @@ class EventCamera:
 
         if len(scan.chunks) > 1 and self._pool is None:
             self._pool = ThreadPoolExecutor(len(scan.chunks) - 1, thread_name_prefix="event-scan")
-        futures = [self._pool.submit(launch, chunk) for chunk in scan.chunks[1:]] if self._pool else []
-        launch(scan.chunks[0])
+        own = 1 + spared_count()  # chunks that this thread does one after the other
+        futures = [self._pool.submit(launch, chunk) for chunk in scan.chunks[own:]] if self._pool else []
+        for chunk in scan.chunks[:own]:
+            launch(chunk)
         for future in futures:
             future.result()
         scan.done.set()

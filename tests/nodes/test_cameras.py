@@ -17,6 +17,7 @@ from neurosim_core.nodes.cameras import Cameras
 from neurosim_core.nodes.status import Meter
 from neurosim_core.nodes.streaming import Streaming
 from neurosim_core.pacing import Pacer
+from neurosim_core.priority import spared_count
 from neurosim_core.simulation import Batch, Model, State, finish, fly_period, free_lanes, make_state
 
 MS = 1_000_000
@@ -117,6 +118,22 @@ def test_what_comes_late_is_left_out_where_there_is_no_thread(model: Model, inli
     assert dict(eyes.dropped) == expected
     assert bool(seen(eyes)) is not inline
     eyes.close()
+
+
+def test_a_core_is_left_to_others_as_long_as_no_picture_waits(model: Model, gate: Gate):
+    spared = []
+    held = module.see
+    module.see = lambda *job: spared.append(spared_count()) or held(*job)  # the gate puts it back
+    eyes = Cameras(inline=False, on_packets=lambda: None)
+    fly(model, eyes)
+    assert gate.reached.wait(SOON_S)
+    gate.open.set()
+    eyes.finish(lambda: False)
+    eyes.close()
+    # as many batches as there are, and the one of stamp 0, which began when no other had come
+    assert len(spared) == PERIODS + 1
+    assert set(spared[1:-1]) == {0}
+    assert spared[-1] == 1
 
 
 def test_a_request_does_not_keep_the_loop_awake():

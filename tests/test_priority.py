@@ -1,0 +1,70 @@
+"""Threads that give way, and cores that are left to others."""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import numpy as np
+import pytest
+import warp as wp
+
+from neurosim_core import priority
+from neurosim_core.priority import give_way, niceness, spared_count, sparing
+from neurosim_core.render import launch
+from neurosim_core.sensors.events import EventCamera, EventCameraConfig
+
+
+@wp.kernel
+def _number(first: int, numbers_out: wp.array[int]) -> None:
+    thread = first + wp.tid()
+    numbers_out[thread] = thread
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no priorities of their own")
+def test_a_thread_gives_way_with_those_that_it_starts_and_no_other():
+    before, found = niceness(), []
+
+    def work() -> None:
+        give_way()
+        found.append(niceness())
+        child = threading.Thread(target=lambda: found.append(niceness()))
+        child.start()
+        child.join()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    expected = min(before + priority._STEPS, 19)
+    assert found == [expected, expected]
+    assert niceness() == before
+
+
+@pytest.mark.parametrize(("cores", "spared", "used"), [(4, 0, 4), (4, 1, 3), (2, 1, 1), (1, 1, 1)])
+def test_a_launch_leaves_cores_to_others(monkeypatch: pytest.MonkeyPatch, cores: int, spared: int, used: int):
+    asked = []
+    pool = launch._pool
+    monkeypatch.setattr(launch, "core_count", lambda: cores)
+    monkeypatch.setattr(launch, "_pool", lambda count, nice: asked.append(count) or pool(count, nice))
+    numbers = wp.zeros(100_000, dtype=int, device="cpu")
+    with sparing(spared):
+        launch.launch_split(_number, dim=numbers.size, inputs=[], outputs=[numbers], device="cpu")
+    assert asked == ([used] if used > 1 else [])  # alone it needs no pool
+    assert np.array_equal(numbers.numpy(), np.arange(numbers.size))
+    assert spared_count() == 0
+
+
+def test_the_events_are_the_same_with_fewer_cores(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("neurosim_core.sensors.events.core_count", lambda: 4)
+    frames = np.random.default_rng(5).normal(0.0, 0.5, (4, 128, 256)).astype(np.float32)
+
+    def events(spared: int) -> list[bytes]:
+        camera = EventCamera(EventCameraConfig(), width=256, height=128)
+        camera.reset(frames[0])
+        with sparing(spared):
+            packet = camera.feed(frames[1:], [1_000_000, 2_000_000, 3_000_000])
+        return [column.tobytes() for column in packet.numpy()]
+
+    every = events(0)
+    assert len(every[0]) > 0
+    assert events(1) == events(3) == every
