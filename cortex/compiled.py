@@ -13,4 +13,6 @@ native: Any = None
 """`cortex._native`, or None."""
 if not os.environ.get("CORTEX_PURE_PYTHON"):
     with contextlib.suppress(ImportError):  # there was no compiler when this was installed
-        from cortex import _native as native
+        from cortex import _native
+
+        native = _native

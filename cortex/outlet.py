@@ -13,7 +13,7 @@ from typing import Protocol
 
 import zmq
 
-from cortex.context import new_socket
+from cortex.context import Frames, new_socket
 from cortex.wire import AttachKey, parse_attach_key, parse_resume_key
 
 logger = logging.getLogger(__name__)
@@ -57,8 +57,19 @@ class Outlet:
     """Where its unix socket lies, and readers offer pipes."""
 
     def __post_init__(self) -> None:
-        # pyzmq's own `send` spends half of its time on checking arguments that we never pass.
-        self.send: Callable[..., zmq.MessageTracker | None] = super(zmq.Socket, self.socket).send
+        self._frames = Frames(self.socket)
+        self.send: Callable[..., object] = self._frames.send
+
+    def lend(self, body: memoryview) -> zmq.MessageTracker:
+        """Send a frame without a copy; the tracker says when its memory is free."""
+        tracker = self.socket.send(body, DONTWAIT, copy=False, track=True)
+        assert tracker is not None
+        return tracker
+
+    def close(self) -> None:
+        """Close the socket; queued frames are still sent for a second."""
+        self._frames.close()
+        self.socket.close()
 
     def try_send(self, frame: bytes, flags: int = 0) -> bool:
         """Send one frame; False if a strict reader's queue is full."""
@@ -192,7 +203,7 @@ class Outlets:
         with self.lock:
             self.closed = True
             for outlet in self._outlets:
-                outlet.socket.close()
+                outlet.close()
             self._outlets.clear()
 
 

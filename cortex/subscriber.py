@@ -40,8 +40,8 @@ DRAIN_MAX = 64
 """Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
 DRAIN_LOSSY_MAX = 4096
 """Where only the last messages count, all that has arrived is read: more than a socket holds."""
-BACKLOG_NS = 10_000
-"""A message that is received within this time was there before we asked."""
+PAUSE_NS = 1_000_000
+"""An asyncio loop that always finds a message runs other tasks after so long."""
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
 WAIT_MAX_S = 0.1
@@ -93,14 +93,13 @@ class Subscriber(Generic[T]):
         self._problems: deque[Exception] = deque()
         self._drained_ns = 0
         self._exhausted = True
-        self._hot = False
         self._whole_batches = False
         self._on_close = on_close
         self._closed = False
         self._reader: LoopReader | None = None
         self._generation = 0
         self._first = 0
-        self._since_pause = 0
+        self._pause_ns = 0
         self._raised = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
@@ -176,29 +175,51 @@ class Subscriber(Generic[T]):
         return _AsyncMessages(self)
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
-        """Take the next message without blocking the running loop; see `recv`."""
+        """Take the next message without blocking the running loop; see `recv`.
+
+        A message that is there is returned without a switch of tasks, for up to a millisecond; then other
+        tasks get a turn. A task that is cancelled while it waits has taken no message.
+        """
+        if monotonic_ns() < self._pause_ns and (found := self._take_now()) is not _LOST:
+            return found
         reader = self._reader
         if reader is None or reader.loop is not asyncio.get_running_loop():
             if reader is not None:
                 reader.stop()
             reader = self._reader = LoopReader(self._watched, self._on_wake)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        if monotonic_ns() >= self._pause_ns:  # other tasks of the loop want to run, too
+            await asyncio.sleep(0)
         while True:
-            item = self._take()
-            if item is not None:
-                self._since_pause += 1
-                if self._since_pause >= DRAIN_MAX:  # other tasks of the loop want to run, too
-                    self._since_pause = 0
-                    await asyncio.sleep(0)
-                message: T = self._open(item, self._decode)
-                if message is not _LOST:
-                    return message
+            self._pause_ns = monotonic_ns() + PAUSE_NS
+            message: T = self._take_now()
+            if message is not _LOST:
+                return message
+            if self._queue or not self._exhausted:  # what came could not be read
+                await asyncio.sleep(0)
                 continue
-            self._since_pause = 0
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(self._nothing_came(timeout_s))
             await reader.wait(min(left_s, WAIT_MAX_S))
+
+    def _take_now(self) -> Any:
+        """Take the next message if it is there; `_LOST` if not, or if it could not be read."""
+        if self.policy.reliable and not self._queue:
+            with self._lock:
+                message = self._receive_decoded(DONTWAIT) if not self._queue else _LOST
+                if message is not _LOST:
+                    self.counters.received += 1
+                    return message
+        item = self._take()
+        return _LOST if item is None else self._open(item, self._decode)
+
+    async def _next_async(self) -> T:
+        """As `recv_async`, with one coroutine less for a message that is there."""
+        if monotonic_ns() < self._pause_ns and (found := self._take_now()) is not _LOST:
+            message: T = found
+            return message
+        return await self.recv_async()
 
     def _nothing_came(self, timeout_s: float | None) -> str:
         others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
@@ -382,20 +403,23 @@ class Subscriber(Generic[T]):
             return links[self._first :] + links[: self._first]
         return links
 
-    def _receive_decoded(self) -> Any:
-        """Wait for one message in the only socket, and decode it; the lock is held, and the queue is empty.
+    def _receive_decoded(self, flags: int = 0) -> Any:
+        """Take one message from the only socket, and decode it; the lock is held, and the queue is empty.
+
+        Args:
+            flags: DONTWAIT, or 0 to wait up to `BLOCK_S`.
 
         Returns:
             The message, or `_LOST` if none came, or if it went to the queue because it needs more care.
         """
         links = self._links
-        if len(links) != 1 or self._turn.asked or self._closed or self._problems:
+        if len(links) != 1 or (not flags and self._turn.asked) or self._closed or self._problems:
             return _LOST
         link = links[0]
         read = link.read
         self._exhausted = True
         try:
-            frame = link.receive(0)
+            frame = link.receive(flags)
         except zmq.Again:
             return _LOST
         self._exhausted = False
@@ -458,17 +482,16 @@ class Subscriber(Generic[T]):
             self._time(publish_ns, link)
         self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
 
-    def _drain_decoded(self) -> deque[T]:
+    def _drain_decoded(self, messages: deque[T]) -> None:
         """As `_drain`, for an empty queue that cannot overflow: messages are decoded on the spot.
 
         This is where a stream spends its time. A message that cannot be decoded here goes to the queue, and
         what follows it waits in the socket, so that the order is kept.
         """
-        messages: deque[T] = deque()
         exhausted = True
         self._drained_ns = monotonic_ns()
         for link in self._rotated():
-            left = min(self.policy.depth, DRAIN_MAX)
+            left = min(self.policy.depth, DRAIN_MAX) - len(messages)
             while left > 0 and not self._queue:
                 link.expected, count, frame = link.drain(
                     link.receive,
@@ -491,7 +514,6 @@ class Subscriber(Generic[T]):
             if self._queue:
                 break
         self._exhausted = exhausted
-        return messages
 
     def _take_decoded(self, link: Link, frame: bytes, messages: deque[T]) -> None:
         """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
@@ -568,17 +590,10 @@ class Subscriber(Generic[T]):
                 return False
             problems, self._problems = self._problems, deque()
             if self.policy.reliable or self.policy.depth >= DRAIN_MAX:
-                if self._hot and not self._queue:
-                    messages = self._drain_decoded()
-                    self._hot = not self._exhausted
-                elif not self._queue:
-                    asked_ns = monotonic_ns()
-                    if block and (message := self._receive_decoded()) is not _LOST:
-                        messages.append(message)
-                    elif not block:
-                        self._receive_one()
-                    # A message that waited for us is rarely the last: the next are read together.
-                    self._hot = bool(messages or self._queue) and monotonic_ns() - asked_ns < BACKLOG_NS
+                if block and not self._queue and (message := self._receive_decoded()) is not _LOST:
+                    messages.append(message)
+                if not self._queue:
+                    self._drain_decoded(messages)
             else:
                 if block and not self._queue:
                     self._receive_one(block=True)
@@ -789,7 +804,7 @@ class _AsyncMessages(Generic[T]):
 
     async def __anext__(self) -> T:
         try:
-            return await self._subscriber.recv_async()
+            return await self._subscriber._next_async()
         except Closed:
             raise StopAsyncIteration from None
 
