@@ -21,6 +21,7 @@ import warp as wp
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
+from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.tile_walk import ASK, TILE, WalkData, find_face, find_faces, meet_face
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
@@ -508,6 +509,10 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     packets = (TILE // side) ** 2  # of a tile
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
+    together = with_radiance and baked and not with_bodies and not finest_level
+    each_lane = with_geometry or walked or not together
+    shade_packet = packet_shader(lanes, textured=textured, emissive=emissive, unit_normals=walked)
+
     @wp.kernel(module="unique", enable_backward=False)
     def raycast_packets(
         first: int,
@@ -570,6 +575,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         v = wp.zeros(shape=(lanes,), dtype=float)
         normal = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
+        spread_rad = wp.zeros(shape=(lanes if together else 1,), dtype=float)
         columns = wp.min(width - left, side)
         rows = wp.min(height - top, side)
         for layer in range(rays.shape[0]):
@@ -580,6 +586,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                 for x in range(columns):
                     ray_C = rays[layer, first_ray + (top + y) * width + left + x]
                     ray[side * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+                    if wp.static(together):
+                        spread_rad[side * y + x] = ray_C[3]
             if wp.static(walked):
                 walk = instant // walk_data.instants
                 find_faces(
@@ -601,43 +609,73 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                 cast_packet(
                     scene.embree_intersect, scene.embree_scene, origin, ray, _FAR_M, face, t, u, v, normal
                 )
-            for y in range(rows):
-                for x in range(columns):
-                    lane = side * y + x
-                    ray_C = rays[layer, first_ray + (top + y) * width + left + x]
-                    if wp.static(walked):
-                        hit = meet_listed(scene, origin, ray[lane], face[lane])
-                    else:
-                        hit = Hit()
-                        hit.face = face[lane]
-                        hit.t = t[lane]
-                        hit.u = u[lane]
-                        hit.v = v[lane]
-                        hit.normal = wp.normalize(normal[lane])
-                    body = int(-1)
-                    if wp.static(with_bodies):
-                        hit, body = meet_bodies(
-                            bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
-                        )
-                    if wp.static(with_radiance):
-                        if wp.static(not supersampled) or layer > 0:
-                            radiance[lane] += radiance_of(
-                                scene, bodies, instant, body, q, ray[lane], origin, ray_C[3], hit
+            if wp.static(each_lane):
+                for y in range(rows):
+                    for x in range(columns):
+                        lane = side * y + x
+                        ray_C = rays[layer, first_ray + (top + y) * width + left + x]
+                        if wp.static(walked):
+                            hit = meet_listed(scene, origin, ray[lane], face[lane])
+                        else:
+                            hit = Hit()
+                            hit.face = face[lane]
+                            hit.t = t[lane]
+                            hit.u = u[lane]
+                            hit.v = v[lane]
+                            hit.normal = wp.normalize(normal[lane])
+                        body = int(-1)
+                        if wp.static(with_bodies):
+                            hit, body = meet_bodies(
+                                bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
                             )
-                    if wp.static(with_geometry):
-                        if slot >= 0 and layer == 0:
-                            write_geometry(
-                                scene,
-                                ray[lane],
-                                ray_C[2],
-                                hit,
-                                slot,
-                                top + y,
-                                left + x,
-                                depth_out,
-                                normal_out,
-                                instance_out,
-                            )
+                        if wp.static(walked and together):
+                            face[lane] = hit.face
+                            t[lane] = hit.t
+                            u[lane] = hit.u
+                            v[lane] = hit.v
+                            normal[lane] = hit.normal
+                        if wp.static(with_radiance and not together):
+                            if wp.static(not supersampled) or layer > 0:
+                                radiance[lane] += radiance_of(
+                                    scene, bodies, instant, body, q, ray[lane], origin, ray_C[3], hit
+                                )
+                        if wp.static(with_geometry):
+                            if slot >= 0 and layer == 0:
+                                write_geometry(
+                                    scene,
+                                    ray[lane],
+                                    ray_C[2],
+                                    hit,
+                                    slot,
+                                    top + y,
+                                    left + x,
+                                    depth_out,
+                                    normal_out,
+                                    instance_out,
+                                )
+            if wp.static(together):
+                if wp.static(not supersampled) or layer > 0:
+                    shade_packet(
+                        scene.face_material,
+                        scene.face_lod,
+                        scene.corner_uv,
+                        scene.corner_light,
+                        scene.base_color,
+                        scene.emission,
+                        scene.material_texture,
+                        scene.levels,
+                        scene.texels,
+                        scene.sky,
+                        scene.mip_bias,
+                        ray,
+                        spread_rad,
+                        face,
+                        t,
+                        u,
+                        v,
+                        normal,
+                        radiance,
+                    )
         if wp.static(with_radiance):
             for y in range(rows):
                 for x in range(columns):
