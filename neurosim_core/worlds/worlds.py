@@ -451,9 +451,12 @@ class Worlds:
             "orientation": orientation,
             "body_rate": body_rate,
         }
-        for name, value in given.items():
+        for name, given_value in given.items():
             array = getattr(self._start, name)
-            value = self._begin[name] if value is None else value
+            if given_value is None and name in self._as_configured:
+                continue
+            value = self._begin[name] if given_value is None else given_value
+            (self._as_configured.add if given_value is None else self._as_configured.discard)(name)
             on_device = _as_device_array(value, self.device)
             if on_device is not None:
                 self._take_rows(on_device, array, name)
@@ -478,9 +481,13 @@ class Worlds:
             "orientation": np.array([[0.0, 0.0, np.sin(half), np.cos(half)] for half in half_yaw]),
             "body_rate": np.zeros((len(begins), 3)),
         }
+        self._as_configured = set(of_scene)
+        """What in `_start` is where vehicles begin by default."""
         self._begin = {name: rows[list(self._scenes.scene_of_world)] for name, rows in of_scene.items()}
         start = flight.Start()
         for name, rows in self._begin.items():
+            if name == "orientation":
+                rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
             setattr(start, name, wp.array(rows, dtype=wp.float64, device=self.device))
         return start
 

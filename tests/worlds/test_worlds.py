@@ -66,6 +66,9 @@ def test_places_of_their_own(plain):
         alone = fly_alone(settings(plain, seed=seed), commands[:, world], start=start)
         for step, packets in enumerate(alone):
             assert_same(seen[step][world], packets)
+    (packets,) = fly_alone(settings(plain, seed=3), commands[:0, 0])  # where the path begins
+    for still in (None, wp.zeros((2, 3), dtype=float, device="cpu")):
+        assert_same(snapshot(worlds.reset(velocity=still), 0), packets)
 
 
 def test_scenes_of_their_own(plain, textured):
