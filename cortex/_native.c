@@ -42,6 +42,8 @@ enum {
     BATCH_COUNT = 64,       /* as in publisher.py */
     BATCH_BYTES = 128 * 1024,
     BATCH_NS = 150000,
+    DEFERRED_BYTES = 1 << 14,
+    UNLOCKED_BYTES = 1 << 17, /* to copy so many takes longer than to let others have the lock meanwhile */
 };
 static const Py_ssize_t BODY_LIMIT = (Py_ssize_t)1 << 32;
 
@@ -71,6 +73,7 @@ typedef struct {
     int has_tail; /* bodies differ in size */
     int has_head;
     char head[HEAD_SIZE];
+    PyObject *slots; /* a SlotView whose messages are read here, too; NULL or None: none */
     Field *fields;
 } Flat;
 
@@ -81,6 +84,7 @@ typedef struct {
     Py_ssize_t size[FIELDS_MAX];
     int64_t stamp_ns;
     Py_ssize_t end;
+    int defers; /* whether `write_body` leaves large arrays to `copy_arrays` */
 } Layout;
 
 static inline PyObject **place_of(const Field *field, PyObject *message) {
@@ -224,6 +228,29 @@ static int lay_out(const Flat *flat, PyObject *message, Layout *layout) {
     return 1;
 }
 
+static int is_deferred(const Layout *layout, const Field *field, Py_ssize_t index) {
+    return layout->defers && layout->size[index] >= DEFERRED_BYTES && (field->kind == FIXED || field->kind == VARIABLE);
+}
+
+/* Third pass, where arrays were deferred: it needs no thread state, but someone who keeps the arrays. */
+static void copy_arrays(const Flat *flat, const Layout *layout, char *out) {
+    for (Py_ssize_t index = 0; index < flat->count; ++index) {
+        const Field *field = &flat->fields[index];
+        if (field->kind <= BOOL || !is_deferred(layout, field, index)) continue;
+        const Py_ssize_t start = field->kind == FIXED ? field->offset : layout->start[index];
+        memcpy(out + start, layout->data[index], (size_t)layout->size[index]);
+    }
+}
+
+/* Hold on to the deferred arrays of a message (`hold` 1), or let them go (-1). */
+static void hold_arrays(const Flat *flat, const Layout *layout, PyObject **arrays, int hold) {
+    for (Py_ssize_t index = 0; index < flat->count; ++index) {
+        if (flat->fields[index].kind <= BOOL || !is_deferred(layout, &flat->fields[index], index)) continue;
+        if (hold < 0) Py_DECREF(arrays[index]);
+        else Py_INCREF(arrays[index]);
+    }
+}
+
 /* Second pass: the body; `out` has room for `layout->end` bytes. */
 static int write_body(const Flat *flat, PyObject *message, Layout *layout, char *out) {
     memset(out, 0, (size_t)flat->block);
@@ -241,7 +268,7 @@ static int write_body(const Flat *flat, PyObject *message, Layout *layout, char 
                 *place = value == Py_True;
                 continue;
             case FIXED:
-                memcpy(place, layout->data[index], (size_t)layout->size[index]);
+                if (!is_deferred(layout, field, index)) memcpy(place, layout->data[index], (size_t)layout->size[index]);
                 continue;
             default:
                 break;
@@ -257,7 +284,7 @@ static int write_body(const Flat *flat, PyObject *message, Layout *layout, char 
         memcpy(place, numbers, 4 * count);
         if (size) {
             memset(out + end, 0, (size_t)(start - end));
-            memcpy(out + start, layout->data[index], (size_t)size);
+            if (!is_deferred(layout, field, index)) memcpy(out + start, layout->data[index], (size_t)size);
             end = start + size;
         }
     }
@@ -273,7 +300,7 @@ static int write_body(const Flat *flat, PyObject *message, Layout *layout, char 
     return 1;
 }
 
-static PyObject *dont_wait; /* the flag of ZeroMQ, as an int */
+static PyObject *dont_wait, *no_flags; /* of ZeroMQ, as ints */
 
 /* The clock of Python's `time.monotonic_ns`. */
 static int64_t monotonic_ns(void) {
@@ -300,18 +327,16 @@ static int arguments_are(Py_ssize_t count, Py_ssize_t wanted) {
 
 /* A whole frame; NULL without error if the message is not as usual. */
 static PyObject *make_frame(
-    const Flat *flat, PyObject *message, uint64_t sequence, int64_t publish_ns, Py_ssize_t limit) {
-    Layout layout = {.stamp_ns = 0};
-    if (!flat->has_head || !lay_out(flat, message, &layout) || layout.end > limit) return NULL;
-    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + layout.end);
+    const Flat *flat, PyObject *message, Layout *layout, uint64_t sequence, int64_t publish_ns) {
+    PyObject *frame = PyBytes_FromStringAndSize(NULL, HEADER_SIZE + layout->end);
     if (frame == NULL) return NULL;
     char *out = PyBytes_AS_STRING(frame);
-    if (!write_body(flat, message, &layout, out + HEADER_SIZE)) {
+    if (!write_body(flat, message, layout, out + HEADER_SIZE)) {
         Py_DECREF(frame);
         return NULL;
     }
     memcpy(out, flat->head, HEAD_SIZE);
-    const uint64_t rest[5] = {sequence, (uint64_t)layout.stamp_ns, (uint64_t)publish_ns, (uint64_t)layout.end, 0};
+    const uint64_t rest[5] = {sequence, (uint64_t)layout->stamp_ns, (uint64_t)publish_ns, (uint64_t)layout->end, 0};
     memcpy(out + HEAD_SIZE, rest, sizeof rest);
     return frame;
 }
@@ -328,7 +353,9 @@ static PyObject *flat_frame(Flat *flat, PyObject *const *arguments, Py_ssize_t c
     const int64_t publish_ns = PyLong_AsLongLong(arguments[2]);
     const Py_ssize_t limit = PyLong_AsSsize_t(arguments[3]);
     if (PyErr_Occurred()) return NULL;
-    PyObject *frame = make_frame(flat, message, sequence, publish_ns, limit);
+    Layout layout = {.stamp_ns = 0};
+    if (!flat->has_head || !lay_out(flat, message, &layout) || layout.end > limit) Py_RETURN_NONE;
+    PyObject *frame = make_frame(flat, message, &layout, sequence, publish_ns);
     return frame == NULL ? none_or_error(NULL) : frame;
 }
 
@@ -465,10 +492,31 @@ PyDoc_STRVAR(read_doc,
 "A frame to its sequence, publish_ns and message; None if it does not begin with the head, or is not as usual.\n"
 "Arrays of the message are read-only views of the frame.");
 
+/* The message in the slot that a descriptor names; NULL without error if it is not as usual. */
+static PyObject *read_slot(const Flat *flat, PyObject *frame, uint64_t *sequence, int64_t *publish_ns) {
+    const char *bytes = PyBytes_AS_STRING(frame), *body;
+    if (PyBytes_GET_SIZE(frame) != SLOT_FRAME_SIZE || memcmp(bytes, flat->head, 3)
+        || memcmp(bytes + 4, flat->head + 4, HEAD_SIZE - 4))
+        return NULL;
+    Py_ssize_t size;
+    PyObject *lease = take_lease(flat->slots, bytes, &body, &size);
+    if (lease == NULL) return NULL;
+    PyObject *message = read_body(flat, lease, body, size);
+    if (message == NULL) {
+        cancel_lease(lease);
+        return NULL;
+    }
+    Py_DECREF(lease);
+    memcpy(sequence, bytes + HEAD_SIZE, 8);
+    memcpy(publish_ns, bytes + HEAD_SIZE + 16, 8);
+    return message;
+}
+
 /* What a plain frame of this publisher says; NULL without error if it is none. */
 static PyObject *read_frame(const Flat *flat, PyObject *frame, uint64_t *sequence, int64_t *publish_ns) {
     if (!flat->has_head || !PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) < HEADER_SIZE) return NULL;
     const char *bytes = PyBytes_AS_STRING(frame);
+    if (bytes[3] == 'S' && flat->slots != NULL) return read_slot(flat, frame, sequence, publish_ns);
     if (memcmp(bytes, flat->head, HEAD_SIZE)) return NULL;
     uint64_t rest[5];
     memcpy(rest, bytes + HEAD_SIZE, sizeof rest);
@@ -487,8 +535,24 @@ static PyObject *flat_read(Flat *flat, PyObject *frame) {
     return Py_BuildValue("KLN", (unsigned long long)sequence, (long long)publish_ns, message);
 }
 
+static PyObject *reader_take(PyObject *self, int may_wait);
+static PyTypeObject PipeReaderType;
+
+/* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
+static PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait) {
+    if (PyCFunction_CheckExact(receive)) { /* one of ours needs no exception */
+        PyObject *self = PyCFunction_GET_SELF(receive);
+        if (self != NULL && Py_IS_TYPE(self, &PipeReaderType)) return reader_take(self, may_wait);
+        if (self != NULL && Py_IS_TYPE(self, &SocketType)) return socket_take(self, may_wait);
+    }
+    PyObject *flags[2] = {NULL, may_wait ? no_flags : dont_wait};
+    PyObject *frame = PyObject_Vectorcall(receive, flags + 1, 1 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+    if (frame == NULL && PyErr_ExceptionMatches(again)) PyErr_Clear();
+    return frame;
+}
+
 PyDoc_STRVAR(drain_doc,
-"drain($self, receive, again, messages, expected, limit, latency, clock_offset_ns, /)\n--\n\n"
+"drain($self, receive, again, messages, expected, limit, latency, clock_offset_ns, may_wait, /)\n--\n\n"
 "Read plain frames that follow one another, and append their messages.\n\n"
 "Args:\n"
 "    receive: Called with DONTWAIT (1); returns a frame.\n"
@@ -497,7 +561,8 @@ PyDoc_STRVAR(drain_doc,
 "    expected: Sequence of the next message; -1: not known.\n"
 "    limit: Most messages to read.\n"
 "    latency: Counts by powers of two of a nanosecond; every eighth message is entered.\n"
-"    clock_offset_ns: What to add to the publisher's clock to read it on ours [ns].\n\n"
+"    clock_offset_ns: What to add to the publisher's clock to read it on ours [ns].\n"
+"    may_wait: Whether to wait a little for the first: call `receive` without DONTWAIT.\n\n"
 "Returns:\n"
 "    The sequence expected next, how many were read, and what ended it: None where there were no more or the limit\n"
 "    was reached, or a frame that was taken from the socket and is something else, or out of sequence.\n");
@@ -514,11 +579,12 @@ static int note_latency(PyObject *latency, int64_t elapsed_ns) {
 }
 
 static PyObject *flat_drain(Flat *flat, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 7)) return NULL;
+    if (!arguments_are(count, 8)) return NULL;
     PyObject *receive = arguments[0], *again = arguments[1], *messages = arguments[2], *latency = arguments[5];
     int64_t expected = PyLong_AsLongLong(arguments[3]);
     const Py_ssize_t limit = PyLong_AsSsize_t(arguments[4]);
     const int64_t clock_offset_ns = PyLong_AsLongLong(arguments[6]);
+    const int may_wait = PyObject_IsTrue(arguments[7]);
     if (PyErr_Occurred()) return NULL;
     if (!PyList_Check(latency) || PyList_GET_SIZE(latency) == 0) {
         PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
@@ -529,11 +595,9 @@ static PyObject *flat_drain(Flat *flat, PyObject *const *arguments, Py_ssize_t c
     PyObject *frame = NULL;
     Py_ssize_t read = 0;
     for (; read < limit; ++read) {
-        PyObject *flags[2] = {NULL, dont_wait};
-        frame = PyObject_Vectorcall(receive, flags + 1, 1 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+        frame = take_frame(receive, again, may_wait && read == 0);
         if (frame == NULL) {
-            if (!PyErr_ExceptionMatches(again)) goto failed;
-            PyErr_Clear();
+            if (PyErr_Occurred()) goto failed;
             break;
         }
         uint64_t sequence;
@@ -588,11 +652,9 @@ static PyObject *flat_gather(Flat *flat, PyObject *const *arguments, Py_ssize_t 
     PyObject *frames[GATHER_MAX], *frame = NULL, *bodies = NULL;
     Py_ssize_t found = 0;
     while (found < limit && found < GATHER_MAX) {
-        PyObject *flags[2] = {NULL, dont_wait};
-        frame = PyObject_Vectorcall(arguments[0], flags + 1, 1 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+        frame = take_frame(arguments[0], arguments[1], 0);
         if (frame == NULL) {
-            if (!PyErr_ExceptionMatches(arguments[1])) goto done;
-            PyErr_Clear();
+            if (PyErr_Occurred()) goto done;
             break;
         }
         if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE + size) break;
@@ -789,11 +851,13 @@ static PyObject *flat_new(PyTypeObject *type, PyObject *arguments, PyObject *key
 
 static int flat_traverse(Flat *flat, visitproc visit, void *arg) {
     Py_VISIT(flat->cls);
+    Py_VISIT(flat->slots);
     return 0;
 }
 
 static int flat_clear(Flat *flat) {
     Py_CLEAR(flat->cls);
+    Py_CLEAR(flat->slots);
     return 0;
 }
 
@@ -818,6 +882,11 @@ static PyMethodDef flat_methods[] = {
     {NULL, NULL, 0, NULL},
 };
 
+static PyMemberDef flat_members[] = {
+    {"slots", T_OBJECT, offsetof(Flat, slots), 0, "A `SlotView`: descriptors of its ring are read as messages; None: none are."},
+    {NULL, 0, 0, 0, NULL},
+};
+
 PyDoc_STRVAR(flat_doc,
 "Flat(cls, fields, block, stamp, head)\n--\n\n"
 "Writes and reads the messages of one flat type.\n\n"
@@ -839,6 +908,7 @@ static PyTypeObject FlatType = {
     .tp_clear = (inquiry)flat_clear,
     .tp_dealloc = (destructor)flat_dealloc,
     .tp_methods = flat_methods,
+    .tp_members = flat_members,
 };
 
 /* Gate */
@@ -853,6 +923,9 @@ typedef struct {
     uint64_t sequence;
     int64_t bytes;
     int64_t refresh_ns;
+    /* Where larger bodies go; NULL or None: the long way. */
+    PyObject *ledger;
+    PyObject *prepare, *large_acquire, *large_release, *finish;
     /* A batch that is being collected: its first record is put in by Python, which starts the clock. */
     PyObject *records; /* a list; NULL or None: messages are not collected */
     PyObject *flush;
@@ -890,17 +963,16 @@ static PyObject *gate_collect(Gate *gate, PyObject *message) {
     Py_RETURN_TRUE;
 }
 
-/* Send with the lock held; NULL without error if the message has to go the long way. */
-static PyObject *gate_send(Gate *gate, PyObject *message) {
-    if (gate->records != NULL && PyList_CheckExact(gate->records) && PyList_GET_SIZE(gate->records))
-        return gate_collect(gate, message);
-    if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
-    const int64_t now_ns = monotonic_ns();
-    if (now_ns >= gate->refresh_ns) return NULL;
-    PyObject *frame = make_frame(gate->flat, message, gate->sequence, now_ns, gate->limit);
-    if (frame == NULL) return NULL;
-    gate->sequence += 1;
-    gate->bytes += PyBytes_GET_SIZE(frame) - HEADER_SIZE;
+/* See who has come and gone, now and then; 0 with an error set, or if nobody is there to do it. */
+static int gate_prepare(Gate *gate, int64_t now_ns) {
+    if (gate->prepare == NULL) return 0;
+    PyObject *prepared = PyObject_CallFunction(gate->prepare, "L", (long long)now_ns);
+    Py_XDECREF(prepared);
+    return prepared != NULL;
+}
+
+/* Send a frame to all; the lock is held. */
+static PyObject *gate_send_frame(Gate *gate, PyObject *frame) {
     PyObject *sends = Py_NewRef(gate->sends); /* who comes or goes meanwhile replaces it */
     int on_time = 1;
     for (Py_ssize_t place = 0; on_time >= 0 && place < PyTuple_GET_SIZE(sends); ++place) {
@@ -916,8 +988,115 @@ static PyObject *gate_send(Gate *gate, PyObject *message) {
         Py_XDECREF(sent);
     }
     Py_DECREF(sends);
-    Py_DECREF(frame);
     return on_time < 0 ? NULL : PyBool_FromLong(on_time);
+}
+
+/* Take the lock back, whatever signals come; 0 with an error set if one of their handlers raised. */
+static int gate_relock(Gate *gate) {
+    PyObject *acquired, *type = NULL, *value = NULL, *traceback = NULL;
+    while ((acquired = PyObject_CallNoArgs(gate->acquire)) == NULL) {
+        Py_XDECREF(type);
+        Py_XDECREF(value);
+        Py_XDECREF(traceback);
+        PyErr_Fetch(&type, &value, &traceback);
+    }
+    Py_DECREF(acquired);
+    if (type == NULL) return 1;
+    PyErr_Restore(type, value, traceback);
+    return 0;
+}
+
+/* Copy the arrays of a large message without the lock, which is held before and after; 0 with an error set. */
+static int gate_copy(Gate *gate, PyObject *message, const Layout *layout, char *out) {
+    const Flat *flat = gate->flat;
+    PyObject *arrays[FIELDS_MAX];
+    for (Py_ssize_t index = 0; index < flat->count; ++index) arrays[index] = *place_of(&flat->fields[index], message);
+    hold_arrays(flat, layout, arrays, 1);
+    PyObject *released = PyObject_CallNoArgs(gate->release);
+    if (released == NULL) {
+        hold_arrays(flat, layout, arrays, -1);
+        return 0;
+    }
+    Py_DECREF(released);
+    Py_BEGIN_ALLOW_THREADS
+    copy_arrays(flat, layout, out);
+    Py_END_ALLOW_THREADS
+    const int locked = gate_relock(gate);
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    hold_arrays(flat, layout, arrays, -1);
+    PyErr_Restore(type, value, traceback);
+    return locked;
+}
+
+/* Write a large message into a slot and send its descriptor, with the lock held; NULL as below.
+
+   While much is copied others may have the lock: then `large_acquire` keeps other large messages away, and whatever
+   has changed meanwhile is left to `finish`. */
+static PyObject *gate_send_slot(Gate *gate, PyObject *message, Layout *layout, int64_t now_ns) {
+    Ledger *ledger = gate->ledger == NULL ? NULL : ledger_of(gate->ledger);
+    if (ledger == NULL || gate->records != NULL || !ledger_has_room(ledger)) return NULL;
+    const int unlocked = layout->end >= UNLOCKED_BYTES;
+    if (unlocked) {
+        PyObject *acquired = PyObject_CallOneArg(gate->large_acquire, Py_False);
+        Py_XDECREF(acquired);
+        if (acquired != Py_True) return NULL;
+    }
+    PyObject *kept = Py_NewRef(gate->ledger), *result = NULL;
+    const Py_ssize_t slot = ledger_acquire(ledger, layout->end);
+    if (slot >= 0) {
+        char *out = ledger_memory(ledger, slot);
+        layout->defers = 1;
+        int written = write_body(gate->flat, message, layout, out);
+        ledger_use(ledger, 1);
+        if (written && unlocked) written = gate_copy(gate, message, layout, out);
+        else if (written) copy_arrays(gate->flat, layout, out);
+        ledger_use(ledger, -1);
+        if (!written) {
+            ledger_abandon(ledger, slot);
+        } else if (gate->ledger != kept || gate->refresh_ns == 0 || !ledger_has_room(ledger)) {
+            result = PyObject_CallFunction(gate->finish, "nnLL", slot, layout->end, (long long)layout->stamp_ns, (long long)now_ns);
+        } else {
+            PyObject *frame = ledger_commit(ledger, slot, gate->sequence, layout->stamp_ns, now_ns, layout->end);
+            if (frame == NULL) {
+                ledger_abandon(ledger, slot);
+            } else {
+                gate->sequence += 1;
+                gate->bytes += layout->end;
+                result = gate_send_frame(gate, frame);
+                Py_DECREF(frame);
+            }
+        }
+    }
+    Py_DECREF(kept);
+    if (unlocked) {
+        PyObject *type, *value, *traceback;
+        PyErr_Fetch(&type, &value, &traceback);
+        PyObject *released = PyObject_CallNoArgs(gate->large_release);
+        if (released == NULL) PyErr_Clear(); /* it was ours */
+        Py_XDECREF(released);
+        PyErr_Restore(type, value, traceback);
+    }
+    return result;
+}
+
+/* Send with the lock held; NULL without error if the message has to go the long way. */
+static PyObject *gate_send(Gate *gate, PyObject *message) {
+    if (gate->records != NULL && PyList_CheckExact(gate->records) && PyList_GET_SIZE(gate->records))
+        return gate_collect(gate, message);
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns && !gate_prepare(gate, now_ns)) return NULL;
+    if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
+    Layout layout = {.stamp_ns = 0};
+    if (!lay_out(gate->flat, message, &layout)) return NULL;
+    if (layout.end > gate->limit) return gate_send_slot(gate, message, &layout, now_ns);
+    PyObject *frame = make_frame(gate->flat, message, &layout, gate->sequence, now_ns);
+    if (frame == NULL) return NULL;
+    gate->sequence += 1;
+    gate->bytes += layout.end;
+    PyObject *sent = gate_send_frame(gate, frame);
+    Py_DECREF(frame);
+    return sent;
 }
 
 static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t flags, PyObject *keywords) {
@@ -977,6 +1156,11 @@ static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
     Py_VISIT(gate->retry);
     Py_VISIT(gate->again);
     Py_VISIT(gate->sends);
+    Py_VISIT(gate->ledger);
+    Py_VISIT(gate->prepare);
+    Py_VISIT(gate->large_acquire);
+    Py_VISIT(gate->large_release);
+    Py_VISIT(gate->finish);
     Py_VISIT(gate->records);
     Py_VISIT(gate->flush);
     return 0;
@@ -990,6 +1174,11 @@ static int gate_clear(Gate *gate) {
     Py_CLEAR(gate->retry);
     Py_CLEAR(gate->again);
     Py_CLEAR(gate->sends);
+    Py_CLEAR(gate->ledger);
+    Py_CLEAR(gate->prepare);
+    Py_CLEAR(gate->large_acquire);
+    Py_CLEAR(gate->large_release);
+    Py_CLEAR(gate->finish);
     Py_CLEAR(gate->records);
     Py_CLEAR(gate->flush);
     return 0;
@@ -1003,6 +1192,11 @@ static void gate_dealloc(Gate *gate) {
 
 static PyMemberDef gate_members[] = {
     {"sends", T_OBJECT, offsetof(Gate, sends), 0, "Take a frame and flags; none: every message goes the long way."},
+    {"ledger", T_OBJECT, offsetof(Gate, ledger), 0, "A `Ledger`: where larger bodies go; None: the long way."},
+    {"prepare", T_OBJECT, offsetof(Gate, prepare), 0, "Called with the lock held and the time when `refresh_ns` is over."},
+    {"large_acquire", T_OBJECT, offsetof(Gate, large_acquire), 0, "Called with False, takes the lock of large messages."},
+    {"large_release", T_OBJECT, offsetof(Gate, large_release), 0, "Gives it back."},
+    {"finish", T_OBJECT, offsetof(Gate, finish), 0, "Sends a written slot: number, size, stamp_ns, publish_ns."},
     {"records", T_OBJECT, offsetof(Gate, records), 0, "Those of the batch that is being collected; None: none is."},
     {"batch_bytes", T_LONGLONG, offsetof(Gate, batch_bytes), 0, "Their bytes."},
     {"batch_start_ns", T_LONGLONG, offsetof(Gate, batch_start_ns), 0, "When the first was published."},
@@ -1227,14 +1421,13 @@ static PyObject *next_frame(PipeReader *reader) {
     return data == NULL ? NULL : PyBytes_FromStringAndSize(data, size);
 }
 
-static PyObject *reader_receive(PipeReader *reader, PyObject *flags) {
-    const long wanted = PyLong_AsLong(flags);
-    if (wanted == -1 && PyErr_Occurred()) return NULL;
+/* The next frame, from the pipe or else from the socket; NULL if there is none, perhaps with an error. */
+static PyObject *reader_take(PyObject *self, int may_wait) {
+    PipeReader *reader = (PipeReader *)self;
     PyObject *frame = next_frame(reader);
     if (frame != NULL || PyErr_Occurred()) return frame;
-    frame = PyObject_CallOneArg(reader->receive, dont_wait);
-    if (frame != NULL || (wanted & 1) || !PyErr_ExceptionMatches(reader->again)) return frame;
-    PyErr_Clear();
+    frame = take_frame(reader->receive, reader->again, 0); /* after this its descriptor shows what comes */
+    if (frame != NULL || PyErr_Occurred() || !may_wait) return frame;
     struct pollfd sources[2] = {{reader->fd, POLLIN, 0}, {reader->socket_fd, POLLIN, 0}};
     Py_BEGIN_ALLOW_THREADS
     poll(sources, 2, reader->wait_ms);
@@ -1242,7 +1435,15 @@ static PyObject *reader_receive(PipeReader *reader, PyObject *flags) {
     if (PyErr_CheckSignals() < 0) return NULL;
     frame = next_frame(reader);
     if (frame != NULL || PyErr_Occurred()) return frame;
-    return PyObject_CallOneArg(reader->receive, dont_wait);
+    return take_frame(reader->receive, reader->again, 0);
+}
+
+static PyObject *reader_receive(PipeReader *reader, PyObject *flags) {
+    const long wanted = PyLong_AsLong(flags);
+    if (wanted == -1 && PyErr_Occurred()) return NULL;
+    PyObject *frame = reader_take((PyObject *)reader, !(wanted & 1));
+    if (frame == NULL && !PyErr_Occurred()) PyErr_SetNone(reader->again);
+    return frame;
 }
 
 static PyObject *reader_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
@@ -1320,7 +1521,8 @@ PyMODINIT_FUNC PyInit__native(void) {
         if (PyType_Ready(types[index]) < 0) return NULL;
     }
     dont_wait = PyLong_FromLong(1);
-    if (dont_wait == NULL) return NULL;
+    no_flags = PyLong_FromLong(0);
+    if (dont_wait == NULL || no_flags == NULL) return NULL;
     PyObject *module = PyModule_Create(&native_module);
     if (module == NULL) return NULL;
     for (int index = 0; index < 4; ++index) {
@@ -1329,7 +1531,7 @@ PyMODINIT_FUNC PyInit__native(void) {
             return NULL;
         }
     }
-    if (add_construct(module) < 0 || add_ring(module) < 0) {
+    if (add_construct(module) < 0 || add_socket(module) < 0 || add_ring(module) < 0) {
         Py_DECREF(module);
         return NULL;
     }

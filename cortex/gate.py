@@ -26,6 +26,18 @@ class Gate(Protocol):
     """Of all bodies so far."""
     refresh_ns: int
     """When the next message goes the long way, on the monotonic clock."""
+    ledger: Any
+    """Account of the slots into which larger bodies go; None: they go the long way."""
+    prepare: Callable[[int], None]
+    """Called with the lock held, and the time, when `refresh_ns` is over."""
+    large_acquire: Callable[[bool], bool]
+    """Takes the lock of large messages, without waiting if called with False."""
+    large_release: Callable[[], None]
+    """Gives it back."""
+    finish: Callable[[int, int, int, int], bool]
+    """Sends what was written into a slot, where something has changed meanwhile; both locks are held.
+
+    Number of the slot, size of the body, its stamp and when it was published [ns]."""
     records: list[Any] | None
     """Those of the batch that is being collected; None where none ever is."""
     batch_bytes: int
@@ -48,6 +60,11 @@ class LongGate:
         self.sequence = 0
         self.bytes = 0
         self.refresh_ns = 0
+        self.ledger: Any = None
+        self.prepare: Callable[[int], None]
+        self.large_acquire: Callable[[bool], bool]
+        self.large_release: Callable[[], None]
+        self.finish: Callable[[int, int, int, int], bool]
         self.records: list[Any] | None = None
         self.batch_bytes = 0
         self.batch_start_ns = 0

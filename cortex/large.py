@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
@@ -150,6 +150,8 @@ class LargeSender:
             (column, 1 << column, quota(reader), reader.request.strict)
             for column, reader in self._columns.items()
         ]
+        if ring is not None:
+            ring.ledger.plan([(column, quota) for column, _, quota, _ in self._grants])
         self._has_strict = any(r.request.strict for r in (*self._columns.values(), *self._inline))
         self._inline_strict = any(reader.request.strict for reader in self._inline)
         self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
@@ -189,7 +191,7 @@ class LargeSender:
         """The frame that tells a reader its column and the rings."""
         rings: tuple[RingPlace, ...] = ()
         if reader.column is not None:
-            rings = tuple(_place_of(ring) for ring in self._rings[-RINGS_ALIVE:])
+            rings = tuple(ring.place for ring in self._rings[-RINGS_ALIVE:])
         return answer_frame(reader.key, AttachAnswer(sequence, reader.column, rings, latched))
 
     @staticmethod
@@ -262,7 +264,21 @@ class LargeSender:
             else:
                 passed_over = True
                 full |= strict
+        if passed_over:
+            ring.ledger.keep()
         return mask, full, passed_over
+
+    @property
+    def short_cut(self) -> Any:
+        """The ledger of the ring if every message goes to all readers through its slots; see `gate.py`."""
+        if self._ring is None or self._inline or self._late or self._ring.slots < self._slots_wanted:
+            return None
+        return self._ring.ledger
+
+    def slot_of(self, number: int) -> Slot:
+        """A slot of the ring in use that the short cut has written."""
+        assert self._ring is not None
+        return Slot(self._ring.buffer(number), self._ring, number)
 
     @property
     def is_leaving_out(self) -> bool:
@@ -348,9 +364,7 @@ class LargeSender:
         if self._columns:
             place = ring.ring_id << 32 | slot.number
             # The ring's place goes along: an announcement that was dropped on its way does no harm.
-            frame = (
-                self._slot_head + _SLOT_REST.pack(*stamps, size, place, mask) + pack_place(_place_of(ring))
-            )
+            frame = self._slot_head + _SLOT_REST.pack(*stamps, size, place, mask) + pack_place(ring.place)
             for outlet in self._slot_outlets:
                 if not outlet.strict:
                     outlet.send(frame, DONTWAIT)
@@ -385,7 +399,7 @@ class LargeSender:
         whole[:HEADER_SIZE] = np.frombuffer(header, np.uint8)
         frame = whole[: HEADER_SIZE + size]
         try:
-            tracker = outlet.send(frame.data, DONTWAIT, False, True)
+            tracker = outlet.lend(frame.data)
         except zmq.Again:
             return send_strict(outlet, frame.tobytes(), 0)
         assert tracker is not None
@@ -418,7 +432,7 @@ class LargeSender:
         if outlet.strict:  # who took the header gets the body, too
             outlet.socket.setsockopt(zmq.XPUB_NODROP, 0)
         try:
-            tracker = outlet.send(body.data, DONTWAIT, False, True)
+            tracker = outlet.lend(body.data)
         finally:
             if outlet.strict:
                 outlet.socket.setsockopt(zmq.XPUB_NODROP, 1)
@@ -465,7 +479,9 @@ class LargeSender:
         if current is not None and current.slot_bytes >= size and current.slots >= slots:
             return current
         try:
-            ring = Ring(self._source, self._ring_count, slots=slots, slot_bytes=slot_bytes)
+            ring = Ring(
+                self._source, self._ring_count, slots=slots, slot_bytes=slot_bytes, head=self._slot_head
+            )
         except ShmUnavailable as error:
             if current is not None and current.slot_bytes >= size:
                 self._slots_wanted = current.slots  # make do with what there is
@@ -500,7 +516,3 @@ class LargeSender:
             ring.close()
         self._rings.clear()
         self._plan()
-
-
-def _place_of(ring: Ring) -> RingPlace:
-    return RingPlace(ring.ring_id, ring.slots, ring.slot_bytes, ring.pid, ring.fd)

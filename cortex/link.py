@@ -14,7 +14,7 @@ import numpy as np
 import zmq
 
 from cortex.codec import Codec, MalformedMessage
-from cortex.context import new_socket
+from cortex.context import Frames, new_socket
 from cortex.packer import make_reader
 from cortex.pipe import Offer
 from cortex.policy import Policy
@@ -108,7 +108,7 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read, self.drain, self.gather, self.records = make_reader(codec, self.message_head)
+        self.read, self.drain, self.gather, self.records, self._flat = make_reader(codec, self.message_head)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,
@@ -134,8 +134,9 @@ class Link:
             zmq.SUB, tcp=not local, high_water_mark=policy.depth if policy.reliable else QUEUE_MAX
         )
         self.socket.rcvtimeo = BLOCK_MS
-        self._receive_socket: Callable[..., bytes] = super(zmq.Socket, self.socket).recv
-        self.receive: Callable[..., bytes] = self._receive_socket
+        self._frames = Frames(self.socket)
+        self._receive_socket = self._frames.receive
+        self.receive: Callable[[int], bytes] = self._receive_socket
         self._piped = False
         try:
             if secure is not None:
@@ -148,6 +149,7 @@ class Link:
             self._key = b""
             self._ask(shared_memory=shared_memory)
         except BaseException:
+            self._frames.close()
             self.socket.close(0)
             self._close_offer()
             raise
@@ -367,12 +369,14 @@ class Link:
         if answer.column is None and not self._large_subscribed:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
+            self._shorten()
         if answer.column is not None:
             if answer.rings and not self._take_rings(answer.rings):
                 return []
             if self._large_subscribed:
                 self.socket.unsubscribe(self._large_head)
                 self._large_subscribed = False
+                self._shorten()
         if first and self._offer is not None and self._offer.taken():
             self._use_pipe(self._offer)
         if not first or self.expected >= 0:
@@ -425,7 +429,14 @@ class Link:
         assert self._column is not None
         view = self._rings[place.ring] = RingView(self.source, *place, self._column)
         self._newest_ring = max(self._newest_ring, place.ring)
+        self._shorten()
         return view
+
+    def _shorten(self) -> None:
+        """Let the short cut in C read the slots of the ring, if there is one ring only."""
+        if self._flat is not None:
+            views = list(self._rings.values())
+            self._flat.slots = views[0].short_cut if len(views) == 1 and not self._large_subscribed else None
 
     def _open_ring(self, place: RingPlace) -> RingView | None:
         """Map the ring of a descriptor; where that cannot be done, go on without shared memory."""
@@ -448,6 +459,7 @@ class Link:
             given_up = number < self._given_up and not view.is_awaited
             if number < newest and (surplus or given_up or view.idle):
                 del self._rings[number]
+                self._shorten()
                 view.close()
 
     def _latched(self, frame: bytes) -> list[Item]:
@@ -479,6 +491,7 @@ class Link:
         The end of the socket tells the publisher that it may write to our slots again: the rings close first.
         """
         self._close_rings()
+        self._frames.close()
         self.socket.close(0)
         self._close_offer()
 
@@ -487,6 +500,8 @@ class Link:
             self._offer.close()
 
     def _close_rings(self) -> None:
+        if self._flat is not None:
+            self._flat.slots = None
         for ring in self._rings.values():
             ring.close()
         self._rings.clear()

@@ -32,6 +32,8 @@ class Reader(NamedTuple):
     """Read what waits and join the bodies, for types of fixed size; see `gather` below."""
     records: Callable[[bytes, int], list[Any] | None] | None
     """The messages of a batch's frame with so many records; None: not as it should be."""
+    flat: Any
+    """None in Python. Its `slots` may be a `SlotView`: then descriptors of that ring are read as messages."""
 
 
 def flat_of(codec: Codec, head: bytes) -> Any:
@@ -58,7 +60,8 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
     """
     flat = flat_of(codec, head)
     if flat is not None:
-        return Reader(flat.read, flat.drain, None if codec.fixed_size is None else flat.gather, flat.records)
+        gather_flat = None if codec.fixed_size is None else flat.gather
+        return Reader(flat.read, flat.drain, gather_flat, flat.records, flat)
     decode, unpack = codec.decode, REST.unpack_from
 
     def read(frame: bytes) -> tuple[int, int, Any] | None:
@@ -75,7 +78,7 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
     gatherer = None
     if codec.fixed_size is not None:
         gatherer = functools.partial(gather, head, codec.fixed_size)
-    return Reader(read, functools.partial(drain, read), gatherer, None)
+    return Reader(read, functools.partial(drain, read), gatherer, None, None)
 
 
 def drain(
@@ -87,18 +90,20 @@ def drain(
     limit: int,
     latency: list[int],
     clock_offset_ns: int,
+    may_wait: bool,
 ) -> tuple[int, int, bytes | None]:
     """Read plain frames that follow one another, and append their messages.
 
     Args:
         read: As in `Reader`.
-        receive: Called with DONTWAIT; returns a frame.
+        receive: Called with flags; returns a frame.
         again: What it raises when there is none.
         messages: Where they are appended.
         expected: Sequence of the next message; -1: not known.
         limit: Most messages to read.
         latency: Counts by powers of two of a nanosecond; every eighth message is entered (all cost 10 %).
         clock_offset_ns: What to add to the publisher's clock to read it on ours [ns].
+        may_wait: Whether to wait a little for the first: call `receive` without DONTWAIT.
 
     Returns:
         The sequence expected next, how many were read, and what ended it: None where there were no more or
@@ -107,7 +112,7 @@ def drain(
     """
     for count in range(limit):
         try:
-            frame = receive(DONTWAIT)
+            frame = receive(0 if may_wait and not count else DONTWAIT)
         except again:
             return expected, count, None
         found = read(frame)

@@ -119,6 +119,12 @@ class Publisher(Generic[T]):
         self._batch: list[bytes] = []
         if self._gathers:
             self._gate.records = self._batch
+        self._gate.prepare = self._prepare
+        self._gate.large_acquire, self._gate.large_release = (
+            self._large_lock.acquire,
+            self._large_lock.release,
+        )
+        self._gate.finish = self._finish
         self._batch_sequence = 0
         self._on_batch = on_batch
         self._on_close = on_close
@@ -434,6 +440,7 @@ class Publisher(Generic[T]):
         self._skipped += passed_over or inline_passed_over
         on_time &= sent and not self._late
         self._timeouts += not on_time
+        self._arm()
         return on_time
 
     def _block(self) -> None:
@@ -506,10 +513,20 @@ class Publisher(Generic[T]):
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
         self._strict_pipes = tuple(reader for reader, _ in pipes if reader.request.strict)
         strict = [pipe.send for reader, pipe in pipes if reader.request.strict]
-        usual = self._plain and not self._was_large and not self._late
+        usual = self._plain and not self._late
         waiting: list[Callable[..., Any]] = [outlet.send for outlet in self._strict_outlets]
         self._gate.sends = (*self._lossy_sends, *waiting, *strict) if usual else ()
         self._targets = (*[None] * len(self._lossy_sends), *self._strict_outlets, *self._strict_pipes)
+        self._arm()
+
+    def _arm(self) -> None:
+        """Let the gate send large messages, too, or not: when readers, the ring, or who is late has changed."""
+        self._gate.ledger = self._large.short_cut if self._plain and not self._late else None
+
+    def _finish(self, number: int, size: int, stamp_ns: int, now_ns: int) -> bool:
+        """Send a slot that the gate has written, but that needs more care; both locks are held."""
+        self._check_open()
+        return self._publish_slot(self._large.slot_of(number), size, stamp_ns, now_ns)
 
     def tick(self, now_ns: int) -> None:
         """Free what the sockets have sent, end a burst; called by the node now and then."""

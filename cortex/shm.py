@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cortex.compiled import native
+from cortex.ledger import NO_SEQUENCE, PyLedger
 from cortex.memory import (
     COLUMNS,
     HEADER_WORDS,
@@ -43,13 +45,13 @@ from cortex.memory import (
     make_private,
     open_ring_memory,
 )
+from cortex.wire import RingPlace, pack_place
 
 __all__ = ["Ring", "RingGone", "RingView", "ShmUnavailable"]
 
 _log = logging.getLogger(__name__)
 
 _SEQUENCE, _SIZE = 1, 2  # where they are in a slot's header; the state is first
-_NO_SEQUENCE = (1 << 64) - 1
 _U8 = np.dtype(np.uint8)
 
 Bytes = npt.NDArray[np.uint8]
@@ -70,12 +72,13 @@ class Ring:
         ring_id: Number of this ring among the publisher's, 0 to 2^32 - 1.
         slots: How many messages the ring holds.
         slot_bytes: Least size of a slot [bytes]; it is rounded up to a multiple of 4096.
+        head: What descriptors begin with, for the short cut in C: the first 24 bytes of the header.
 
     Raises:
         ShmUnavailable: No such memory on this system, or not enough of it.
     """
 
-    def __init__(self, source: int, ring_id: int, *, slots: int, slot_bytes: int) -> None:
+    def __init__(self, source: int, ring_id: int, *, slots: int, slot_bytes: int, head: bytes = b"") -> None:
         if not 0 < source < 1 << 64:
             raise ValueError(f"source must be 1 to 2^64 - 1, got {source}")
         if not 0 <= ring_id < 1 << 32:
@@ -89,50 +92,37 @@ class Ring:
         layout = layout_of(slots, self.slot_bytes)
         self.fd, memory = create_ring_memory(source, ring_id, slots, self.slot_bytes)
         self._close_fd = weakref.finalize(self, os.close, self.fd)
-        view = memoryview(memory)
-        table = view[layout.leases : layout.headers]
-        self._rows = [table[i : i + COLUMNS] for i in range(0, slots * COLUMNS, COLUMNS)]
-        self._headers = view[layout.headers : layout.headers + slots * HEADER_WORDS * 8].cast("Q")
         self._buffers: list[Bytes] = [
             np.ndarray((self.slot_bytes,), _U8, memory, layout.slots + k * self.slot_bytes)
             for k in range(slots)
         ]
         self._lock = threading.RLock()  # reentrant: the garbage collector may call unpin anywhere
         self._closed = False
-        self._last = slots - 1
-        self._state = [0] * slots
-        self._busy = [0] * slots  # pins, and one more while the slot is being written
-        self._granted: list[tuple[int, ...]] = [()] * slots  # columns of a slot's message, some given back
-        self._held: list[set[int]] = [set() for _ in range(COLUMNS)]  # slots of a column, some given back
-        self._columns_of: dict[int, tuple[int, ...]] = {0: ()}
+        self.place = RingPlace(ring_id, slots, self.slot_bytes, self.pid, self.fd)
+        """What readers are told."""
+        self.ledger: Any
+        """A `Ledger`."""
+        if native is None:
+            self.ledger = PyLedger(memoryview(memory), slots, layout)
+        else:
+            self.ledger = native.Ledger(
+                memory,
+                slots,
+                self.slot_bytes,
+                *layout[:3],
+                ring_id,
+                head.ljust(24, b"\0"),
+                pack_place(self.place),
+            )
         in_forked_child(self, Ring._after_fork)
 
     def acquire(self) -> int:
-        """Return a slot to write, the longest written first, or -1 if none is free.
+        """Return a slot to write, or -1 if none is free.
 
         The slot is then being written until `commit` or `abandon`.
         """
         with self._lock:
-            slot = self._last
-            for _ in self._busy:
-                slot += 1
-                if slot == self.slots:
-                    slot = 0
-                if self._busy[slot]:
-                    continue
-                row = self._rows[slot]
-                for column in self._granted[slot]:
-                    if row[column]:
-                        break
-                else:
-                    self._last = slot
-                    self._busy[slot] = 1
-                    state = self._state[slot] = self._state[slot] + 1
-                    self._headers[slot * HEADER_WORDS] = state
-                    if not STORES_IN_ORDER:
-                        fence()
-                    return slot
-        return -1
+            return -1 if self._closed else int(self.ledger.acquire())
 
     def buffer(self, slot: int) -> Bytes:
         """Return a slot's memory, writable, shape [slot_bytes]; write only between acquire and commit."""
@@ -148,94 +138,62 @@ class Ring:
             mask: Bit c is set for a reader with column c that shall hold the slot.
         """
         with self._lock:
-            state = self._writing(slot)
+            self._check_writing(slot)
             if not 0 <= body_size <= self.slot_bytes:
                 raise ValueError(f"body_size must be 0 to {self.slot_bytes}, got {body_size}")
-            columns = self._columns_of.get(mask)
-            if columns is None:
-                columns = self._columns(mask)
-            headers, word = self._headers, slot * HEADER_WORDS
-            headers[word + _SEQUENCE] = sequence
-            headers[word + _SIZE] = body_size
-            if not STORES_IN_ORDER:
-                fence()
-            headers[word] = self._state[slot] = state + 1
-            if columns:
-                if not STORES_IN_ORDER:
-                    fence()
-                row, held = self._rows[slot], self._held
-                for column in columns:
-                    row[column] = 1
-                    held[column].add(slot)
-            self._granted[slot] = columns
-            self._busy[slot] -= 1
+            _check_mask(mask)
+            self.ledger.commit(slot, sequence, body_size, mask)
 
     def abandon(self, slot: int) -> None:
         """Give back a slot from `acquire` that will not be committed, as when a message cannot be encoded."""
         with self._lock:
-            state = self._writing(slot)
-            # What was there is overwritten in part: nobody may copy it.
-            self._headers[slot * HEADER_WORDS + _SEQUENCE] = _NO_SEQUENCE
-            if not STORES_IN_ORDER:
-                fence()
-            self._headers[slot * HEADER_WORDS] = self._state[slot] = state + 1
-            self._busy[slot] -= 1
+            self._check_writing(slot)
+            self.ledger.abandon(slot)
 
     def revoke(self, slot: int, mask: int) -> None:
         """Take the leases of `mask` back, because the message could not be sent."""
         with self._lock:
-            if self._closed:
-                return
-            revoked = self._columns(mask)
-            for column in revoked:
-                self._rows[slot][column] = 0
-                self._held[column].discard(slot)
-            self._granted[slot] = tuple(c for c in self._granted[slot] if c not in revoked)
+            _check_mask(mask)
+            if not self._closed:
+                self.ledger.revoke(slot, mask)
 
     def pin(self, slot: int) -> None:
         """Keep a slot from being written, because a socket still reads from it; pins are counted."""
         with self._lock:
-            self._busy[slot] += 1
+            self.ledger.pin(slot)
 
     def unpin(self, slot: int) -> None:
         """Take back one `pin`; harmless after `close`."""
         with self._lock:
-            self._busy[slot] -= 1
+            self.ledger.unpin(slot)
 
     def outstanding(self, column: int) -> int:
         """Return how many slots the reader with this column holds now, messages on the way to it included."""
         with self._lock:
-            held = self._held[column]
-            if held:
-                rows = self._rows
-                held.difference_update([slot for slot in held if not rows[slot][column]])
-            return len(held)
+            return int(self.ledger.outstanding(column))
 
     def has_room(self, column: int, quota: int) -> bool:
         """Say whether a column holds fewer than `quota` slots; cheaper than `outstanding`, and as exact."""
-        # What was granted is an upper bound of what is held: most calls need no look at the lease bytes.
-        return len(self._held[column]) < quota or self.outstanding(column) < quota
+        with self._lock:
+            return bool(self.ledger.has_room(column, quota))
 
     def free_column(self, column: int) -> None:
         """Take back all leases of a column, because its reader left or died."""
         with self._lock:
-            for row in self._rows:
-                row[column] = 0  # those not granted too: the next reader with this column shall find none
-            self._held[column].clear()
+            if not self._closed:
+                self.ledger.free_column(column)
 
     @property
     def in_writing(self) -> bool:
         """Whether a slot is being written, or read by a socket."""
         with self._lock:
-            return any(self._busy)
+            return bool(self.ledger.is_busy())
 
     @property
     def idle(self) -> bool:
         """Whether no reader, socket or writer uses any slot, so that the ring can be closed unnoticed."""
         with self._lock:
-            return not any(self._busy) and not any(
-                self.outstanding(c) for c, held in enumerate(self._held) if held
-            )
+            return not self.ledger.is_busy() and not any(map(self.ledger.outstanding, range(COLUMNS)))
 
     def close(self) -> None:
         """Close the descriptor and let go of the memory; buffers that someone still has stay valid."""
@@ -244,33 +202,24 @@ class Ring:
                 return
             self._closed = True
             self.fd = -1
-            self._busy = [1] * self.slots  # so acquire finds none
-            self._rows, self._buffers, self._headers = [], [], memoryview(b"")
-            for held in self._held:
-                held.clear()
+            self.ledger.close()
+            self._buffers = []
             self._close_fd()
 
-    def _writing(self, slot: int) -> int:
-        """Return the state of a slot that is being written."""
+    def _check_writing(self, slot: int) -> None:
         if self._closed:
             raise ValueError(f"ring {self.ring_id} is closed")
-        state = self._state[slot]
-        if not state & 1:
+        if not self.ledger.is_writing(slot):
             raise ValueError(f"slot {slot} is not being written: acquire comes first")
-        return state
-
-    def _columns(self, mask: int) -> tuple[int, ...]:
-        """Return the columns of a mask and remember them."""
-        if not 0 <= mask < 1 << COLUMNS:
-            raise ValueError(f"mask must be 0 to 2^{COLUMNS} - 1, got {mask}")
-        if len(self._columns_of) >= 1024:  # masks of readers long gone
-            self._columns_of = {0: ()}
-        columns = self._columns_of[mask] = tuple(c for c in range(COLUMNS) if mask >> c & 1)
-        return columns
 
     def _after_fork(self) -> None:
         self._lock = threading.RLock()  # another thread of the parent may have had it
         self.close()
+
+
+def _check_mask(mask: int) -> None:
+    if not 0 <= mask < 1 << COLUMNS:
+        raise ValueError(f"mask must be 0 to 2^{COLUMNS} - 1, got {mask}")
 
 
 class _Lease(np.ndarray[Any, np.dtype[np.uint8]]):
@@ -328,7 +277,16 @@ class RingView:
         self._own = self._table[column::COLUMNS]
         self._headers = view[layout.headers : layout.headers + slots * HEADER_WORDS * 8].cast("Q")
         self._memory = memoryview(memory)[layout.slots :]
-        self._delivered = [-1] * slots  # sequence of the message last leased from a slot
+        # Sequence of the message last leased from a slot; in memory that the short cut in C can look at.
+        self._delivered = memoryview(bytearray(8 * slots)).cast("Q")
+        for slot in range(slots):
+            self._delivered[slot] = NO_SEQUENCE
+        self.short_cut: Any = None
+        """`SlotView` of `_ring.c`, which leases slots, too; None where there is no such thing."""
+        if native is not None:
+            self.short_cut = native.SlotView(
+                head, self._memory, self._delivered, slots, slot_bytes, *layout[:2], ring_id, column
+            )
 
     def lease(self, slot: int, sequence: int, size: int) -> Bytes:
         """Return the message in a slot that was granted to this reader, read-only, shape [size].
@@ -349,6 +307,11 @@ class RingView:
             )
         if self._delivered[slot] == sequence:
             raise ValueError(f"message {sequence} in slot {slot} of ring {self.ring_id} was delivered before")
+        if self.short_cut is not None:
+            found: Bytes | None = self.short_cut.lease(slot, sequence, size)
+            if found is None:
+                raise ValueError(f"slot {slot} of ring {self.ring_id} was taken back")
+            return found
         root = _Lease((size,), _U8, self._memory, slot * self.slot_bytes)
         root.table, root.index = self._table, index
         self._delivered[slot] = sequence
@@ -431,8 +394,8 @@ class RingView:
         while slot >= 0:  # no other byte: the publisher may be granting a slot at this moment
             self._own[slot] = 0
             slot = leased.find(1, slot + 1)
-        self._table = self._own = self._headers = self._memory = memoryview(b"")
-        self._delivered = []
+        self._table = self._own = self._headers = self._memory = self._delivered = memoryview(b"")
+        self.short_cut = None
         if in_use:
             head.detach()  # when their arrays die, the column may be another reader's
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortex import shm
+from cortex import ledger, shm
 from cortex.shm import Ring, RingView
 
 SIZE = 4096
@@ -99,6 +99,8 @@ def test_copies_do_not_keep_the_lease(ring: Ring, reader: RingView):
 def test_parts_of_the_root_die_silently(ring: Ring, reader: RingView):
     """Somebody who slices an array's `base` gets arrays that have no lease, but keep the root that has."""
     base = reader.lease(publish(ring, 0, 3), 0, SIZE).base
+    if not isinstance(base, np.ndarray):
+        pytest.skip("in C the root is no array")
     part = base[5:10]
     del base
     assert ring.outstanding(3) == 1
@@ -116,8 +118,9 @@ def test_messages_cannot_be_written(ring: Ring, reader: RingView):
         message.flags.writeable = True
     with pytest.raises(TypeError, match="read-only"):
         memoryview(message)[0] = 1
-    with pytest.raises(ValueError, match="cannot set WRITEABLE"):
-        message.base.flags.writeable = True
+    if isinstance(message.base, np.ndarray):  # in C it gives no access to the memory at all
+        with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+            message.base.flags.writeable = True
 
 
 def test_an_empty_message(ring: Ring, reader: RingView):
@@ -329,7 +332,9 @@ def test_snapshot_notices_a_writer_meanwhile(
 def test_barriers_are_placed_where_processors_reorder(monkeypatch: pytest.MonkeyPatch):
     """State, content and leases are stored in order, as seen at the barriers another processor needs."""
     seen: list[tuple[int, int]] = []
-    monkeypatch.setattr(shm, "STORES_IN_ORDER", False)
+    monkeypatch.setattr(shm, "native", None)  # in C they are there in any case
+    for module in (shm, ledger):
+        monkeypatch.setattr(module, "STORES_IN_ORDER", False)
     ring = Ring(7, 1, slots=4, slot_bytes=SIZE)
     reader = attach(ring, 0)
 
@@ -337,7 +342,8 @@ def test_barriers_are_placed_where_processors_reorder(monkeypatch: pytest.Monkey
         header = os.pread(ring.fd, 24, 4096 + 4 * 64)
         seen.append((int.from_bytes(header[:8], "little"), int.from_bytes(header[8:16], "little")))
 
-    monkeypatch.setattr(shm, "fence", look)
+    for module in (shm, ledger):
+        monkeypatch.setattr(module, "fence", look)
     slot = ring.acquire()
     ring.commit(slot, 9, 5, 1)
     assert seen == [(1, 0), (1, 9), (2, 9)]

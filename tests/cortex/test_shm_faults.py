@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cortex.ledger import PyLedger
 from cortex.shm import Ring, RingView
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -402,7 +403,8 @@ class Yielding:
 
 def test_writers_in_several_threads_never_share_a_slot(monkeypatch: pytest.MonkeyPatch):
     ring = Ring(SOURCE, 1, slots=5, slot_bytes=4096)
-    monkeypatch.setattr(ring, "_rows", [Yielding(row) for row in ring._rows])
+    if isinstance(ring.ledger, PyLedger):  # the one in C lets nobody else run
+        monkeypatch.setattr(ring.ledger, "_rows", [Yielding(row) for row in ring.ledger._rows])
     failures: list[BaseException] = []
     written = []
 

@@ -7,6 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from cortex.compiled import native
 from cortex.shm import Ring, RingView
 
 SIZE = 4096
@@ -30,9 +31,12 @@ class RingModel(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.ring = Ring(7, 1, slots=4, slot_bytes=SIZE)
+        self.ring.ledger.plan([])
         self.readers = [attach(self.ring, column) for column in range(3)]
         self.sequence = self.last = 0
         self.last = 3
+        self.keeping = self.clock = 0
+        self.written = [0] * 4
         self.queues: list[list[tuple[int, int]]] = [[], [], []]  # (slot, sequence) on the way
         self.dropped: list[list[tuple[int, int]]] = [[], [], []]
         self.views: list[list[tuple[int, int, np.ndarray]]] = [[], [], []]
@@ -46,13 +50,19 @@ class RingModel(RuleBasedStateMachine):
     @rule(mask=st.integers(0, 7), revoked=st.integers(0, 7), abandon=st.sampled_from([False, False, True]))
     def write(self, mask: int, revoked: int, abandon: bool) -> None:
         used = {slot for column in range(3) for slot in self.holds(column)} | set(self.pins)
-        turn = [(self.last + k) % 4 for k in (1, 2, 3, 4)]
+        if native is None or self.keeping > 0:  # they take turns
+            turn = [(self.last + k) % 4 for k in (1, 2, 3, 4)]
+        else:  # the one that was written last
+            turn = sorted(range(4), key=lambda slot: (-self.written[slot], slot))
+        self.keeping -= 1
         expected = next((slot for slot in turn if slot not in used), -1)
         slot = self.ring.acquire()
         assert slot == expected
         if slot < 0:
             return
         self.last = slot
+        self.clock += 1
+        self.written[slot] = self.clock
         self.ring.buffer(slot)[:] = content(self.sequence)
         if abandon:
             self.ring.abandon(slot)
@@ -104,6 +114,11 @@ class RingModel(RuleBasedStateMachine):
         self.queues[column], self.dropped[column], self.views[column] = [], [], []
         self.ring.free_column(column)
         self.readers[column] = attach(self.ring, column)
+
+    @rule()
+    def keep(self) -> None:
+        self.ring.ledger.keep()
+        self.keeping = 4
 
     @rule(slot=st.integers(0, 3))
     def pin(self, slot: int) -> None:
