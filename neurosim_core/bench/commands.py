@@ -281,6 +281,12 @@ def _worlds(options: Mapping[str, Any], progress: Progress) -> Chapter:
     return worlds_chapter(measure_worlds(**options, progress=progress))
 
 
+def _shared_walk(options: Mapping[str, Any], progress: Progress) -> Chapter:
+    from neurosim_core.bench.shared_walk import measure_shared_walk, shared_walk_chapter
+
+    return shared_walk_chapter(measure_shared_walk(**options, progress=progress))
+
+
 def _leave_out(options: Mapping[str, Any], progress: Progress) -> Chapter:
     from neurosim_core.bench.leave_out import leave_out_chapter, measure_leave_out
 
@@ -330,6 +336,15 @@ STUDIES: Sequence[Study] = (
         "device and a naive event camera. Two to five minutes.",
         chapter=_throughput,
         options=frozenset({"scene", "device"}),
+    ),
+    Study(
+        name="shared-walk",
+        help="rays that share a walk through the scene's tree: same bits, and how much sooner",
+        description="Look at a slow and a fast part of a flight with rays that each walk by themselves, and "
+        "with tiles of rays that share walks over 1 to 16 instants; compare bits and events. "
+        "By default 346x260 pixels.",
+        chapter=_shared_walk,
+        options=frozenset({"scene", "device", "width", "height"}),
     ),
     Study(
         name="worlds",

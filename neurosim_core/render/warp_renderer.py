@@ -268,6 +268,8 @@ class WarpRenderer:
         depth: float32, shape [M, H, W].
         normal: vec3, shape [M, H, W].
         instance: int32, shape [M, H, W].
+        rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W].
+        walk: What the rays of a tile share; None: each walks by itself.
     """
 
     def __init__(
@@ -303,12 +305,12 @@ class WarpRenderer:
         self._instant_threads = tiles * TILE * TILE // rays_together
         rays = ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
-        self._rays = wp.array(rays, dtype=wp.vec4, device=device)
+        self.rays = wp.array(rays, dtype=wp.vec4, device=device)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
         self._world_data = WorldData()
-        self._walk = None
+        self.walk = None
         if arrays.config.shared_walk is not None:
-            self._walk = TileWalk(
+            self.walk = TileWalk(
                 arrays.mesh,
                 rays,
                 width=lens.width,
@@ -357,14 +359,14 @@ class WarpRenderer:
             place_camera(
                 self._arrays.bodies, bodies, p_WC, q_WC, instant_count=instant_count, data=self._body_data
             )
-        if self._walk is not None:
-            self._walk.launch(self._rays, p_WC, q_WC, instant_count=instant_count)
+        if self.walk is not None:
+            self.walk.launch(self.rays, p_WC, q_WC, instant_count=instant_count)
         launch_split(
             self._kernel,
             dim=instant_count * self._instant_threads,
             inputs=[
                 self._arrays.data,
-                self._rays,
+                self.rays,
                 self._width,
                 self._height,
                 instant_count,
@@ -373,7 +375,7 @@ class WarpRenderer:
                 image_slot,
                 self._body_data,
                 self._world_data,
-                WalkData() if self._walk is None else self._walk.data,
+                WalkData() if self.walk is None else self.walk.data,
             ],
             outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
             device=self._arrays.device,

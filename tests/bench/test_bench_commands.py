@@ -16,7 +16,7 @@ from neurosim_core.bench import commands
 from neurosim_core.bench.commands import STUDIES, Study
 from neurosim_core.bench.report import Bar, Chapter
 
-NAMES = ("dynamics", "events", "pixel", "render", "throughput", "worlds", "leave-out")
+NAMES = ("dynamics", "events", "pixel", "render", "throughput", "shared-walk", "worlds", "leave-out")
 
 
 def chapter_of(name, quick):

@@ -149,7 +149,7 @@ def test_same_bits_when_the_camera_whirls(device):
     scene, poses = scene_of(soup(200, 5)), path(4, 0.0, 1.0, start=(0.0, 0.0, 0.0))
     compare(scene, poses, device)
     renderer, _ = lists_of(scene, poses, device)
-    assert (renderer._walk.data.count.numpy() == -1).all()
+    assert (renderer.walk.data.count.numpy() == -1).all()
 
 
 def test_same_bits_with_moving_bodies(device):
@@ -190,7 +190,7 @@ def test_lists_hold_what_rays_hit(device):
     part = soup(60, 6)
     poses = path(6, 0.03, 0.02)
     renderer, _ = lists_of(scene_of(part), poses, device, instants=6, face_count_max=64)
-    data = renderer._walk.data
+    data = renderer.walk.data
     count, reach = data.count.numpy()[0], data.reach.numpy()[0]
     lists = data.faces.numpy().reshape(len(count), 64)
     a, b, c = np.moveaxis(part.triangles.astype(np.float32).astype(np.float64), 1, 0)
@@ -219,7 +219,7 @@ def test_lists_are_short_and_used(device):
     scene = scene_of(plane(30.0), soup(40, 7, size_m=0.2))
     renderer, arguments = lists_of(scene, path(8, 0.005, 0.002), device, lens=lens)
     seen = renderer.log_radiance.numpy().copy()
-    data = renderer._walk.data
+    data = renderer.walk.data
     count = data.count.numpy()
     assert (count >= 0).all()
     assert count.mean() < 15.0  # of 42 triangles
@@ -229,7 +229,7 @@ def test_lists_are_short_and_used(device):
         """Render with what the lists are replaced by, not walking again."""
         data.count.zero_()
         data.reach.assign(np.broadcast_to(np.asarray(reach, np.float32), true_reach.shape))
-        renderer._walk.launch = lambda *_, **__: None
+        renderer.walk.launch = lambda *_, **__: None
         renderer.render(*arguments, instant_count=8)
         return renderer.log_radiance.numpy().copy()
 
@@ -288,8 +288,8 @@ def test_what_does_not_go_together_is_refused():
 
 def test_nothing_is_allocated_without(device):
     arrays = upload_scene(scene_of(plane(1.0)), ALONE, device)
-    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=2)._walk is None
+    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=2).walk is None
     shared = upload_scene(scene_of(plane(1.0)), together(instants=2, face_count_max=8), device)
-    walk = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5)._walk
+    walk = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5).walk
     assert isinstance(walk, TileWalk)
     assert walk.data.faces.shape == (3 * 30 * 8,)
