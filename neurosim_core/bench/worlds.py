@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -46,6 +46,10 @@ class WorldsCase:
     """Events that did not fit."""
     alone_renders_per_s: float
     """Single simulations one after the other: renders a second, the best of the rounds in between."""
+    cpu_ms: float
+    """CPU time for each render of the batch [ms], the least of the rounds; hardly changed by other programs."""
+    alone_cpu_ms: float
+    """The same of single simulations [ms]."""
     phases_ms: dict[str, float]
     """Time of a step by part [ms], each waited for."""
 
@@ -158,52 +162,63 @@ def _measure_case(model: Model, count: int, width: int, height: int, budget_s: f
     for _ in range(3):
         worlds.step(turning, mode="velocity")  # kernels, graphs
     _fly_singles(model, singles, turning, 0.0)
-    best, alone, events, dropped = 0.0, 0.0, 0.0, 0
+    together, alone = [], []
     for _ in range(_ROUNDS):
-        steps_per_s, events_per_step, lost = _fly_worlds(worlds, turning, budget_s)
-        dropped += lost
-        if steps_per_s > best:
-            best, events = steps_per_s, steps_per_s * events_per_step / count
-        alone = max(alone, _fly_singles(model, singles, turning, budget_s))
+        together.append(_fly_worlds(worlds, turning, budget_s))
+        alone.append(_fly_singles(model, singles, turning, budget_s))
+    best = max(together, key=lambda pace: pace.steps_per_s)
     phases = [worlds.time_step(turning, mode="velocity") for _ in range(3)]
     return WorldsCase(
         count=count,
         width=width,
         height=height,
-        renders_per_s=best * RENDERS_PER_STEP,
-        steps_per_s=best,
-        events_per_s=events,
-        dropped=dropped,
-        alone_renders_per_s=alone * RENDERS_PER_STEP,
+        renders_per_s=best.steps_per_s * RENDERS_PER_STEP,
+        steps_per_s=best.steps_per_s,
+        events_per_s=best.steps_per_s * best.events_per_step,
+        dropped=sum(pace.dropped for pace in together),
+        alone_renders_per_s=max(pace.steps_per_s for pace in alone) * RENDERS_PER_STEP,
+        cpu_ms=1e3 * min(pace.cpu_s_per_step for pace in together) / RENDERS_PER_STEP,
+        alone_cpu_ms=1e3 * min(pace.cpu_s_per_step for pace in alone) / RENDERS_PER_STEP,
         phases_ms={name: 1e3 * min(phase[name] for phase in phases) for name in phases[0]},
     )
 
 
-def _fly_worlds(worlds: Worlds, commands: Any, budget_s: float) -> tuple[float, float, int]:
-    """Return steps of all worlds a second, events of all in the last step, and those dropped in it."""
+class _Pace(NamedTuple):
+    """What one round of steps took, for each step of one world."""
+
+    steps_per_s: float
+    cpu_s_per_step: float
+    events_per_step: float = 0.0
+    dropped: int = 0
+
+
+def _fly_worlds(worlds: Worlds, commands: Any, budget_s: float) -> _Pace:
+    """Step for about a time; events are those of the last step."""
     step_s = sum(worlds.time_step(commands, mode="velocity").values())
     count = max(2, int(budget_s / step_s))  # known before: on CUDA a step is queued in no time
-    begin = time.perf_counter()
+    begin, cpu_begin = time.perf_counter(), time.process_time()
     for _ in range(count):
         observation = worlds.step(commands, mode="velocity")
     wp.synchronize_device(worlds.device)
-    elapsed_s = time.perf_counter() - begin
+    elapsed_s, cpu_s = time.perf_counter() - begin, time.process_time() - cpu_begin
     seen = observation.events["front"]
-    return (
-        count * worlds.count / elapsed_s,
-        float(seen.counts.numpy().sum()),
+    flown = count * worlds.count
+    return _Pace(
+        flown / elapsed_s,
+        cpu_s / flown,
+        float(seen.counts.numpy().sum()) / worlds.count,
         int(seen.dropped.numpy().sum()),
     )
 
 
-def _fly_singles(model: Model, singles: list[State], commands: Any, budget_s: float) -> float:
-    """Return steps a second of single simulations that take turns."""
-    begin, flown = time.perf_counter(), 0
+def _fly_singles(model: Model, singles: list[State], commands: Any, budget_s: float) -> _Pace:
+    """Step single simulations that take turns for about a time."""
+    begin, cpu_begin, flown = time.perf_counter(), time.process_time(), 0
     while flown < len(singles) or time.perf_counter() - begin < budget_s:
         index = flown % len(singles)
         step(model, singles[index], commands[index], mode="velocity")
         flown += 1
-    return flown / (time.perf_counter() - begin)
+    return _Pace(flown / (time.perf_counter() - begin), (time.process_time() - cpu_begin) / flown)
 
 
 def _bar(result: WorldsResult) -> Bar:
@@ -232,6 +247,8 @@ def _table(result: WorldsResult) -> Table:
             "dropped": "events dropped",
             "alone_renders_per_s": "renders of single simulations [1/s]",
             "ratio": "ratio",
+            "cpu_ms": "CPU time a render [ms]",
+            "alone_cpu_ms": "of single simulations [ms]",
             "flight_ms": "flight [ms]",
             "render_ms": "render [ms]",
             "events_ms": "events [ms]",
@@ -247,6 +264,8 @@ def _table(result: WorldsResult) -> Table:
                 "dropped": case.dropped,
                 "alone_renders_per_s": case.alone_renders_per_s,
                 "ratio": case.renders_per_s / case.alone_renders_per_s,
+                "cpu_ms": case.cpu_ms,
+                "alone_cpu_ms": case.alone_cpu_ms,
                 **{f"{name}_ms": value for name, value in case.phases_ms.items()},
             }
             for case in result.cases

@@ -20,6 +20,8 @@ CASE = WorldsCase(
     events_per_s=1e7,
     dropped=0,
     alone_renders_per_s=13_000.0,
+    cpu_ms=0.004,
+    alone_cpu_ms=0.08,
     phases_ms={"flight": 0.5, "render": 20.0, "events": 2.0},
 )
 
@@ -35,6 +37,7 @@ def test_what_is_measured(result):
         assert case.renders_per_s == pytest.approx(8 * case.steps_per_s)
         assert case.alone_renders_per_s > 0.0
         assert case.events_per_s > 0.0
+        assert min(case.cpu_ms, case.alone_cpu_ms) > 0.0
         assert set(case.phases_ms) == {"flight", "render", "events"}
         assert all(value > 0.0 for value in case.phases_ms.values())
 
