@@ -1,7 +1,11 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 class Flat:
+    slots: SlotView | None
     def __init__(
         self, cls: type, fields: list[tuple[Any, ...]], block: int, stamp: int, head: bytes
     ) -> None: ...
@@ -20,6 +24,7 @@ class Flat:
         limit: int,
         latency: list[int],
         clock_offset_ns: int,
+        may_wait: bool,
         /,
     ) -> tuple[int, int, bytes | None]: ...
     def gather(
@@ -35,6 +40,11 @@ class Flat:
 
 class Gate:
     sends: tuple[Callable[..., Any], ...]
+    ledger: Ledger | None
+    prepare: Callable[[int], None]
+    large_acquire: Callable[[bool], bool]
+    large_release: Callable[[], None]
+    finish: Callable[[int, int, int, int], bool]
     sequence: int
     bytes: int
     refresh_ns: int
@@ -72,3 +82,48 @@ class PipeReader:
         wait_ms: int,
     ) -> None: ...
     def receive(self, flags: int, /) -> bytes: ...
+
+class Ledger:
+    def __init__(
+        self,
+        memory: Any,
+        slots: int,
+        slot_bytes: int,
+        leases: int,
+        headers: int,
+        first: int,
+        ring: int,
+        head: bytes,
+        place: bytes,
+    ) -> None: ...
+    def acquire(self) -> int: ...
+    def commit(self, slot: int, sequence: int, size: int, mask: int, /) -> None: ...
+    def abandon(self, slot: int, /) -> None: ...
+    def is_writing(self, slot: int, /) -> bool: ...
+    def revoke(self, slot: int, mask: int, /) -> None: ...
+    def pin(self, slot: int, /) -> None: ...
+    def unpin(self, slot: int, /) -> None: ...
+    def outstanding(self, column: int, /) -> int: ...
+    def has_room(self, column: int, quota: int, /) -> bool: ...
+    def free_column(self, column: int, /) -> None: ...
+    def is_busy(self) -> bool: ...
+    def plan(self, grants: list[tuple[int, int]], /) -> None: ...
+    def keep(self) -> None: ...
+    def close(self) -> None: ...
+
+class SlotView:
+    def __init__(
+        self,
+        head: Any,
+        memory: Any,
+        delivered: Any,
+        slots: int,
+        slot_bytes: int,
+        leases: int,
+        headers: int,
+        ring: int,
+        column: int,
+    ) -> None: ...
+    def lease(self, slot: int, sequence: int, size: int, /) -> NDArray[np.uint8] | None: ...
+
+class Lease: ...
