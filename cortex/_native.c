@@ -39,9 +39,6 @@ enum {
     SLOT_FRAME_SIZE = HEADER_SIZE + 8 + 32,
     READ_BYTES = 1 << 16,
     GATHER_MAX = 256,
-    BATCH_COUNT = 64,       /* as in publisher.py */
-    BATCH_BYTES = 128 * 1024,
-    BATCH_NS = 150000,
     DEFERRED_BYTES = 1 << 14,
     UNLOCKED_BYTES = 1 << 17, /* to copy so many takes longer than to let others have the lock meanwhile */
 };
@@ -930,6 +927,7 @@ typedef struct {
     PyObject *records; /* a list; NULL or None: messages are not collected */
     PyObject *flush;
     int64_t batch_bytes, batch_start_ns, last_ns;
+    int64_t batch_count_max, batch_bytes_max, batch_ns_max;
 } Gate;
 
 PyDoc_STRVAR(gate_doc,
@@ -957,8 +955,8 @@ static PyObject *gate_collect(Gate *gate, PyObject *message) {
     if (failed) return NULL;
     gate->sequence += 1;
     gate->last_ns = now_ns;
-    if (PyList_GET_SIZE(gate->records) >= BATCH_COUNT || gate->batch_bytes >= BATCH_BYTES
-        || now_ns - gate->batch_start_ns >= BATCH_NS)
+    if (PyList_GET_SIZE(gate->records) >= gate->batch_count_max || gate->batch_bytes >= gate->batch_bytes_max
+        || now_ns - gate->batch_start_ns >= gate->batch_ns_max)
         return PyObject_CallNoArgs(gate->flush);
     Py_RETURN_TRUE;
 }
@@ -1200,6 +1198,9 @@ static PyMemberDef gate_members[] = {
     {"records", T_OBJECT, offsetof(Gate, records), 0, "Those of the batch that is being collected; None: none is."},
     {"batch_bytes", T_LONGLONG, offsetof(Gate, batch_bytes), 0, "Their bytes."},
     {"batch_start_ns", T_LONGLONG, offsetof(Gate, batch_start_ns), 0, "When the first was published."},
+    {"batch_count_max", T_LONGLONG, offsetof(Gate, batch_count_max), 0, "A batch of so many messages is full."},
+    {"batch_bytes_max", T_LONGLONG, offsetof(Gate, batch_bytes_max), 0, "A batch of so many bytes is full."},
+    {"batch_ns_max", T_LONGLONG, offsetof(Gate, batch_ns_max), 0, "A batch that is so old is sent."},
     {"last_ns", T_LONGLONG, offsetof(Gate, last_ns), 0, "When the last message was published."},
     {"sequence", T_ULONGLONG, offsetof(Gate, sequence), 0, "Of the next message."},
     {"bytes", T_LONGLONG, offsetof(Gate, bytes), 0, "Of all bodies so far."},

@@ -51,6 +51,9 @@ class Gate:
     records: list[Any] | None
     batch_bytes: int
     batch_start_ns: int
+    batch_count_max: int
+    batch_bytes_max: int
+    batch_ns_max: int
     last_ns: int
     def __init__(
         self,

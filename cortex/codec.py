@@ -126,15 +126,6 @@ class Codec:
         """Return the size of the body [bytes]. It raises as `encode` does."""
         return self.plan(message).size
 
-    def encode_into(self, message: Any, buffer: memoryview | NDArray[np.uint8]) -> int:
-        """Write the body to writable memory and return its size [bytes].
-
-        Raises:
-            ValueError: The memory is too small, or as `encode` does.
-            TypeError: As `encode` does.
-        """
-        return self.plan(message).write(buffer)
-
     def _encode(self, message: Any, limit: int) -> bytes | None:
         plan = self.plan(message)
         return None if plan.size > limit else join(plan.parts)

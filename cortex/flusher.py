@@ -7,7 +7,8 @@ import time
 from typing import Any
 
 from cortex.context import Closed
-from cortex.publisher import BATCH_NS, Publisher
+from cortex.gate import BATCH_NS
+from cortex.publisher import Publisher
 
 
 class Flusher:

@@ -8,11 +8,14 @@ from typing import Any, Protocol
 
 import zmq
 
-from cortex.codec import Codec
 from cortex.native import NativeGate
-from cortex.packer import flat_of
 
 monotonic_ns = time.monotonic_ns
+
+BATCH_NS = 150_000
+"""Longest time that a message of a burst waits for others."""
+BATCH_COUNT = 64
+BATCH_BYTES = 128 * 1024
 
 
 class Gate(Protocol):
@@ -77,8 +80,7 @@ class LongGate:
 
 
 def make_gate(
-    codec: Codec,
-    head: bytes,
+    flat: Any,
     lock: Any,
     *,
     slowly: Callable[[Any], bool],
@@ -89,17 +91,16 @@ def make_gate(
     """Build the gate of one publisher.
 
     Args:
-        codec: Of its type.
-        head: What its frames begin with: the first 24 bytes of the header.
+        flat: Packs its messages in C, see `packer.flat_of`; None: Python does.
         lock: Held while sending.
         slowly: Called without the lock with a message that has to go the long way.
         retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.
         limit: Most bytes of a body that is sent so.
         flush: Called with the lock held when a batch is full; sends it.
     """
-    flat = flat_of(codec, head)
     if flat is None:
         return LongGate(slowly)
     gate: Any = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit, flush)
     gate.sends = ()
+    gate.batch_count_max, gate.batch_bytes_max, gate.batch_ns_max = BATCH_COUNT, BATCH_BYTES, BATCH_NS
     return gate  # type: ignore[no-any-return]

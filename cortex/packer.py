@@ -17,9 +17,6 @@ from cortex.wire import HEAD_SIZE, HEADER_SIZE, REST
 
 monotonic_ns = time.monotonic_ns
 
-PackRecord = Callable[[Any, int, int], "bytes | None"]
-"""Message, publish_ns and the limit of its body [bytes] to a record of a batch; None: the codec does it."""
-
 
 class Reader(NamedTuple):
     """How a subscriber reads the plain messages of one publisher."""
@@ -39,16 +36,6 @@ class Reader(NamedTuple):
 def flat_of(codec: Codec, head: bytes) -> Any:
     """Return what packs and reads one publisher's messages in C; None: Python does."""
     return None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
-
-
-def make_record_packer(codec: Codec, head: bytes) -> PackRecord:
-    """Build what packs the messages of one publisher as records of batches."""
-    flat = flat_of(codec, head)
-    return _no_record if flat is None else flat.record
-
-
-def _no_record(message: Any, publish_ns: int, limit: int) -> None:
-    return None
 
 
 def make_reader(codec: Codec, head: bytes) -> Reader:

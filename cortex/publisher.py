@@ -14,10 +14,10 @@ import zmq
 
 from cortex.codec import Codec
 from cortex.context import Closed
-from cortex.gate import Gate, LongGate, make_gate
+from cortex.gate import BATCH_BYTES, BATCH_COUNT, BATCH_NS, Gate, LongGate, make_gate
 from cortex.large import LargeSender, Reader, Slot, Stamps
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
-from cortex.packer import make_record_packer
+from cortex.packer import flat_of
 from cortex.stats import PublisherCounters
 from cortex.wire import (
     BATCH,
@@ -46,10 +46,6 @@ LINGER_S = 0.5
 
 BURST_NS = 15_000
 """Two messages closer than this are a burst."""
-BATCH_NS = 150_000
-"""Longest time that a message of a burst waits for others."""
-BATCH_COUNT = 64
-BATCH_BYTES = 128 * 1024
 
 
 class Publisher(Generic[T]):
@@ -80,15 +76,15 @@ class Publisher(Generic[T]):
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         self._batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
-        self._pack_record = make_record_packer(codec, self._head)
+        flat = flat_of(codec, self._head)
+        self._pack_record = None if flat is None else flat.record
         self._plain = not latch and not coalesce
         self._gathers = coalesce and not latch
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
         self._gate: Gate = make_gate(
-            codec,
-            self._head,
+            flat,
             outlets.lock,
             slowly=self._publish_slowly,
             retry=self._send_again,
@@ -155,7 +151,7 @@ class Publisher(Generic[T]):
             if now_ns >= self._gate.refresh_ns:
                 self._prepare(now_ns)
             if self._gathers and (self._batch or now_ns - self._gate.last_ns < BURST_NS):
-                record = self._pack_record(message, now_ns, self._inline_max)
+                record = self._pack_record and self._pack_record(message, now_ns, self._inline_max)
                 if record is not None:
                     return self._collect(record, now_ns)
             if type(message) is not self._type:
@@ -520,7 +516,7 @@ class Publisher(Generic[T]):
         self._arm()
 
     def _arm(self) -> None:
-        """Let the gate send large messages, too, or not: when readers, the ring, or who is late has changed."""
+        """Let the gate send large messages, or not: when readers, the ring, or who is late has changed."""
         self._gate.ledger = self._large.short_cut if self._plain and not self._late else None
 
     def _finish(self, number: int, size: int, stamp_ns: int, now_ns: int) -> bool:

@@ -482,15 +482,21 @@ class Subscriber(Generic[T]):
             self._time(publish_ns, link)
         self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
 
-    def _drain_decoded(self, messages: deque[T]) -> None:
+    def _drain_decoded(self, messages: deque[T], *, may_wait: bool) -> None:
         """As `_drain`, for an empty queue that cannot overflow: messages are decoded on the spot.
 
         This is where a stream spends its time. A message that cannot be decoded here goes to the queue, and
         what follows it waits in the socket, so that the order is kept.
+
+        Args:
+            messages: Where they are appended.
+            may_wait: Wait up to `BLOCK_S` for the first if there is one socket only.
         """
+        links, latency = self._rotated(), self.counters.latency
+        may_wait = may_wait and len(links) == 1 and not self._turn.asked
         exhausted = True
         self._drained_ns = monotonic_ns()
-        for link in self._rotated():
+        for link in links:
             left = min(self.policy.depth, DRAIN_MAX) - len(messages)
             while left > 0 and not self._queue:
                 link.expected, count, frame = link.drain(
@@ -499,9 +505,11 @@ class Subscriber(Generic[T]):
                     messages,
                     link.expected,
                     left,
-                    self.counters.latency,
+                    latency,
                     link.clock_offset_ns,
+                    may_wait,
                 )
+                may_wait = False
                 left -= count
                 if frame is None:
                     break
@@ -588,12 +596,12 @@ class Subscriber(Generic[T]):
         with self._lock:
             if self._closed:
                 return False
-            problems, self._problems = self._problems, deque()
+            problems: deque[Exception] = deque()
+            if self._problems:
+                problems, self._problems = self._problems, problems
             if self.policy.reliable or self.policy.depth >= DRAIN_MAX:
-                if block and not self._queue and (message := self._receive_decoded()) is not _LOST:
-                    messages.append(message)
                 if not self._queue:
-                    self._drain_decoded(messages)
+                    self._drain_decoded(messages, may_wait=block)
             else:
                 if block and not self._queue:
                     self._receive_one(block=True)

@@ -206,3 +206,80 @@ def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
 
     delays = asyncio.run(run())
     assert max(np.median(delays[k : k + 5]) for k in (0, 5, 10)) < 0.05e9
+
+
+def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers):
+    """A task that was never suspended cannot have let another one run."""
+    publisher, subscriber = numbers
+    for value in range(200):
+        publisher.publish(Number(0, value))
+    turns = []
+
+    async def run():
+        async def other():
+            while True:
+                turns.append(len(values))
+                await asyncio.sleep(0)
+
+        values: list[int] = [(await subscriber.recv_async(5.0)).value]
+        task = asyncio.ensure_future(other())
+        async for message in subscriber:
+            values.append(message.value)
+            if len(values) == 200:
+                break
+        task.cancel()
+        return values
+
+    assert asyncio.run(run()) == list(range(200))
+    assert len(turns) < 150  # one for each message, were there a switch
+
+
+def test_a_stream_that_never_ends_lets_others_run(numbers):
+    publisher, subscriber = numbers
+
+    async def run():
+        done = False
+
+        async def other():
+            nonlocal done
+            for _ in range(5):
+                await asyncio.sleep(0)
+            done = True
+
+        task = asyncio.ensure_future(other())
+        publisher.publish(Number(0, 0))
+        count = 0
+        async for message in subscriber:
+            publisher.publish(Number(0, message.value + 1))  # there is always one
+            count += 1
+            if done or count == 1_000_000:
+                break
+        await task
+        return count
+
+    assert asyncio.run(run()) < 1_000_000
+
+
+def test_cancelling_before_and_while_waiting_takes_no_message(numbers):
+    publisher, subscriber = numbers
+
+    async def run():
+        iterator = aiter_of(subscriber)
+        early = asyncio.ensure_future(iterator.__anext__())
+        early.cancel()  # before it ran
+        waiting = asyncio.ensure_future(iterator.__anext__())
+        await asyncio.sleep(0.01)
+        waiting.cancel()
+        await asyncio.gather(early, waiting, return_exceptions=True)
+        assert early.cancelled()
+        assert waiting.cancelled()
+        for value in range(3):
+            publisher.publish(Number(0, value))
+        return [(await iterator.__anext__()).value for _ in range(3)]
+
+    assert asyncio.run(run()) == [0, 1, 2]
+    assert subscriber.counters.received == 3
+
+
+def aiter_of(subscriber):
+    return type(subscriber).__aiter__(subscriber)

@@ -101,7 +101,7 @@ def check_against_oracle(value: Any) -> None:
         assert codec.encode(value, len(body) - 1) is None
         assert isinstance(codec.prepare(value, len(body) - 1), Plan)
     memory = np.full(len(body) + 8, 0xAA, np.uint8)
-    assert codec.encode_into(value, memory) == len(body)
+    assert codec.plan(value).write(memory) == len(body)
     assert memory.tobytes() == body + b"\xaa" * 8  # and not a byte beyond
 
     assert wire_oracle.decode(schema, body) == plain
@@ -195,7 +195,7 @@ def test_wrong_values_are_named(field, value, kind, text):
     for attempt in (
         lambda: codec.encode(wrong, 2**20),
         lambda: codec.size(wrong),
-        lambda: codec.encode_into(wrong, np.zeros(10000, np.uint8)),
+        lambda: codec.plan(wrong).write(np.zeros(10000, np.uint8)),
         lambda: codec.prepare(wrong, 0),
     ):
         with pytest.raises(kind, match=rf"Everything\.{field}.*{text}"):
@@ -246,7 +246,7 @@ def test_arrays_of_any_memory_layout_are_accepted():
         decoded = codec_of(Image).decode(body_of(image))
         assert decoded == image
         memory = np.zeros(2**16, np.uint8)
-        size = codec_of(Image).encode_into(image, memory)
+        size = codec_of(Image).plan(image).write(memory)
         assert memory[:size].tobytes() == body_of(image)
     strided = MotorCommand(0, grid[0, ::2])
     assert codec_of(MotorCommand).decode(body_of(strided)) == strided
@@ -296,21 +296,21 @@ def test_views_keep_the_buffer_alive():
     assert gone() is None
 
 
-def test_encode_into_refuses_small_memory_and_touches_nothing():
+def test_a_plan_refuses_small_memory_and_touches_nothing():
     memory = np.full(100, 7, np.uint8)
     with pytest.raises(ValueError, match="does not fit into a buffer of 100"):
-        codec_of(Everything).encode_into(everything(), memory)
+        codec_of(Everything).plan(everything()).write(memory)
     assert (memory == 7).all()
 
 
-def test_encode_into_takes_a_memoryview():
+def test_a_plan_takes_a_memoryview():
     body = body_of(everything())
     memory = bytearray(len(body))
-    assert codec_of(Everything).encode_into(everything(), memoryview(memory)) == len(body)
+    assert codec_of(Everything).plan(everything()).write(memoryview(memory)) == len(body)
     assert memory == body
     large = bytearray(2**17)
     command = MotorCommand(0, np.arange(10000.0))
-    size = codec_of(MotorCommand).encode_into(command, memoryview(large))
+    size = codec_of(MotorCommand).plan(command).write(memoryview(large))
     assert large[:size] == body_of(command)
 
 

@@ -190,11 +190,18 @@ def frames_of(*sequences):
         ([], 0, 64),
     ],
 )
-def test_drain_is_that_of_python(frames, expected, limit):
+@pytest.mark.parametrize("may_wait", [False, True])
+def test_drain_is_that_of_python(frames, expected, limit, may_wait):
     def drain(reader):
-        messages, latency, script = deque(), [0] * 8, Script(frames)
-        result = reader(script, zmq.Again, messages, expected, limit, latency, 10**12)
-        return result, list(messages), latency, len(script.frames)
+        messages, latency, script, flags = deque(), [0] * 8, Script(frames), []
+
+        def receive(flag):
+            flags.append(flag)
+            return script(zmq.DONTWAIT)
+
+        result = reader(receive, zmq.Again, messages, expected, limit, latency, 10**12, may_wait)
+        assert flags[1:] == [zmq.DONTWAIT] * (len(flags) - 1)
+        return result, list(messages), latency, len(script.frames), flags
 
     reader = packer.make_reader(codec_of(Sample), HEAD)
     flat = flat_of(Sample, HEAD)
@@ -228,7 +235,7 @@ def test_drain_passes_errors_on():
         raise OSError("gone")
 
     with pytest.raises(OSError, match="gone"):
-        flat_of(Sample, HEAD).drain(broken, zmq.Again, deque(), 0, 4, [0] * 8, 0)
+        flat_of(Sample, HEAD).drain(broken, zmq.Again, deque(), 0, 4, [0] * 8, 0, False)
 
 
 # The gate
@@ -241,8 +248,7 @@ class Taken:
         self.lock = threading.Lock()
         self.sent, self.slow, self.retried, self.flushed = [], [], [], 0
         self.gate = gate.make_gate(
-            codec_of(Sample),
-            HEAD,
+            flat_of(Sample, HEAD),
             self.lock,
             slowly=self.slowly,
             retry=self.retry,
