@@ -47,7 +47,7 @@ class WorldsCase:
     alone_renders_per_s: float
     """Single simulations one after the other: renders a second, the best of the rounds in between."""
     cpu_ms: float
-    """CPU time for each render of the batch [ms], the least of the rounds; hardly changed by other programs."""
+    """CPU time for each render of the batch [ms], the least of the rounds: hardly changed by other loads."""
     alone_cpu_ms: float
     """The same of single simulations [ms]."""
     phases_ms: dict[str, float]
