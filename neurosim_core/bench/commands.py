@@ -350,8 +350,8 @@ STUDIES: Sequence[Study] = (
         name="worlds",
         help="many worlds stepped together for learning: renders a second of all",
         description="Turn on the spot in many worlds with an event camera each, all on the device, and in "
-        "single simulations beside it. By default up to 128 worlds on a CPU, which takes two to three minutes on "
-        "two cores, and up to 4096 on CUDA.",
+        "single simulations beside it. By default up to 128 worlds on a CPU, which takes two to three "
+        "minutes on two cores, and up to 4096 on CUDA.",
         chapter=_worlds,
         options=frozenset({"scene", "device", "width", "height", "worlds", "seconds"}),
     ),
