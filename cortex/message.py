@@ -176,7 +176,7 @@ def _hasten(cls: type[Any]) -> None:
         native is not None
         and type(cls) is type
         and not hasattr(cls, "__post_init__")
-        and cls.__new__ is object.__new__
+        and not any("__new__" in vars(base) for base in cls.__mro__[:-1])
         and [argument.name for argument in arguments] == [field.name for field in fields]
         and all(argument.kind is argument.POSITIONAL_OR_KEYWORD for argument in arguments)
         and len(fields) <= _HASTENED_FIELDS_MAX

@@ -180,8 +180,9 @@ class Subscriber(Generic[T]):
         A message that is there is returned without a switch of tasks, for up to a millisecond; then other
         tasks get a turn. A task that is cancelled while it waits has taken no message.
         """
-        if monotonic_ns() < self._pause_ns and (found := self._take_now()) is not _LOST:
-            return found
+        message: T
+        if monotonic_ns() < self._pause_ns and (message := self._take_now()) is not _LOST:
+            return message
         reader = self._reader
         if reader is None or reader.loop is not asyncio.get_running_loop():
             if reader is not None:
@@ -192,7 +193,7 @@ class Subscriber(Generic[T]):
             await asyncio.sleep(0)
         while True:
             self._pause_ns = monotonic_ns() + PAUSE_NS
-            message: T = self._take_now()
+            message = self._take_now()
             if message is not _LOST:
                 return message
             if self._queue or not self._exhausted:  # what came could not be read
@@ -216,8 +217,8 @@ class Subscriber(Generic[T]):
 
     async def _next_async(self) -> T:
         """As `recv_async`, with one coroutine less for a message that is there."""
-        if monotonic_ns() < self._pause_ns and (found := self._take_now()) is not _LOST:
-            message: T = found
+        message: T
+        if monotonic_ns() < self._pause_ns and (message := self._take_now()) is not _LOST:
             return message
         return await self.recv_async()
 
