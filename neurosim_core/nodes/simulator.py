@@ -100,6 +100,8 @@ class Simulator:
         self._bell = threading.Event()
         """Rung when the loop has something to do before what it waits for."""
         self._tick = 0
+        self._flown = False
+        """The control period has been computed, and its end is waited for."""
         self._paused = False
         self._ended = False
         self._exit: int | None = None
@@ -208,7 +210,7 @@ class Simulator:
         The first commands of a run begin its time, once those who came with them are connected.
         """
         live, first = self.config.live, self._tick == 0
-        if live.mode == "streaming" and not first:
+        if live.mode == "streaming" and (self._flown or not first):
             return True  # taken in at the end of the period before
         for craft in self.crafts:
             if craft.answers_ns is not None and self._tick % live.command_every == 0:
@@ -233,21 +235,29 @@ class Simulator:
             if not streaming:
                 for craft in self.crafts:
                     craft.step(self.stamp_ns)
-            elif not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
+            elif not self._flown and not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
                 return
         except DynamicsError as error:
             self._end(f"the motion of {self._culprit(error)} cannot be computed: {error}")
             return
-        self._meetings.check(self.crafts)
-        self._meter.step_times.add(time.monotonic_ns() - begin_ns)
-        period_ns = end_ns - self.stamp_ns
-        if streaming and not self._streaming.publish_until(end_ns, period_ns, live, self._stop.is_set):
+        if not self._flown:
+            self._meetings.check(self.crafts)
+            self._meter.step_times.add(time.monotonic_ns() - begin_ns)
+        self._flown = streaming
+        if streaming and not self._wait_for_end(end_ns):
             return
+        self._flown = False
         if streaming:  # before anything of this stamp goes out: an answer to it counts from the next tick on
             self._take_commands(end_ns)
         for craft in self.crafts:
             craft.answers_ns = craft.outlet.publish_due(end_ns)
         self._end_period(end_ns)
+
+    def _wait_for_end(self, end_ns: int) -> bool:
+        """Publish until the end of a control period [ns]; False if something else has to be done first."""
+        period_ns = end_ns - self.stamp_ns
+        stop, called = self._stop.is_set, self._requests.__bool__
+        return self._streaming.publish_until(end_ns, period_ns, self.config.live, stop, called=called)
 
     def _take_commands(self, stamp_ns: int) -> None:
         """Send what has arrived by a tick [ns] on its way."""
@@ -331,7 +341,8 @@ class Simulator:
         if self._recorder is not None:
             self._recorder.begin(beginning.seeds, replace=self._tick == 0)
         self._tick = self.stamp_ns = 0
-        self._ended, self._reason = False, ""
+        self._flown = self._ended = False
+        self._reason = ""
         self._meter.reset()
         self._meetings.reset()
         for craft in self.crafts:

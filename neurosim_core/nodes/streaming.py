@@ -13,6 +13,8 @@ from neurosim_core.pacing import Pacer
 
 HICCUP_NS = 10_000_000
 """The machine may be this late, or a control period if that is longer, and catch up [ns]."""
+ANSWER_NS = 50_000_000
+"""A request waits for the end of a control period that is this near [ns]."""
 BEHIND_MAX_NS = 500_000_000
 """How far the machine may be behind where camera frames give way [ns]."""
 
@@ -98,7 +100,15 @@ class Streaming:
         for craft in self._crafts:
             craft.outlet.publish_due(stamp_ns)
 
-    def publish_until(self, end_ns: int, period_ns: int, live: LiveConfig, stop: Callable[[], bool]) -> bool:
+    def publish_until(
+        self,
+        end_ns: int,
+        period_ns: int,
+        live: LiveConfig,
+        stop: Callable[[], bool],
+        *,
+        called: Callable[[], bool],
+    ) -> bool:
         """Publish what arrives before the end of a control period, each when it is due, and wait for the end.
 
         Args:
@@ -106,17 +116,22 @@ class Streaming:
             period_ns: Its length [ns].
             live: Says what gives way when the machine is late.
             stop: Ends the wait.
+            called: Whether somebody asks for something; that waits for an end that is near, and ends the wait
+                for another.
 
         Returns:
-            Whether it came to the end.
+            Whether it came to the end; where it was `called`, it can be called again to go on.
         """
 
+        def leave() -> bool:
+            return stop() or (called() and self._pacer.lateness_ns(end_ns) < -ANSWER_NS)
+
         def interrupted() -> bool:
-            self._bell.clear()  # before the look at why it was rung; requests wait for the end
-            return stop() or self._cameras.has_packets
+            self._bell.clear()  # before the look at why it was rung
+            return leave() or self._cameras.has_packets
 
         self._make_way(end_ns, period_ns, live)
-        while not stop():
+        while not leave():
             self.offer_seen()
             due_ns = min([end_ns, *(d for c in self._crafts if (d := c.outlet.next_due_ns) is not None)])
             late_ns = self._pacer.wait_until(due_ns, interrupted)

@@ -548,6 +548,26 @@ def test_pause_step_resume():
         assert clock.recv(SOON_S).stamp_ns == stepped.stamp_ns + PERIOD_NS
 
 
+def test_requests_do_not_wait_for_the_end_of_a_slow_period():
+    """A control period takes 50 s by the wall clock; what was flown of it is not flown twice."""
+    slow = {"live.real_time_factor": 1e-4}
+    with LiveRig(make_config(**slow)) as rig:
+        imu = rig.listen("/drone/imu", Imu)
+        rig.send(rig.hover())
+        assert imu.recv(SOON_S).stamp_ns == 0  # the first period has begun
+        assert rig.call("/pause", Trigger()).phase == "paused"
+        assert rig.call("/resume", Trigger()).accepted
+        assert rig.set({"live.fail_safe": "cut"}).accepted
+        assert rig.call("/reset", Reset()).stamp_ns == 0
+        assert rig.simulator.phase == "waiting"
+        rig.send(rig.hover())
+        assert imu.recv(SOON_S).stamp_ns == 0
+        assert rig.set({"live.real_time_factor": 0.0}).accepted
+        assert [imu.recv(SOON_S).stamp_ns for _ in range(8)] == [2_500_000 * k for k in range(1, 9)]
+        status = rig.wait_for_status(lambda status: status.step_count >= 4)
+        assert status.vehicles[0].command_count == 1
+
+
 def test_a_paused_run_shows_all_its_pictures(monkeypatch: pytest.MonkeyPatch):
     """Those that were not ready are published before /pause and /step are answered, and no later."""
     _with_slow_cameras(monkeypatch, 0.03)
