@@ -20,7 +20,7 @@ from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.overrides import add_set_option, read_settings
-from neurosim_core.signals import handle_signals, leave_at_once
+from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
     _Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"neurosim: {error}", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
-            print("neurosim: interrupted", file=sys.stderr)
+            print(INTERRUPTED_LINE, file=sys.stderr)
             return 130
 
 

@@ -9,6 +9,9 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+INTERRUPTED_LINE = "neurosim: interrupted"
+"""What a command says that is interrupted."""
+
 
 @contextlib.contextmanager
 def handle_signals(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
@@ -39,5 +42,5 @@ def stop_at_signals(stop: threading.Event) -> Iterator[None]:
 
 def leave_at_once(_signal: int, _frame: FrameType | None) -> None:
     """End the process on the spot, as long as nothing is open; imports may swallow a `KeyboardInterrupt`."""
-    os.write(2, b"neurosim: interrupted\n")
+    os.write(2, f"{INTERRUPTED_LINE}\n".encode())
     os._exit(130)

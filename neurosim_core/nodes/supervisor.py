@@ -21,6 +21,8 @@ from typing import Literal
 from rich.console import Console
 from rich.text import Text
 
+from neurosim_core.signals import INTERRUPTED_LINE
+
 GRACE_S = 1.5
 """How long a process may take to end after it was interrupted, before it is killed [s]."""
 INTERRUPTED = 130
@@ -111,6 +113,7 @@ class _Child:
         self.output = self._process.stdout
         os.set_blocking(self.output.fileno(), False)
         self._begun = b""
+        self._interrupted = False
 
     def poll(self) -> int | None:
         """Return its exit status, None while it runs; kill what an ended one has left in its session."""
@@ -120,6 +123,7 @@ class _Child:
         return self._process.returncode
 
     def interrupt(self) -> None:
+        self._interrupted = True
         self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
@@ -139,6 +143,8 @@ class _Child:
         if not chunk and self._begun:  # a last line without an end
             lines, self._begun = [self._begun], b""
         for line in lines:
+            if self._interrupted and line.decode(errors="replace").strip() == INTERRUPTED_LINE:
+                continue  # the user knows: all of them are
             text = Text.from_ansi(line.decode(errors="replace"))
             if self.part.prefixed:
                 text = Text.assemble((f"{self.part.name}: ", "dim"), text)

@@ -188,6 +188,17 @@ def test_a_signal_interrupts_each_once_and_ends_all(start, number):
     assert supervisor.process.returncode == 130
 
 
+def test_that_a_part_was_interrupted_is_not_said(start):
+    """The user has done it; the same words before that are passed on."""
+    talking = WAIT.replace('print("ready", os.getpid())', 'print("neurosim: interrupted")').replace(
+        'print("closed")', 'print("neurosim: interrupted"); print("closed")'
+    )
+    supervisor = start(part("controller", talking))
+    supervisor.read_until("controller: neurosim: interrupted")
+    supervisor.interrupt()
+    assert supervisor.rest() == ["controller: closed"]
+
+
 def test_the_terminal_cannot_interrupt_them_a_second_time(start):
     """They have sessions of their own, so that Ctrl-C goes to the supervisor alone."""
     supervisor = start(part("simulator"), part("viewer"))
