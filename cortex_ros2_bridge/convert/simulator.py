@@ -19,10 +19,13 @@ _SIMULATOR_VALUES = (
     *("mode", "real_time_factor", "real_time_factor_wanted", "step_count"),
     *("step_median_ns", "step_p99_ns", "late_p99_ns", "overrun_count", "slipped_ns"),
 )
-_SENSOR_VALUES = ("subscriber_count", "published_count", "dropped_count", "injected_lost_count")
+_SENSOR_VALUES = (
+    *("subscriber_count", "published_count"),
+    *("dropped_count", "injected_lost_count", "undelivered_count"),
+)
 _VEHICLE_VALUES = (
     *("command_count", "refused_count", "refused_reason", "superseded_count", "lost_count"),
-    *("command_age_ns", "fail_safe_count", "collision_count"),
+    *("command_age_ns", "fail_safe_count", "collision_count", "undelivered_count"),
 )
 
 
@@ -126,7 +129,10 @@ def _of_sensor(sensor: messages.SensorStatus, judged: _Judged) -> Any:
     said = "ok" if sensor.active else "idle"
     if dropped:
         said = f"{dropped} dropped {judged.period}" + ("" if unwanted else ", as its link is configured")
-    level = _WARN if unwanted else _OK
+    undelivered = judged.more(sensor, "undelivered_count", name)
+    if undelivered:
+        said = f"{'' if said == 'ok' else f'{said}; '}{undelivered} lost by reliable readers {judged.period}"
+    level = _WARN if unwanted or undelivered else _OK
     return _status(level, f"sensor {name}", said, sensor.vehicle, sensor, _SENSOR_VALUES)
 
 
@@ -139,6 +145,9 @@ def _of_vehicle(vehicle: messages.VehicleStatus, judged: _Judged) -> Any:
     collisions = judged.more(vehicle, "collision_count", vehicle.name)
     if collisions:
         trouble.append(f"{collisions} collisions {judged.period}")
+    undelivered = judged.more(vehicle, "undelivered_count", vehicle.name)
+    if undelivered:
+        trouble.append(f"{undelivered} messages lost by reliable readers {judged.period}")
     mode = f"commands: {vehicle.command_mode}" if vehicle.command_mode else "no command yet"
     said = "; ".join([*trouble, mode])
     return _status(

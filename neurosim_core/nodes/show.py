@@ -103,7 +103,7 @@ class Show:
         self._shapes: SceneShapes | None = None
         self._paths: dict[str, Any] = {}
         self._command_ns: dict[str, int] = {}
-        self._links = _links(config)
+        self._links: dict[str, list[str]] = _links(config)
         self._episodes = Episodes()
         self._statuses: deque[msg.SimulatorStatus] = deque()
         self._streams: list[_Stream] = []
@@ -124,6 +124,21 @@ class Show:
     def settled(self) -> bool:
         """Whether its recording began long enough ago for another one to begin."""
         return time.monotonic() - self._opened_s >= APART_S
+
+    def change(self, simulation: msg.Simulation) -> None:
+        """Listen to links that do something since the settings were changed.
+
+        Their delays are logged at once; a recording that begins later has their plot in its layout.
+
+        Raises:
+            ValueError: The settings cannot be read.
+        """
+        for vehicle, links in _links(load_config(yaml.safe_load(simulation.config))).items():
+            known = self._links.setdefault(vehicle, [])
+            for link in links:
+                if link not in known:
+                    known.append(link)
+                    self._subscribe_link(vehicle, link)
 
     def read(self) -> None:
         """Take what has come, and log it."""
@@ -208,18 +223,6 @@ class Show:
         def on_packet(name: str) -> Callable[[Any], None]:
             return lambda message: self._logger.log(to_packet(message, name), vehicle=vehicle)
 
-        def on_delivery(link: str) -> Callable[[msg.Delivery], None]:
-            return lambda found: self._logger.log(
-                Delivery(
-                    stamp_ns=found.stamp_ns,
-                    sequence=found.sequence,
-                    sensor=f"{link}_link",
-                    delivered_ns=found.delivered_ns,
-                    size_bytes=found.size_bytes,
-                ),
-                vehicle=vehicle,
-            )
-
         def on_command(mode: str) -> Callable[[Any], None]:
             return lambda command: self._take_command(vehicle, mode, command)
 
@@ -237,7 +240,20 @@ class Show:
             topic = topics.command_topic(vehicle, mode)
             add(topic, command, on_command(mode), vehicle, of_simulator=False, ordered=False)
         for link in self._links.get(vehicle, ()):
-            add(topics.delivery_topic(vehicle, link), msg.Delivery, on_delivery(link), vehicle)
+            self._subscribe_link(vehicle, link)
+
+    def _subscribe_link(self, vehicle: str, link: str) -> None:
+        def on_delivery(found: msg.Delivery) -> None:
+            delivery = Delivery(
+                stamp_ns=found.stamp_ns,
+                sequence=found.sequence,
+                sensor=f"{link}_link",
+                delivered_ns=found.delivered_ns,
+                size_bytes=found.size_bytes,
+            )
+            self._logger.log(delivery, vehicle=vehicle)
+
+        self._add(topics.delivery_topic(vehicle, link), msg.Delivery, on_delivery, vehicle)
 
     def _add(
         self,
@@ -295,6 +311,8 @@ class Show:
                     s.dropped_count - s.injected_lost_count for s in status.sensors
                 ),
                 "lost by links": sum(s.injected_lost_count for s in status.sensors),
+                "lost by reliable readers": sum(s.undelivered_count for s in status.sensors)
+                + sum(v.undelivered_count for v in status.vehicles),
                 "commands lost or refused": sum(v.lost_count + v.refused_count for v in status.vehicles),
                 "lost on the way here": sum(lost.values()),
             },

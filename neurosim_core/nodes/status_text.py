@@ -51,7 +51,8 @@ def status_text(
             if count
         ]
         lines.append(f"{vehicle.name}: {', '.join([doing, *bad])}")
-    lines = ["  \n".join(lines), "", "| sensor | Hz | dropped | lost here |", "| :-- | --: | --: | --: |"]
+    lines = ["  \n".join(lines), "", "| sensor | Hz | dropped | by reader | lost here |"]
+    lines.append("| :-- | --: | --: | --: | --: |")
     earlier = {(s.vehicle, s.name): s.published_count for s in before.sensors}
     elapsed_s = (status.stamp_ns - before.stamp_ns) / 1e9
     for sensor in status.sensors:
@@ -63,5 +64,6 @@ def status_text(
             rate = f"{max(sensor.published_count - earlier[key], 0) / elapsed_s:.0f}"
         else:
             rate = "-"
-        lines.append(f"| {name} | {rate} | {sensor.dropped_count:,} | {lost.get(key, 0):,} |")
+        lost_counts = (sensor.dropped_count, sensor.undelivered_count, lost.get(key, 0))
+        lines.append(f"| {name} | {rate} | {' | '.join(f'{count:,}' for count in lost_counts)} |")
     return "\n".join(lines)

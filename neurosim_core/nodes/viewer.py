@@ -209,6 +209,8 @@ def watch(
                 shown.enter_context(show)
                 names = "; ".join(f"{name}: {', '.join(s)}" for name, s in show.sensors.items())
                 say(f"showing {names} ({simulation.mode})")
+            elif found is not None and show is not None:
+                show.change(found[0])
             if show is None:
                 continue
             show.read()

@@ -170,7 +170,7 @@ STATUS = messages.SimulatorStatus(
     slipped_ns=2_500_000_000,
     sensors=[
         messages.SensorStatus("drone", "imu", True, 1, 1000, 2, 2),
-        messages.SensorStatus("drone", "rgb", False, 0, 30, 5, 0),
+        messages.SensorStatus("drone", "rgb", False, 0, 30, 5, 0, 3),
     ],
     vehicles=[messages.VehicleStatus("drone", "rates", 9, 3, 0, 0, 5, True, 1, 2, 0, "three rotors")],
 )
@@ -500,9 +500,10 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                             pair("published_count", published),
                             pair("dropped_count", dropped),
                             pair("injected_lost_count", injected),
+                            pair("undelivered_count", undelivered),
                         ],
                     )
-                    for level, name, said, subscribers, published, dropped, injected in (
+                    for level, name, said, subscribers, published, dropped, injected, undelivered in (
                         (
                             0,
                             "sensor drone/imu",
@@ -511,8 +512,18 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                             "1000",
                             "2",
                             "2",
+                            "0",
                         ),
-                        (1, "sensor drone/rgb", "5 dropped so far", "0", "30", "5", "0"),
+                        (
+                            1,
+                            "sensor drone/rgb",
+                            "5 dropped so far; 3 lost by reliable readers so far",
+                            "0",
+                            "30",
+                            "5",
+                            "0",
+                            "3",
+                        ),
                     )
                 ),
                 record(
@@ -532,6 +543,7 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                         pair("command_age_ns", "5"),
                         pair("fail_safe_count", "1"),
                         pair("collision_count", "2"),
+                        pair("undelivered_count", "0"),
                     ],
                 ),
             ],

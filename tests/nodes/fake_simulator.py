@@ -77,6 +77,11 @@ class FakeSimulator:
             for mode, kind in topics.COMMANDS.items()
         }
 
+    def change(self, settings: Mapping[str, Any]) -> None:
+        """Announce other settings, as after `/set_parameters`."""
+        self.config = load_config(self.config.model_dump(mode="json"), overrides=settings)
+        self.announce()
+
     def announce(self, *, wait: bool = True) -> None:
         """Say what there is; wait until the viewer listens to all of it but the cameras."""
         self.path.publish(msg.Path(stamp_ns=0, time_ns=np.arange(3), position=np.arange(9.0).reshape(3, 3)))
@@ -158,6 +163,7 @@ class FakeSimulator:
                         subscriber_count=1,
                         published_count=stamp_ns // (10 * MS),
                         dropped_count=dropped,
+                        undelivered_count=2 if name == "rgb" else 0,
                     )
                     for name in self.sensors
                 ],
@@ -173,6 +179,7 @@ class FakeSimulator:
                         fail_safe=phase == "running" and stamp_ns > 900 * MS,
                         fail_safe_count=1,
                         collision_count=0,
+                        undelivered_count=1,
                     )
                 ],
                 sequence=self._status_count,

@@ -174,13 +174,31 @@ def test_what_is_published_is_in_the_file(tmp_path, box, start):
     assert scalars(rows, "/simulator/timing") == [(500 * MS, [2.0, 3.0, 0.5, 1.0])]
     assert scalars(rows, "/simulator/real_time_factor") == [(500 * MS, [0.5])]
     assert scalars(rows, "/simulator/losses") == [
-        (0, [0.0, 0.0, 5.0, 0.0]),
-        (500 * MS, [36.0, 0.0, 5.0, 0.0]),
+        (0, [0.0, 0.0, 3.0, 5.0, 0.0]),
+        (500 * MS, [36.0, 0.0, 3.0, 5.0, 0.0]),
     ]
     text = rows["/status"][-1][1]["text"][0]
     assert re.search(r"\*\*running\*\*.*0\.50 s, 0\.50 x real time \(wanted: 1\)", text, re.DOTALL)
-    assert "| dvs | 100 | 9 | 0 |" in text  # 50 windows in half a second
-    assert "| z | off | 9 | 0 |" in text
+    assert "| dvs | 100 | 9 | 0 | 0 |" in text  # 50 windows in half a second
+    assert "| rgb | 100 | 9 | 2 | 0 |" in text
+    assert "| z | off | 9 | 0 | 0 |" in text
+
+
+def test_a_link_that_is_set_in_flight_is_shown(tmp_path, box, start, monkeypatch):
+    monkeypatch.setattr(show_module, "APART_S", 0.0)
+    file = tmp_path / "live.rrd"
+    watcher = start(file)
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        simulator.change({"links.imu.latency_s": 0.008})
+        deliveries = simulator.node.publisher("/drone/imu/delivery", msg.Delivery)
+        assert deliveries.wait_for_subscribers(timeout_s=15.0)
+        delivery = msg.Delivery(stamp_ns=5 * MS, delivered_ns=13 * MS, size_bytes=48, sequence=0)
+        deliveries.publish(delivery)
+        simulator.state(1)
+        grows_to(file, lambda rows: "/plots/drone/links/imu" in rows)
+    watcher.end()
+    assert scalars(read(file), "/plots/drone/links/imu") == [(5 * MS, [8.0])]
 
 
 def test_pictures_are_limited_by_the_wall_clock(tmp_path, box, start):
