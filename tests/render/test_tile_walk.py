@@ -144,6 +144,30 @@ def test_same_bits_beside_the_sky(device):
     assert 0.01 < np.isfinite(expected["depth"]).mean() < 0.5
 
 
+def test_same_bits_through_a_slit_that_no_probe_finds(device):
+    """A slope that begins within the reach is listed, a bar before it but beyond the reach is not."""
+    lens = PinholeConfig(width=16, height=16, fx=16.0, fy=16.0, cx=8.0, cy=8.0)
+    slope = trimesh.Trimesh(
+        [[-20.0, -20.0, 16.0], [20.0, -20.0, -24.0], [20.0, 20.0, -24.0], [-20.0, 20.0, 16.0]],
+        [[0, 1, 2], [0, 2, 3]],
+        process=False,
+    )
+    plates = [
+        box((10.0, 20.0, 0.01), (x, 0.0, 1.5)) for x in (-5.3, 4.74)
+    ]  # rays of column 3 pass at x = -0.28
+    bar = box((0.4, 20.0, 0.1), (-0.84, 0.0, 0.0))
+    scene = scene_of(*plates, slope, bar)
+    pose = [((0.0, 0.0, 2.5), LOOK_DOWN)]
+    expected = render(scene, lens, pose, outputs=("instance", "depth"), config=ALONE, device=device)
+    assert (expected["instance"][0, :, 3] == 3).all()
+    assert (np.delete(expected["instance"][0], 3, axis=1) < 2).all()
+    renderer, _ = lists_of(scene, pose, device, lens=lens)
+    assert renderer.walk.data.reach.numpy().max() < 2.0
+    arrays = upload_scene(scene, together(), device)
+    for form in (arrays, by_block(arrays)):
+        assert_same(render(form, lens, pose, outputs=("instance", "depth"), device=device), expected)
+
+
 def test_same_bits_when_the_camera_whirls(device):
     """Turned by a radian from one instant to the next, no frustum holds the rays: such tiles have no list."""
     scene, poses = scene_of(soup(200, 5)), path(4, 0.0, 1.0, start=(0.0, 0.0, 0.0))
