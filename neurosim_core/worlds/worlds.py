@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,69 +25,18 @@ from neurosim_core.frames import as_rows
 from neurosim_core.sensors.imu import Imu
 from neurosim_core.sensors.rig import ImuSensorConfig
 from neurosim_core.simulation import Model
-from neurosim_core.streams import Graphs, HostInput, Milestone
+from neurosim_core.streams import Graphs
 from neurosim_core.vehicle import Multirotor
 from neurosim_core.worlds import flight
 from neurosim_core.worlds.cameras import WorldCast
+from neurosim_core.worlds.inputs import CommandBuffer, as_device_array, make_seeds
+from neurosim_core.worlds.observation import ImuRows, Observation, VehicleStates
 from neurosim_core.worlds.parameters import vary_sensors
 from neurosim_core.worlds.scenes import SceneSource, SceneTable, make_scene_table
 from neurosim_core.worlds.timetable import Pattern, Timetable
-from neurosim_core.worlds.world_events import WorldEvents
 
 COUNT_MAX = 4096
 """Most worlds."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class VehicleStates:
-    """The states of all vehicles, on the device, valid until the next step or reset."""
-
-    position: wp.array[wp.vec3d]
-    """p_WB [m], shape [N, 3]."""
-    velocity: wp.array[wp.vec3d]
-    """v_WB in W [m/s], shape [N, 3]."""
-    orientation: wp.array[wp.quatd]
-    """q_WB, xyzw, shape [N, 4]."""
-    body_rate: wp.array[wp.vec3d]
-    """w_WB in B [rad/s], shape [N, 3]."""
-    rotor_speed: wp.array2d[wp.float64]
-    """[rad/s], shape [N, R]."""
-    stamp_ns: wp.array[wp.int64]
-    """Time of each state since the reset of its world [ns], shape [N]; stops where a vehicle is held."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ImuRows:
-    """What an IMU read in a step, in the order of time, on the device, valid until the next step or reset."""
-
-    specific_force: wp.array2d[wp.vec3d]
-    """In S [m/s^2], shape [sample, N, 3]."""
-    angular_rate: wp.array2d[wp.vec3d]
-    """In S [rad/s], shape [sample, N, 3]."""
-    offsets_ns: tuple[int, ...]
-    """When each sample was taken, after the begin of the step [ns]."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Observation:
-    """What all worlds yield in a step: arrays on the device that the next step or reset overwrites."""
-
-    state: VehicleStates
-    """At the end of the step."""
-    clock_ns: wp.array[wp.int64]
-    """Time since the reset of each world [ns], shape [N]."""
-    events: Mapping[str, WorldEvents]
-    """Of each event camera."""
-    images: Mapping[str, Any]
-    """The last picture of each image camera: rgb, uint8 [N, H, W, 3]; depth [m], float32 [N, H, W]."""
-    fresh: frozenset[str]
-    """Image cameras that took their picture in this step."""
-    imu: Mapping[str, ImuRows]
-    """Of each IMU."""
-    collided: wp.array[wp.int32]
-    """1: the vehicle touched the scene in this step, or is held because it did; shape [N]."""
-    status: wp.array[wp.int32]
-    """0, or why a vehicle is held: index into `vehicle.status.STATUS_TERMS`, shape [N]."""
 
 
 class Worlds:
@@ -168,8 +116,8 @@ class Worlds:
         self._start = self._make_start()
         self._fleet = self._make_fleet()
         self._pilots: dict[str, Controller] = {}
-        self._inputs: dict[str, _CommandBuffer] = {
-            "motor_speeds": _CommandBuffer(self._vehicle.arrays.rotor_speed_command)
+        self._inputs: dict[str, CommandBuffer] = {
+            "motor_speeds": CommandBuffer(self._vehicle.arrays.rotor_speed_command)
         }
         self._graphs = Graphs(device)
         self._observations: dict[Pattern, Observation] = {}
@@ -404,9 +352,9 @@ class Worlds:
                 device=self._model.device,
             )
             self._pilots[mode] = pilot
-            self._inputs[mode] = _CommandBuffer(pilot.setpoint)
+            self._inputs[mode] = CommandBuffer(pilot.setpoint)
         buffer = self._inputs[mode]
-        on_device = _as_device_array(commands, self.device)
+        on_device = as_device_array(commands, self.device)
         if on_device is not None:
             self._take_rows(on_device, buffer.array, "commands")
         elif mode == "motor_speeds":
@@ -427,7 +375,7 @@ class Worlds:
         if mask is None:
             self._mask.fill_(1)
             return
-        given = _as_device_array(mask, self.device)
+        given = as_device_array(mask, self.device)
         if given is None:
             host = np.asarray(mask)
             if host.shape != (self.count,) or host.dtype not in (np.bool_, np.uint8, np.int32):
@@ -457,7 +405,7 @@ class Worlds:
                 continue
             value = self._begin[name] if given_value is None else given_value
             (self._as_configured.add if given_value is None else self._as_configured.discard)(name)
-            on_device = _as_device_array(value, self.device)
+            on_device = as_device_array(value, self.device)
             if on_device is not None:
                 self._take_rows(on_device, array, name)
                 if name == "orientation":
@@ -526,27 +474,6 @@ class Worlds:
         wp.launch(kernel, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
 
 
-class _CommandBuffer:
-    """Commands of one mode on the device; those of the host go through two buffers in turn.
-
-    The host waits only if the device has not yet copied what it was given two steps ago.
-    """
-
-    def __init__(self, array: Any) -> None:
-        self.array = array
-        self._hosts = [HostInput(array) for _ in range(2)]
-        self._read = [Milestone(array.device) for _ in range(2)]
-        self._turn = 0
-
-    def write(self, rows: NDArray[np.float64]) -> None:
-        """Launch the copy of rows to the device."""
-        turn, self._turn = self._turn, 1 - self._turn
-        self._read[turn].wait()
-        self._hosts[turn].rows[:] = rows
-        self._hosts[turn].upload()
-        self._read[turn].set()
-
-
 def make_worlds(
     config: SimulationConfig | Mapping[str, Any] | str | Path | None = None,
     *,
@@ -602,28 +529,6 @@ def make_worlds(
     )
 
 
-def make_seeds(seeds: int | ArrayLike, count: int) -> list[int]:
-    """Return a seed for each world.
-
-    Args:
-        seeds: That of world 0, which the others count on from, or one for each.
-        count: Number of worlds.
-
-    Raises:
-        ValueError: They are no integers in [0, 2^64), or of the wrong number.
-    """
-    given = np.asarray(seeds)
-    if not np.issubdtype(given.dtype, np.integer) or given.shape not in ((), (count,)):
-        raise ValueError(
-            f"seeds must be an integer or integers of shape [{count}], got {given.dtype} "
-            f"of shape {list(given.shape)}"
-        )
-    chosen = [int(s) for s in given] if given.ndim else [int(given) + world for world in range(count)]
-    if min(chosen) < 0 or max(chosen) >= 1 << 64:
-        raise ValueError(f"seeds must be in [0, 2^64), got {min(chosen)} to {max(chosen)}")
-    return chosen
-
-
 def _check_image_rates(images: Sequence[Mapping[str, Rate]], control: Rate) -> None:
     for name, rate in (item for cameras in images for item in cameras.items()):
         ratio = control.rate_hz / rate.rate_hz
@@ -648,14 +553,3 @@ def _first(rows: Any, count: int) -> Any:
     if count == 0:
         return wp.empty((0, *rows.shape[1:]), dtype=rows.dtype, device=rows.device)
     return rows[:count]
-
-
-def _as_device_array(value: Any, device: Any) -> Any:
-    """Return a Warp array of the device without a copy, or None: it is something of the host."""
-    if isinstance(value, wp.array):
-        if value.device == device:
-            return value
-        raise ValueError(f"arrays must be on {device} or be NumPy arrays, got one on {value.device}")
-    if device.is_cuda and hasattr(value, "__cuda_array_interface__"):
-        return wp.from_dlpack(value)
-    return None

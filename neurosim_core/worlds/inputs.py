@@ -1,0 +1,66 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""What users hand to many worlds: commands and seeds, from the host or on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from neurosim_core.streams import HostInput, Milestone
+
+
+class CommandBuffer:
+    """Commands of one mode on the device; those of the host go through two buffers in turn.
+
+    The host waits only if the device has not yet copied what it was given two steps ago.
+    """
+
+    def __init__(self, array: Any) -> None:
+        self.array = array
+        self._hosts = [HostInput(array) for _ in range(2)]
+        self._read = [Milestone(array.device) for _ in range(2)]
+        self._turn = 0
+
+    def write(self, rows: NDArray[np.float64]) -> None:
+        """Launch the copy of rows to the device."""
+        turn, self._turn = self._turn, 1 - self._turn
+        self._read[turn].wait()
+        self._hosts[turn].rows[:] = rows
+        self._hosts[turn].upload()
+        self._read[turn].set()
+
+
+def make_seeds(seeds: int | ArrayLike, count: int) -> list[int]:
+    """Return a seed for each world.
+
+    Args:
+        seeds: That of world 0, which the others count on from, or one for each.
+        count: Number of worlds.
+
+    Raises:
+        ValueError: They are no integers in [0, 2^64), or of the wrong number.
+    """
+    given = np.asarray(seeds)
+    if not np.issubdtype(given.dtype, np.integer) or given.shape not in ((), (count,)):
+        raise ValueError(
+            f"seeds must be an integer or integers of shape [{count}], got {given.dtype} "
+            f"of shape {list(given.shape)}"
+        )
+    chosen = [int(s) for s in given] if given.ndim else [int(given) + world for world in range(count)]
+    if min(chosen) < 0 or max(chosen) >= 1 << 64:
+        raise ValueError(f"seeds must be in [0, 2^64), got {min(chosen)} to {max(chosen)}")
+    return chosen
+
+
+def as_device_array(value: Any, device: Any) -> Any:
+    """Return a Warp array of the device without a copy, or None: it is something of the host."""
+    if isinstance(value, wp.array):
+        if value.device == device:
+            return value
+        raise ValueError(f"arrays must be on {device} or be NumPy arrays, got one on {value.device}")
+    if device.is_cuda and hasattr(value, "__cuda_array_interface__"):
+        return wp.from_dlpack(value)
+    return None
