@@ -89,7 +89,7 @@ def test_every_part_is_measured_alone(result):
     assert all(part.per_step_us > 0.0 for part in result.roofline.parts)
     rays = [part.rays_per_step for part in result.roofline.parts if part.rays_per_step]
     assert rays == [result.roofline.width * result.roofline.height] * 2
-    assert result.roofline.copy_gigabytes_per_s > 0.1  # of any machine's memory
+    assert result.roofline.copy_gigabytes_per_s > 0.0
     for comparison in (result.scan, result.loop):
         assert not comparison.failure
         assert comparison.ratio > 0.0
