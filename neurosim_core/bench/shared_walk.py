@@ -1,4 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,arg-type,operator,untyped-decorator"
+# mypy: disable-error-code="call-overload,union-attr"
 """Rays that share a walk through the tree: whether anything is seen otherwise, what is saved, and where not.
 
 The claim is that nothing is: so pictures are compared bit by bit, and events one by one, with rays that each
@@ -264,7 +265,8 @@ def _look(flown: Flown, eye: _Eye, begins: Sequence[int]) -> _Seen:
     """Render the launches that begin at some ticks, and find the events."""
     _, height, width = eye.renderer.log_radiance.shape
     camera = EventCamera(EventCameraConfig(), width=width, height=height, device=eye.device)
-    frames, packets, lengths, asked, walk_s = [], [], [], [0.0], [0.0]
+    packets: list[EventArrays] = []
+    frames, lengths, asked, walk_s = [], [], [0.0], [0.0]
     for first in begins:
         eye.place(first)
         frames.append(eye.look())

@@ -1,5 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
 # mypy: disable-error-code="call-overload,empty-body,no-untyped-call,untyped-decorator,valid-type"
+# mypy: disable-error-code="no-untyped-def,union-attr"
 # ruff: noqa: UP018  (typed literals have a meaning in kernels)
 """One walk through the tree for all rays of a tile of pixels in several consecutive instants; exact.
 

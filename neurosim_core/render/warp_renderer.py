@@ -305,7 +305,7 @@ class WarpRenderer:
         self._instant_threads = tiles * TILE * TILE // rays_together
         rays = ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
-        self.rays = wp.array(rays, dtype=wp.vec4, device=device)
+        self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
         self._world_data = WorldData()
         self.walk = None
