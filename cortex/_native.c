@@ -1,4 +1,5 @@
-/* The way of a small message, in C: what `fast.py`, `gate.py` and `drain` of `subscriber.py` do, in a fifth of the time.
+/* The way of a message, in C: what `fast.py`, `gate.py` and `drain` of `packer.py` do, in a fifth of the time.
+   A large one is written into and read from a slot of shared memory, whose account `_ring.c` keeps.
 
    A `Flat` is made once per message type and publisher. It writes a message as a frame, as a record of a batch or as a bare body,
    and reads a frame or a body back. It is strict: of whatever is not exactly as usual (another class, an integer
