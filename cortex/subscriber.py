@@ -41,7 +41,8 @@ DRAIN_MAX = 64
 DRAIN_LOSSY_MAX = 4096
 """Where only the last messages count, all that has arrived is read: more than a socket holds."""
 PAUSE_NS = 1_000_000
-"""An asyncio loop that always finds a message runs other tasks after so long."""
+PAUSE_COUNT = 256
+"""An asyncio loop that always finds a message runs other tasks after so long, or so many messages."""
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
 WAIT_MAX_S = 0.1
@@ -100,6 +101,7 @@ class Subscriber(Generic[T]):
         self._generation = 0
         self._first = 0
         self._pause_ns = 0
+        self._in_a_row = 0
         self._raised = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
@@ -177,11 +179,11 @@ class Subscriber(Generic[T]):
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`.
 
-        A message that is there is returned without a switch of tasks, for up to a millisecond; then other
-        tasks get a turn. A task that is cancelled while it waits has taken no message.
+        A message that is there is returned without a switch of tasks, for up to a millisecond or 256
+        messages; then other tasks get a turn. A task that is cancelled while it waits has taken no message.
         """
         message: T
-        if monotonic_ns() < self._pause_ns and (message := self._take_now()) is not _LOST:
+        if self._may_go_on() and (message := self._take_now()) is not _LOST:
             return message
         reader = self._reader
         if reader is None or reader.loop is not asyncio.get_running_loop():
@@ -189,10 +191,10 @@ class Subscriber(Generic[T]):
                 reader.stop()
             reader = self._reader = LoopReader(self._watched, self._on_wake)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        if monotonic_ns() >= self._pause_ns:  # other tasks of the loop want to run, too
+        if self._in_a_row >= PAUSE_COUNT or monotonic_ns() >= self._pause_ns:  # others want to run, too
             await asyncio.sleep(0)
         while True:
-            self._pause_ns = monotonic_ns() + PAUSE_NS
+            self._in_a_row, self._pause_ns = 0, monotonic_ns() + PAUSE_NS
             message = self._take_now()
             if message is not _LOST:
                 return message
@@ -203,6 +205,11 @@ class Subscriber(Generic[T]):
             if left_s <= 0.0:
                 raise TimeoutError(self._nothing_came(timeout_s))
             await reader.wait(min(left_s, WAIT_MAX_S))
+
+    def _may_go_on(self) -> bool:
+        """Whether an asyncio task may take one more message before other tasks get a turn."""
+        self._in_a_row += 1
+        return self._in_a_row < PAUSE_COUNT and monotonic_ns() < self._pause_ns
 
     def _take_now(self) -> Any:
         """Take the next message if it is there; `_LOST` if not, or if it could not be read."""
@@ -218,7 +225,7 @@ class Subscriber(Generic[T]):
     async def _next_async(self) -> T:
         """As `recv_async`, with one coroutine less for a message that is there."""
         message: T
-        if monotonic_ns() < self._pause_ns and (message := self._take_now()) is not _LOST:
+        if self._may_go_on() and (message := self._take_now()) is not _LOST:
             return message
         return await self.recv_async()
 
