@@ -329,7 +329,7 @@ def test_a_latched_state_is_sent_again_to_a_subscriber_that_may_have_been_too_ea
 
             rig.update_until(stream)
         new = [data for data in ros.sent if data != ros.sent[0]]
-        assert len(set(new)) == len(new) > 10  # what streams is not repeated
+        assert len(set(new)) == len(new) > 2  # what streams is not repeated
 
 
 def test_what_cannot_be_converted_is_counted_and_the_next_one_goes_through(caplog):

@@ -73,7 +73,7 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["cmake", "--build", build, "-j2"],
         ["cmake", "--install", build, "--prefix", build / "installed"],
     ):
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=900.0, check=False)
         assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
     return build
 
