@@ -35,7 +35,9 @@ class SceneTable:
     scene: wp.array[int]
     """`scene_of_world` on the device, shape [world]."""
     data: wp.array[Any] | None
-    """Arrays of each scene, array of `SceneData`, shape [scene]; None: there is one, or no camera."""
+    """`completed` on the device, array of `SceneData`, shape [scene]; None: there is one, or no camera."""
+    completed: tuple[SceneData, ...]
+    """Arrays of each scene, with all that a kernel for all scenes reads; empty: `data` is None."""
     terms: Terms | None
     """What some scene needs in the kernel of the renderer; None: there is no camera."""
 
@@ -102,14 +104,14 @@ def make_scene_table(
     if arrays:
         terms = Terms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
         terms = terms._replace(worlds=True, world_scenes=len(arrays) > 1)
+    completed = tuple(_completed(a) for a in arrays) if len(arrays) > 1 else ()
     return SceneTable(
         models=made,
         scene_of_world=tuple(int(scene) for scene in chosen),
         fields=wp.array([m.free_space.arrays for m in made], dtype=DistanceField, device=device),
         scene=wp.array(chosen.astype(np.int32), dtype=int, device=device),
-        data=wp.array([_completed(a) for a in arrays], dtype=SceneData, device=device)
-        if len(arrays) > 1
-        else None,
+        data=wp.array(list(completed), dtype=SceneData, device=device) if completed else None,
+        completed=completed,
         terms=terms,
     )
 
@@ -125,10 +127,19 @@ def _in_scene(config: SimulationConfig, source: SceneSource) -> SimulationConfig
 
 
 def _completed(arrays: SceneArrays) -> SceneData:
-    """Return the arrays of a scene with what a kernel for textured scenes reads of one that is not."""
-    data = arrays.data
-    if not arrays.terms.textured:
-        materials = arrays.data.base_color.shape[0]
-        data.material_texture = wp.zeros(materials, dtype=wp.vec2i, device=arrays.device)
-        data.face_lod = wp.zeros(1, dtype=float, device=arrays.device)
+    """Return the arrays of a scene with what a kernel for textured scenes reads of one that is not.
+
+    On a CPU rays are shaded in packets without a branch (`packet_shading`): all of it is read, and not used.
+    """
+    if arrays.terms.textured:
+        return arrays.data
+    data = SceneData()  # that of the model stays as it is: others may look at it
+    for name in SceneData.vars:
+        setattr(data, name, getattr(arrays.data, name))
+    faces, materials, device = data.face_material.shape[0], data.base_color.shape[0], arrays.device
+    data.material_texture = wp.zeros(materials, dtype=wp.vec2i, device=device)
+    data.face_lod = wp.zeros(faces, dtype=float, device=device)
+    data.corner_uv = wp.zeros(3 * faces, dtype=wp.vec2, device=device)
+    data.levels = wp.array([(0, 1, 1)], dtype=wp.vec3i, device=device)
+    data.texels = wp.zeros(1, dtype=wp.uint32, device=device)
     return data

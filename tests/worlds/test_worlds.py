@@ -71,18 +71,22 @@ def test_places_of_their_own(plain):
         assert_same(snapshot(worlds.reset(velocity=still), 0), packets)
 
 
-def test_scenes_of_their_own(plain, textured):
+@pytest.mark.parametrize("render", [{}, {"lighting": {"mode": "unshadowed"}}], ids=["baked", "unshadowed"])
+def test_scenes_of_their_own(render, plain, textured):
     """Worlds in two scenes, of which one has textures, are what they are alone."""
     commands = commands_of("rates", 6, 3)
     worlds = make_worlds(
-        settings(plain), count=3, scenes=[scene_of(plain), scene_of(textured)], scene_of_world=[1, 0, 1]
+        settings(plain, render=render),
+        count=3,
+        scenes=[scene_of(plain), scene_of(textured)],
+        scene_of_world=[1, 0, 1],
     )
     seen = record(worlds, commands)
     pictures = [seen[0][world]["rgb"] for world in range(3)]
     assert not np.array_equal(pictures[0], pictures[1])
     assert np.array_equal(pictures[0], pictures[2])
     for world, path in enumerate((textured, plain, textured)):
-        alone = fly_alone(settings(path, seed=7 + world), commands[:, world])
+        alone = fly_alone(settings(path, seed=7 + world, render=render), commands[:, world])
         for step, packets in enumerate(alone):
             assert_same(seen[step][world], packets)
 
