@@ -46,6 +46,7 @@ class WorldCast:
     Attributes:
         pictures: The last picture of each image camera by name, shape [world, H, W] or [world, H, W, 3].
         events: The event cameras by name.
+        parity: Which of their two states is the present one; a step with a frame goes on to the other.
 
     Raises:
         ValueError: A camera has what only single runs have, or there is more than one launch can do.
@@ -96,6 +97,7 @@ class WorldCast:
         self._q_WC = wp.zeros(world_count * instant_count, dtype=wp.quat, device=device)
         self._bodies = arrays.bodies
         self._make_bodies(bodies)
+        self.parity = 0
         self._slots: dict[tuple[int, bool], Any] = {}
         shape = (world_count, cast.lens.height, cast.lens.width)
         frames = (world_count * instant_count, *shape[1:])

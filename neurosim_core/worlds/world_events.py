@@ -210,7 +210,7 @@ class WorldEventCamera:
             clock_ns: Time of each world at the begin of the step [ns].
             offsets_ns: From there to the last frame seen before, and to each frame [ns]; seen before on the
                 host, so that nothing is allocated.
-            parity: Which of the two states is the present one; the other is after this.
+            parity: Which of the two states is the present one; the other is after this, if there is a frame.
         """
         frame_count = len(offsets_ns) - 1
         world_count = self._base.shape[0]

@@ -122,7 +122,6 @@ class Worlds:
         self._graphs = Graphs(device)
         self._observations: dict[Pattern, Observation] = {}
         self._now_ns: int | None = None
-        self._parity = 0
         self.duration_ns = 0
 
     @property
@@ -183,7 +182,7 @@ class Worlds:
             cast.begin(self._vehicle, self._clock)
             cast.render(1, names, self._mask)
             for camera in cast.events.values():
-                camera.begin(self._mask, self._parity)
+                camera.begin(self._mask, cast.parity)
         self._everybody.fill_(1)
         if mask is None:
             self._now_ns = 0
@@ -210,10 +209,10 @@ class Worlds:
             ValueError: Commands on the host are of a wrong shape or not finite. Those on the device are not
                 looked at: a vehicle whose command is not finite is held (`Observation.status`).
         """
-        order, pattern, parity = self._plan(commands, mode)
+        order, pattern, parities = self._plan(commands, mode)
         self._graphs.run(
-            (order, pattern, parity),
-            lambda: [launch() for launch in self._phases(order, pattern, parity).values()],
+            (order, pattern, parities),
+            lambda: [launch() for launch in self._phases(order, pattern, parities).values()],
         )
         return self._observe(pattern)
 
@@ -222,30 +221,37 @@ class Worlds:
 
         Arguments and errors as for `step`.
         """
-        order, pattern, parity = self._plan(commands, mode)
+        order, pattern, parities = self._plan(commands, mode)
         wall_s = {}
         wp.synchronize_device(self.device)
-        for name, launch in self._phases(order, pattern, parity).items():
+        for name, launch in self._phases(order, pattern, parities).items():
             begin = time.perf_counter()
             launch()
             wp.synchronize_device(self.device)
             wall_s[name] = time.perf_counter() - begin
         return wall_s
 
-    def _plan(self, commands: Any, mode: CommandMode) -> tuple[str | None, Pattern, int]:
-        """Take commands, and return what the next step is made of; the host's time moves on."""
+    def _plan(self, commands: Any, mode: CommandMode) -> tuple[str | None, Pattern, tuple[int, ...]]:
+        """Take commands, and return what the next step is made of; the host's time moves on.
+
+        The last is which of their two states the event cameras of each cast are in.
+        """
         if self._now_ns is None:
             raise RuntimeError("reset() must be called before step()")
         order = None if commands is None else self._take_commands(commands, mode)
-        pattern, parity = self._timetable.at(self._now_ns), self._parity
+        pattern = self._timetable.at(self._now_ns)
+        parities = tuple(cast.parity for cast in self._casts)
         for cast, offsets_ns, names in zip(self._casts, pattern.offsets_ns, pattern.pictures, strict=True):
             cast.prepare(offsets_ns, picture=bool(names))
-        self._parity = 1 - parity
+            if len(offsets_ns) > 1:  # without a frame nothing is written, and the state stays where it is
+                cast.parity = 1 - cast.parity
         self._now_ns += pattern.duration_ns
         self.duration_ns = pattern.duration_ns
-        return order, pattern, parity
+        return order, pattern, parities
 
-    def _phases(self, order: str | None, pattern: Pattern, parity: int) -> dict[str, Callable[[], None]]:
+    def _phases(
+        self, order: str | None, pattern: Pattern, parities: tuple[int, ...]
+    ) -> dict[str, Callable[[], None]]:
         """Return what launches the parts of a step, by name and in order."""
         arrays = self._vehicle.arrays
 
@@ -263,7 +269,7 @@ class Worlds:
                     cast.render(len(offsets_ns) - 1, names, self._everybody)
 
         def find_events() -> None:
-            for cast, offsets_ns in zip(self._casts, pattern.offsets_ns, strict=True):
+            for cast, offsets_ns, parity in zip(self._casts, pattern.offsets_ns, parities, strict=True):
                 for camera in cast.events.values():
                     camera.find(self._clock, offsets_ns, parity)
             self._launch(flight.end_period, [pattern.duration_ns], [self._clock])

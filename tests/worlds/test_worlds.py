@@ -11,7 +11,7 @@ import warp as wp
 from world_rig import RIG, assert_same, commands_of, fly_alone, room, scene_of, settings, snapshot
 
 import neurosim_core as ns
-from neurosim_core.packets import Collision
+from neurosim_core.packets import Collision, Events
 from neurosim_core.render import launch
 from neurosim_core.simulation import StartState
 from neurosim_core.vehicle.status import STATUS_TERMS
@@ -141,6 +141,34 @@ def test_walks_that_rays_share(textured):
             config = settings(textured, seed=7 + world, sensors=rig, render=render)
             for step, packets in enumerate(fly_alone(config, commands[:, world])):
                 assert_same(seen[step][world], packets)
+
+
+@pytest.mark.parametrize(("front_hz", "side_hz"), [(50, 250), (30, 400)])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_event_cameras_that_miss_steps(front_hz, side_hz, noisy, plain):
+    """Steps without a frame of one camera or the other, or with now two and now three, change no event."""
+    pixel = {"threshold_on": 0.12, "threshold_off": 0.1, **(NOISE if noisy else {})}
+    rig = {
+        name: {**RIG["front"], "sampling_rate_hz": rate, "packet_rate_hz": rate, "pixel": pixel}
+        for name, rate in (("front", front_hz), ("side", side_hz))
+    }
+    commands = commands_of("rates", 12, 2)
+    seen = record(make_worlds(settings(plain, sensors=rig), count=2), commands)
+    for world in range(2):
+        alone = fly_alone(settings(plain, seed=7 + world, sensors=rig), commands[:, world])
+        for name in rig:
+            found = [p.numpy() for step in alone for p in step if isinstance(p, Events) and p.sensor == name]
+            of_steps = [step[world][name] for step in seen]
+            for column, expected in zip(in_order(of_steps), in_order(found), strict=True):
+                np.testing.assert_array_equal(column, expected)
+            assert sum(len(part[0]) for part in found) > 100
+
+
+def in_order(parts: list[tuple]) -> list[np.ndarray]:
+    """Return t, x, y and polarity of several packets in one, sorted by (t, y, x, polarity)."""
+    t, x, y, polarity = (np.concatenate([part[index] for part in parts]) for index in range(4))
+    order = np.lexsort((polarity, x, y, t))
+    return [t[order], x[order], y[order], polarity[order]]
 
 
 def test_what_moves_by_itself(plain):
