@@ -408,22 +408,11 @@ class Publisher(Generic[T]):
 
     def _publish_slot(self, slot: Slot, size: int, stamp_ns: int, now_ns: int) -> bool:
         """Send what was written into a slot; both locks are held."""
-        if self._blocked:
-            self._prepare(now_ns)
-        if self._batch:
-            self._flush()
-        on_time = not self._late
-        mask, full, passed_over = self._large.grant(slot.ring)
-        if full:
-            self._block()
-            try:
-                on_time &= self._large.await_strict(slot.ring)
-            finally:
-                self._blocked = False
-            mask, _, passed_over = self._large.grant(slot.ring)
-        on_time &= not self._large.is_leaving_out
-        if self._closed:
-            self._check_open()
+        try:
+            mask, passed_over, on_time = self._await_readers(slot, now_ns)
+        except BaseException:  # of a signal, say, while it waits
+            self._large.abandon(slot)
+            raise
         stamps = Stamps(self._gate.sequence, stamp_ns, now_ns)
         self._gate.sequence += 1
         self._gate.bytes += size
@@ -438,6 +427,29 @@ class Publisher(Generic[T]):
         self._timeouts += not on_time
         self._arm()
         return on_time
+
+    def _await_readers(self, slot: Slot, now_ns: int) -> tuple[int, bool, bool]:
+        """Wait until reliable readers have room for one more slot; both locks are held.
+
+        Returns:
+            The columns that get a lease, whether some reader is passed over, whether all had room in time.
+        """
+        if self._blocked:
+            self._prepare(now_ns)
+        if self._batch:
+            self._flush()
+        on_time = not self._late
+        mask, full, passed_over = self._large.grant(slot.ring)
+        if full:
+            self._block()
+            try:
+                on_time &= self._large.await_strict(slot.ring)
+            finally:
+                self._blocked = False
+            mask, _, passed_over = self._large.grant(slot.ring)
+        if self._closed:
+            self._check_open()
+        return mask, passed_over, on_time and not self._large.is_leaving_out
 
     def _block(self) -> None:
         """Make other threads wait until this message is sent; the lock is held."""

@@ -145,10 +145,14 @@ class Ring:
             self.ledger.commit(slot, sequence, body_size, mask)
 
     def abandon(self, slot: int) -> None:
-        """Give back a slot from `acquire` that will not be committed, as when a message cannot be encoded."""
+        """Give back a slot from `acquire` that will not be committed, as when a message cannot be encoded.
+
+        Harmless after `close`.
+        """
         with self._lock:
-            self._check_writing(slot)
-            self.ledger.abandon(slot)
+            if not self._closed:
+                self._check_writing(slot)
+                self.ledger.abandon(slot)
 
     def revoke(self, slot: int, mask: int) -> None:
         """Take the leases of `mask` back, because the message could not be sent."""

@@ -185,3 +185,40 @@ def test_who_hoards_every_slot_costs_a_reliable_reader_nothing(node):
         assert (message.ranges == number).all()
         hoard.append(message)
     assert subscriber.counters.lost == 0
+
+
+class Interrupted(Exception):
+    """Raised by a signal, as Ctrl-C raises KeyboardInterrupt."""
+
+
+def accepted_before(error: type[Exception], publisher: Publisher[Scan]) -> int:
+    """Publish until that raises; return how many messages were taken."""
+    for count in range(64):
+        try:
+            publisher.publish(scan(1))
+        except error:
+            return count
+    raise AssertionError("there was always room")
+
+
+def test_an_interrupted_publish_gives_its_slot_back(node, monkeypatch):
+    """A reliable reader has no room, and the wait for it is broken off, again and again."""
+    publisher, subscriber = connected(node, Scan, reliable(2, timeout_s=30.0))
+    publisher.publish(scan(0))
+    wait_for(lambda: is_shared(subscriber.recv(1.0)))
+
+    def interrupted(_ring: object) -> bool:
+        raise Interrupted
+
+    accepted: list[int] = []
+    for _ in range(12):  # more often than there are slots
+        with monkeypatch.context() as patched:
+            patched.setattr(publisher._large, "await_strict", interrupted)
+            count = accepted_before(Interrupted, publisher)
+        accepted.append(count)
+        for _ in range(count):
+            subscriber.recv(5.0)
+    assert len(set(accepted)) == 1
+    ring = publisher._large._ring
+    assert ring is not None
+    assert not ring.in_writing
