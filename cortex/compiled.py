@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 from typing import Any
 
@@ -13,6 +14,4 @@ native: Any = None
 """`cortex._native`, or None."""
 if not os.environ.get("CORTEX_PURE_PYTHON"):
     with contextlib.suppress(ImportError):  # there was no compiler when this was installed
-        from cortex import _native
-
-        native = _native
+        native = importlib.import_module("cortex._native")
