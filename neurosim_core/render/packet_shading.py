@@ -184,7 +184,6 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
     for name, value in names.items():
         snippet = snippet.replace(name, value)
 
-    @wp.func_native(snippet)
     def shade_packet(
         face_material: wp.array[int],
         face_lod: wp.array[float],
@@ -207,4 +206,6 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
         total: wp.array[wp.vec3],
     ): ...
 
-    return shade_packet
+    if textured:  # by its name the code of a kernel tells whether it samples textures
+        shade_packet.__name__ = shade_packet.__qualname__ = "shade_textured_packet"
+    return wp.func_native(snippet)(shade_packet)
