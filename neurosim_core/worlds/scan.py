@@ -287,7 +287,7 @@ def begin_noise(
     # Model:
     models: wp.array[PixelModel],
     phase_stream: wp.uint32,
-    random_phase: wp.bool,
+    random_phase: wp.array[wp.bool],
     # In:
     mask: wp.array[wp.int32],
     base: wp.array2d[wp.float32],
@@ -297,19 +297,20 @@ def begin_noise(
     """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
     world, pixel = wp.tid()
     if mask[world] != 0:
-        begin_pixel(models[world], phase_stream, random_phase, base[world], pixel, memory_out[world])
+        begin_pixel(models[world], phase_stream, random_phase[world], base[world], pixel, memory_out[world])
 
 
 @wp.kernel
 def find_overflow(
     # Model:
-    event_count_max: wp.int64,
+    capacity: wp.int32,
+    event_count_max: wp.array[wp.int32],
     # In/out:
     stack: Stack,
 ) -> None:
     """Mark the worlds that have more events than may be in a step, and clear their table."""
     world = wp.tid()
-    if stack.counters[world, 0] > event_count_max:
+    if stack.counters[world, 0] > wp.int64(wp.min(capacity, event_count_max[world])):
         stack.overflow[world] = 1
         for frame in range(stack.table.shape[1]):
             for row in range(stack.table.shape[2]):
@@ -319,7 +320,8 @@ def find_overflow(
 @wp.kernel
 def limit_rows(
     # Model:
-    frame_event_count_max: wp.int32,
+    frame_capacity: wp.int32,
+    event_count_max: wp.array[wp.int32],
     # In/out:
     stack: Stack,
 ) -> None:
@@ -327,6 +329,7 @@ def limit_rows(
     world = wp.tid()
     if stack.overflow[world] == 0:
         return
+    most = wp.min(frame_capacity, event_count_max[world])
     lost = wp.int32(0)
     for frame in range(stack.table.shape[1]):
         kept = wp.int32(0)
@@ -334,7 +337,7 @@ def limit_rows(
         full = wp.bool(False)
         for row in range(stack.table.shape[2]):
             count = stack.table[world, frame, row]
-            full = full or kept + count > frame_event_count_max
+            full = full or kept + count > most
             if full:
                 lost += count
             else:

@@ -57,7 +57,10 @@ class WorldEvents:
     def numpy(self, world: int) -> tuple[Any, Any, Any, Any]:
         """Return t, x, y and polarity of one world on the host; waits for the device."""
         begin, end = (int(edge) for edge in self.offsets.numpy()[world : world + 2])
-        return tuple(np.array(c.numpy()[begin:end]) for c in (self.t, self.x, self.y, self.polarity))  # type: ignore[return-value]
+        columns = (self.t, self.x, self.y, self.polarity)
+        if begin == end:  # Warp refuses an empty slice
+            return tuple(np.empty(0, dtype=wp.dtype_to_numpy(column.dtype)) for column in columns)  # type: ignore[return-value]
+        return tuple(np.array(column[begin:end].numpy()) for column in columns)  # type: ignore[return-value]
 
 
 class WorldEventCamera:
@@ -98,7 +101,9 @@ class WorldEventCamera:
         self._row_shift = SUB_BITS + (width - 1).bit_length()
         self._time_shift = self._row_shift + (height - 1).bit_length() + 1
         self._capacity = capacity
-        self._step_count_max = min(capacity, configs[0].event_count_max)
+        self._event_count_max: Any = wp.array(
+            [config.event_count_max for config in configs], dtype=wp.int32, device=self.device
+        )
         self._base = self._empty((world_count, pixel_count), wp.float32)
         self._last = [self._empty((world_count, pixel_count), wp.float32) for _ in range(2)]
         self._crossed = [self._empty((world_count, pixel_count), wp.vec2i) for _ in range(2)]
@@ -130,6 +135,8 @@ class WorldEventCamera:
         )
         self._noise: list[PixelNoise] = []
         self._models: Any = None
+        self._phase_stream = 0
+        self._random_phase: Any = None
         self._memories: list[Any] = []
         if self.terms:
             self.seed(seeds)
@@ -163,6 +170,10 @@ class WorldEventCamera:
         ]
         if self._models is None:
             self._models, self._memories = models, memories
+            self._phase_stream = noise[0].phase()[0]  # it hangs on the name of the sensor
+            self._random_phase = wp.array(
+                [each.phase()[1] for each in noise], dtype=wp.bool, device=self.device
+            )
         else:  # graphs hold these arrays
             for array, values in zip((self._models, *self._memories), (models, *memories), strict=True):
                 wp.copy(array, values)
@@ -188,7 +199,7 @@ class WorldEventCamera:
             wp.launch(
                 scan.begin_noise,
                 dim=shape,
-                inputs=[self._models, *self._noise[0].phase(), mask, self._base],
+                inputs=[self._models, self._phase_stream, self._random_phase, mask, self._base],
                 outputs=[self._memories[parity]],
                 device=self.device,
             )
@@ -217,11 +228,13 @@ class WorldEventCamera:
         self._launch(scan.begin_step, world_count, [clock_ns, self.offsets(offsets_ns)], [self._stack])
         if frame_count > 0:
             self._take_frames(frame_count, scan.ALL, parity)
-            self._launch(scan.find_overflow, world_count, [self._step_count_max], [self._stack])
+            self._launch(
+                scan.find_overflow, world_count, [self._capacity, self._event_count_max], [self._stack]
+            )
             if self.device.is_cuda or self._stack.overflow.numpy().any():
                 self._take_frames(frame_count, scan.COUNT, parity)
-                each = min(self._capacity // frame_count, self._configs[0].event_count_max)
-                self._launch(scan.limit_rows, world_count, [each], [self._stack])
+                each = self._capacity // frame_count
+                self._launch(scan.limit_rows, world_count, [each, self._event_count_max], [self._stack])
                 self._take_frames(frame_count, scan.AGAIN, parity)
         self._hand_out()
 

@@ -252,6 +252,38 @@ def test_more_events_than_fit(textured):
             assert_same(seen[step][world], limited[step] if count else free[step])
 
 
+def test_as_many_events_as_each_world_may_have(textured):
+    """What a frame may yield at most differs from world to world."""
+    rig = {"front": {**RIG["front"], "pixel": {"threshold_on": 0.03, "threshold_off": 0.03}}}
+    config = settings(textured, sensors=rig)
+    commands = commands_of("rates", 4, 2)
+    given = {"front.event_count_max": [100_000, 100]}
+    worlds = make_worlds(config, count=2, parameters=given, event_capacity=50_000)
+    seen = record(worlds, commands, body_rate=[0.0, 0.0, 3.0])
+    lost = [sum(step[world]["dropped"]["front"] for step in seen) for world in range(2)]
+    assert lost[0] == 0 < lost[1]
+    for world, most in enumerate(given["front.event_count_max"]):
+        own = {"sensors.front.pixel.event_count_max": most, "seed": 7 + world}
+        start = StartState(body_rate=[0.0, 0.0, 3.0])
+        for step, packets in enumerate(fly_alone(config, commands[:, world], overrides=own, start=start)):
+            assert_same(seen[step][world], packets)
+
+
+def test_random_phases_in_some_worlds(plain):
+    """Voltages of stochastic pixels begin at a random phase in one world, and at 0 in the other."""
+    pixel = {"stochastic": {"k1": 5.3, "k2": 20.0, "k3": 1e-4, "k4": 1e-7, "k5": 5e-9, "k6": 1e-5}}
+    rig = {"front": {**RIG["front"], "pixel": pixel}}
+    config = settings(plain, sensors=rig)
+    commands = commands_of("rates", 3, 2)
+    seen = record(
+        make_worlds(config, count=2, parameters={"front.stochastic.random_phase": [1, 0]}), commands
+    )
+    for world, phase in enumerate((True, False)):
+        own = {"sensors.front.pixel.stochastic.random_phase": phase, "seed": 7 + world}
+        for step, packets in enumerate(fly_alone(config, commands[:, world], overrides=own)):
+            assert_same(seen[step][world], packets)
+
+
 def test_a_collision_holds_one_world(plain):
     """It is told and held where it touched; the other flies on as if alone."""
     config = settings(plain, vehicle={"on_collision": "end"})
