@@ -24,7 +24,8 @@ from neurosim_core.worlds.parameters import Rig, lens_tables
 from neurosim_core.worlds.scenes import SceneTable
 from neurosim_core.worlds.world_events import WorldEventCamera
 
-_THREAD_COUNT_MAX = 2**31 - 1
+_INDEX_MAX = 2**31 - 1
+"""Threads of a launch and events of all worlds are counted in 32 bits."""
 
 
 class WorldCast:
@@ -77,10 +78,16 @@ class WorldCast:
         terms = terms._replace(world_lenses=len(lenses) > 1)
         if terms.world_scenes or terms.world_lenses:  # walks change nothing but the speed
             terms = terms._replace(walked=False, by_tile=False)
+        room = capacity or max(1024, 2 * cast.lens.width * cast.lens.height)
+        if cast.event_cameras and world_count * room > _INDEX_MAX:
+            raise ValueError(
+                f"{world_count} worlds with room for {room} events each are more than 2^31: give a smaller "
+                f"event_capacity, at most {_INDEX_MAX // world_count}, or take fewer worlds"
+            )
         tiles = -(-cast.lens.width // TILE) * -(-cast.lens.height // TILE)
         rays_together = TILE * TILE if terms.by_tile else PACKET if terms.embree else 1
         self._instant_threads = tiles * TILE * TILE // rays_together
-        if world_count * instant_count * tiles * TILE * TILE > _THREAD_COUNT_MAX:
+        if world_count * instant_count * tiles * TILE * TILE > _INDEX_MAX:
             raise ValueError(
                 f"{world_count} worlds of {instant_count} instants of {self._size[0]} x {self._size[1]} px "
                 "are more than 2^31 rays a step: take fewer worlds, or commands more often"
@@ -122,7 +129,7 @@ class WorldCast:
                 frames=self._outputs["log_radiance"].reshape(
                     (world_count, instant_count, cast.lens.width * cast.lens.height)
                 ),
-                capacity=capacity or max(1024, 2 * cast.lens.width * cast.lens.height),
+                capacity=room,
                 sensor=name,
                 seeds=seeds,
                 ordered=ordered,

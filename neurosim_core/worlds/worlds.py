@@ -522,8 +522,8 @@ def make_worlds(
     chosen = chosen.of(next(iter(chosen.vehicles)))
     if device is not None:
         chosen = chosen.model_copy(update={"device": device})
-    if event_capacity is not None and not 1 <= event_capacity <= (2**31 - 1) // count:
-        raise ValueError(f"event_capacity must be in [1, 2^31 / count), got {event_capacity}")
+    if event_capacity is not None and event_capacity < 1:
+        raise ValueError(f"event_capacity must be 1 at least, got {event_capacity}")
     table = make_scene_table(chosen, count=count, scenes=scenes, models=models, scene_of_world=scene_of_world)
     return Worlds(
         chosen,

@@ -430,6 +430,11 @@ def test_a_step_allocates_nothing(plain):
         ({}, {"scene_of_world": [0, 1]}, r"scene_of_world must be in \[0, 0\], got 0 to 1"),
         ({}, {"seeds": [1, 2, 3]}, r"shape \[2\]"),
         ({}, {"event_capacity": 0}, "event_capacity"),
+        (
+            {},
+            {"event_capacity": 2**30},
+            r"more than 2\^31: give a smaller event_capacity, at most 1073741823",
+        ),
         ({"vehicles": {"a": {}, "b": {}}}, {}, "one vehicle, got a, b"),
         ({"control": {"rate_hz": 120}}, {}, "rate_hz must divide control.rate_hz = 120"),
     ],
@@ -447,6 +452,18 @@ def test_cameras_that_are_refused(front, message, plain):
     rig = {"front": {**RIG["front"], **front}}
     with pytest.raises(ValueError, match=message):
         make_worlds(settings(plain, sensors=rig), count=2)
+
+
+def test_more_than_32_bits_can_count(plain):
+    """Said before anything is allocated: rooms for events, and the lists of shared walks."""
+    lens = {"width": 640, "height": 480, "horizontal_fov_rad": 1.5}
+    rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
+    with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):
+        make_worlds(settings(plain, sensors=rig, control={"rate_hz": 100}), count=4096)
+    walking = {"lighting": {"mode": "unshadowed"}, "shared_walk": {"face_count_max": 4096}}
+    rig["front"]["lens"] = {**lens, "width": 128, "height": 128}
+    with pytest.raises(ValueError, match=r"shared walks of 256 tiles .* are more than 2.31"):
+        make_worlds(settings(plain, sensors=rig, render=walking), count=4096)
 
 
 def test_wrong_calls(plain):
