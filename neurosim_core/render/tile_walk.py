@@ -26,12 +26,22 @@ max|a, b, c| |c - b|; a ray is within rounding of an edge if the function is bel
 product. The distance of a triangle is off by less than TIE / 2 of it, unless the triangle is seen nearly from
 the side or is a sliver (SIDE): rays within rounding of such a one ask the tree.
 
+Frustums and the sides of tiles hold all rays of a tile by an angle of 1e-5 rad to spare. What that has to
+cover is the rounding of rays and of the camera's axes when they are rotated (5e-7 rad each), of the unit
+normals of the sides (5e-7 rad), and of a triangle's corners along them (1e-6 of the distance): 3e-6 rad
+together, wherever in the picture, because all of it is measured as angles. Bounds are kept as slopes x / z,
+and a slope is an angle only short of 90 degrees from the axis: lenses are taken up to a slope of 100 (89.4
+degrees), where the 1e-5 rad move a bound by two thousandths of itself at most, and are refused beyond. A
+triangle whose plane contains the ray to within rounding is the one exception: Woop's test can hit it outside
+of its edges, and where that is outside of the frustum, too, the tree may see it and a list not.
+
 Reference: Woop, Benthin, Wald (2013), Watertight Ray/Triangle Intersection. The frustum: Reshetov, Soupikov,
 Hurley (2005), Multi-Level Ray Tracing Algorithm.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
+import math
 from functools import cache
 
 import numpy as np
@@ -48,8 +58,12 @@ BLOCK = TILE * TILE
 ASK = -2
 """In place of a face: the list does not tell, ask the tree."""
 
-_BORDER = 1.0e-5
-"""By how much the rays of a tile are taken to reach beyond their border, on the plane z = 1."""
+_BORDER_RAD = 1.0e-5
+"""By how much the rays of a tile are taken to reach beyond their border [rad]."""
+_SLOPE_MAX = 100.0
+"""Largest |x / z| and |y / z| of a ray: 89.4 degrees from the axis."""
+_INDEX_MAX = 2**31 - 1
+"""Kernels count in 32 bits."""
 _FAR_M = wp.constant(1.0e9)
 _ROUNDING = wp.constant(4.0e-6)
 """Of the coordinates of a scene: what frustums are widened by."""
@@ -253,7 +267,7 @@ _FACE_TEST = (
 #endif
     for (int side = lane; side < 4; side += lanes) {
         const float slope = bounds[side];
-        border[side] = (side % 2 ? -1.0f : 1.0f) * ((side < 2 ? x : y) - slope * z);
+        border[side] = normalize((side % 2 ? -1.0f : 1.0f) * ((side < 2 ? x : y) - slope * z));
         corner[side] = normalize(bounds[side % 2] * x + bounds[2 + side / 2] * y + z);
     }
     auto prepare = [&](int face, Face& to) {
@@ -545,7 +559,8 @@ def walk_kernel(lanes: int) -> wp.Kernel:
 def tile_bounds(rays: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Return the least and largest x / z and the least and largest y / z of the rays of each tile.
 
-    They are widened by more than rounding.
+    They are widened by 1e-5 rad, more than rounding. A ray that reaches z = 1 after the length L, and a plane
+    x = (s + ds) z where it has the slope s, are ds / (L sqrt(1 + s^2)) apart [rad].
 
     Args:
         rays: Rays in C, shape [layer, H * W, 3 or more].
@@ -556,19 +571,42 @@ def tile_bounds(rays: NDArray[np.float32], width: int, height: int) -> NDArray[n
         Bounds, shape [tile, 4], tiles row by row.
 
     Raises:
-        ValueError: A ray does not look forward (z <= 0).
+        ValueError: A ray does not look forward (z <= 0), or is too close to 90 degrees from the axis: |x / z|
+            or |y / z| is above 100.
     """
     directions = rays[..., :3].astype(np.float64).reshape(-1, height, width, 3)
     if not (directions[..., 2] > 0.0).all():
         raise ValueError("rays that share a walk must look forward, and some of this lens do not (z <= 0)")
     slopes = directions[..., :2] / directions[..., 2:]
+    steepest = float(np.abs(slopes).max())
+    if steepest > _SLOPE_MAX:
+        raise ValueError(
+            f"rays that share a walk must have |x / z| and |y / z| up to {_SLOPE_MAX:g} "
+            f"({math.degrees(math.atan(_SLOPE_MAX)):.1f} deg from the axis), and this lens has "
+            f"{steepest:.4g}: take a narrower lens, or set render.shared_walk to null"
+        )
+    length = np.sqrt(1.0 + (slopes**2).sum(axis=-1, keepdims=True))
+    widened = _BORDER_RAD * length * np.sqrt(1.0 + slopes**2)
+    lowest, highest = slopes - widened, slopes + widened
     bounds = []
     for top in range(0, height, TILE):
         for left in range(0, width, TILE):
-            part = slopes[:, top : top + TILE, left : left + TILE].reshape(-1, 2)
-            low, high = part.min(axis=0) - _BORDER, part.max(axis=0) + _BORDER
+            part = np.s_[:, top : top + TILE, left : left + TILE]
+            low, high = lowest[part].min(axis=(0, 1, 2)), highest[part].max(axis=(0, 1, 2))
             bounds.append((low[0], high[0], low[1], high[1]))
     return np.array(bounds, dtype=np.float32)
+
+
+def _check_counts(config: WalkConfig, *, walks: int, tiles: int) -> None:
+    """Refuse what kernels, which count in 32 bits, cannot address: threads, and entries of the lists."""
+    longest = _INDEX_MAX // (walks * tiles)
+    if max(config.face_count_max, BLOCK) > longest:
+        allowed = f"at most {longest}" if longest >= BLOCK else "no value is small enough"
+        raise ValueError(
+            f"{walks} shared walks of {tiles} tiles with render.shared_walk.face_count_max = "
+            f"{config.face_count_max} are more than 2^31 - 1 entries: {allowed} here; or take fewer worlds "
+            "or pixels, or share a walk between more instants (render.shared_walk.instants)"
+        )
 
 
 class TileWalk:
@@ -603,14 +641,16 @@ class TileWalk:
             thread_count: Threads on a CPU device; all cores if None.
 
         Raises:
-            ValueError: A ray does not look forward (z <= 0).
+            ValueError: A ray does not look forward enough (`tile_bounds`), or there are more than 2^31 - 1
+                threads or entries of the lists.
         """
+        walks = -(-instant_count // config.instants)
+        _check_counts(config, walks=walks, tiles=-(-width // TILE) * -(-height // TILE))
         bounds = tile_bounds(rays, width, height)
         self._mesh, self._width, self._height, self._extent_m = mesh, width, height, extent_m
         self._device = str(mesh.device)
         self._thread_count = thread_count
         self._lanes = 1 if mesh.device.is_cpu else BLOCK
-        walks = -(-instant_count // config.instants)
         self.data = WalkData()
         self.data.instants = config.instants
         self.data.limit = config.face_count_max

@@ -42,6 +42,8 @@ _logger = logging.getLogger(__name__)
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _MIDDLE_GREY = 0.2
 _BRIGHT = 0.6
+_THREAD_COUNT_MAX = 2**31 - 1
+"""Kernels count in 32 bits."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -293,14 +295,20 @@ class WarpRenderer:
             thread_count: Threads on a CPU device; all cores if None.
 
         Raises:
-            ValueError: If an output is unknown or none is asked for, or rays that share a walk do not look
-                forward.
+            ValueError: If an output is unknown or none is asked for, the instants have more than 2^31 - 1
+                rays of a layer together, or rays that share a walk do not look forward or are too many.
         """
         self._kernel = raycast_kernel(outputs, arrays.terms)
         self._arrays = arrays
         self._width, self._height = lens.width, lens.height
         self._thread_count = thread_count
         tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
+        most = _THREAD_COUNT_MAX // (tiles * TILE * TILE)
+        if instant_count > most:
+            raise ValueError(
+                f"{instant_count} instants of {lens.width} x {lens.height} px are more than 2^31 - 1 rays a "
+                f"launch: at most {most} instants of this size (instants_per_launch), or take fewer pixels"
+            )
         rays_together = TILE * TILE if arrays.terms.by_tile else PACKET if arrays.terms.embree else 1
         self._instant_threads = tiles * TILE * TILE // rays_together
         rays = ray_layers(lens, arrays.config.samples_per_pixel)

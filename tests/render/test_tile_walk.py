@@ -138,6 +138,55 @@ def test_same_bits_where_rounding_decides(device):
         assert_same(render(form, lens, poses, outputs=OUTPUTS, device=device), expected)
 
 
+def along_borders(lens, count, seed):
+    """Triangles in C with an edge along the outermost rays of a tile, and the rest of them outside of it.
+
+    The edge lies within a few roundings of the plane through those rays, on either side.
+    """
+    rng = np.random.default_rng(seed)
+    fx, fy, cx, cy = lens.intrinsics()
+    corners = np.empty((count, 3, 3))
+    for triangle in corners:
+        axis = int(rng.integers(2))  # 0: the border is a column, 1: a row
+        size, focal, centre = ((lens.width, fx, cx), (lens.height, fy, cy))[axis]
+        other_size, other_focal, other_centre = ((lens.height, fy, cy), (lens.width, fx, cx))[axis]
+        outwards = rng.choice([-1.0, 1.0])
+        pixel = 8 * int(rng.integers(size // 8)) + (7 if outwards > 0.0 else 0)
+        angle = np.arctan((pixel + 0.5 - centre) / focal) + rng.choice([0.0, 1e-7, 3e-7]) * rng.choice(
+            [-1, 1]
+        )
+        angles = np.array([angle, angle, angle + outwards * rng.uniform(0.02, 0.1)])
+        along = (rng.uniform(0.0, other_size, 3) - other_centre) / other_focal
+        direction = np.empty((3, 3))
+        direction[:, axis] = np.sin(angles)
+        direction[:, 1 - axis] = along * np.cos(angles)
+        direction[:, 2] = np.cos(angles)
+        distance = rng.uniform(1.0, 4.0, (3, 1))
+        triangle[:] = distance * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return corners
+
+
+@pytest.mark.parametrize("behind", ["sky", "walls"])
+@pytest.mark.parametrize("fov_deg", [90.0, 170.0, 178.5])
+def test_same_bits_where_silhouettes_run_along_tiles(device, fov_deg, behind):
+    lens = PinholeConfig(width=40, height=32, horizontal_fov_rad=np.radians(fov_deg))
+    hits = 0
+    for seed in range(8):
+        turn = Rotation.random(random_state=seed)
+        place = np.random.default_rng(seed).uniform(-1.0, 1.0, 3)
+        corners = turn.apply(along_borders(lens, 60, seed).reshape(-1, 3)) + place
+        parts = [trimesh.Trimesh(corners, np.arange(180).reshape(-1, 3), process=False)]
+        parts += [box((12.0, 12.0, 12.0), (0.0, 0.0, 0.0))] if behind == "walls" else []
+        poses = [(tuple(place), tuple(turn.as_quat()))] * 2
+        scene = scene_of(*parts)
+        expected = render(scene, lens, poses, outputs=("instance", "depth"), config=ALONE, device=device)
+        arrays = upload_scene(scene, together(), device)
+        for form in (arrays, by_block(arrays)):
+            assert_same(render(form, lens, poses, outputs=("instance", "depth"), device=device), expected)
+        hits += (expected["instance"] == 0).sum()
+    assert hits > 1000
+
+
 def test_same_bits_beside_the_sky(device):
     """Rays that hit nothing, in tiles with something and in tiles without."""
     expected = compare(scene_of(box((0.3, 0.3, 0.3), (0.5, 0.2, 0.0))), path(5), device, instants=5)
@@ -274,6 +323,53 @@ def test_bounds_hold_the_rays_of_a_tile():
         assert high - 5e-5 < part[..., axis].max() < high
     with pytest.raises(ValueError, match="must look forward"):
         tile_bounds(-rays, 45, 34)
+
+
+@pytest.mark.parametrize("fov_deg", [60.0, 170.0, 178.8])
+def test_rays_are_inside_of_bounds_by_an_angle(fov_deg):
+    lens = PinholeConfig(width=40, height=32, horizontal_fov_rad=np.radians(fov_deg))
+    rays = lens.ray_table().astype(np.float64)
+    bounds = tile_bounds(lens.ray_table().reshape(1, -1, 3), 40, 32).astype(np.float64)
+    for tile, (low_x, high_x, low_y, high_y) in enumerate(bounds):
+        row, col = 8 * (tile // 5), 8 * (tile % 5)
+        part = rays[row : row + 8, col : col + 8].reshape(-1, 3)
+        for axis, slope, sign in ((0, low_x, 1), (0, high_x, -1), (1, low_y, 1), (1, high_y, -1)):
+            normal = np.array([0.0, 0.0, -slope])
+            normal[axis] = 1.0
+            inside = sign * (part @ normal) / np.linalg.norm(normal)  # sines
+            assert 0.98e-5 < inside.min() < 1.02e-5
+
+
+def test_a_lens_that_is_too_wide_is_refused():
+    lens = PinholeConfig(width=40, height=32, horizontal_fov_rad=np.radians(179.5))
+    with pytest.raises(ValueError, match=r"up to 100 \(89.4 deg .* has 223[.].*render.shared_walk to null"):
+        tile_bounds(lens.ray_table().reshape(1, -1, 3), 40, 32)
+
+
+def test_what_kernels_cannot_count_is_refused():
+    rays = np.tile(np.array([0.0, 0.0, 1.0, 0.01], np.float32), (1, 128 * 128, 1))
+
+    def walks(count, face_count_max):
+        return TileWalk(
+            upload_scene(scene_of(plane(1.0)), ALONE, "cpu").mesh,
+            rays,
+            width=128,
+            height=128,
+            extent_m=1.0,
+            config=WalkConfig(instants=1, face_count_max=face_count_max),
+            instant_count=count,
+        )
+
+    with pytest.raises(
+        ValueError, match=r"4096 shared walks of 256 tiles .*_max = 4096 .*: at most 2047 here"
+    ):
+        walks(4096, 4096)
+    with pytest.raises(ValueError, match="no value is small enough here"):
+        walks(200_000, 1)
+    lens = PinholeConfig(width=16384, height=16384, horizontal_fov_rad=1.0)
+    arrays = upload_scene(scene_of(plane(1.0)), ALONE, "cpu")
+    with pytest.raises(ValueError, match=r"8 instants of 16384 x 16384 px .* at most 7 instants"):
+        WarpRenderer(arrays, lens, outputs=("depth",), instant_count=8)
 
 
 def test_events_of_a_flight_are_the_same():
