@@ -30,8 +30,6 @@ def draw_steps(result: ThroughputResult, figure: Figure) -> None:
         left.set_xscale("log")
         left.set_xticks([w * h for w, h in sizes], [f"{w}x{h}" for w, h in sizes], rotation=30)
         left.minorticks_off()
-        left.axhline(result.rate_hz, color="0.5", ls="--", lw=1.0, marker="", label="real time")
-        left.legend()
     left.set(title="size of the picture", ylabel=_RATE_AXIS)
     hall = [row for row in rows if row.study == "triangles"]
     _line(middle, hall, lambda row: row.triangles or 0, label="", place=0)
@@ -54,6 +52,11 @@ def draw_steps(result: ThroughputResult, figure: Figure) -> None:
         figures = [x for row in shown for x in (row.slowest_per_s, row.fastest_per_s) if x]
         axes.set_ylim(0.7 * min(figures), 1.6 * max(figures))
         plain_ticks(axes.yaxis)
+    if by_size:
+        slowest, fastest = left.get_ylim()
+        if slowest <= result.rate_hz <= fastest:
+            left.axhline(result.rate_hz, color="0.5", ls="--", lw=1.0, marker="", label="real time")
+        left.legend()
 
 
 def _size(rows: Sequence[StepRow]) -> str:

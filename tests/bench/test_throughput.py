@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from matplotlib.figure import Figure
 
 from neurosim_core.bench import commands, throughput
 from neurosim_core.bench import step as step_bench
@@ -16,6 +17,7 @@ from neurosim_core.bench.report import Bar, Chapter, write_report
 from neurosim_core.bench.step import measure_steps
 from neurosim_core.bench.throughput import measure_throughput
 from neurosim_core.bench.throughput_chapter import throughput_bars, throughput_chapter
+from neurosim_core.bench.throughput_plots import draw_steps
 from neurosim_core.bench.throughput_result import (
     ADAPTIVE,
     EXACT,
@@ -300,6 +302,18 @@ def verdicts(result):
 
 
 GPU = [True, True, True, True, True, None, True, True, True, None]
+
+
+@pytest.mark.parametrize(("scale", "shown"), [(1.0, True), (100.0, False)])
+def test_real_time_is_in_the_legend_where_its_line_is_on_the_axis(scale, shown):
+    figure = Figure()
+    draw_steps(made_up(scale=scale), figure)
+    axes = figure.axes[0]
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert ("real time" in texts) is shown
+    assert {EXACT, SHARED_WALK, ADAPTIVE} <= set(texts)
+    low, high = axes.get_ylim()
+    assert (low <= 1000.0 <= high) == shown
 
 
 def test_bars_of_a_gpu():
