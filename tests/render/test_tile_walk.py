@@ -171,7 +171,7 @@ def along_borders(lens, count, seed):
 def test_same_bits_where_silhouettes_run_along_tiles(device, fov_deg, behind):
     lens = PinholeConfig(width=40, height=32, horizontal_fov_rad=np.radians(fov_deg))
     hits = 0
-    for seed in range(8):
+    for seed in (10, 40, 49, 70, 91, 195, 216):  # of which borders on the plane z = 1 lost some at 178.5 deg
         turn = Rotation.random(random_state=seed)
         place = np.random.default_rng(seed).uniform(-1.0, 1.0, 3)
         corners = turn.apply(along_borders(lens, 60, seed).reshape(-1, 3)) + place
