@@ -1,6 +1,7 @@
-"""What pyproject.toml cannot say: the one module in C, left out where it cannot be compiled."""
+"""What pyproject.toml cannot say: the module in C, left out without a compiler or without a GIL."""
 
 import sys
+import sysconfig
 
 import numpy
 from setuptools import Extension, setup
@@ -16,4 +17,6 @@ setup(
             optional=True,
         ),
     ]
+    if not sysconfig.get_config_var("Py_GIL_DISABLED")
+    else []
 )

@@ -1533,7 +1533,8 @@ PyMODINIT_FUNC PyInit__native(void) {
             return NULL;
         }
     }
-    if (add_construct(module) < 0 || add_socket(module) < 0 || add_ring(module) < 0) {
+    if (PyModule_AddIntConstant(module, "INTERFACE", 1) < 0 /* compiled.py compares it */
+        || add_construct(module) < 0 || add_socket(module) < 0 || add_ring(module) < 0) {
         Py_DECREF(module);
         return NULL;
     }

@@ -4,6 +4,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+INTERFACE: int
+
 class Flat:
     slots: SlotView | None
     def __init__(

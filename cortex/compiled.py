@@ -5,13 +5,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
+import logging
 import os
 from typing import Any
 
-native: Any = None
+INTERFACE = 1
+"""What `_native.c` must say of itself: counts up with each change of what it offers."""
+
+
+def _load() -> Any:
+    """Return `cortex._native` if it is there and of this version."""
+    if os.environ.get("CORTEX_PURE_PYTHON"):
+        return None
+    try:
+        module = importlib.import_module("cortex._native")
+    except ImportError:  # there was no compiler when this was installed
+        return None
+    if getattr(module, "INTERFACE", 0) != INTERFACE:
+        logging.getLogger(__name__).warning(
+            "%s is older or newer than cortex and is left out, which is slower: install cortex again",
+            module.__file__,
+        )
+        return None
+    return module
+
+
+native: Any = _load()
 """`cortex._native`, or None."""
-if not os.environ.get("CORTEX_PURE_PYTHON"):
-    with contextlib.suppress(ImportError):  # there was no compiler when this was installed
-        native = importlib.import_module("cortex._native")

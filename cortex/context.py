@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -85,11 +86,10 @@ class Frames:
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._direct: Any = None
-        with contextlib.suppress(ImportError, AttributeError, OSError):  # another backend, or a static libzmq
-            from zmq.backend.cython import _zmq
-
-            if native is not None:
-                self._direct = native.Socket(socket.underlying, _zmq.__file__, zmq.Again, zmq.ZMQError)
+        library = sys.modules.get("zmq.backend.cython._zmq")  # not there: another backend
+        with contextlib.suppress(AttributeError, OSError):  # a static libzmq, say
+            if native is not None and library is not None:
+                self._direct = native.Socket(socket.underlying, library.__file__, zmq.Again, zmq.ZMQError)
         plain: Any = super(zmq.Socket, socket)
         self.send = plain.send if self._direct is None else self._direct.send
         self.receive = plain.recv if self._direct is None else self._direct.receive

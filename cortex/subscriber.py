@@ -198,12 +198,12 @@ class Subscriber(Generic[T]):
             message = self._take_now()
             if message is not _LOST:
                 return message
-            if self._queue or not self._exhausted:  # what came could not be read
-                await asyncio.sleep(0)
-                continue
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(self._nothing_came(timeout_s))
+            if self._queue or not self._exhausted:  # what came could not be read
+                await asyncio.sleep(0)
+                continue
             await reader.wait(min(left_s, WAIT_MAX_S))
 
     def _may_go_on(self) -> bool:
@@ -252,12 +252,12 @@ class Subscriber(Generic[T]):
                 result = self._open(item, use)
                 if result is not _LOST:
                     return result
-                continue
             if deadline_s is not None:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0.0:
                     raise TimeoutError(self._nothing_came(timeout_s))
-            self._wait(min(left_s, WAIT_MAX_S))
+            if item is None:  # else what came could not be read: look for the next
+                self._wait(min(left_s, WAIT_MAX_S))
 
     def _take(self, *, whole: bool = False, block: bool = False) -> Item | None:
         """The next item, or None if nothing is there.

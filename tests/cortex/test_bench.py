@@ -200,9 +200,9 @@ def test_child_may_end_before_the_one_that_is_waited_for(tmp_path: Path):
 
 def test_child_beside_that_dies_is_noticed(tmp_path: Path):
     slow = Child(_is_slow, None, log=tmp_path / "log", deadline_s=20.0)
-    with slow, Child(_dies, None, log=tmp_path / "log", deadline_s=20.0) as server:
-        with pytest.raises(ChildFailed, match="died before 'result'"):
-            slow.expect("result", beside=[server])
+    server = Child(_dies, None, log=tmp_path / "log", deadline_s=20.0)
+    with slow, server, pytest.raises(ChildFailed, match="died before 'result'"):
+        slow.expect("result", beside=[server])
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")

@@ -213,7 +213,7 @@ def test_a_descriptor_is_read_as_its_message(slots):
 
 
 def test_no_descriptor_does_harm(slots):
-    """Whatever bit of it or of the body is wrong: the message, or None and the slot as if nobody had looked."""
+    """Whatever bit of it or of the body is wrong: a message, or None and the slot as if nobody had looked."""
     generator = np.random.Generator(np.random.Philox(key=[7, 1]))
     read = refused = 0
     for count in range(4000):

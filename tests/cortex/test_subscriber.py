@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+import zmq
 from peer import Block, Number, OtherNumber, Scan, is_whole, make_block
 from processes import wait_for
 
@@ -496,3 +497,29 @@ def test_messages_for_a_callback_are_not_to_be_fetched(node):
     subscriber = node.subscriber("/numbers", Number, lambda message: None)
     with pytest.raises(RuntimeError, match="callback"):
         subscriber.recv(0.01)
+
+
+@pytest.mark.parametrize("how", ["recv", "recv_async"])
+def test_a_deadline_holds_while_what_comes_cannot_be_read(node, monkeypatch, how):
+    """A publisher that only sends what is malformed does not keep a control loop waiting."""
+    publisher, subscriber = node.publisher("/number", Number), node.subscriber("/number", Number)
+    assert publisher.wait_for_subscribers()
+    publisher.publish(Number(1, 1))
+    assert subscriber.recv(5.0) == Number(1, 1)
+    (link,) = subscriber._links
+    end_s = time.monotonic() + 20.0
+
+    def malformed(_flags: int) -> bytes:
+        if time.monotonic() > end_s:
+            raise zmq.Again
+        return link.message_head + b"\xff" * 48
+
+    monkeypatch.setattr(link, "receive", malformed)
+
+    async def receive() -> None:
+        await subscriber.recv_async(0.1)
+
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.1) if how == "recv" else asyncio.run(receive())
+    assert time.monotonic() < end_s
+    assert subscriber.counters.rejected > 0

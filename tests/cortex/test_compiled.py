@@ -1,0 +1,38 @@
+"""The C module is left out where it is of another version."""
+
+from __future__ import annotations
+
+import logging
+import types
+
+import pytest
+
+from cortex import compiled
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """What is found as `cortex._native`."""
+    module = types.ModuleType("cortex._native")
+    module.__file__ = "there/_native.so"
+    monkeypatch.setattr(compiled.importlib, "import_module", lambda name: module)
+    monkeypatch.delenv("CORTEX_PURE_PYTHON", raising=False)
+    return module
+
+
+def test_the_compiled_module_is_of_this_version():
+    assert compiled.native is None or compiled.native.INTERFACE == compiled.INTERFACE
+
+
+def test_a_module_of_another_version_is_left_out(found, caplog):
+    with caplog.at_level(logging.WARNING):
+        assert compiled._load() is None
+    assert "there/_native.so is older or newer" in caplog.text
+    found.INTERFACE = compiled.INTERFACE
+    assert compiled._load() is found
+
+
+def test_it_can_be_left_out_on_request(found, monkeypatch):
+    found.INTERFACE = compiled.INTERFACE
+    monkeypatch.setenv("CORTEX_PURE_PYTHON", "1")
+    assert compiled._load() is None
