@@ -289,7 +289,7 @@ def make_fleet(
             on_phase(name)
         return timed(setup_s, name)
 
-    device = _device(config.device)
+    device = find_device(config.device)
     with phase("scene"):
         members = {name: config.of(name) for name in config.vehicles}
         seeing = any(plan_casts(member.sensors) for member in members.values())
@@ -324,7 +324,7 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
     """
     members = {name: config.of(name) for name in (vehicles or config.vehicles)}
     scene = load_scene(config.scene, pictures=False)
-    free_space = make_free_space(scene, config.free_space, device=_device(config.device))
+    free_space = make_free_space(scene, config.free_space, device=find_device(config.device))
     return {name: _plan(member, free_space) for name, member in members.items()}
 
 
@@ -1058,7 +1058,7 @@ class timed:
         self._wall_s[self._phase] += time.perf_counter() - self._begin
 
 
-def _device(name: str) -> str:
+def find_device(name: str) -> str:
     """Return the device that is meant.
 
     Raises:

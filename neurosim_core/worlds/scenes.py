@@ -16,7 +16,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.render.raycast import SceneData, Terms
 from neurosim_core.render.warp_renderer import SceneArrays
 from neurosim_core.scene.freespace import DistanceField
-from neurosim_core.simulation import Model, make_model, refit
+from neurosim_core.simulation import Model, find_device, make_model, refit
 
 SceneSource = str | Path | Mapping[str, Any]
 """A settings file, of which the scene counts; a mesh file; or settings of a scene."""
@@ -67,18 +67,19 @@ def make_scene_table(
         config: What to fly; its scene counts where no others are given.
         count: Number of worlds.
         scenes: The scenes.
-        models: Scenes that were loaded before, in place of `scenes`.
+        models: Scenes that were loaded before, in place of `scenes`, each with its path and light.
         scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
 
     Raises:
         ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
-            move and there are several scenes.
+            move and there are several scenes; or models are on another device, have other bodies or were
+            lit or packed by other settings of the renderer than `config` says.
     """
     if config.renderer != "warp":
         raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer!r}")
     if scenes is not None and models is not None:
         raise ValueError("give scenes or models, not both")
-    if scenes == [] or models == []:
+    if any(given is not None and len(given) == 0 for given in (scenes, models)):
         raise ValueError("scenes or models must name one scene at least, got none")
     if len(scenes or models or ()) > 1 and config.bodies:
         raise ValueError(
@@ -86,6 +87,7 @@ def make_scene_table(
             f"{', '.join(config.bodies)}"
         )
     if models is not None:
+        _check_models(models, config)
         made = tuple(refit(model, config) for model in models)
     else:
         configs = [config] if scenes is None else [_in_scene(config, source) for source in scenes]
@@ -114,6 +116,24 @@ def make_scene_table(
         completed=completed,
         terms=terms,
     )
+
+
+def _check_models(models: Sequence[Model], config: SimulationConfig) -> None:
+    """Refuse models that hold something else than is asked for."""
+    wanted = find_device(config.device)
+    for index, model in enumerate(models):
+        if model.device != wanted:
+            raise ValueError(
+                f"models[{index}] is on {model.device}, and worlds are to be on {wanted}: make it there"
+            )
+        if model.config.bodies != config.bodies:
+            raise ValueError(
+                f"models[{index}] has the bodies {sorted(model.config.bodies)}, or moves them otherwise than "
+                f"the configuration, which has {sorted(config.bodies)}"
+            )
+        arrays = model.scene_on_device
+        if isinstance(arrays, SceneArrays) and arrays.config != config.render:
+            raise ValueError(f"models[{index}] was made with other settings of `render` than these worlds")
 
 
 def _in_scene(config: SimulationConfig, source: SceneSource) -> SimulationConfig:
