@@ -939,7 +939,7 @@ PyDoc_STRVAR(gate_doc,
 "    acquire: Takes the lock.\n"
 "    release: Gives it back.\n"
 "    slowly: Called without the lock with a message that has to go the long way.\n"
-"    retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.\n"
+"    retry: Called with the lock held, a frame, and that of `sends` which had no room for it.\n"
 "    again: What that raised.\n"
 "    limit: Most bytes of a body.\n"
 "    flush: Called with the lock held when a batch is full; sends it.\n");
@@ -980,7 +980,7 @@ static PyObject *gate_send_frame(Gate *gate, PyObject *frame) {
             PyTuple_GET_ITEM(sends, place), arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
         if (sent == NULL && PyErr_ExceptionMatches(gate->again)) {
             PyErr_Clear();
-            sent = PyObject_CallFunction(gate->retry, "On", frame, place);
+            sent = PyObject_CallFunction(gate->retry, "OO", frame, PyTuple_GET_ITEM(sends, place));
             if (sent == Py_False) on_time = 0;
         }
         if (sent == NULL) on_time = -1;

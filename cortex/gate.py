@@ -84,7 +84,7 @@ def make_gate(
     lock: Any,
     *,
     slowly: Callable[[Any], bool],
-    retry: Callable[[bytes, int], bool],
+    retry: Callable[[bytes, Callable[..., Any]], bool],
     limit: int,
     flush: Callable[[], bool],
 ) -> Gate:
@@ -94,7 +94,7 @@ def make_gate(
         flat: Packs its messages in C, see `packer.flat_of`; None: Python does.
         lock: Held while sending.
         slowly: Called without the lock with a message that has to go the long way.
-        retry: Called with the lock held, a frame, and the place in `sends` of what had no room for it.
+        retry: Called with the lock held, a frame, and that of `sends` which had no room for it.
         limit: Most bytes of a body that is sent so.
         flush: Called with the lock held when a batch is full; sends it.
     """

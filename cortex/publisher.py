@@ -92,8 +92,8 @@ class Publisher(Generic[T]):
             flush=self._flush,
         )
         """Sends small messages if nothing special is to be done."""
-        self._targets: tuple[Outlet | Reader | None, ...] = ()
-        """What the gate's `sends` belong to; None where they never refuse."""
+        self._targets: dict[Callable[..., Any], Outlet | Reader] = {}
+        """What those of the gate's `sends` belong to that may refuse."""
         self._large_lock = threading.Lock()
         self._large = LargeSender(
             self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
@@ -274,9 +274,9 @@ class Publisher(Generic[T]):
             self._timeouts += 1
         return on_time
 
-    def _send_again(self, frame: bytes, place: int) -> bool:
+    def _send_again(self, frame: bytes, send: Callable[..., Any]) -> bool:
         """Send what the gate could not; the lock is held, and let go while sleeping."""
-        target = self._targets[place] if place < len(self._targets) else None
+        target = self._targets.get(send)  # None: it has left since
         on_time = True
         if isinstance(target, Reader):
             on_time = self._send_piped(target, frame)
@@ -520,11 +520,10 @@ class Publisher(Generic[T]):
         self._lossy_sends = (*sends, *lossy)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
         self._strict_pipes = tuple(reader for reader, _ in pipes if reader.request.strict)
-        strict = [pipe.send for reader, pipe in pipes if reader.request.strict]
+        strict = {pipe.send: reader for reader, pipe in pipes if reader.request.strict}
         usual = self._plain and not self._late
-        waiting: list[Callable[..., Any]] = [outlet.send for outlet in self._strict_outlets]
-        self._gate.sends = (*self._lossy_sends, *waiting, *strict) if usual else ()
-        self._targets = (*[None] * len(self._lossy_sends), *self._strict_outlets, *self._strict_pipes)
+        self._targets = {outlet.send: outlet for outlet in self._strict_outlets} | strict
+        self._gate.sends = (*self._lossy_sends, *self._targets) if usual else ()
         self._arm()
 
     def _arm(self) -> None:

@@ -275,9 +275,9 @@ class Taken:
         self.gate.batch_bytes = 0
         return True
 
-    def retry(self, frame, place):
+    def retry(self, frame, send):
         assert self.lock.locked()
-        self.retried.append((frame, place))
+        self.retried.append((frame, send))
         return False
 
 
@@ -359,7 +359,7 @@ def test_a_full_queue_and_an_error_leave_the_lock_free():
 
     taken.gate.sends = (full,)
     assert taken.gate(sample()) is False
-    assert len(taken.retried) == 1
+    assert [send for _, send in taken.retried] == [full]
     assert not taken.lock.locked()
 
     def broken(frame, flags):
