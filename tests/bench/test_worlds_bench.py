@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
+import warp as wp
 
 from neurosim_core import cli
-from neurosim_core.bench import commands
+from neurosim_core.bench import commands, worlds
 from neurosim_core.bench.report import write_report
 from neurosim_core.bench.worlds import WorldsCase, WorldsResult, measure_worlds, worlds_chapter
 
@@ -40,6 +41,15 @@ def test_what_is_measured(result):
         assert min(case.cpu_ms, case.alone_cpu_ms) > 0.0
         assert set(case.phases_ms) == {"flight", "render", "events"}
         assert all(value > 0.0 for value in case.phases_ms.values())
+
+
+def test_events_of_all_steps_are_counted():
+    """Also of steps after which more follow, and of all worlds."""
+    totals = wp.array([5, 1], dtype=wp.int64, device="cpu")
+    for counts, dropped in (([3, 4], [0, 2]), ([0, 10], [1, 0])):
+        arrays = [wp.array(values, dtype=wp.int32, device="cpu") for values in (counts, dropped)]
+        wp.launch(worlds._tally, dim=2, inputs=arrays, outputs=[totals], device="cpu")
+    assert totals.numpy().tolist() == [22, 4]
 
 
 def test_a_report_of_it(result, tmp_path):
