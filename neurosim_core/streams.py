@@ -17,7 +17,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-_GRAPH_COUNT_MAX = 64
+_GRAPH_COUNT_MAX = 512
+"""Most graphs that are kept. Steps whose sensors do not divide the control clock come in many patterns, each
+in two states of the pixels; batches that are streamed take turns among slots: each combination is a graph.
+With fewer places than a cycle has, each would be given up before it comes again."""
 
 
 def make_stream(device: Any, *, urgent: bool = False) -> wp.Stream | None:
@@ -60,11 +63,16 @@ class Milestone:
 
 
 class Graphs:
-    """Sequences of launches, replayed as CUDA graphs when they come again; they must not allocate or wait."""
+    """Sequences of launches, replayed as CUDA graphs when they come again; they must not allocate or wait.
+
+    Attributes:
+        dropped_count: Keys that were forgotten for others, as there is room for 512.
+    """
 
     def __init__(self, device: Any) -> None:
         self._device = wp.get_device(device)
         self._graphs: dict[Hashable, tuple[Any, Any]] = {}
+        self.dropped_count = 0
 
     def run(self, key: Hashable, launch: Callable[[], Any]) -> None:
         """Do what `launch` does.
@@ -89,6 +97,7 @@ class Graphs:
             wp.capture_launch(graph)
         if len(self._graphs) >= _GRAPH_COUNT_MAX:
             del self._graphs[next(iter(self._graphs))]
+            self.dropped_count += 1
         self._graphs[key] = (graph, kept)  # at the end: the one that was not used for longest goes first
 
 

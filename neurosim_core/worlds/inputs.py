@@ -56,11 +56,17 @@ def make_seeds(seeds: int | ArrayLike, count: int) -> list[int]:
 
 
 def as_device_array(value: Any, device: Any) -> Any:
-    """Return a Warp array of the device without a copy, or None: it is something of the host."""
+    """Return a Warp array of the device without a copy, or None: it is something of the host.
+
+    Raises:
+        ValueError: It is on another device, or a tensor through which gradients are to flow.
+    """
     if isinstance(value, wp.array):
         if value.device == device:
             return value
         raise ValueError(f"arrays must be on {device} or be NumPy arrays, got one on {value.device}")
+    if getattr(value, "requires_grad", False):
+        raise ValueError("gradients do not flow through worlds: give tensor.detach()")
     if device.is_cuda and hasattr(value, "__cuda_array_interface__"):
         return wp.from_dlpack(value)
     return None

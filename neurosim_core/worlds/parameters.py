@@ -58,6 +58,12 @@ def vary_sensors(sensors: Rig, parameters: Mapping[str, ArrayLike], count: int) 
     return rigs
 
 
+def lenses_differ(rigs: Sequence[Rig]) -> bool:
+    """Return whether some camera has different lenses in two worlds."""
+    lenses = [{name: getattr(sensor, "lens", None) for name, sensor in rig.items()} for rig in rigs]
+    return any(other != lenses[0] for other in lenses[1:])
+
+
 def lens_tables(cast: Cast, rigs: Sequence[Rig]) -> tuple[list[Any], list[int]]:
     """Return the lenses that a cast has in some world, and which of them it has in each.
 

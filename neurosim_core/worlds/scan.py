@@ -34,6 +34,9 @@ AGAIN = wp.constant(2)
 """What a scan is for: all worlds; those with too many events, to count these by row; the same with fewer
 rows."""
 
+SECTION = wp.constant(64)
+"""Worlds whose events are added up first: of N worlds no thread reads more than N / 64 + 64 counts."""
+
 _US = wp.constant(wp.int64(1000))
 
 
@@ -350,9 +353,25 @@ def limit_rows(
 
 
 @wp.kernel
+def add_up_sections(
+    # In:
+    counters: wp.array2d[wp.int64],
+    # Out:
+    sections_out: wp.array[wp.int64],
+) -> None:
+    """Add up the events of `SECTION` worlds; threads are the sections."""
+    section = wp.tid()
+    total = wp.int64(0)
+    for world in range(section * SECTION, wp.min((section + 1) * SECTION, counters.shape[0])):
+        total += counters[world, 0]
+    sections_out[section] = total
+
+
+@wp.kernel
 def add_up(
     # In:
     counters: wp.array2d[wp.int64],
+    sections: wp.array[wp.int64],
     # Out:
     offsets_out: wp.array[wp.int32],
     counts_out: wp.array[wp.int32],
@@ -360,7 +379,9 @@ def add_up(
     """Write where each world begins among the events of all, and how many it has; thread N is the end."""
     world = wp.tid()
     before = wp.int64(0)
-    for other in range(world):
+    for section in range(world // SECTION):
+        before += sections[section]
+    for other in range(world // SECTION * SECTION, world):
         before += counters[other, 0]
     offsets_out[world] = wp.int32(before)
     if world < counts_out.shape[0]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from neurosim_core.render.raycast import SceneData, Terms
 from neurosim_core.render.warp_renderer import SceneArrays
 from neurosim_core.scene.freespace import DistanceField
 from neurosim_core.simulation import Model, find_device, make_model, refit
+
+_logger = logging.getLogger(__name__)
 
 SceneSource = str | Path | Mapping[str, Any]
 """A settings file, of which the scene counts; a mesh file; or settings of a scene."""
@@ -60,6 +63,7 @@ def make_scene_table(
     scenes: Sequence[SceneSource] | None = None,
     models: Sequence[Model] | None = None,
     scene_of_world: ArrayLike | None = None,
+    lenses_differ: bool = False,
 ) -> SceneTable:
     """Load the scenes and bring them to the device.
 
@@ -69,6 +73,7 @@ def make_scene_table(
         scenes: The scenes.
         models: Scenes that were loaded before, in place of `scenes`, each with its path and light.
         scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
+        lenses_differ: Worlds look through different lenses.
 
     Raises:
         ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
@@ -88,6 +93,11 @@ def make_scene_table(
         )
     if models is not None:
         _check_models(models, config)
+    if config.render.shared_walk is not None and (lenses_differ or len(scenes or models or ()) > 1):
+        _logger.info("render.shared_walk is left out: worlds differ in their scenes or lenses")
+        alone = config.render.model_copy(update={"shared_walk": None})  # Embree may do it on a CPU
+        config = config.model_copy(update={"render": alone})
+    if models is not None:
         made = tuple(refit(model, config) for model in models)
     else:
         configs = [config] if scenes is None else [_in_scene(config, source) for source in scenes]

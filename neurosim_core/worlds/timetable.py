@@ -11,7 +11,8 @@ from fractions import Fraction
 from neurosim_core.clock import Rate
 from neurosim_core.schedule import Boundary, Schedule, boundaries
 
-_PATTERN_COUNT_MAX = 4096
+PATTERN_COUNT_MAX = 4096
+"""Most patterns that are remembered; where clocks hardly ever tick together, no two steps are alike."""
 _KIND_COUNT_MAX = 64
 _COMMON_MAX_NS = 10**13
 
@@ -65,7 +66,7 @@ class Timetable:
         """Return the period that begins at a tick of the control clock."""
         key = begin_ns % self.common_ns if self.common_ns else begin_ns
         if key not in self._patterns:
-            if len(self._patterns) >= _PATTERN_COUNT_MAX:
+            if len(self._patterns) >= PATTERN_COUNT_MAX:
                 self._patterns.clear()
             self._patterns[key] = self._make(begin_ns)
         return self._patterns[key]

@@ -17,6 +17,7 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_noise import Memory, PixelModel, PixelNoise, terms_of
 from neurosim_core.sensors.event_scan import SUB_BITS, TILE_SIZE
 from neurosim_core.worlds import scan
+from neurosim_core.worlds.timetable import PATTERN_COUNT_MAX
 
 _BLOCK_SIZE = 256
 _SORT_BLOCK_SIZE = 1024
@@ -119,6 +120,7 @@ class WorldEventCamera:
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._lead = self._zeros((world_count, 0 if self.terms else pixel_count), wp.int32)
         self._stack = self._make_stack(frames, frame_count)
+        self._sections = self._zeros(-(-world_count // int(scan.SECTION)), wp.int64)
         self._offsets_ns: dict[tuple[int, ...], Any] = {}
         room = world_count * capacity
         self.events = WorldEvents(
@@ -207,8 +209,10 @@ class WorldEventCamera:
             array.zero_()
 
     def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
-        """Return offsets of a pattern on the device; kept, so that a graph may hold them."""
+        """Return offsets of a pattern on the device; whoever makes a graph with them keeps them."""
         if offsets_ns not in self._offsets_ns:
+            if len(self._offsets_ns) >= PATTERN_COUNT_MAX:
+                self._offsets_ns.clear()
             self._offsets_ns[offsets_ns] = wp.array(
                 np.array(offsets_ns, dtype=np.int64), dtype=wp.int64, device=self.device
             )
@@ -243,7 +247,9 @@ class WorldEventCamera:
         lanes = _BLOCK_SIZE if self.device.is_cuda else 1
         if self._ordered:
             self._sort()
-        self._launch(scan.add_up, world_count + 1, [self._stack.counters], [events.offsets, events.counts])
+        counters, sections = self._stack.counters, self._sections
+        self._launch(scan.add_up_sections, sections.shape[0], [counters], [sections])
+        self._launch(scan.add_up, world_count + 1, [counters, sections], [events.offsets, events.counts])
         wp.launch(
             scan.decode,
             dim=(world_count, lanes),

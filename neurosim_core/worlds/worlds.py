@@ -8,6 +8,7 @@ overwrites.
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,9 +32,11 @@ from neurosim_core.worlds import flight
 from neurosim_core.worlds.cameras import WorldCast
 from neurosim_core.worlds.inputs import CommandBuffer, as_device_array, make_seeds
 from neurosim_core.worlds.observation import ImuRows, Observation, VehicleStates
-from neurosim_core.worlds.parameters import vary_sensors
+from neurosim_core.worlds.parameters import Rig, lenses_differ, vary_sensors
 from neurosim_core.worlds.scenes import SceneSource, SceneTable, make_scene_table
-from neurosim_core.worlds.timetable import Pattern, Timetable
+from neurosim_core.worlds.timetable import PATTERN_COUNT_MAX, Pattern, Timetable
+
+_logger = logging.getLogger(__name__)
 
 COUNT_MAX = 4096
 """Most worlds."""
@@ -61,7 +64,7 @@ class Worlds:
         scenes: SceneTable,
         *,
         seeds: Sequence[int],
-        parameters: Mapping[str, ArrayLike],
+        rigs: Sequence[Rig],
         event_capacity: int | None,
         ordered: bool,
     ) -> None:
@@ -71,7 +74,6 @@ class Worlds:
         self.count = count = len(seeds)
         self.device = device = wp.get_device(model.device)
         self.seeds = [int(seed) for seed in seeds]
-        rigs = vary_sensors(config.sensors, parameters, count)
         images = tuple({n: Rate(config.sensors[n].rate_hz) for n in c.image_cameras} for c in model.casts)
         _check_image_rates(images, model.schedule.control)
         self._timetable = Timetable(model.schedule, images)
@@ -120,6 +122,8 @@ class Worlds:
             "motor_speeds": CommandBuffer(self._vehicle.arrays.rotor_speed_command)
         }
         self._graphs = Graphs(device)
+        self._told = False
+        """That there are too many patterns."""
         self._observations: dict[Pattern, Observation] = {}
         self._now_ns: int | None = None
         self.duration_ns = 0
@@ -165,10 +169,15 @@ class Worlds:
         """
         if mask is not None:
             self._check_partial(seed)
-        if seed is not None:
-            self._reseed(make_seeds(seed, self.count))
-        self._take_mask(mask)
-        self._take_start(position, velocity, orientation, body_rate)
+        seeds = None if seed is None else make_seeds(seed, self.count)
+        chosen = None if mask is None else self._checked_mask(mask)
+        start = self._checked_start(
+            position=position, velocity=velocity, orientation=orientation, body_rate=body_rate
+        )
+        if seeds is not None:  # all is checked: nothing is half done
+            self._reseed(seeds)
+        self._take_mask(chosen)
+        self._take_start(start)
         hover = self._model.airframe.hover_rotor_speed_rad_s
         self._launch(flight.restart, [hover, self._mask, self._start], [self._fleet])
         self._vehicle.begin(self._mask)
@@ -214,6 +223,14 @@ class Worlds:
             (order, pattern, parities),
             lambda: [launch() for launch in self._phases(order, pattern, parities).values()],
         )
+        if self._graphs.dropped_count > 0 and not self._told:
+            self._told = True
+            _logger.warning(
+                "steps of these worlds come in more patterns than there is room for graphs, and are launched "
+                "one by one, which is slower: give sensors rates that are simple fractions of "
+                "control.rate_hz = %g or multiples of it",
+                self._config.control.rate_hz,
+            )
         return self._observe(pattern)
 
     def time_step(self, commands: Any = None, mode: CommandMode = "rates") -> dict[str, float]:
@@ -251,8 +268,11 @@ class Worlds:
 
     def _phases(
         self, order: str | None, pattern: Pattern, parities: tuple[int, ...]
-    ) -> dict[str, Callable[[], None]]:
-        """Return what launches the parts of a step, by name and in order."""
+    ) -> dict[str, Callable[[], Any]]:
+        """Return what launches the parts of a step, by name and in order.
+
+        What they return has to be kept as long as a graph of them.
+        """
         arrays = self._vehicle.arrays
 
         def fly() -> None:
@@ -268,11 +288,14 @@ class Worlds:
                 if len(offsets_ns) > 1:
                     cast.render(len(offsets_ns) - 1, names, self._everybody)
 
-        def find_events() -> None:
+        def find_events() -> list[Any]:
+            held = []
             for cast, offsets_ns, parity in zip(self._casts, pattern.offsets_ns, parities, strict=True):
                 for camera in cast.events.values():
+                    held.append(camera.offsets(offsets_ns))
                     camera.find(self._clock, offsets_ns, parity)
             self._launch(flight.end_period, [pattern.duration_ns], [self._clock])
+            return held
 
         return {"flight": fly, "render": render, "events": find_events}
 
@@ -314,6 +337,8 @@ class Worlds:
     def _observe(self, pattern: Pattern) -> Observation:
         """Return the views of what a pattern yields: the same arrays each time."""
         if pattern not in self._observations:
+            if len(self._observations) >= PATTERN_COUNT_MAX:
+                self._observations.clear()
             self._observations[pattern] = self._make_observation(pattern)
         return self._observations[pattern]
 
@@ -371,59 +396,61 @@ class Worlds:
         return mode
 
     def _take_rows(self, rows: Any, out: Any, name: str) -> None:
-        if rows.ndim != 2 or tuple(rows.shape) != tuple(out.shape):
-            raise ValueError(f"{name} must have shape {list(out.shape)}, got {list(rows.shape)}")
-        if rows.dtype not in (wp.float32, wp.float64):
-            raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")
+        _check_rows(rows, out, name)
         wp.launch(flight.take_rows, dim=out.shape, inputs=[rows], outputs=[out], device=self.device)
+
+    def _checked_mask(self, mask: Any) -> Any:
+        """Return a mask of the right shape and type: an array of the device, or int32 on the host."""
+        given = as_device_array(mask, self.device)
+        kinds: tuple[Any, ...] = (wp.bool, wp.uint8, wp.int32)
+        if given is None:
+            given = np.asarray(mask)
+            kinds = (np.bool_, np.uint8, np.int32)
+        if given.shape != (self.count,) or given.dtype not in kinds:
+            raise ValueError(
+                f"mask must be bool, uint8 or int32 of shape [{self.count}], "
+                f"got {getattr(given.dtype, '__name__', given.dtype)} of shape {list(given.shape)}"
+            )
+        return (given != 0).astype(np.int32) if isinstance(given, np.ndarray) else given
 
     def _take_mask(self, mask: Any) -> None:
         if mask is None:
             self._mask.fill_(1)
-            return
-        given = as_device_array(mask, self.device)
-        if given is None:
-            host = np.asarray(mask)
-            if host.shape != (self.count,) or host.dtype not in (np.bool_, np.uint8, np.int32):
-                raise ValueError(
-                    f"mask must be bool, uint8 or int32 of shape [{self.count}], "
-                    f"got {host.dtype} of shape {list(host.shape)}"
-                )
-            self._mask.assign((host != 0).astype(np.int32))
-            return
-        if given.shape != (self.count,) or given.dtype not in (wp.bool, wp.uint8, wp.int32):
-            raise ValueError(
-                f"mask must be bool, uint8 or int32 of shape [{self.count}], "
-                f"got {given.dtype.__name__} of shape {list(given.shape)}"
-            )
-        self._launch(flight.take_mask, [given], [self._mask])
+        elif isinstance(mask, np.ndarray):
+            self._mask.assign(mask)
+        else:
+            self._launch(flight.take_mask, [mask], [self._mask])
 
-    def _take_start(self, position: Any, velocity: Any, orientation: Any, body_rate: Any) -> None:
-        given = {
-            "position": position,
-            "velocity": velocity,
-            "orientation": orientation,
-            "body_rate": body_rate,
-        }
-        for name, given_value in given.items():
+    def _checked_start(self, **given: Any) -> dict[str, Any]:
+        """Return where vehicles are to begin: arrays of the device, rows on the host, None: by default."""
+        checked: dict[str, Any] = {}
+        for name, value in given.items():
             array = getattr(self._start, name)
-            if given_value is None and name in self._as_configured:
+            if (on_device := as_device_array(value, self.device)) is not None:
+                _check_rows(on_device, array, name)
+                checked[name] = on_device
+            elif value is None:
+                checked[name] = None
+            else:
+                rows = as_rows(value, name=name, count=self.count, width=array.shape[1])
+                checked[name] = _normalised(rows) if name == "orientation" else rows
+        return checked
+
+    def _take_start(self, checked: Mapping[str, Any]) -> None:
+        for name, value in checked.items():
+            array = getattr(self._start, name)
+            if value is None:
+                if name not in self._as_configured:
+                    array.assign(self._begin[name])
+                    self._as_configured.add(name)
                 continue
-            value = self._begin[name] if given_value is None else given_value
-            (self._as_configured.add if given_value is None else self._as_configured.discard)(name)
-            on_device = as_device_array(value, self.device)
-            if on_device is not None:
-                self._take_rows(on_device, array, name)
-                if name == "orientation":
-                    self._launch(flight.normalise, [], [array])
+            self._as_configured.discard(name)
+            if isinstance(value, np.ndarray):
+                array.assign(value)
                 continue
-            rows = as_rows(value, name=name, count=self.count, width=array.shape[1])
+            self._take_rows(value, array, name)
             if name == "orientation":
-                norm = np.linalg.norm(rows, axis=1, keepdims=True)
-                if not (norm > 1e-6).all():
-                    raise ValueError(f"orientation must not be 0, got {rows.tolist()}")
-                rows = rows / norm
-            array.assign(rows)
+                self._launch(flight.normalise, [], [array])
 
     def _make_start(self) -> Any:
         """Allocate what says where vehicles begin, and look up where the paths do."""
@@ -438,10 +465,9 @@ class Worlds:
         self._as_configured = set(of_scene)
         """What in `_start` is where vehicles begin by default."""
         self._begin = {name: rows[list(self._scenes.scene_of_world)] for name, rows in of_scene.items()}
+        self._begin["orientation"] = _normalised(self._begin["orientation"])
         start = flight.Start()
         for name, rows in self._begin.items():
-            if name == "orientation":
-                rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
             setattr(start, name, wp.array(rows, dtype=wp.float64, device=self.device))
         return start
 
@@ -504,7 +530,8 @@ def make_worlds(
             dead time of event cameras ("front.threshold_on", "front.shot_noise.rate_hz") and lenses
             ("front.lens.horizontal_fov_rad").
         scenes: Scenes to be in: settings files, mesh files or settings; None: the configured one.
-        models: What `make_model` returned for each scene, in place of `scenes`: nothing is loaded twice.
+        models: What `make_model` returned for each scene, in place of `scenes`: nothing is loaded twice. They
+            must be on the same device, and have the bodies and `render` of `config`.
         scene_of_world: Which of them each world is in, shape [N]; by default they take turns.
         event_capacity: Room for the events of one world and camera in one step; by default two for each
             pixel. What does not fit is counted (`WorldEvents.dropped`).
@@ -524,12 +551,20 @@ def make_worlds(
         chosen = chosen.model_copy(update={"device": device})
     if event_capacity is not None and event_capacity < 1:
         raise ValueError(f"event_capacity must be 1 at least, got {event_capacity}")
-    table = make_scene_table(chosen, count=count, scenes=scenes, models=models, scene_of_world=scene_of_world)
+    rigs = vary_sensors(chosen.sensors, parameters or {}, count)
+    table = make_scene_table(
+        chosen,
+        count=count,
+        scenes=scenes,
+        models=models,
+        scene_of_world=scene_of_world,
+        lenses_differ=lenses_differ(rigs),
+    )
     return Worlds(
         chosen,
         table,
         seeds=make_seeds(chosen.seed if seeds is None else seeds, count),
-        parameters=parameters or {},
+        rigs=rigs,
         event_capacity=event_capacity,
         ordered=sorted,
     )
@@ -543,6 +578,21 @@ def _check_image_rates(images: Sequence[Mapping[str, Rate]], control: Rate) -> N
                 f"sensors.{name}.rate_hz must divide control.rate_hz = {control.rate_hz:g} in worlds, where "
                 f"pictures are taken at the end of steps, got {rate.rate_hz:g}"
             )
+
+
+def _check_rows(rows: Any, out: Any, name: str) -> None:
+    """Refuse an array of the device that cannot be copied to another."""
+    if rows.ndim != 2 or tuple(rows.shape) != tuple(out.shape):
+        raise ValueError(f"{name} must have shape {list(out.shape)}, got {list(rows.shape)}")
+    if rows.dtype not in (wp.float32, wp.float64):
+        raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")
+
+
+def _normalised(orientation: NDArray[np.float64]) -> NDArray[np.float64]:
+    norm: NDArray[np.float64] = np.linalg.norm(orientation, axis=1, keepdims=True)
+    if not (norm > 1e-6).all():
+        raise ValueError(f"orientation must not be 0, got {orientation.tolist()}")
+    return orientation / norm
 
 
 def _offsets_ns(pattern: Pattern, sampler: int) -> tuple[int, ...]:

@@ -49,6 +49,22 @@ def test_many_keys(count, device):
         np.testing.assert_array_equal(row, [*np.sort(given_row[:n]), *given_row[n:]])
 
 
+@pytest.mark.parametrize("world_count", [1, 63, 64, 65, 1000, 4096])
+def test_where_the_events_of_each_world_begin(world_count, device):
+    counts = np.random.default_rng(world_count).integers(0, 500, world_count)
+    counters = np.stack([counts, counts + 7, counts + 9], axis=1)
+    array = wp.array(counters, dtype=wp.int64, device=device)
+    sections = wp.zeros(-(-world_count // 64), dtype=wp.int64, device=device)
+    offsets = wp.zeros(world_count + 1, dtype=wp.int32, device=device)
+    found = wp.zeros(world_count, dtype=wp.int32, device=device)
+    wp.launch(scan.add_up_sections, dim=sections.shape, inputs=[array], outputs=[sections], device=device)
+    wp.launch(
+        scan.add_up, dim=offsets.shape, inputs=[array, sections], outputs=[offsets, found], device=device
+    )
+    np.testing.assert_array_equal(offsets.numpy(), [0, *np.cumsum(counts)])
+    np.testing.assert_array_equal(found.numpy(), counts)
+
+
 def test_values_that_are_no_radiance_are_counted(device):
     """A single camera refuses them; a world holds its pixels, counts, and says where the first is."""
     frames = np.zeros((2, 3, 6), np.float32)

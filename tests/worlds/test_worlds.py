@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from neurosim_core.render import launch
 from neurosim_core.simulation import StartState
 from neurosim_core.vehicle.status import STATUS_TERMS
 from neurosim_core.worlds import make_worlds, world_events
+from neurosim_core.worlds import worlds as worlds_module
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +171,33 @@ def in_order(parts: list[tuple]) -> list[np.ndarray]:
     t, x, y, polarity = (np.concatenate([part[index] for part in parts]) for index in range(4))
     order = np.lexsort((polarity, x, y, t))
     return [t[order], x[order], y[order], polarity[order]]
+
+
+@pytest.mark.parametrize("several", ["scenes", "lenses"])
+def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
+    """They are left out and that is said; what finds the rays' hits without the setting does so here."""
+    caplog.set_level("INFO", logger="neurosim_core.worlds.scenes")
+    rig = {"front": RIG["front"]}
+    given: dict[str, Any] = {"scenes": [scene_of(plain), scene_of(textured)]}
+    if several == "lenses":
+        given = {"parameters": {"front.lens.horizontal_fov_rad": [1.2, 1.5]}}
+    made = [
+        make_worlds(
+            settings(plain, sensors=rig, render={"lighting": {"mode": "unshadowed"}, **walk}),
+            count=2,
+            **given,
+        )
+        for walk in ({}, {"shared_walk": {}})
+    ]
+    assert caplog.text.count("render.shared_walk is left out") == 1
+    assert made[0]._scenes.terms == made[1]._scenes.terms
+    commands = commands_of("rates", 3, 2)
+    plainly, walking = (record(worlds, commands) for worlds in made)
+    assert event_count(plainly) > 100
+    for step, other in zip(plainly, walking, strict=True):
+        for world in range(2):
+            for column, expected in zip(other[world]["front"], step[world]["front"], strict=True):
+                np.testing.assert_array_equal(column, expected)
 
 
 def test_what_moves_by_itself(plain):
@@ -454,6 +483,56 @@ def test_cameras_that_are_refused(front, message, plain):
         make_worlds(settings(plain, sensors=rig), count=2)
 
 
+def test_models_that_were_made_before(plain, textured):
+    """They are taken as they are, or refused if they are something else than the configuration says."""
+    config = ns.load_config(settings(plain))
+    models = [ns.make_model(ns.load_config(settings(path))) for path in (plain, textured)]
+    commands = commands_of("rates", 2, 2)
+    seen = record(make_worlds(config, count=2, models=models), commands)
+    for world, path in enumerate((plain, textured)):
+        for step, packets in enumerate(fly_alone(settings(path, seed=7 + world), commands[:, world])):
+            assert_same(seen[step][world], packets)
+    moving = {"ball": {"shape": {"kind": "sphere", "radius_m": 0.3}, "motion": {"position_m": [1, 0, 1]}}}
+    for changes, message in (
+        ({"bodies": moving}, r"models\[0\] has the bodies \[\]"),
+        ({"render": {}}, r"models\[0\] was made with other settings of `render`"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_worlds(settings(plain, **changes), count=2, models=models[:1])
+    elsewhere = dataclasses.replace(models[1], device="cuda:7")
+    with pytest.raises(ValueError, match=r"models\[1\] is on cuda:7, and worlds are to be on cpu"):
+        make_worlds(config, count=2, models=[models[0], elsewhere])
+    for none in ({"models": ()}, {"scenes": ()}, {"scenes": []}):
+        with pytest.raises(ValueError, match="must name one scene at least"):
+            make_worlds(config, count=2, **none)
+
+
+def test_patterns_that_never_come_again(plain, monkeypatch, caplog):
+    """What is kept of them is bounded, and that graphs are given up is said once."""
+    for module in (worlds_module, world_events):
+        monkeypatch.setattr(module, "PATTERN_COUNT_MAX", 3)
+    rig = {
+        "front": {**RIG["front"], "sampling_rate_hz": 59.94, "packet_rate_hz": 59.94},
+        "imu": {**RIG["imu"], "rate_hz": 333.333},
+    }
+    config = settings(plain, sensors=rig)
+    commands = commands_of("rates", 12, 1)
+    worlds = make_worlds(config, count=1)
+    seen = record(worlds, commands)
+    assert len(worlds._observations) <= 3
+    assert len(worlds._casts[0].events["front"]._offsets_ns) <= 3
+    packets = [p for step in fly_alone(config, commands[:, 0]) for p in step]
+    found = [p.numpy() for p in packets if isinstance(p, Events)]
+    for column, expected in zip(in_order([s[0]["front"] for s in seen]), in_order(found), strict=True):
+        np.testing.assert_array_equal(column, expected)
+    assert not caplog.records
+    worlds._graphs.dropped_count = 1  # as on a CUDA device
+    for command in commands[:2]:
+        worlds.step(command)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "more patterns than there is room for graphs" in caplog.text
+
+
 def test_more_than_32_bits_can_count(plain):
     """Said before anything is allocated: rooms for events, and the lists of shared walks."""
     lens = {"width": 640, "height": 480, "horizontal_fov_rad": 1.5}
@@ -489,6 +568,30 @@ def test_wrong_calls(plain):
     worlds.step(np.zeros(4))
     worlds.reset(mask=np.array([True, False]))
     assert worlds.width == {"motor_speeds": 4, "rates": 4}
+
+
+def test_a_reset_that_is_refused_changes_nothing(plain):
+    """Seeds, starts and the mask are checked before any of them counts."""
+    torch = pytest.importorskip("torch")
+    rig = {"front": {**RIG["front"], "pixel": {"threshold_on": 0.12, **NOISE}}}
+    worlds = make_worlds(settings(plain, sensors=rig), count=2)
+    commands = commands_of("rates", 4, 2)
+    worlds.reset(position=[0.5, 0.0, 1.5])
+    for wrong, message in (
+        ({"seed": 3, "position": [1.0, 2.0]}, "position"),
+        ({"position": [1.0, 0.0, 1.0], "orientation": np.zeros(4)}, "orientation must not be 0"),
+        ({"seed": 3, "velocity": wp.zeros((2, 2), dtype=float, device="cpu")}, "velocity must have shape"),
+        ({"mask": np.array([1, 0, 0], np.uint8), "position": [1.0, 0.0, 1.0]}, "mask must be"),
+        ({"seed": 3, "velocity": torch.zeros((2, 3), requires_grad=True)}, r"give tensor\.detach\(\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            worlds.reset(**wrong)
+    assert worlds.seeds == [7, 8]
+    seen = [worlds.step(command) for command in commands][-1]
+    start = StartState(position=[0.5, 0.0, 1.5])
+    for world in range(2):
+        alone = fly_alone(settings(plain, seed=7 + world, sensors=rig), commands[:, world], start=start)
+        assert_same(snapshot(seen, world), alone[-1])
 
 
 def test_a_flight_without_cameras(plain):
