@@ -512,5 +512,5 @@ def test_memory_stays(tmp_path, box, start):
                 written = file.stat().st_size
                 sizes_mb.append(resident_mb())
     watcher.end()
-    assert len(read(file)[f"{BODY}/dvs/image"]) > 50
+    assert len(read(file)[f"{BODY}/dvs/image"]) > 10  # at most 100 a second of the wall clock
     assert sizes_mb[2] - sizes_mb[0] < 20.0  # the events of 2000 windows, 13 bytes each, would be 100 MB
