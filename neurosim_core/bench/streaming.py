@@ -31,8 +31,9 @@ JITTER_BAR_S = 1e-3
 """What the 99th percentile of the jitter is to stay under [s]."""
 GROWTH_BAR_BYTES = 4 << 20
 """Memory that a process may come to hold without being said to grow: what its allocator keeps back."""
-RENDER_SHARE = 0.4
-"""How much of the machine's renders the event camera takes: the rest is for everybody else."""
+RENDER_SHARE = 0.25
+"""How much of the machine's renders the event camera takes: the rest is for everybody else, and a live run
+renders on one core less than the machine has, so that others are in time."""
 _SAMPLING_RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 100.0, 50.0, 25.0, 20.0, 10.0, 5.0)
 """Those that are chosen from; each divides the IMU's."""
 _CALIBRATION_RATE_HZ = 100.0
