@@ -299,7 +299,7 @@ def _table(result: WorldsResult) -> Table:
 
 def _draw(result: WorldsResult, figure: Figure) -> None:
     """Draw renders a second against the number of worlds, and those of single simulations."""
-    from neurosim_core.bench.figures import COLORS, MARKERS
+    from neurosim_core.bench.figures import COLORS, MARKERS, plain_ticks
 
     axes = figure.subplots()
     sizes = sorted({(case.width, case.height) for case in result.cases})
@@ -318,4 +318,10 @@ def _draw(result: WorldsResult, figure: Figure) -> None:
             label=f"{name} px, single simulations",
         )
     axes.set(xscale="log", yscale="log", xlabel="worlds", ylabel="renders a second")
+    counts = sorted({case.count for case in result.cases})
+    axes.set_xticks(counts, [f"{count:,}" for count in counts])
+    axes.minorticks_off()
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, high / 6.0), high)  # so wide that some of 1, 2 and 5 are on it
+    plain_ticks(axes.yaxis)
     axes.legend()
