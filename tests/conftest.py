@@ -1,4 +1,4 @@
-"""Fixtures that every test can use."""
+"""Fixtures that every test can use, and who runs beside whom."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 import warp as wp
+from alone import pytest_runtest_protocol
+
+__all__ = ["pytest_runtest_protocol"]
 
 wp.config.log_level = wp.LOG_WARNING
 
