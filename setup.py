@@ -6,12 +6,15 @@ import sysconfig
 import numpy
 from setuptools import Extension, setup
 
+SUBJECTS = ("coder", "construct", "gate", "items", "native", "pack", "pipe", "ring", "socket", "unpack")
+HEADERS = ("coder", "items", "native", "numpy", "ring")
+
 setup(
     ext_modules=[
         Extension(
             "cortex._native",
-            ["cortex/_construct.c", "cortex/_native.c", "cortex/_ring.c", "cortex/_socket.c"],
-            depends=["cortex/_native.h", "cortex/_ring.h"],
+            [f"cortex/_{name}.c" for name in SUBJECTS],
+            depends=[f"cortex/_{name}.h" for name in HEADERS],
             libraries=["dl"] if sys.platform == "linux" else [],
             include_dirs=[numpy.get_include()],
             optional=True,

@@ -7,9 +7,21 @@
 #include <Python.h>
 
 #include <stddef.h>
+#include <stdint.h>
+#include <time.h>
+
+enum {
+    HEADER_SIZE = 64,
+    HEAD_SIZE = 24,   /* of a header: what all frames of a publisher begin with */
+    RECORD_SIZE = 24, /* what precedes each body of a batch */
+    SLOT_FRAME_SIZE = HEADER_SIZE + 8 + 32,
+};
 
 /* Each adds its names to the module; 0, or -1 with an error set. */
+int add_coder(PyObject *module);
 int add_construct(PyObject *module);
+int add_gate(PyObject *module);
+int add_pipe(PyObject *module);
 int add_socket(PyObject *module);
 
 /* Where objects of a class keep a field that is one of its slots; -1 with an error set if it is none. */
@@ -20,5 +32,36 @@ extern PyTypeObject SocketType;
 /* The next frame of a `Socket` as bytes; NULL if there is none, perhaps with an error set. If it may wait, it does so
    without the GIL, for as long as the socket's RCVTIMEO says. */
 PyObject *socket_take(PyObject *socket, int may_wait);
+
+/* The next frame that `receive` has, which raises `again` if it has none: then NULL without error. */
+PyObject *take_frame(PyObject *receive, PyObject *again, int may_wait);
+
+static inline Py_ssize_t align_to(Py_ssize_t position, Py_ssize_t alignment) {
+    return (position + alignment - 1) & -alignment;
+}
+
+/* The clock of Python's `time.monotonic_ns`. */
+static inline int64_t monotonic_ns(void) {
+#ifdef __APPLE__
+    return (int64_t)clock_gettime_nsec_np(CLOCK_UPTIME_RAW);
+#else
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+#endif
+}
+
+/* Let go of what was made; None, or NULL if an error is set. */
+static inline PyObject *none_or_error(PyObject *made) {
+    Py_XDECREF(made);
+    if (PyErr_Occurred()) return NULL;
+    Py_RETURN_NONE;
+}
+
+static inline int arguments_are(Py_ssize_t count, Py_ssize_t wanted) {
+    if (count == wanted) return 1;
+    PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", wanted, count);
+    return 0;
+}
 
 #endif

@@ -16,7 +16,7 @@ from cortex.draft import Draft, Drafter
 from cortex.encoder import ENCODE_ERRORS, Encoder, join, write
 from cortex.fast import Layout, is_flat, make_decode, make_layout
 from cortex.layout import has_tail, record_dtype
-from cortex.native import make_flat
+from cortex.native import make_coder
 from cortex.schema import schema_of
 
 __all__ = ["Codec", "MalformedMessage", "Plan", "codec_of"]
@@ -91,11 +91,10 @@ class Codec:
         if is_flat(self.schema):
             self._layout = make_layout(self.schema, message_type)
             self.decode = make_decode(self.schema, message_type, decoder.decode)
-        flat = make_flat(self.schema, message_type)
-        if flat is not None:
-            self.encode = _encode_natively(flat.encode, self._encode)
-            self.decode = _decode_natively(flat.decode, self.decode)
-        self._has_short_encode = flat is not None
+        self._coder = make_coder(self.schema, message_type)
+        if self._coder is not None:
+            self.encode = _encode_natively(self._coder.encode, self._encode)
+            self.decode = _decode_natively(self._coder.decode, self.decode)
         self._drafter = Drafter(self.schema, message_type, encoder)
 
     def plan(self, message: Any) -> Plan:
@@ -117,8 +116,10 @@ class Codec:
 
         It raises as `encode` does, and does the work of `encode` and `plan` once.
         """
-        if self._has_short_encode:
-            return self.encode(message, limit) or self.plan(message)
+        if self._coder is not None:
+            body: bytes | None = self._coder.encode(message, limit)
+            if body is not None:
+                return body
         plan = self.plan(message)
         return plan if plan.size > limit else join(plan.parts)
 

@@ -80,7 +80,7 @@ class LongGate:
 
 
 def make_gate(
-    flat: Any,
+    coder: Any,
     lock: Any,
     *,
     slowly: Callable[[Any], bool],
@@ -91,16 +91,16 @@ def make_gate(
     """Build the gate of one publisher.
 
     Args:
-        flat: Packs its messages in C, see `packer.flat_of`; None: Python does.
+        coder: Packs its messages in C, see `packer.coder_of`; None: Python does.
         lock: Held while sending.
         slowly: Called without the lock with a message that has to go the long way.
         retry: Called with the lock held, a frame, and that of `sends` which had no room for it.
         limit: Most bytes of a body that is sent so.
         flush: Called with the lock held when a batch is full; sends it.
     """
-    if flat is None:
+    if coder is None:
         return LongGate(slowly)
-    gate: Any = NativeGate(flat, lock.acquire, lock.release, slowly, retry, zmq.Again, limit, flush)
+    gate: Any = NativeGate(coder, lock.acquire, lock.release, slowly, retry, zmq.Again, limit, flush)
     gate.sends = ()
     gate.batch_count_max, gate.batch_bytes_max, gate.batch_ns_max = BATCH_COUNT, BATCH_BYTES, BATCH_NS
     return gate  # type: ignore[no-any-return]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from cortex.codec import Codec, MalformedMessage
-from cortex.native import make_flat
+from cortex.native import make_coder
 from cortex.outlet import DONTWAIT
 from cortex.raw import RawMessage
 from cortex.stats import note_latency
@@ -29,13 +29,13 @@ class Reader(NamedTuple):
     """Read what waits and join the bodies, for types of fixed size; see `gather` below."""
     records: Callable[[bytes, int], list[Any] | None] | None
     """The messages of a batch's frame with so many records; None: not as it should be."""
-    flat: Any
+    coder: Any
     """None in Python. Its `slots` may be a `SlotView`: then descriptors of that ring are read as messages."""
 
 
-def flat_of(codec: Codec, head: bytes) -> Any:
+def coder_of(codec: Codec, head: bytes) -> Any:
     """Return what packs and reads one publisher's messages in C; None: Python does."""
-    return None if codec.type is RawMessage else make_flat(codec.schema, codec.type, head)
+    return None if codec.type is RawMessage else make_coder(codec.schema, codec.type, head)
 
 
 def make_reader(codec: Codec, head: bytes) -> Reader:
@@ -45,10 +45,10 @@ def make_reader(codec: Codec, head: bytes) -> Reader:
         codec: Of its type.
         head: What these frames begin with: the first 24 bytes of the header.
     """
-    flat = flat_of(codec, head)
-    if flat is not None:
-        gather_flat = None if codec.fixed_size is None else flat.gather
-        return Reader(flat.read, flat.drain, gather_flat, flat.records, flat)
+    coder = coder_of(codec, head)
+    if coder is not None:
+        gather_fixed = None if codec.fixed_size is None else coder.gather
+        return Reader(coder.read, coder.drain, gather_fixed, coder.records, coder)
     decode, unpack = codec.decode, REST.unpack_from
 
     def read(frame: bytes) -> tuple[int, int, Any] | None:

@@ -17,7 +17,7 @@ from cortex.context import Closed
 from cortex.gate import BATCH_BYTES, BATCH_COUNT, BATCH_NS, Gate, LongGate, make_gate
 from cortex.large import LargeSender, Reader, Slot, Stamps
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
-from cortex.packer import flat_of
+from cortex.packer import coder_of
 from cortex.stats import PublisherCounters
 from cortex.wire import (
     BATCH,
@@ -76,15 +76,15 @@ class Publisher(Generic[T]):
         self._inline_max = inline_max
         self._head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         self._batch_head = message_head(BATCH, self.source, codec.fingerprint, stamped=stamped)
-        flat = flat_of(codec, self._head)
-        self._pack_record = None if flat is None else flat.record
+        coder = coder_of(codec, self._head)
+        self._pack_record = None if coder is None else coder.record
         self._plain = not latch and not coalesce
         self._gathers = coalesce and not latch
         self._large_kind = prefix(LARGE, self.source, stamped=stamped)
         self._outlets = outlets
         self._lock = outlets.lock
         self._gate: Gate = make_gate(
-            flat,
+            coder,
             outlets.lock,
             slowly=self._publish_slowly,
             retry=self._send_again,

@@ -153,7 +153,7 @@ class Slots:
         ring = self.ring
         self.view = RingView(SOURCE, 1, 4, 4096, ring.pid, ring.fd, COLUMN)
         self.reader = make_reader(self.codec, self.head)
-        self.reader.flat.slots = self.view.short_cut
+        self.reader.coder.slots = self.view.short_cut
         self.sequence = 0
 
     def publish(self, change=None):

@@ -51,34 +51,34 @@ def sample(stamp_ns=5, count=10):
     return Sample(stamp_ns, np.arange(count, dtype=np.float32))
 
 
-def flat_of(cls, head=b""):
-    return native.make_flat(schema_of(cls), cls, head)
+def coder_of(cls, head=b""):
+    return native.make_coder(schema_of(cls), cls, head)
 
 
 @given(any_message(flat_schemas))
 def test_bodies_are_those_of_the_general_code(value):
     codec = codec_of(type(value))
-    flat = native.make_flat(codec.schema, type(value))
-    if flat is None:
+    coder = native.make_coder(codec.schema, type(value))
+    if coder is None:
         return  # an enum or an open dtype: left to Python
     body = codec.plan(value)
     expected = bytearray(body.size)
     body.write(memoryview(expected))
-    assert flat.encode(value, 1 << 30) == expected
-    assert flat.encode(value, body.size - 1) is None
-    assert flat.decode(bytes(expected), 0, body.size) == value
+    assert coder.encode(value, 1 << 30) == expected
+    assert coder.encode(value, body.size - 1) is None
+    assert coder.decode(bytes(expected), 0, body.size) == value
 
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 4000])
 def test_frames_and_records_are_header_and_body(count):
-    flat, value = flat_of(Sample, HEAD), sample(count=count)
+    coder, value = coder_of(Sample, HEAD), sample(count=count)
     body = codec_of(Sample).encode(value, 1 << 20)
-    assert flat.frame(value, 3, 4, 1 << 20) == HEAD + REST.pack(3, 5, 4, len(body), 0) + body
+    assert coder.frame(value, 3, 4, 1 << 20) == HEAD + REST.pack(3, 5, 4, len(body), 0) + body
     padded = body + bytes(-len(body) % 8)
-    assert flat.record(value, 4, 1 << 20) == RECORD.pack(5, 4, len(body), 0) + padded
-    assert flat.frame(value, 3, 4, len(body) - 1) is None
-    assert flat.record(value, 4, len(body) - 1) is None
-    assert flat.read(flat.frame(value, 3, 4, 1 << 20)) == (3, 4, value)
+    assert coder.record(value, 4, 1 << 20) == RECORD.pack(5, 4, len(body), 0) + padded
+    assert coder.frame(value, 3, 4, len(body) - 1) is None
+    assert coder.record(value, 4, len(body) - 1) is None
+    assert coder.read(coder.frame(value, 3, 4, 1 << 20)) == (3, 4, value)
 
 
 @pytest.mark.parametrize(
@@ -97,8 +97,8 @@ def test_frames_and_records_are_header_and_body(count):
     ],
 )
 def test_what_is_not_as_usual_is_left_to_python(wrong):
-    assert flat_of(Numbers).encode(wrong, 1000) is None
-    assert flat_of(Numbers, HEAD).frame(wrong, 0, 0, 1000) is None
+    assert coder_of(Numbers).encode(wrong, 1000) is None
+    assert coder_of(Numbers, HEAD).frame(wrong, 0, 0, 1000) is None
     with pytest.raises((TypeError, ValueError)):
         codec_of(Numbers).encode(wrong, 1000)
 
@@ -112,41 +112,41 @@ def test_values_that_python_takes_and_c_does_not():
     ]
     for value in values:
         codec = codec_of(type(value))
-        assert flat_of(type(value)).encode(value, 1000) is None
+        assert coder_of(type(value)).encode(value, 1000) is None
         assert codec.decode(codec.encode(value, 1000)) == value
 
 
 def test_frames_that_are_none_of_this_publisher():
-    flat = flat_of(Sample, HEAD)
-    frame = flat.frame(sample(), 3, 4, 1 << 20)
+    coder = coder_of(Sample, HEAD)
+    frame = coder.frame(sample(), 3, 4, 1 << 20)
     for other in (b"", frame[:63], frame[:-1], frame + b"x", b"X" + frame[1:], bytearray(frame)):
-        assert flat.read(other) is None
-    assert flat_of(Sample).read(frame) is None  # it has no head
+        assert coder.read(other) is None
+    assert coder_of(Sample).read(frame) is None  # it has no head
 
 
 def test_views_are_read_only_and_keep_what_they_look_at():
-    flat = flat_of(Sample, HEAD)
-    _, _, value = flat.read(flat.frame(sample(), 3, 4, 1 << 20))
+    coder = coder_of(Sample, HEAD)
+    _, _, value = coder.read(coder.frame(sample(), 3, 4, 1 << 20))
     data = value.data[3:]
     del value
     gc.collect()
     assert not data.flags.writeable
     assert data.tolist() == [3, 4, 5, 6, 7, 8, 9]
     buffer = np.frombuffer(bytes(8) + codec_of(Sample).encode(sample(), 1000), np.uint8)
-    view = flat.decode(buffer, 8, len(buffer) - 8).data
+    view = coder.decode(buffer, 8, len(buffer) - 8).data
     assert np.shares_memory(view, buffer)
     assert view.tolist() == list(range(10))
 
 
 def test_nothing_is_leaked():
-    flat, value = flat_of(Sample, HEAD), sample()
-    numbers, many = flat_of(Numbers), Numbers(1, 2, 3.0, True, "four")
+    coder, value = coder_of(Sample, HEAD), sample()
+    numbers, many = coder_of(Numbers), Numbers(1, 2, 3.0, True, "four")
     text = numbers.encode(many, 1000)
 
     def use():
         for _ in range(2000):
-            flat.read(flat.frame(value, 3, 4, 1 << 20))
-            flat.record(value, 4, 1 << 20)
+            coder.read(coder.frame(value, 3, 4, 1 << 20))
+            coder.record(value, 4, 1 << 20)
             numbers.decode(text, 0, len(text))
             numbers.decode(text[:-1], 0, len(text) - 1)
 
@@ -174,8 +174,8 @@ class Script:
 
 
 def frames_of(*sequences):
-    flat = flat_of(Sample, HEAD)
-    return [flat.frame(sample(s), s, 0, 1000) for s in sequences]
+    coder = coder_of(Sample, HEAD)
+    return [coder.frame(sample(s), s, 0, 1000) for s in sequences]
 
 
 @pytest.mark.parametrize(
@@ -204,14 +204,14 @@ def test_drain_is_that_of_python(frames, expected, limit, may_wait):
         return result, list(messages), latency, len(script.frames), flags
 
     reader = packer.make_reader(codec_of(Sample), HEAD)
-    flat = flat_of(Sample, HEAD)
-    assert drain(flat.drain) == drain(lambda *rest: packer.drain(reader.read, *rest))
+    coder = coder_of(Sample, HEAD)
+    assert drain(coder.drain) == drain(lambda *rest: packer.drain(reader.read, *rest))
 
 
 @pytest.mark.parametrize("case", range(4))
 def test_gather_is_that_of_python(case):
-    flat, codec = flat_of(Numbers3, HEAD), codec_of(Numbers3)
-    frames = [flat.frame(Numbers3(s, float(s)), s, 0, 1000) for s in range(20)]
+    coder, codec = coder_of(Numbers3, HEAD), codec_of(Numbers3)
+    frames = [coder.frame(Numbers3(s, float(s)), s, 0, 1000) for s in range(20)]
     frames, expected, limit = [
         (frames, 0, 64),
         (frames, 0, 7),
@@ -235,7 +235,7 @@ def test_drain_passes_errors_on():
         raise OSError("gone")
 
     with pytest.raises(OSError, match="gone"):
-        flat_of(Sample, HEAD).drain(broken, zmq.Again, deque(), 0, 4, [0] * 8, 0, False)
+        coder_of(Sample, HEAD).drain(broken, zmq.Again, deque(), 0, 4, [0] * 8, 0, False)
 
 
 # The gate
@@ -248,7 +248,7 @@ class Taken:
         self.lock = threading.Lock()
         self.sent, self.slow, self.retried, self.flushed = [], [], [], 0
         self.gate = gate.make_gate(
-            flat_of(Sample, HEAD),
+            coder_of(Sample, HEAD),
             self.lock,
             slowly=self.slowly,
             retry=self.retry,
@@ -284,7 +284,7 @@ class Taken:
 def test_a_gate_sends_frames_and_counts_them():
     taken = Taken()
     assert all(taken.gate(sample(k)) is True for k in range(3))
-    found = [flat_of(Sample, HEAD).read(frame) for frame in taken.sent]
+    found = [coder_of(Sample, HEAD).read(frame) for frame in taken.sent]
     assert [(sequence, value.stamp_ns) for sequence, _, value in found] == [(0, 0), (1, 1), (2, 2)]
     assert all(found[k][1] <= found[k + 1][1] for k in range(2))
     assert (taken.gate.sequence, taken.gate.bytes) == (3, sum(map(len, taken.sent)) - 3 * 64)
@@ -294,8 +294,8 @@ def test_a_gate_sends_frames_and_counts_them():
 
 def test_a_gate_adds_to_a_batch_that_has_begun():
     """The first record of a batch is put in by Python; a full batch is flushed."""
-    taken, flat = Taken(), flat_of(Sample, HEAD)
-    first = flat.record(sample(0), 1, 1000)
+    taken, coder = Taken(), coder_of(Sample, HEAD)
+    first = coder.record(sample(0), 1, 1000)
     taken.gate.records, taken.gate.batch_start_ns = [first], time.monotonic_ns() + 10**12
     for k in range(1, publisher.BATCH_COUNT - 1):
         assert taken.gate(sample(k)) is True
@@ -303,7 +303,7 @@ def test_a_gate_adds_to_a_batch_that_has_begun():
     assert [len(record) for record in records] == [len(first)] * (publisher.BATCH_COUNT - 1)
     assert taken.gate.batch_bytes == len(first) * (publisher.BATCH_COUNT - 2)
     frame = bytes(64) + b"".join(records)
-    assert flat.records(frame, len(records)) == [sample(k) for k in range(len(records))]
+    assert coder.records(frame, len(records)) == [sample(k) for k in range(len(records))]
     assert taken.flushed == 0
     assert taken.gate(sample(63)) is True
     assert (taken.flushed, taken.sent, taken.slow) == (1, [], [])
@@ -320,10 +320,10 @@ def test_a_gate_adds_to_a_batch_that_has_begun():
 
 @pytest.mark.parametrize("damage", ["short", "long", "reserved", "count", "body"])
 def test_batches_that_are_not_as_they_should_be(damage):
-    flat = flat_of(Sample, HEAD)
-    records = [flat.record(sample(k), 1, 1000) for k in range(3)]
+    coder = coder_of(Sample, HEAD)
+    records = [coder.record(sample(k), 1, 1000) for k in range(3)]
     frame, count = bytes(64) + b"".join(records), 3
-    assert flat.records(frame, count) == [sample(k) for k in range(3)]
+    assert coder.records(frame, count) == [sample(k) for k in range(3)]
     if damage == "short":
         frame = frame[:-8]
     elif damage == "long":
@@ -334,7 +334,7 @@ def test_batches_that_are_not_as_they_should_be(damage):
         count = 4
     else:
         frame = frame[: 64 + 24 + 8] + b"\xff" * 16 + frame[64 + 24 + 24 :]
-    assert flat.records(frame, count) is None
+    assert coder.records(frame, count) is None
 
 
 def test_what_goes_the_long_way():

@@ -1,0 +1,57 @@
+/* Messages to bytes and back, for the files that send and receive them. */
+
+#ifndef CORTEX_CODER_H
+#define CORTEX_CODER_H
+
+#include "_items.h"
+
+enum { DEFERRED_MAX = 16 };
+
+typedef struct {
+    PyObject_HEAD
+    Record record;
+    Py_ssize_t stamp; /* field that is the stamp, -1: none */
+    int has_head;
+    char head[HEAD_SIZE];
+    PyObject *slots; /* a SlotView whose messages are read here, too; NULL or None: none */
+} Coder;
+
+extern PyTypeObject CoderType;
+
+/* An array that is still to be copied. */
+typedef struct {
+    PyObject *array; /* borrowed */
+    const char *data;
+    Py_ssize_t start, size;
+} Deferred;
+
+/* One message on its way to bytes. */
+typedef struct {
+    char *out;        /* NULL: it is only measured */
+    Py_ssize_t end;   /* where the next item of the tail may begin */
+    Py_ssize_t limit; /* where the body must end */
+    int64_t stamp_ns;
+    int defers; /* whether large arrays are left to `copy_deferred` */
+    int deferred_count;
+    Deferred deferred[DEFERRED_MAX];
+} Pack;
+
+/* Size of a message's body; -1 without error if it is not as usual. */
+Py_ssize_t measure_body(const Coder *coder, PyObject *message);
+
+/* Write a body of the size that was measured; 0 without error if the message is not as usual. */
+int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_ssize_t size, int defers);
+
+/* Copy what was deferred: this needs no GIL, but someone who keeps the arrays (`hold` 1) and lets them go (-1). */
+void copy_deferred(const Pack *pack);
+void hold_deferred(const Pack *pack, int hold);
+
+/* A whole frame, or a record of a batch; NULL without error if the message is not as usual. A record's body has at most
+   `limit` bytes. */
+PyObject *make_frame(const Coder *coder, PyObject *message, Py_ssize_t size, uint64_t sequence, int64_t publish_ns);
+PyObject *make_record(const Coder *coder, PyObject *message, int64_t publish_ns, Py_ssize_t limit);
+
+/* The message of a body within `owner`, which its arrays keep; NULL without error if it is malformed. */
+PyObject *read_body(const Coder *coder, PyObject *owner, const char *body, Py_ssize_t size);
+
+#endif

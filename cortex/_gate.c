@@ -1,0 +1,325 @@
+/* The way of a message out; see `gate.py`. A large one is written into a slot of shared memory, whose account
+   `_ring.c` keeps. */
+
+#include "_coder.h"
+#include "_ring.h"
+
+#include <structmember.h>
+
+enum { UNLOCKED_BYTES = 1 << 17 /* to copy so many takes longer than to let others have the lock meanwhile */ };
+
+static PyObject *dont_wait; /* of ZeroMQ, as an int */
+
+typedef struct {
+    PyObject_HEAD
+    vectorcallfunc vectorcall;
+    Coder *coder;
+    PyObject *acquire, *release, *slowly, *retry, *again;
+    PyObject *sends; /* a tuple; empty or NULL: every message goes the long way */
+    Py_ssize_t limit;
+    uint64_t sequence;
+    int64_t bytes;
+    int64_t refresh_ns;
+    /* Where larger bodies go; NULL or None: the long way. */
+    PyObject *ledger;
+    PyObject *prepare, *large_acquire, *large_release, *finish;
+    /* A batch that is being collected: its first record is put in by Python, which starts the clock. */
+    PyObject *records; /* a list; NULL or None: messages are not collected */
+    PyObject *flush;
+    int64_t batch_bytes, batch_start_ns, last_ns;
+    int64_t batch_count_max, batch_bytes_max, batch_ns_max;
+} Gate;
+
+PyDoc_STRVAR(gate_doc,
+"Gate(coder, acquire, release, slowly, retry, again, limit, flush)\n--\n\n"
+"Called with a message, it sends it, or adds it to a batch that has begun; see `gate.py`.\n\n"
+"Args:\n"
+"    coder: Makes the frames; has a head.\n"
+"    acquire: Takes the lock.\n"
+"    release: Gives it back.\n"
+"    slowly: Called without the lock with a message that has to go the long way.\n"
+"    retry: Called with the lock held, a frame, and that of `sends` which had no room for it.\n"
+"    again: What that raised.\n"
+"    limit: Most bytes of a body.\n"
+"    flush: Called with the lock held when a batch is full; sends it.\n");
+
+/* Add to the batch that is being collected, with the lock held; NULL as below. */
+static PyObject *gate_collect(Gate *gate, PyObject *message) {
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns) return NULL;
+    PyObject *record = make_record(gate->coder, message, now_ns, gate->limit);
+    if (record == NULL) return NULL;
+    gate->batch_bytes += PyBytes_GET_SIZE(record);
+    const int failed = PyList_Append(gate->records, record);
+    Py_DECREF(record);
+    if (failed) return NULL;
+    gate->sequence += 1;
+    gate->last_ns = now_ns;
+    if (PyList_GET_SIZE(gate->records) >= gate->batch_count_max || gate->batch_bytes >= gate->batch_bytes_max
+        || now_ns - gate->batch_start_ns >= gate->batch_ns_max)
+        return PyObject_CallNoArgs(gate->flush);
+    Py_RETURN_TRUE;
+}
+
+/* See who has come and gone, now and then; 0 with an error set, or if nobody is there to do it. */
+static int gate_prepare(Gate *gate, int64_t now_ns) {
+    if (gate->prepare == NULL) return 0;
+    PyObject *prepared = PyObject_CallFunction(gate->prepare, "L", (long long)now_ns);
+    Py_XDECREF(prepared);
+    return prepared != NULL;
+}
+
+/* Send a frame to all; the lock is held. */
+static PyObject *gate_send_frame(Gate *gate, PyObject *frame) {
+    PyObject *sends = Py_NewRef(gate->sends); /* who comes or goes meanwhile replaces it */
+    int on_time = 1;
+    for (Py_ssize_t place = 0; on_time >= 0 && place < PyTuple_GET_SIZE(sends); ++place) {
+        PyObject *arguments[3] = {NULL, frame, dont_wait};
+        PyObject *sent = PyObject_Vectorcall(
+            PyTuple_GET_ITEM(sends, place), arguments + 1, 2 | PY_VECTORCALL_ARGUMENTS_OFFSET, NULL);
+        if (sent == NULL && PyErr_ExceptionMatches(gate->again)) {
+            PyErr_Clear();
+            sent = PyObject_CallFunction(gate->retry, "OO", frame, PyTuple_GET_ITEM(sends, place));
+            if (sent == Py_False) on_time = 0;
+        }
+        if (sent == NULL) on_time = -1;
+        Py_XDECREF(sent);
+    }
+    Py_DECREF(sends);
+    return on_time < 0 ? NULL : PyBool_FromLong(on_time);
+}
+
+/* Take the lock back, whatever signals come; 0 with an error set if one of their handlers raised. */
+static int gate_relock(Gate *gate) {
+    PyObject *acquired, *type = NULL, *value = NULL, *traceback = NULL;
+    while ((acquired = PyObject_CallNoArgs(gate->acquire)) == NULL) {
+        Py_XDECREF(type);
+        Py_XDECREF(value);
+        Py_XDECREF(traceback);
+        PyErr_Fetch(&type, &value, &traceback);
+    }
+    Py_DECREF(acquired);
+    if (type == NULL) return 1;
+    PyErr_Restore(type, value, traceback);
+    return 0;
+}
+
+/* Copy the arrays of a large message without the lock, which is held before and after; 0 with an error set. */
+static int gate_copy(Gate *gate, const Pack *pack) {
+    hold_deferred(pack, 1);
+    PyObject *released = PyObject_CallNoArgs(gate->release);
+    if (released == NULL) {
+        hold_deferred(pack, -1);
+        return 0;
+    }
+    Py_DECREF(released);
+    Py_BEGIN_ALLOW_THREADS
+    copy_deferred(pack);
+    Py_END_ALLOW_THREADS
+    const int locked = gate_relock(gate);
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    hold_deferred(pack, -1);
+    PyErr_Restore(type, value, traceback);
+    return locked;
+}
+
+/* Write a large message into a slot and send its descriptor, with the lock held; NULL as below.
+
+   While much is copied others may have the lock: then `large_acquire` keeps other large messages away, and whatever
+   has changed meanwhile is left to `finish`. */
+static PyObject *gate_send_slot(Gate *gate, PyObject *message, Py_ssize_t size, int64_t now_ns) {
+    Ledger *ledger = gate->ledger == NULL ? NULL : ledger_of(gate->ledger);
+    if (ledger == NULL || gate->records != NULL || !ledger_has_room(ledger)) return NULL;
+    const int unlocked = size >= UNLOCKED_BYTES;
+    if (unlocked) {
+        PyObject *acquired = PyObject_CallOneArg(gate->large_acquire, Py_False);
+        Py_XDECREF(acquired);
+        if (acquired != Py_True) return NULL;
+    }
+    PyObject *kept = Py_NewRef(gate->ledger), *result = NULL;
+    const Py_ssize_t slot = ledger_acquire(ledger, size);
+    if (slot >= 0) {
+        Pack pack;
+        int written = write_body(gate->coder, message, &pack, ledger_memory(ledger, slot), size, 1);
+        ledger_use(ledger, 1);
+        if (written && unlocked) written = gate_copy(gate, &pack);
+        else if (written) copy_deferred(&pack);
+        ledger_use(ledger, -1);
+        if (!written) {
+            ledger_abandon(ledger, slot);
+        } else if (gate->ledger != kept || gate->refresh_ns == 0 || !ledger_has_room(ledger)) {
+            result = PyObject_CallFunction(gate->finish, "nnLL", slot, size, (long long)pack.stamp_ns, (long long)now_ns);
+        } else {
+            PyObject *frame = ledger_commit(ledger, slot, gate->sequence, pack.stamp_ns, now_ns, size);
+            if (frame == NULL) {
+                ledger_abandon(ledger, slot);
+            } else {
+                gate->sequence += 1;
+                gate->bytes += size;
+                result = gate_send_frame(gate, frame);
+                Py_DECREF(frame);
+            }
+        }
+    }
+    Py_DECREF(kept);
+    if (unlocked) {
+        PyObject *type, *value, *traceback;
+        PyErr_Fetch(&type, &value, &traceback);
+        PyObject *released = PyObject_CallNoArgs(gate->large_release);
+        if (released == NULL) PyErr_Clear(); /* it was ours */
+        Py_XDECREF(released);
+        PyErr_Restore(type, value, traceback);
+    }
+    return result;
+}
+
+/* Send with the lock held; NULL without error if the message has to go the long way. */
+static PyObject *gate_send(Gate *gate, PyObject *message) {
+    if (gate->records != NULL && PyList_CheckExact(gate->records) && PyList_GET_SIZE(gate->records))
+        return gate_collect(gate, message);
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns && !gate_prepare(gate, now_ns)) return NULL;
+    if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
+    const Py_ssize_t size = measure_body(gate->coder, message);
+    if (size < 0) return NULL;
+    if (size > gate->limit) return gate_send_slot(gate, message, size, now_ns);
+    PyObject *frame = make_frame(gate->coder, message, size, gate->sequence, now_ns);
+    if (frame == NULL) return NULL;
+    gate->sequence += 1;
+    gate->bytes += size;
+    PyObject *sent = gate_send_frame(gate, frame);
+    Py_DECREF(frame);
+    return sent;
+}
+
+static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t flags, PyObject *keywords) {
+    Gate *gate = (Gate *)self;
+    if (PyVectorcall_NARGS(flags) != 1 || (keywords != NULL && PyTuple_GET_SIZE(keywords))) {
+        PyErr_SetString(PyExc_TypeError, "publish() takes one message, by position");
+        return NULL;
+    }
+    PyObject *acquired = PyObject_CallNoArgs(gate->acquire);
+    if (acquired == NULL) return NULL;
+    Py_DECREF(acquired);
+    PyObject *result = gate_send(gate, arguments[0]);
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    PyObject *released = PyObject_CallNoArgs(gate->release);
+    if (released == NULL) {
+        Py_XDECREF(result);
+        Py_XDECREF(type);
+        Py_XDECREF(value);
+        Py_XDECREF(traceback);
+        return NULL;
+    }
+    Py_DECREF(released);
+    if (type != NULL) {
+        PyErr_Restore(type, value, traceback);
+        return NULL;
+    }
+    return result != NULL ? result : PyObject_CallOneArg(gate->slowly, arguments[0]);
+}
+
+static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
+    static char *names[] = {"coder", "acquire", "release", "slowly", "retry", "again", "limit", "flush", NULL};
+    PyObject *coder, *acquire, *release, *slowly, *retry, *again, *flush;
+    Py_ssize_t limit;
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!OOOOOnO:Gate", names, &CoderType, &coder, &acquire, &release,
+                                     &slowly, &retry, &again, &limit, &flush))
+        return NULL;
+    Gate *gate = (Gate *)type->tp_alloc(type, 0);
+    if (gate == NULL) return NULL;
+    gate->vectorcall = gate_call;
+    gate->coder = (Coder *)Py_NewRef(coder);
+    gate->acquire = Py_NewRef(acquire);
+    gate->release = Py_NewRef(release);
+    gate->slowly = Py_NewRef(slowly);
+    gate->retry = Py_NewRef(retry);
+    gate->again = Py_NewRef(again);
+    gate->flush = Py_NewRef(flush);
+    gate->limit = limit;
+    return (PyObject *)gate;
+}
+
+static int gate_traverse(Gate *gate, visitproc visit, void *arg) {
+    Py_VISIT(gate->coder);
+    Py_VISIT(gate->acquire);
+    Py_VISIT(gate->release);
+    Py_VISIT(gate->slowly);
+    Py_VISIT(gate->retry);
+    Py_VISIT(gate->again);
+    Py_VISIT(gate->sends);
+    Py_VISIT(gate->ledger);
+    Py_VISIT(gate->prepare);
+    Py_VISIT(gate->large_acquire);
+    Py_VISIT(gate->large_release);
+    Py_VISIT(gate->finish);
+    Py_VISIT(gate->records);
+    Py_VISIT(gate->flush);
+    return 0;
+}
+
+static int gate_clear(Gate *gate) {
+    Py_CLEAR(gate->coder);
+    Py_CLEAR(gate->acquire);
+    Py_CLEAR(gate->release);
+    Py_CLEAR(gate->slowly);
+    Py_CLEAR(gate->retry);
+    Py_CLEAR(gate->again);
+    Py_CLEAR(gate->sends);
+    Py_CLEAR(gate->ledger);
+    Py_CLEAR(gate->prepare);
+    Py_CLEAR(gate->large_acquire);
+    Py_CLEAR(gate->large_release);
+    Py_CLEAR(gate->finish);
+    Py_CLEAR(gate->records);
+    Py_CLEAR(gate->flush);
+    return 0;
+}
+
+static void gate_dealloc(Gate *gate) {
+    PyObject_GC_UnTrack(gate);
+    gate_clear(gate);
+    Py_TYPE(gate)->tp_free((PyObject *)gate);
+}
+
+static PyMemberDef gate_members[] = {
+    {"sends", T_OBJECT, offsetof(Gate, sends), 0, "Take a frame and flags; none: every message goes the long way."},
+    {"ledger", T_OBJECT, offsetof(Gate, ledger), 0, "A `Ledger`: where larger bodies go; None: the long way."},
+    {"prepare", T_OBJECT, offsetof(Gate, prepare), 0, "Called with the lock held and the time when `refresh_ns` is over."},
+    {"large_acquire", T_OBJECT, offsetof(Gate, large_acquire), 0, "Called with False, takes the lock of large messages."},
+    {"large_release", T_OBJECT, offsetof(Gate, large_release), 0, "Gives it back."},
+    {"finish", T_OBJECT, offsetof(Gate, finish), 0, "Sends a written slot: number, size, stamp_ns, publish_ns."},
+    {"records", T_OBJECT, offsetof(Gate, records), 0, "Those of the batch that is being collected; None: none is."},
+    {"batch_bytes", T_LONGLONG, offsetof(Gate, batch_bytes), 0, "Their bytes."},
+    {"batch_start_ns", T_LONGLONG, offsetof(Gate, batch_start_ns), 0, "When the first was published."},
+    {"batch_count_max", T_LONGLONG, offsetof(Gate, batch_count_max), 0, "A batch of so many messages is full."},
+    {"batch_bytes_max", T_LONGLONG, offsetof(Gate, batch_bytes_max), 0, "A batch of so many bytes is full."},
+    {"batch_ns_max", T_LONGLONG, offsetof(Gate, batch_ns_max), 0, "A batch that is so old is sent."},
+    {"last_ns", T_LONGLONG, offsetof(Gate, last_ns), 0, "When the last message was published."},
+    {"sequence", T_ULONGLONG, offsetof(Gate, sequence), 0, "Of the next message."},
+    {"bytes", T_LONGLONG, offsetof(Gate, bytes), 0, "Of all bodies so far."},
+    {"refresh_ns", T_LONGLONG, offsetof(Gate, refresh_ns), 0, "When the next message goes the long way."},
+    {NULL, 0, 0, 0, NULL},
+};
+
+static PyTypeObject GateType = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "cortex._native.Gate",
+    .tp_doc = gate_doc,
+    .tp_basicsize = sizeof(Gate),
+    .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_HAVE_VECTORCALL,
+    .tp_vectorcall_offset = offsetof(Gate, vectorcall),
+    .tp_call = PyVectorcall_Call,
+    .tp_new = gate_new,
+    .tp_traverse = (traverseproc)gate_traverse,
+    .tp_clear = (inquiry)gate_clear,
+    .tp_dealloc = (destructor)gate_dealloc,
+    .tp_members = gate_members,
+};
+
+int add_gate(PyObject *module) {
+    dont_wait = PyLong_FromLong(1);
+    return dont_wait == NULL ? -1 : PyModule_AddType(module, &GateType);
+}

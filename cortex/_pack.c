@@ -1,0 +1,290 @@
+/* Messages to bodies, as `encoder.py` writes them.
+
+   The same walk is done twice, first to learn the size, then to write. Between the two others may have had the GIL, and
+   may have changed a list: so the second checks that all goes where it was measured, and gives up if not. No Python code
+   runs within a walk. */
+
+#include "_coder.h"
+
+#include <string.h>
+
+enum {
+    LARGE_ARRAY_BYTES = 1024,
+    DEFERRED_BYTES = 1 << 14,
+};
+
+static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t at, npy_intp *dimensions);
+
+/* Numbers: each returns 0 if the value is not of the usual class or out of range, with no error set. */
+
+static int write_integer(char code, PyObject *value, char *out) {
+    if (!PyLong_Check(value)) return 0;
+    if (code == 'Q') {
+        const uint64_t number = PyLong_AsUnsignedLongLong(value);
+        if (number == (uint64_t)-1 && PyErr_Occurred()) {
+            PyErr_Clear();
+            return 0;
+        }
+        memcpy(out, &number, 8);
+        return 1;
+    }
+    int overflow;
+    const int64_t number = PyLong_AsLongLongAndOverflow(value, &overflow);
+    if (overflow) return 0;
+#define INTEGER(CODE, TYPE, LOW, HIGH) \
+    case CODE: { \
+        if (number < (LOW) || number > (HIGH)) return 0; \
+        const TYPE narrow = (TYPE)number; \
+        memcpy(out, &narrow, sizeof narrow); \
+        return 1; \
+    }
+    switch (code) {
+        INTEGER('b', int8_t, INT8_MIN, INT8_MAX)
+        INTEGER('h', int16_t, INT16_MIN, INT16_MAX)
+        INTEGER('i', int32_t, INT32_MIN, INT32_MAX)
+        INTEGER('q', int64_t, INT64_MIN, INT64_MAX)
+        INTEGER('B', uint8_t, 0, UINT8_MAX)
+        INTEGER('H', uint16_t, 0, UINT16_MAX)
+        INTEGER('I', uint32_t, 0, UINT32_MAX)
+    }
+#undef INTEGER
+    return 0;
+}
+
+static int write_float(char code, PyObject *value, char *out) {
+    double number;
+    if (PyFloat_Check(value)) {
+        number = PyFloat_AS_DOUBLE(value);
+    } else if (PyLong_CheckExact(value)) {
+        number = PyLong_AsDouble(value);
+        if (number == -1.0 && PyErr_Occurred()) {
+            PyErr_Clear();
+            return 0;
+        }
+    } else {
+        return 0;
+    }
+    if (code == 'd') {
+        memcpy(out, &number, 8);
+        return 1;
+    }
+    const float narrow = (float)number;
+    if (narrow - narrow != 0.0f && number - number == 0.0) return 0; /* too large for a float32 */
+    memcpy(out, &narrow, 4);
+    return 1;
+}
+
+static inline int write_number(char code, PyObject *value, char *out) {
+    return code == 'd' || code == 'f' ? write_float(code, value, out) : write_integer(code, value, out);
+}
+
+static int write_member(const Members *members, PyObject *value, char *out) {
+    Py_ssize_t low = 0, high = members->count;
+    while (low < high) {
+        const Py_ssize_t middle = (low + high) / 2;
+        const Member *member = &members->by_member[middle];
+        if (member->member == value) {
+            memcpy(out, &member->number, 4);
+            return 1;
+        }
+        if ((uintptr_t)member->member < (uintptr_t)value) low = middle + 1;
+        else high = middle;
+    }
+    return 0;
+}
+
+/* The tail */
+
+/* Make room in the tail: where so many bytes go, or -1. What is empty lies at 0. */
+static Py_ssize_t claim(Pack *pack, Py_ssize_t size, Py_ssize_t alignment) {
+    if (size == 0) return 0;
+    const Py_ssize_t start = align_to(pack->end, alignment);
+    if (start > pack->limit || size > pack->limit - start) return -1;
+    if (pack->out != NULL) memset(pack->out + pack->end, 0, (size_t)(start - pack->end));
+    pack->end = start + size;
+    return start;
+}
+
+/* Write an offset and a second number, as begin the descriptors of all that lies in the tail. */
+static void describe(const Pack *pack, Py_ssize_t at, Py_ssize_t start, Py_ssize_t second) {
+    const uint32_t numbers[2] = {(uint32_t)start, (uint32_t)second};
+    memcpy(pack->out + at, numbers, sizeof numbers);
+}
+
+static int pack_bytes(Pack *pack, const char *data, Py_ssize_t size, Py_ssize_t at) {
+    const Py_ssize_t start = claim(pack, size, 8);
+    if (start < 0) return 0;
+    if (pack->out == NULL) return 1;
+    describe(pack, at, start, size);
+    if (size) memcpy(pack->out + start, data, (size_t)size);
+    return 1;
+}
+
+static int pack_str(Pack *pack, PyObject *value, Py_ssize_t at) {
+    if (!PyUnicode_CheckExact(value)) return 0;
+    Py_ssize_t size;
+    const char *data = PyUnicode_AsUTF8AndSize(value, &size);
+    if (data != NULL) return pack_bytes(pack, data, size, at);
+    PyErr_Clear();
+    return 0;
+}
+
+/* Arrays */
+
+/* Index of an array's dtype; -1 if the array is not of the usual class, of a right dtype and shape. */
+static Py_ssize_t find_dtype(const Array *known, PyObject *value, npy_intp *dimensions) {
+    if (!PyArray_CheckExact(value)) return -1;
+    PyArrayObject *array = (PyArrayObject *)value;
+    if (PyArray_NDIM(array) != known->rank || !PyArray_IS_C_CONTIGUOUS(array)) return -1;
+    const npy_intp *shape = PyArray_DIMS(array);
+    for (int axis = 0; axis < known->rank; ++axis) {
+        if (shape[axis] > UINT32_MAX || !fits_axis(&known->axes[axis], shape[axis], dimensions)) return -1;
+    }
+    const PyArray_Descr *descr = PyArray_DESCR(array);
+    for (Py_ssize_t index = 0; index < known->dtype_count; ++index) {
+        if (known->dtypes[index].descr == descr) return index;
+    }
+    return -1;
+}
+
+/* Copy the items of an array to where they belong, or leave that for later. */
+static void put_items(Pack *pack, PyArrayObject *array, Py_ssize_t start) {
+    const Py_ssize_t size = PyArray_NBYTES(array);
+    if (pack->defers && size >= DEFERRED_BYTES && pack->deferred_count < DEFERRED_MAX) {
+        pack->deferred[pack->deferred_count++] = (Deferred){(PyObject *)array, PyArray_BYTES(array), start, size};
+    } else if (size) {
+        memcpy(pack->out + start, PyArray_BYTES(array), (size_t)size);
+    }
+}
+
+static int pack_variable(Pack *pack, const Array *known, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
+    const Py_ssize_t dtype = find_dtype(known, value, dimensions);
+    if (dtype < 0) return 0;
+    PyArrayObject *array = (PyArrayObject *)value;
+    const Py_ssize_t size = PyArray_NBYTES(array);
+    const Py_ssize_t start = claim(pack, size, size >= LARGE_ARRAY_BYTES ? 64 : 8);
+    if (start < 0) return 0;
+    if (pack->out == NULL) return 1;
+    describe(pack, at, start, known->head + dtype);
+    for (int axis = 0; axis < known->rank; ++axis) {
+        const uint32_t length = (uint32_t)PyArray_DIM(array, axis);
+        memcpy(pack->out + at + 8 + 4 * axis, &length, 4);
+    }
+    put_items(pack, array, start);
+    return 1;
+}
+
+static int pack_fixed(Pack *pack, const Array *known, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
+    if (find_dtype(known, value, dimensions) < 0) return 0;
+    put_items(pack, (PyArrayObject *)value, at);
+    return 1;
+}
+
+/* What has others within */
+
+static int pack_list(Pack *pack, const List *list, PyObject *value, Py_ssize_t at) {
+    if (!PyList_CheckExact(value) && !PyTuple_CheckExact(value)) return 0;
+    const Py_ssize_t count = PySequence_Fast_GET_SIZE(value);
+    if (count > BODY_LIMIT / list->stride) return 0;
+    const Py_ssize_t start = claim(pack, count * list->stride, list->alignment);
+    if (start < 0) return 0;
+    if (pack->out != NULL) {
+        describe(pack, at, start, count);
+        memset(pack->out + start, 0, (size_t)(count * list->stride));
+    } else if (!list->item->has_tail) {
+        return 1;
+    }
+    PyObject **elements = PySequence_Fast_ITEMS(value);
+    npy_intp dimensions[DIMENSIONS_MAX];
+    for (Py_ssize_t index = 0; index < count; ++index) {
+        begin_scope(dimensions, list->dimension_count);
+        if (!pack_item(pack, list->item, elements[index], start + index * list->stride, dimensions)) return 0;
+    }
+    return 1;
+}
+
+static int pack_message(Pack *pack, const Record *record, PyObject *message, Py_ssize_t at) {
+    if (Py_TYPE(message) != record->cls) return 0;
+    npy_intp dimensions[DIMENSIONS_MAX];
+    begin_scope(dimensions, record->dimension_count);
+    const Item *end = record->fields + record->count;
+    for (const Item *field = record->fields; field < end; ++field) {
+        if (pack->out == NULL && !field->has_tail) continue;
+        PyObject *value = *place_of(field, message);
+        if (value == NULL || !pack_item(pack, field, value, at + field->offset, dimensions)) return 0;
+    }
+    return 1;
+}
+
+/* Put a value whose block is at `at` and has been filled with zeros; 0 without error if it is not as usual. */
+static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t at, npy_intp *dimensions) {
+    switch (item->kind) {
+        case NUMBER:
+            return write_number(item->code, value, pack->out + at);
+        case BOOL:
+            pack->out[at] = value == Py_True;
+            return value == Py_True || value == Py_False;
+        case ENUM:
+            return write_member(&item->members, value, pack->out + at);
+        case FIXED:
+            return pack_fixed(pack, &item->array, value, at, dimensions);
+        case VARIABLE:
+            return pack_variable(pack, &item->array, value, at, dimensions);
+        case STR:
+            return pack_str(pack, value, at);
+        case BYTES:
+            return PyBytes_CheckExact(value) && pack_bytes(pack, PyBytes_AS_STRING(value), PyBytes_GET_SIZE(value), at);
+        case OPTIONAL:
+            if (value == Py_None) return 1;
+            if (pack->out != NULL) pack->out[at] = 1;
+            return pack_item(pack, item->inner, value, at + item->inner->offset, dimensions);
+        case LIST:
+            return pack_list(pack, &item->list, value, at);
+        case MESSAGE:
+            return pack_message(pack, &item->record, value, at);
+    }
+    Py_UNREACHABLE();
+}
+
+/* Bodies */
+
+Py_ssize_t measure_body(const Coder *coder, PyObject *message) {
+    const Record *record = &coder->record;
+    if (!record->has_tail) return Py_TYPE(message) == record->cls ? record->size : -1;
+    Pack pack;
+    pack.out = NULL;
+    pack.end = record->size;
+    pack.limit = BODY_LIMIT - 1;
+    return pack_message(&pack, record, message, 0) ? pack.end : -1;
+}
+
+int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_ssize_t size, int defers) {
+    const Record *record = &coder->record;
+    pack->out = out;
+    pack->end = record->size;
+    pack->limit = size;
+    pack->stamp_ns = 0;
+    pack->defers = defers;
+    pack->deferred_count = 0;
+    memset(out, 0, (size_t)record->size);
+    if (!pack_message(pack, record, message, 0) || pack->end != size) return 0;
+    if (coder->stamp < 0) return 1;
+    pack->stamp_ns = PyLong_AsLongLong(*place_of(&record->fields[coder->stamp], message)); /* it was written */
+    if (pack->stamp_ns != -1 || !PyErr_Occurred()) return 1;
+    PyErr_Clear();
+    return 0;
+}
+
+void copy_deferred(const Pack *pack) {
+    for (int index = 0; index < pack->deferred_count; ++index) {
+        const Deferred *deferred = &pack->deferred[index];
+        memcpy(pack->out + deferred->start, deferred->data, (size_t)deferred->size);
+    }
+}
+
+void hold_deferred(const Pack *pack, int hold) {
+    for (int index = 0; index < pack->deferred_count; ++index) {
+        if (hold < 0) Py_DECREF(pack->deferred[index].array);
+        else Py_INCREF(pack->deferred[index].array);
+    }
+}
