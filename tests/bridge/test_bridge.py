@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 from bridge_rig import camera_info, image, imu, odometry, rig_of, stamp_ns, transform
-from processes import wait_for
+from processes import SOON_S, wait_for
 from runtime_directory import own_directory
 
 from cortex import Node, message
@@ -461,7 +461,7 @@ class Craft:
         return all(subscriber.publisher_count == 1 for subscriber in self.subscribers.values())
 
     def recv(self, mode):
-        return self.subscribers[mode].recv(5.0)
+        return self.subscribers[mode].recv(SOON_S)
 
 
 def test_every_command_reaches_its_topic():

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from bridge_process import BridgeProcess
 from bridge_rig import imu, odometry
-from processes import ROOT, Child, wait_for
+from processes import ROOT, SOON_S, Child, wait_for
 from runtime_directory import own_directory
 
 from cortex import Node
@@ -103,7 +103,7 @@ def test_a_node_of_ros_hears_sees_and_commands(bridge: BridgeProcess, ros_node: 
 
             def command(stamp_ns: int = stamp_ns) -> Any:
                 state.publish(odometry(stamp_ns))
-                got = commands.recv(1.0)
+                got = commands.recv(SOON_S)
                 return got is not None and got.stamp_ns == stamp_ns and got
 
             assert wait_for(command).velocity.tolist() == [2.0, 0.0, 0.0]

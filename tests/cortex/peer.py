@@ -115,7 +115,7 @@ class Peer:
         return {}
 
     def await_subscribers(self, topic: str, count: int = 1) -> dict[str, Any]:
-        return {"ok": self.publishers[topic].wait_for_subscribers(count, 10.0)}
+        return {"ok": self.publishers[topic].wait_for_subscribers(count, 60.0)}
 
     def await_publisher(self, topic: str) -> dict[str, Any]:
         return {"ok": self.subscribers[topic].wait_for_publisher(10.0)}

@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 from peer import Number
+from processes import SOON_S
 
 from cortex import latest, reliable
 
@@ -22,7 +23,7 @@ def node(make_node):
 def numbers(node):
     publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     return publisher, subscriber
 
 
@@ -67,7 +68,7 @@ def test_two_subscribers_on_one_loop(node):
     """Neither starves the other, nor the loop's other tasks."""
     publishers = [node.publisher(f"/stream{k}", Number) for k in range(2)]
     subscribers = [node.subscriber(f"/stream{k}", Number, policy=reliable(64, 10.0)) for k in range(2)]
-    assert all(publisher.wait_for_subscribers() for publisher in publishers)
+    assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
 
     def publish(publisher):
         for value in range(2000):
@@ -151,7 +152,7 @@ def test_one_loop_after_another(numbers):
         await asyncio.get_running_loop().create_future()
 
     assert [asyncio.run(take()) for _ in range(3)] == [0, 1, 2]
-    assert subscriber.recv(1.0).value == 3
+    assert subscriber.recv(SOON_S).value == 3
 
     async def wait_in_vain():
         with pytest.raises(TimeoutError):
@@ -160,7 +161,7 @@ def test_one_loop_after_another(numbers):
     for _ in range(2):
         asyncio.run(wait_in_vain())
     publisher.publish(Number(0, 4))
-    assert subscriber.recv(1.0).value == 4
+    assert subscriber.recv(SOON_S).value == 4
 
 
 def test_a_loop_is_woken_at_once(numbers):

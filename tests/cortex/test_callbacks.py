@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from peer import Number, Scan
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from cortex import reliable
 from cortex.publisher import Closed
@@ -30,7 +30,7 @@ def test_callbacks_are_called_in_order(node):
     received = []
     publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, received.append, policy=reliable(64, 5.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(3000):
         assert publisher.publish(Number(value, value))
     wait_for(lambda: len(received) == 3000)
@@ -48,7 +48,7 @@ def test_a_callback_that_raises_is_logged_and_called_again(node, caplog):
 
     publisher = node.publisher("/scans", Scan)
     node.subscriber("/scans", Scan, fail)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for number in range(3):
         publisher.publish(scan(number, 1))
     wait_for(lambda: len(received) == 3)
@@ -59,7 +59,7 @@ def test_callbacks_of_large_and_small_messages_keep_the_order(node):
     received = []
     publisher = node.publisher("/scans", Scan)
     node.subscriber("/scans", Scan, lambda m: received.append(m.stamp_ns), policy=reliable(8, 5.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for number in range(300):
         assert publisher.publish(scan(number, LARGE if number % 3 == 0 else 5))
     wait_for(lambda: len(received) == 300)
@@ -82,7 +82,7 @@ def test_no_callback_after_close(node):
 
     publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, slow)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(30):
         publisher.publish(Number(value, value))
     assert started.wait(5.0)
@@ -91,7 +91,7 @@ def test_no_callback_after_close(node):
     assert not running
     done = threading.Event()
     other = node.subscriber("/numbers", Number, lambda message: done.set())
-    assert publisher.wait_for_subscribers(1, 5.0)
+    assert publisher.wait_for_subscribers(1, SOON_S)
     wait_for(lambda: publisher.publish(Number(0, 0)) and done.wait(0.01))
     assert state["late"] == 0
     other.close()
@@ -111,8 +111,8 @@ def test_a_callback_closes_its_subscriber(node):
     node.subscriber("/block", Number, lambda message: (blocker.set(), free.wait(5.0)))
     block = node.publisher("/block", Number)
     subscribers.append(node.subscriber("/numbers", Number, once))
-    assert publisher.wait_for_subscribers()
-    assert block.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert block.wait_for_subscribers(timeout_s=SOON_S)
     block.publish(Number(0, 0))
     assert blocker.wait(5.0)
     for value in range(10):
@@ -132,7 +132,7 @@ def test_a_callback_closes_its_node(make_node):
 
     publisher = node.publisher("/numbers", Number)
     node.subscriber("/numbers", Number, close)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(Number(0, 0))
     assert closed.wait(5.0)
     with pytest.raises(Closed):
@@ -152,9 +152,9 @@ def test_a_callback_publishes_and_subscribes(node):
 
     first = node.publisher("/first", Number)
     node.subscriber("/first", Number, forward, policy=reliable())
-    assert first.wait_for_subscribers()
+    assert first.wait_for_subscribers(timeout_s=SOON_S)
     first.publish(Number(0, 0))
-    assert second.wait_for_subscribers()
+    assert second.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(1, 100):
         first.publish(Number(0, value))
     wait_for(lambda: received and received[-1].value == 100)

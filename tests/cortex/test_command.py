@@ -217,7 +217,7 @@ def test_info_shows_counters_policies_and_the_type(make_node: MakeNode) -> None:
     received: list[Scan] = []
     viewer.subscriber("/scan", Scan, received.append, policy=reliable(8))
     viewer.subscriber("/scan", Scan, policy=keep_last(2))
-    assert publisher.wait_for_subscribers(2)
+    assert publisher.wait_for_subscribers(2, SOON_S)
     for i in range(1234):
         publisher.publish(Scan(i, np.ones(3, np.float32)))
     wait_for(lambda: len(received) == 1234)
@@ -348,7 +348,7 @@ def test_rate_bandwidth_and_delay_are_measured(make_node: MakeNode) -> None:
 def test_silence_is_told(make_node: MakeNode) -> None:
     publisher = make_node("robot").publisher("/number", Number)
     child = start("hz", "/number", "--window", 1)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for i in range(2):
         publisher.publish(Number(i, i))
     assert child.stdout is not None

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from cpp_client import Impostor, Peer, bad_frames, make_frame, make_rich
 from cpp_messages import OtherScan, Picture, Rich, Scan
-from processes import shared_mappings, wait_for
+from processes import SOON_S, shared_mappings, wait_for
 
 import cortex.messages
 from cortex import records, wire
@@ -160,12 +160,12 @@ def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callab
     node = make_node()
     out = node.publisher("/to_cpp", Rich)
     back = node.subscriber("/from_cpp", Rich, policy=reliable(8))
-    assert out.wait_for_subscribers(1, 10.0)
+    assert out.wait_for_subscribers(1, SOON_S)
     assert back.wait_for_publisher(10.0)
     for number, (height, width) in enumerate([(0, 5), (2, 3), (4, 4), (120, 160), (7, 1), (480, 640)]):
         message = make_rich(number, height, width)
         assert out.publish(message)
-        assert back.recv(10.0) == message
+        assert back.recv(SOON_S) == message
     assert (back.counters.lost, back.counters.rejected) == (0, 0)
 
 
@@ -178,7 +178,7 @@ def test_loans_arrive_as_views_of_shared_memory(
         pictures = node.subscriber("/picture", Picture, policy=reliable(8))
         peer = start("loan", 50, height)
         for number in range(50):
-            picture = pictures.recv(10.0)
+            picture = pictures.recv(SOON_S)
             assert picture.stamp_ns == number
             assert picture.name == f"picture {number}"
             expected = np.arange(number, number + 64 * height, dtype=np.uint64).astype(np.uint8)
@@ -199,7 +199,7 @@ def test_reliable_flood_arrives_whole(
     node = make_node()
     scans = node.publisher("/scan", Scan, coalesce=coalesce)
     peer = start("count", "/scan", "reliable", 0, 3)
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     for number in range(3000):
         assert scans.publish(Scan(number, np.full(size, number, np.float32)))
     assert scans.publish(Scan(-1, np.zeros(0, np.float32)))
@@ -215,7 +215,7 @@ def test_slow_reader_knows_what_it_missed(
     node = make_node()
     scans = node.publisher("/scan", Scan)
     peer = start("count", "/scan", policy, 500, 0)
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     for number in range(2000):
         assert scans.publish(Scan(number, np.full(size, number, np.float32)))
     while not peer.has_line():  # on a busy machine the end is lost as well as any other message
@@ -233,7 +233,7 @@ def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Cal
         scans = node.subscriber("/scan", Scan, policy=reliable(64))
         peer = start("publish", "/scan", 3000, size)
         for number in range(3000):
-            scan = scans.recv(10.0)
+            scan = scans.recv(SOON_S)
             assert (scan.stamp_ns, scan.ranges.size, scan.ranges[-1]) == (number, size, number)
         assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
         peer.end()
@@ -246,7 +246,7 @@ def test_late_reliable_reader_of_python_is_told(
     """A reader in C++ that holds up Python for too long loses messages, knows how many, and is taken back."""
     scans = make_node().publisher("/scan", Scan)
     peer = start("count", "/scan", "brief", 1000, 0)
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     refused = 0
     for number in range(1500):
         refused += not scans.publish(Scan(number, np.full(3000, number, np.float32)))
@@ -285,9 +285,9 @@ def test_slow_python_reader_of_cpp(start: Callable[..., Peer], make_node: Callab
     node = make_node()
     scans = node.subscriber("/scan", Scan, policy=keep_last(4))
     start("publish", "/scan", 1000, 20_000)
-    held = [scans.recv(10.0)]
+    held = [scans.recv(SOON_S)]
     while held[-1].stamp_ns < 999:
-        held = [*held[-3:], scans.recv(10.0)]
+        held = [*held[-3:], scans.recv(SOON_S)]
         assert all(float(scan.ranges[7]) == scan.stamp_ns for scan in held)
     stats = scans.counters
     assert stats.received + stats.lost + stats.overtaken == 1000
@@ -304,7 +304,7 @@ def test_latched_message_from_cpp(
     cpp = next(record for record in node.nodes() if record.name == "cpp")
     wait_for(lambda: node.ask_stats(cpp.node).publishers[0].published == 3)
     late = node.subscriber("/map", Scan)
-    assert late.recv(10.0).stamp_ns == 2
+    assert late.recv(SOON_S).stamp_ns == 2
     assert peer.process.poll() is None
 
 
@@ -312,7 +312,7 @@ def test_latched_message_to_cpp(start: Callable[..., Peer], make_node: Callable[
     scans = make_node().publisher("/scan", Scan, latch=True)
     scans.publish(Scan(5, np.full(20_000, 5, np.float32)))
     peer = start("count", "/scan", "4", 0, 0)
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     scans.publish(Scan(-1, np.zeros(0, np.float32)))
     assert json.loads(peer.line()) == {**CLEAN, "received": 1, "sequence": 1}
 
@@ -327,13 +327,13 @@ def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Calla
     assert peer.line() == f"actual: {schema_of(OtherScan).to_json()}"
     others.close()
     scans = node.publisher("/scan", Scan)
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     scans.publish(Scan(-1, np.zeros(0, np.float32)))
     assert json.loads(peer.line())["received"] == 0
     start("publish", "/other", 10, 10, "latch")
     wrong = node.subscriber("/other", OtherScan)
     with pytest.raises(TypeMismatch, match="expected: Scan"):
-        wrong.recv(10.0)
+        wrong.recv(SOON_S)
 
 
 def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
@@ -342,7 +342,7 @@ def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[.
     start("publish", "/scan", 10, 10)
     start("count", "/other", "reliable", 0, 0)
     for _ in range(10):
-        scans.recv(10.0)
+        scans.recv(SOON_S)
     replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
     (published,) = [publisher for reply in replies for publisher in reply.publishers]
     (subscribed,) = [subscriber for reply in replies for subscriber in reply.subscribers]
@@ -357,7 +357,7 @@ def test_killed_cpp_reader_frees_its_slots(
     """A reliable reader that dies with leases does not hold up the publisher longer than its death takes."""
     scans = make_node().publisher("/scan", Scan)
     peer = start("count", "/scan", "reliable", 2000, 3)
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     for number in range(20):
         assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
     peer.process.kill()
@@ -383,10 +383,10 @@ def test_cpp_publisher_takes_slots_of_the_dead_back(
     wait_for(lambda: published() > 45)  # more than the ring has slots: the reader has as many as it may
     slow.process.kill()
     scans = node.subscriber("/scan", Scan, policy=reliable(8))
-    first = scans.recv(10.0).stamp_ns
+    first = scans.recv(SOON_S).stamp_ns
     began_s = time.monotonic()
     for number in range(first + 1, first + 200):
-        assert scans.recv(10.0).stamp_ns == number
+        assert scans.recv(SOON_S).stamp_ns == number
     assert time.monotonic() - began_s < 5.0
     assert scans.counters.lost == 0
 
@@ -397,7 +397,7 @@ def test_killed_cpp_publisher_leaves_no_trace(
     node = make_node()
     scans = node.subscriber("/scan", Scan, policy=reliable(64))
     peer = start("publish", "/scan", 10, 20_000)
-    held = [scans.recv(10.0) for _ in range(3)]
+    held = [scans.recv(SOON_S) for _ in range(3)]
     peer.process.kill()
     wait_for(lambda: not any(record.name == "cpp" for record in node.nodes()))
     assert [int(scan.ranges[0]) for scan in held] == [0, 1, 2]  # what was received stays
@@ -409,7 +409,7 @@ def test_new_registry_learns_of_cpp(start: Callable[..., Peer], make_node: Calla
     domain = Path(os.environ["CORTEX_RUNTIME_DIR"]) / "0"
     os.kill(int((domain / "registry.lock").read_text()), 9)
     node = make_node()  # starts another one
-    assert node.subscriber("/scan", Scan).recv(10.0).stamp_ns == 0
+    assert node.subscriber("/scan", Scan).recv(SOON_S).stamp_ns == 0
     assert peer.process.poll() is None
 
 
@@ -420,7 +420,7 @@ def test_static_peer_without_registry(
     scans = node.publisher("/scan", Scan)
     monkeypatch.setenv("CORTEX_TEST_PEER", node.nodes()[0].endpoints[0].control)
     peer = Peer([programs / "peer", "count", "/scan", "reliable", 0, 0])
-    assert scans.wait_for_subscribers(1, 10.0)
+    assert scans.wait_for_subscribers(1, SOON_S)
     scans.publish(Scan(-1, np.zeros(0, np.float32)))
     assert json.loads(peer.line())["received"] == 0
     peer.end()

@@ -158,7 +158,7 @@ def test_the_other_subscriber_notices_nothing(make_node, start_child, runtime):
         numbers.append(block.number)
 
     other = node.subscriber("/blocks", Block, take, policy=reliable(64, 10.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with Stream(publisher) as stream:
         for round_ in range(max(KILLS // 7, 1)):
             policy = POLICIES[round_ % len(POLICIES)]
@@ -319,7 +319,7 @@ def test_a_subscriber_of_another_version(make_node, start_child, runtime):
     with pytest.raises(TypeMismatch, match="float64"):
         other.recv(SOON_S)
     child.ask(do="publish", topic="/numbers", count=10)
-    assert [right.recv(5.0).value for _ in range(10)] == list(range(10))
+    assert [right.recv(SOON_S).value for _ in range(10)] == list(range(10))
     with pytest.raises(TimeoutError):
         other.recv(0.0)
     assert (other.counters.received, other.counters.rejected) == (0, 1)
@@ -340,7 +340,7 @@ def test_two_hundred_topics(make_node, start_child, runtime):
     for number, topic in enumerate(topics):
         child.ask(do="publish", topic=topic, count=3, start=10 * number)
     for number, subscriber in enumerate(subscribers):
-        assert [subscriber.recv(5.0).value for _ in range(3)] == [10 * number + k for k in range(3)]
+        assert [subscriber.recv(SOON_S).value for _ in range(3)] == [10 * number + k for k in range(3)]
     assert len(node.topics()) == 200
     child.kill()
     wait_for(lambda: not any(info.publishers for info in node.topics()))
@@ -356,7 +356,7 @@ def test_no_memory_for_a_ring(make_node, start_child, runtime, policy):
     assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
     for number, size in enumerate((100, 300_000, 20_000, 100, 1_000_000, 300_000)):
         assert child.ask(do="publish", topic="/blocks", count=1, start=number, size=size)["delivered"] == 1
-        block = subscriber.recv(5.0)
+        block = subscriber.recv(SOON_S)
         assert (block.number, len(block.data), is_whole(block)) == (number, size, True)
     assert subscriber.counters.lost == 0
     child.finish()

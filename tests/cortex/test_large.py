@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from peer import Block, Number, Scan, is_whole, make_block
-from processes import shared_mappings, wait_for
+from processes import SOON_S, shared_mappings, wait_for
 
 import cortex.large
 import cortex.link
@@ -34,7 +34,7 @@ def scan(number, size=LARGE):
 def connected(node, kind, policy, **options):
     publisher = node.publisher("/large", kind, **options)
     subscriber = node.subscriber("/large", kind, policy=policy)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     return publisher, subscriber
 
 
@@ -60,11 +60,11 @@ def is_shared(message):
 def test_a_large_message_is_a_view(node):
     publisher, subscriber = connected(node, Scan, keep_last())
     publisher.publish(scan(1))
-    message = subscriber.recv(1.0)
+    message = subscriber.recv(SOON_S)
     assert is_shared(message)
     assert slots_held(publisher) == 1
     publisher.publish(scan(2, 10))
-    assert not is_shared(subscriber.recv(1.0))
+    assert not is_shared(subscriber.recv(SOON_S))
     del message
     assert slots_held(publisher) == 0
 
@@ -73,10 +73,10 @@ def test_a_slice_keeps_the_lease(node):
     """The slot is not written again until the last array that looks at it is gone."""
     publisher, subscriber = connected(node, Scan, latest())
     publisher.publish(scan(1))
-    part = subscriber.recv(1.0).ranges[10:20][::2]
+    part = subscriber.recv(SOON_S).ranges[10:20][::2]
     for number in range(2, 100):
         publisher.publish(scan(number))
-        subscriber.recv(1.0)
+        subscriber.recv(SOON_S)
     assert part.tolist() == [1.0] * 5
     assert slots_held(publisher) == 1
     del part
@@ -89,10 +89,10 @@ def test_who_keeps_more_than_by_default_is_given_room(node):
     publisher, subscriber = connected(node, Scan, keep_last(128))
     for number in range(4):  # rings are made with the first ones
         publisher.publish(scan(number, size))
-        assert subscriber.recv(1.0).stamp_ns == number
+        assert subscriber.recv(SOON_S).stamp_ns == number
     for number in range(60):
         publisher.publish(scan(number, size))
-    assert [subscriber.recv(1.0).stamp_ns for _ in range(60)] == list(range(60))
+    assert [subscriber.recv(SOON_S).stamp_ns for _ in range(60)] == list(range(60))
     assert subscriber.counters.lost == subscriber.counters.overtaken == 0
 
 
@@ -100,7 +100,7 @@ def test_messages_that_wait_and_are_overtaken_give_their_slots_back(node):
     publisher, subscriber = connected(node, Scan, latest())
     for number in range(50):
         publisher.publish(scan(number))
-    assert subscriber.recv(1.0).stamp_ns == 49
+    assert subscriber.recv(SOON_S).stamp_ns == 49
     wait_for(lambda: slots_held(publisher) == 0)
     counters = subscriber.counters
     assert counters.received + counters.overtaken + counters.lost == 50
@@ -115,10 +115,10 @@ def test_views_outlive_everything(make_node):
         if end == "node of the writer":
             two = make_node("two again")
         subscriber = two.subscriber("/large", Block, policy=reliable(4))
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for number in range(2):
             publisher.publish(make_block(number, 300_000))
-            kept.append(subscriber.recv(1.0))
+            kept.append(subscriber.recv(SOON_S))
         if end == "subscriber":
             subscriber.close()
         elif end == "publisher":
@@ -131,10 +131,10 @@ def test_views_outlive_everything(make_node):
         gc.collect()
         if end == "subscriber":  # its slots are written again
             other = two.subscriber("/large", Block, policy=latest())
-            assert publisher.wait_for_subscribers()
+            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
             for number in range(10, 30):
                 publisher.publish(make_block(number, 300_000))
-                other.recv(1.0)
+                other.recv(SOON_S)
             other.close()
         assert all(is_whole(block) for block in kept)
     two.close()
@@ -152,14 +152,14 @@ def test_a_reader_that_hoards_hurts_only_itself(node):
     """It loses messages and knows it; the other gets all, and the publisher waits for neither."""
     publisher, hoarder = connected(node, Scan, keep_last(64))
     other = node.subscriber("/large", Scan, policy=keep_last(64))
-    assert publisher.wait_for_subscribers(2)
+    assert publisher.wait_for_subscribers(2, SOON_S)
     kept = []
     slowest_s = 0.0
     for number in range(100):
         begin = time.monotonic()
         assert publisher.publish(scan(number))
         slowest_s = max(slowest_s, time.monotonic() - begin)
-        assert other.recv(1.0).stamp_ns == number
+        assert other.recv(SOON_S).stamp_ns == number
         if (message := _try(hoarder)) is not None:
             kept.append(message)
     assert slowest_s < 0.5
@@ -174,7 +174,7 @@ def test_a_reader_that_hoards_hurts_only_itself(node):
     kept.clear()
     del leased, message
     publisher.publish(scan(100))
-    message = hoarder.recv(1.0)
+    message = hoarder.recv(SOON_S)
     assert is_shared(message)
 
 
@@ -184,7 +184,7 @@ def test_a_reader_that_was_passed_over_knows_at_once(node):
     delivered = [publisher.publish(scan(number)) for number in range(20)]
     count = delivered.count(True)
     assert 2 <= count < 20
-    assert [subscriber.recv(1.0).stamp_ns for _ in range(count)] == list(range(count))
+    assert [subscriber.recv(SOON_S).stamp_ns for _ in range(count)] == list(range(count))
     with pytest.raises(TimeoutError):
         subscriber.recv(0.1)
     assert subscriber.counters.lost == 20 - count
@@ -195,10 +195,10 @@ def test_many_readers(node, count):
     """More than there are columns: the others get the same bytes through the socket."""
     publisher = node.publisher("/large", Scan)
     subscribers = [node.subscriber("/large", Scan, policy=keep_last(8)) for _ in range(count)]
-    assert publisher.wait_for_subscribers(count)
+    assert publisher.wait_for_subscribers(count, SOON_S)
     for number in range(5):
         assert publisher.publish(scan(number, 30_000))
-        messages = [subscriber.recv(5.0) for subscriber in subscribers]
+        messages = [subscriber.recv(SOON_S) for subscriber in subscribers]
         assert all(message == scan(number, 30_000) for message in messages)
         with publisher._outlets.lock:
             assert len(publisher._large._columns) == min(count, 64)
@@ -217,7 +217,7 @@ def test_messages_that_grow_and_shrink(node, policy):
     kept = []
     for number, size in enumerate(sizes * 2):
         assert publisher.publish(scan(number, size))
-        message = subscriber.recv(2.0)
+        message = subscriber.recv(SOON_S)
         assert len(message.ranges) == size
         assert (message.ranges == number).all()
         kept.append(message)
@@ -235,7 +235,7 @@ def test_growing_while_messages_wait(node):
     for number, size in enumerate(sizes):
         assert publisher.publish(scan(number, size))
     for number, size in enumerate(sizes):
-        message = subscriber.recv(1.0)
+        message = subscriber.recv(SOON_S)
         assert (message.stamp_ns, len(message.ranges)) == (number, size)
     assert subscriber.counters.lost == 0
 
@@ -252,7 +252,7 @@ def test_memory_stays_flat(node):
     def run(count):
         for number in range(count):
             assert publisher.publish(large if number % 8 == 0 else small)
-            subscriber.recv(1.0)
+            subscriber.recv(SOON_S)
         gc.collect()
 
     run(3000)
@@ -268,7 +268,7 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
     """It gets the same bytes; one that can share goes on sharing."""
     publisher, sharing = connected(node, Scan, reliable(8, 5.0))
     publisher.publish(scan(0))
-    assert is_shared(sharing.recv(1.0))
+    assert is_shared(sharing.recv(SOON_S))
 
     def refuse(*args):
         raise ShmUnavailable("not for you")
@@ -276,14 +276,14 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(cortex.link, "RingView", refuse)
         plain = node.subscriber("/large", Scan, policy=reliable(8, 5.0))
-        assert publisher.wait_for_subscribers(2)
+        assert publisher.wait_for_subscribers(2, SOON_S)
         assert plain.wait_for_publisher()
         wait_for(lambda: publisher.publish(scan(1)) and _try(plain))
     while _try(sharing) or _try(plain):
         pass
     for number, size in enumerate((10, LARGE, 5_000, 10, 300_000)):
         publisher.publish(scan(number, size))
-        first, second = sharing.recv(1.0), plain.recv(1.0)
+        first, second = sharing.recv(SOON_S), plain.recv(SOON_S)
         assert first == second == scan(number, size)
         assert is_shared(first) == (size > 4096)
         assert not second.ranges.flags.writeable
@@ -306,13 +306,13 @@ def test_a_publisher_without_shared_memory(node, monkeypatch, policy, caplog):
     publisher, subscriber = connected(node, Scan, policy)
     for number in range(20):
         assert publisher.publish(scan(number))
-        message = subscriber.recv(1.0)
+        message = subscriber.recv(SOON_S)
         assert message == scan(number)
         assert not is_shared(message)
     with publisher.loan(n=LARGE) as draft:
         draft.stamp_ns = 77
         draft.ranges[:] = 1.0
-    assert subscriber.recv(1.0).stamp_ns == 77
+    assert subscriber.recv(SOON_S).stamp_ns == 77
     assert subscriber.counters.lost == 0
     assert [record.levelname for record in caplog.records if "shared memory" in record.getMessage()] == [
         "WARNING"
@@ -353,7 +353,7 @@ def test_a_loan_is_published_when_it_ends(node, size):
         draft.ranges[:] = np.arange(size)
         with pytest.raises(TimeoutError):
             subscriber.recv(0.02)
-    message, info = subscriber.recv_with_info(1.0)
+    message, info = subscriber.recv_with_info(SOON_S)
     assert (message.stamp_ns, info.stamp_ns, info.sequence) == (5, 5, 0)
     np.testing.assert_array_equal(message.ranges, np.arange(size, dtype=np.float32))
     assert publisher.counters.published == 1
@@ -377,7 +377,7 @@ def test_a_loan_that_raises_is_dropped(node, size):
     with publisher.loan(n=size) as draft:
         draft.stamp_ns = 1
         draft.ranges[:] = 2.0
-    message, info = subscriber.recv_with_info(1.0)
+    message, info = subscriber.recv_with_info(SOON_S)
     assert (message.stamp_ns, info.sequence) == (1, 0)
     assert subscriber.counters.lost == 0
 
@@ -393,7 +393,7 @@ def test_several_loans_at_once(node):
             second.ranges[:] = 2.0
             publisher.publish(scan(3))
             publisher.publish(scan(4, 10))
-    received = [subscriber.recv_with_info(1.0) for _ in range(4)]
+    received = [subscriber.recv_with_info(SOON_S) for _ in range(4)]
     assert [message.stamp_ns for message, _ in received] == [3, 4, 2, 1]
     assert [info.sequence for _, info in received] == [0, 1, 2, 3]
     assert all((message.ranges == message.stamp_ns).all() for message, _ in received)
@@ -417,7 +417,7 @@ def test_too_many_loans(node):
     with publisher.loan(n=1_000_000) as draft:
         draft.stamp_ns = 9
         draft.ranges[:] = 9.0
-    message, info = subscriber.recv_with_info(1.0)
+    message, info = subscriber.recv_with_info(SOON_S)
     assert message.stamp_ns == 9
     assert info.sequence == subscriber.counters.lost  # a loan that was refused may count as skipped
 
@@ -430,8 +430,8 @@ def test_a_loan_while_the_rings_grow(node):
         draft.ranges[:] = 100.0
         for number in range(7):
             publisher.publish(scan(number, 5_000 * 2 ** (number + 1)))
-            assert subscriber.recv(1.0).stamp_ns == number
-    message = subscriber.recv(1.0)
+            assert subscriber.recv(SOON_S).stamp_ns == number
+    message = subscriber.recv(SOON_S)
     assert message.stamp_ns == 100
     assert (message.ranges == 100.0).all()
     assert subscriber.counters.lost == 0
@@ -452,17 +452,17 @@ def test_a_loan_of_a_closed_publisher(node):
         with pytest.raises(Closed):
             lend_and_close(size)
     assert publisher.publish(scan(2))
-    assert subscriber.recv(1.0).stamp_ns == 2
+    assert subscriber.recv(SOON_S).stamp_ns == 2
 
 
 def test_a_fixed_type_has_nothing_to_declare(node):
     publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with publisher.loan() as draft:
         draft.stamp_ns = 1
         draft.value = 2
-    assert subscriber.recv(1.0) == Number(1, 2)
+    assert subscriber.recv(SOON_S) == Number(1, 2)
     with pytest.raises((TypeError, ValueError), match="n"), publisher.loan(n=3):
         pass
 
@@ -484,7 +484,7 @@ def test_a_ring_whose_announcement_was_dropped_is_found(make_node):
         wait_for(lambda: publisher._blocked)
     finally:
         subscriber._turn.lock.release()
-    received = [len(subscriber.recv(5.0).ranges) for _ in range(1500)]
+    received = [len(subscriber.recv(SOON_S).ranges) for _ in range(1500)]
     thread.join(10.0)
     assert done
     assert sum(length == LARGE for length in received) == 50

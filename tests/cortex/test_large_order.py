@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import pytest
 import zmq
 from peer import Scan
-from processes import wait_for
+from processes import SOON_S, wait_for
 from test_large import connected, is_shared, scan
 
 from cortex import Publisher, Subscriber, keep_last, reliable
@@ -68,7 +68,7 @@ def before_announcements(subscriber: Subscriber[Scan], action: Callable[[], None
 def take(subscriber: Subscriber[Scan], *expected: int) -> None:
     """Receive messages with these stamps, in shared memory, and let go of them."""
     for number in expected:
-        message = subscriber.recv(2.0)
+        message = subscriber.recv(SOON_S)
         assert message.stamp_ns == number
         assert (message.ranges == number).all()
         assert is_shared(message)
@@ -121,7 +121,7 @@ def test_the_ring_of_the_answer_may_be_gone(node):
     take(first, 0)
     subscriber = node.subscriber("/large", Scan, policy=reliable(64, 5.0))
     with subscriber._turn.lock:  # it reads nothing yet
-        assert publisher.wait_for_subscribers(2)
+        assert publisher.wait_for_subscribers(2, SOON_S)
         publisher.publish(scan(1, 50_000))
         take(first, 1)
         with publisher._outlets.lock:
@@ -154,13 +154,13 @@ def test_rings_wait_for_a_reliable_reader(node):
     with publisher._outlets.lock:
         assert len(publisher._large._rings) > 4
     for number, size in enumerate(sizes):
-        message = subscriber.recv(2.0)
+        message = subscriber.recv(SOON_S)
         assert (message.stamp_ns, len(message.ranges)) == (number, size)
         assert (message.ranges == number).all()
     assert subscriber.counters.lost == subscriber.counters.rejected == 0
     del message
     publisher.publish(scan(99))
-    assert is_shared(subscriber.recv(2.0))
+    assert is_shared(subscriber.recv(SOON_S))
     wait_for(lambda: len(publisher._large._rings) <= 2)
 
 
@@ -170,17 +170,17 @@ def test_who_hoards_every_slot_costs_a_reliable_reader_nothing(node):
     hoard = []
     for number in range(3):  # the ring gets as many slots as it wants
         publisher.publish(scan(number))
-        hoard.append(hoarder.recv(2.0))
+        hoard.append(hoarder.recv(SOON_S))
     with publisher._outlets.lock:
         slots = publisher._large._rings[-1].slots
     for number in range(slots):
         publisher.publish(scan(number))
-        hoard.append(hoarder.recv(2.0))
+        hoard.append(hoarder.recv(SOON_S))
     subscriber = node.subscriber("/large", Scan, policy=reliable(8, 5.0))
-    assert publisher.wait_for_subscribers(2)
+    assert publisher.wait_for_subscribers(2, SOON_S)
     for number in range(100, 110):
         assert publisher.publish(scan(number))
-        message = subscriber.recv(2.0)
+        message = subscriber.recv(SOON_S)
         assert message.stamp_ns == number
         assert (message.ranges == number).all()
         hoard.append(message)
@@ -205,7 +205,7 @@ def test_an_interrupted_publish_gives_its_slot_back(node, monkeypatch):
     """A reliable reader has no room, and the wait for it is broken off, again and again."""
     publisher, subscriber = connected(node, Scan, reliable(2, timeout_s=30.0))
     publisher.publish(scan(0))
-    wait_for(lambda: is_shared(subscriber.recv(1.0)))
+    wait_for(lambda: is_shared(subscriber.recv(SOON_S)))
 
     def interrupted(_ring: object) -> bool:
         raise Interrupted
@@ -217,7 +217,7 @@ def test_an_interrupted_publish_gives_its_slot_back(node, monkeypatch):
             count = accepted_before(Interrupted, publisher)
         accepted.append(count)
         for _ in range(count):
-            subscriber.recv(5.0)
+            subscriber.recv(SOON_S)
     assert len(set(accepted)) == 1
     ring = publisher._large._ring
     assert ring is not None

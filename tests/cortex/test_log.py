@@ -66,8 +66,8 @@ def test_what_is_recorded_can_be_read(node: Node, tmp_path: Path) -> None:
     number, block = node.publisher("/number", Number), node.publisher("/block", Large)
     before_ns = time.time_ns()
     with Recorder(node, path, ["/number", "/block"]) as recorder:
-        assert number.wait_for_subscribers()
-        assert block.wait_for_subscribers()
+        assert number.wait_for_subscribers(timeout_s=SOON_S)
+        assert block.wait_for_subscribers(timeout_s=SOON_S)
         for i in range(100):
             number.publish(Number(10**18 + i, i))
         for i in range(5):
@@ -105,7 +105,7 @@ def test_other_tools_can_read_the_file(node: Node, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
     with Recorder(node, path) as recorder:
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for i in range(1000):
             publisher.publish(Number(i, i))
         wait_for(lambda: recorder.stats.written == 1000)
@@ -126,8 +126,8 @@ def test_a_busy_topic_is_recorded_without_loss(node: Node, tmp_path: Path, compr
     path = tmp_path / "run.mcap"
     publisher, other = node.publisher("/number", Number), node.publisher("/scan", Scan)
     with Recorder(node, path, compression=compression) as recorder:
-        assert publisher.wait_for_subscribers()
-        assert other.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+        assert other.wait_for_subscribers(timeout_s=SOON_S)
         for i in range(20_000):
             publisher.publish(Number(i, i))
             if i % 1000 == 0:
@@ -144,17 +144,17 @@ def test_all_topics_are_recorded_also_those_that_come_later(make_node: MakeNode,
     robot, logger = make_node("robot"), make_node("logger")
     first = robot.publisher("/first", Number)
     with Recorder(logger, path) as recorder:
-        assert first.wait_for_subscribers()
+        assert first.wait_for_subscribers(timeout_s=SOON_S)
         first.publish(Number(1, 1))
         second = make_node("late").publisher("/second", Scan)
-        assert second.wait_for_subscribers()
+        assert second.wait_for_subscribers(timeout_s=SOON_S)
         second.publish(Scan(2, np.ones(3, np.float32)))
         first.close()
         again = robot.publisher("/first", Number)  # has another number, and counts from 0 again
-        assert again.wait_for_subscribers()
+        assert again.wait_for_subscribers(timeout_s=SOON_S)
         again.publish(Number(3, 3))
         other = robot.publisher("/first", OtherNumber)
-        assert other.wait_for_subscribers()
+        assert other.wait_for_subscribers(timeout_s=SOON_S)
         other.publish(OtherNumber(4, 0.5))
         wait_for(lambda: recorder.stats.written == 4)
     with open_log(path) as log:
@@ -209,7 +209,7 @@ def test_a_node_that_closes_first_ends_the_recording_in_order(make_node: MakeNod
     node = make_node("alone", registry="off")
     publisher = node.publisher("/number", Number)
     recorder = Recorder(node, path)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(Number(1, 1))
     wait_for(lambda: recorder.stats.written)
     node.close()
@@ -225,7 +225,7 @@ def test_best_effort_counts_what_it_loses(node: Node, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
     with Recorder(node, path, ["/number"], policy=keep_last(4)) as recorder:
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for i in range(30_000):
             publisher.publish(Number(i, i))
         published = 30_000
@@ -262,7 +262,7 @@ if limit:
 with Node("child", registry="off") as node:
     publisher = node.publisher("/number", Number)
     recorder = Recorder(node, sys.argv[1])
-    publisher.wait_for_subscribers()
+    publisher.wait_for_subscribers(timeout_s=60.0)
     number = 0
     while recorder.running:
         publisher.publish(Number(time.monotonic_ns(), number))
@@ -353,7 +353,7 @@ def test_times_that_the_file_cannot_hold(node: Node, tmp_path: Path, offset_ns: 
     publisher = node.publisher("/number", Number)
     with Recorder(node, path, ["/number"]) as recorder:
         recorder._wall_offset_ns = offset_ns
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for i in range(10):
             publisher.publish(Number(i, i))
         wait_for(lambda: recorder.stats.written == 10)
@@ -371,7 +371,7 @@ def test_any_failure_ends_the_recording_with_an_error(
     path = tmp_path / "run.mcap"
     publisher = node.publisher("/number", Number)
     recorder = Recorder(node, path, ["/number"])
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(Number(0, 0))
     wait_for(lambda: recorder.stats.written == 1)
 

@@ -16,7 +16,7 @@ import weakref
 import pytest
 import zmq
 from peer import Number, OtherNumber, Scan, make
-from processes import ROOT, wait_for
+from processes import ROOT, SOON_S, wait_for
 
 from cortex import latest, reliable
 from cortex.context import new_socket
@@ -103,10 +103,10 @@ def test_a_subscriber_that_is_there_first(make_node):
         subscriber = first.subscriber(f"/topic{k}", Number)
         begin = time.monotonic()
         publisher = second.publisher(f"/topic{k}", Number)
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         assert time.monotonic() - begin < 2.0
         publisher.publish(Number(0, k))
-        assert subscriber.recv(1.0).value == k
+        assert subscriber.recv(SOON_S).value == k
 
 
 # Counters of others
@@ -116,10 +116,10 @@ def test_counters_of_this_and_other_nodes(make_node):
     one, two = make_node("one"), make_node("two")
     publisher = one.publisher("/numbers", Number)
     subscriber = two.subscriber("/numbers", Number, policy=reliable())
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(10):
         publisher.publish(Number(0, value))
-        subscriber.recv(1.0)
+        subscriber.recv(SOON_S)
     wait_for(lambda: all(len(node.nodes()) == 2 for node in (one, two)))
     for asked in (one, two):
         sent = asked.ask_stats(one.id).publishers[0]
@@ -222,7 +222,7 @@ def test_closing_in_any_order(make_node):
         publisher = one.publisher("/numbers", Number)
         own = one.subscriber("/numbers", Number, lambda message: None)
         subscriber = two.subscriber("/numbers", Number, lambda message: None)
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         stop = threading.Event()
 
         def publish(publisher=publisher, stop=stop):
@@ -246,7 +246,7 @@ def test_closing_from_several_threads(make_node):
         node = make_node(registry="off")
         publisher = node.publisher("/numbers", Number)
         subscriber = node.subscriber("/numbers", Number, lambda message: None)
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         closes = [node.close, publisher.close, subscriber.close] * 2
         threads = [threading.Thread(target=close) for close in closes]
         for thread in threads:
@@ -261,13 +261,13 @@ def test_closing_is_quick(make_node):
     node, other = make_node("one"), make_node("two")
     publisher = node.publisher("/scans", Scan)
     subscriber = other.subscriber("/scans", Scan, policy=reliable(2, 0.01))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for number in range(30):
         publisher.publish(make(Scan, number, 100_000))
     begin = time.monotonic()
     node.close()
     assert time.monotonic() - begin < 1.0
-    assert subscriber.recv(1.0).stamp_ns == 0
+    assert subscriber.recv(SOON_S).stamp_ns == 0
     begin = time.monotonic()
     other.close()
     assert time.monotonic() - begin < 1.0
@@ -284,7 +284,7 @@ def test_what_is_closed_is_forgotten(make_node):
             node.subscriber("/numbers", Number, lambda message: None),
             node.subscriber("/numbers", OtherNumber),
         ]
-        assert publisher.wait_for_subscribers(2)
+        assert publisher.wait_for_subscribers(2, SOON_S)
         publisher.publish(Number(0, 0))
         gone += [weakref.ref(thing) for thing in (publisher, *subscribers)]
         for thing in (*subscribers, publisher):
@@ -318,9 +318,9 @@ node = Node("forgetful")
 publisher = node.publisher("/scans", Scan)
 subscriber = node.subscriber("/scans", Scan)
 callback = node.subscriber("/scans", Scan, lambda message: None)
-assert publisher.wait_for_subscribers(2)
+assert publisher.wait_for_subscribers(2, 60.0)
 publisher.publish(make(Scan, 1, 200_000))
-kept = subscriber.recv(2.0)
+kept = subscriber.recv(60.0)
 print(time.time())
 """
     (ended,) = run_script(code)
@@ -352,9 +352,9 @@ from peer import Number, Scan, make, number_of
 node = Node("parent")
 publisher = node.publisher("/scans", Scan)
 subscriber = node.subscriber("/scans", Scan, policy=reliable(8))
-assert publisher.wait_for_subscribers()
+assert publisher.wait_for_subscribers(timeout_s=60.0)
 publisher.publish(make(Scan, 1, 100_000))
-kept = subscriber.recv(2.0)
+kept = subscriber.recv(60.0)
 pid = os.fork()
 if not pid:
     assert kept.ranges[0] == 1.0
@@ -373,17 +373,17 @@ if not pid:
     node.close()
     with Node("child") as own:
         mine = own.publisher("/numbers", Number)
-        assert mine.wait_for_subscribers(1, 10.0)
+        assert mine.wait_for_subscribers(1, 60.0)
         mine.publish(Number(7, 7))
         time.sleep(0.2)
     sys.exit(0)
 numbers = node.subscriber("/numbers", Number)
-assert numbers.recv(10.0).value == 7
+assert numbers.recv(60.0).value == 7
 assert os.waitpid(pid, 0)[1] == 0
 assert (kept.ranges == 1.0).all()
 for number in range(20):
     assert publisher.publish(make(Scan, number, 100_000 if number % 2 else 10))
-    assert subscriber.recv(2.0).stamp_ns == number
+    assert subscriber.recv(60.0).stamp_ns == number
 assert subscriber.counters.lost == 0
 node.close()
 print("parent", "lives")
@@ -401,7 +401,7 @@ node = Node("parent", registry="off")
 publisher = node.publisher("/numbers", Number)
 count = [0]
 node.subscriber("/numbers", Number, lambda message: count.__setitem__(0, count[0] + 1))
-assert publisher.wait_for_subscribers()
+assert publisher.wait_for_subscribers(timeout_s=60.0)
 stop = threading.Event()
 def publish():
     while not stop.is_set():
@@ -438,7 +438,7 @@ def test_a_jump_of_the_clock(make_node, monkeypatch):
     one, two = make_node("one"), make_node("two")
     publisher = one.publisher("/numbers", Number)
     subscriber = two.subscriber("/numbers", Number, policy=latest())
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     wait_for(lambda: len(two.nodes()) == 2)
 
     def known():
@@ -450,7 +450,7 @@ def test_a_jump_of_the_clock(make_node, monkeypatch):
         wait_for(lambda jump_ns=jump_ns: abs(known() - before_ns - jump_ns) < 10**9)
         for value in range(10):
             publisher.publish(Number(0, value))
-            message, info = subscriber.recv_with_info(1.0)
+            message, info = subscriber.recv_with_info(SOON_S)
             assert message.value == value
             assert 0 < info.latency_ns < 10**9
     assert subscriber.counters.lost == 0
@@ -480,7 +480,7 @@ def test_a_callback_that_always_raises_does_not_flood_the_log(make_node, caplog)
 
     node.subscriber("/numbers", Number, fail, policy=reliable(64))
     publisher = node.publisher("/numbers", Number)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(100):
         publisher.publish(Number(0, value))
     wait_for(lambda: len(called) == 100)

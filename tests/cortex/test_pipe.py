@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import zmq
 from peer import Block, is_whole, make_block
+from processes import SOON_S
 
 from cortex import keep_last, native, pipe, reliable
 from cortex.host import pipe_path, sweep
@@ -227,7 +228,7 @@ def test_processes_speak_through_pipes(make_node, start_child, runtime, policy):
     subscriber = node.subscriber("/blocks", Block, policy=policy)
     numbers = []
     for _ in range(60):
-        block = subscriber.recv(5.0)
+        block = subscriber.recv(SOON_S)
         assert is_whole(block)
         numbers.append(block.number)
     assert numbers == list(range(numbers[0], numbers[0] + 60))
@@ -241,7 +242,7 @@ def test_a_reader_in_the_same_process_needs_no_pipe(make_node, runtime):
     node = make_node()
     publisher = node.publisher("/blocks", Block)
     subscriber = node.subscriber("/blocks", Block, policy=reliable())
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(make_block(1, 100))
-    assert subscriber.recv(5.0).number == 1
+    assert subscriber.recv(SOON_S).number == 1
     assert [link._piped for link in subscriber._links] == [False]

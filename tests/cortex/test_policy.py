@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from peer import Number, Scan
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
 
@@ -26,7 +26,7 @@ def connected(node, policy, **options):
     """A publisher and a subscriber of one node."""
     publisher = node.publisher("/numbers", Number, **options)
     subscriber = node.subscriber("/numbers", Number, policy=policy)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     assert subscriber.wait_for_publisher()
     return publisher, subscriber
 
@@ -95,7 +95,7 @@ def test_latest_gives_the_newest_at_once(node):
         for _ in range(burst):
             publisher.publish(Number(0, value))
             value += 1
-        assert subscriber.recv(1.0).value == value - 1
+        assert subscriber.recv(SOON_S).value == value - 1
     assert take_all(subscriber) == []
 
 
@@ -110,7 +110,7 @@ def test_the_newest_after_a_long_absence(make_node, start_child, policy):
     child.ask(do="publish", topic="/numbers", count=20_000, rate_hz=20_000)
     depth, counters = policy.depth, subscriber.counters
     wait_for(lambda: counters.overtaken + counters.lost == 20_000 - depth)
-    assert [subscriber.recv(1.0).value for _ in range(depth)] == list(range(20_000 - depth, 20_000))
+    assert [subscriber.recv(SOON_S).value for _ in range(depth)] == list(range(20_000 - depth, 20_000))
     assert counters.received == depth
 
 
@@ -124,7 +124,7 @@ def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
     child.say(do="publish", topic="/numbers", count=2000, rate_hz=2000)
     ages_s, value = [], 0
     while value < 1900:
-        message, info = subscriber.recv_with_info(5.0)
+        message, info = subscriber.recv_with_info(SOON_S)
         value = message.value
         ages_s.append(info.latency_ns * 1e-9)
         busy_until = time.monotonic() + 5e-3
@@ -151,7 +151,7 @@ def test_every_message_of_a_reliable_stream_comes_in_order(make_node, start_chil
         policy=["reliable", {"depth": 16, "timeout_s": 20.0}],
     )
     publisher = make_node().publisher("/numbers", Number)
-    assert publisher.wait_for_subscribers(1, 10.0)
+    assert publisher.wait_for_subscribers(1, SOON_S)
     child.say(do="receive", topic="/numbers", until=MANY - 1, timeout_s=120.0)
     assert all(publisher.publish(Number(value, value)) for value in range(MANY))
     received = child.hear(120.0)
@@ -176,7 +176,7 @@ def test_back_pressure_has_an_end(node):
     while len(delivered) < first + 4:  # it goes on, and does not believe that these arrive
         delivered.append(publisher.publish(Number(0, len(delivered))))
     assert not any(delivered[first:])
-    assert [subscriber.recv(1.0).value for _ in range(first)] == list(range(first))
+    assert [subscriber.recv(SOON_S).value for _ in range(first)] == list(range(first))
 
     def resumed():
         delivered.append(publisher.publish(Number(0, len(delivered))))
@@ -195,7 +195,7 @@ def test_back_pressure_of_large_messages(node):
     """A reader that keeps its views holds up the publisher, and no longer than allowed."""
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan, policy=reliable(depth=2, timeout_s=0.05))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     ranges = np.zeros(100_000, np.float32)
     delivered = []
     while all(delivered) or len(delivered) < 3:
@@ -203,10 +203,10 @@ def test_back_pressure_of_large_messages(node):
         begin = time.monotonic()
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
     assert 0.045 < time.monotonic() - begin < 1.0
-    received = [subscriber.recv(1.0).stamp_ns for _ in range(sum(delivered))]
+    received = [subscriber.recv(SOON_S).stamp_ns for _ in range(sum(delivered))]
     assert received == [number for number, came in enumerate(delivered) if came]
     assert publisher.publish(Scan(-1, ranges))
-    assert subscriber.recv(1.0).stamp_ns == -1
+    assert subscriber.recv(SOON_S).stamp_ns == -1
     assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
 
 
@@ -214,7 +214,7 @@ def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
     publisher = node.publisher("/scan", Scan)
     subscriber = node.subscriber("/scan", Scan, policy=reliable(depth=4, timeout_s=0.3))
-    assert publisher.wait_for_subscribers(1)
+    assert publisher.wait_for_subscribers(1, SOON_S)
     ranges = np.zeros(50_000, np.float32)
     delivered: list[bool] = []
     while not delivered or delivered[-1]:
@@ -224,10 +224,10 @@ def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
         delivered.append(publisher.publish(Scan(len(delivered), ranges)))
     assert time.monotonic() - begin < 2.0  # 20 times 0.3 s if each waited
     assert not any(delivered[-20:])
-    received = [subscriber.recv(1.0).stamp_ns for _ in range(sum(delivered))]
+    received = [subscriber.recv(SOON_S).stamp_ns for _ in range(sum(delivered))]
     assert received == [number for number, came in enumerate(delivered) if came]
     assert publisher.publish(Scan(-1, ranges))
-    assert subscriber.recv(1.0).stamp_ns == -1
+    assert subscriber.recv(SOON_S).stamp_ns == -1
     assert subscriber.counters.lost == delivered.count(False) == publisher.counters.timeouts
 
 
@@ -240,7 +240,7 @@ def test_a_reader_that_is_late_within_its_time_loses_nothing(node):
         received.append(message.value)
 
     other = node.subscriber("/numbers", Number, take, policy=reliable(depth=2, timeout_s=10.0))
-    assert publisher.wait_for_subscribers(2)
+    assert publisher.wait_for_subscribers(2, SOON_S)
     subscriber.close()
     assert all(publisher.publish(Number(0, value)) for value in range(5000))
     wait_for(lambda: len(received) == 5000)
@@ -258,7 +258,7 @@ def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_c
         child.hear()
         child.ask(do="subscriber", topic="/numbers", type="Number", policy=policy)
     publisher = make_node().publisher("/numbers", Number)
-    assert publisher.wait_for_subscribers(2, 10.0)
+    assert publisher.wait_for_subscribers(2, SOON_S)
     count = 20_000
     with stopped.stopped():
         steady.say(do="receive", topic="/numbers", until=count - 1, timeout_s=30.0)
@@ -288,8 +288,8 @@ def test_a_topic_that_is_held_up_does_not_hold_up_another(node):
         pass
     free = node.publisher("/free", Number)
     taken = node.subscriber("/free", Number, policy=reliable())
-    assert free.wait_for_subscribers()
+    assert free.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(200):
         assert free.publish(Number(0, value))
-        assert taken.recv(1.0).value == value
+        assert taken.recv(SOON_S).value == value
     assert subscriber.counters.received == 0

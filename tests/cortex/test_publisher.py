@@ -51,7 +51,7 @@ def test_a_message_of_another_type_is_refused(node, listened):
     publisher = node.publisher("/numbers", Number)
     if listened:
         node.subscriber("/numbers", Number)
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for wrong in (scan(1), None, {"stamp_ns": 1}, Number):
         with pytest.raises(TypeError, match="/numbers carries Number, got"):
             publisher.publish(wrong)
@@ -61,7 +61,7 @@ def test_a_value_that_does_not_fit_takes_no_number(node):
     """The subscriber sees no gap."""
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(scan(0))
     with pytest.raises((TypeError, ValueError), match="ranges"):
         publisher.publish(Scan(1, np.zeros(3)))
@@ -71,7 +71,7 @@ def test_a_value_that_does_not_fit_takes_no_number(node):
         publisher.publish(Scan(2**63, np.zeros(LARGE, np.float32)))
     publisher.publish(scan(2))
     publisher.publish(scan(3, LARGE))
-    assert [subscriber.recv_with_info(1.0)[1].sequence for _ in range(3)] == [0, 1, 2]
+    assert [subscriber.recv_with_info(SOON_S)[1].sequence for _ in range(3)] == [0, 1, 2]
     assert subscriber.counters.lost == 0
 
 
@@ -97,11 +97,11 @@ def test_a_type_must_be_a_message(node):
 def test_what_was_published_may_be_changed(node, size):
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     ranges = np.ones(size, np.float32)
     publisher.publish(Scan(1, ranges))
     ranges[:] = 2.0
-    received = subscriber.recv(1.0).ranges
+    received = subscriber.recv(SOON_S).ranges
     assert (received == 1.0).all()
     assert not np.shares_memory(received, ranges)
 
@@ -109,24 +109,24 @@ def test_what_was_published_may_be_changed(node, size):
 def test_arrays_that_are_not_contiguous(node):
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for size in (10, LARGE):
         ranges = np.arange(2 * size, dtype=np.float32)[::-2]
         publisher.publish(Scan(1, ranges))
-        np.testing.assert_array_equal(subscriber.recv(1.0).ranges, ranges)
+        np.testing.assert_array_equal(subscriber.recv(SOON_S).ranges, ranges)
 
 
 @pytest.mark.parametrize("coalesce", [False, True])
 def test_small_and_large_messages_keep_their_order(node, coalesce):
     publisher = node.publisher("/scans", Scan, coalesce=coalesce)
     subscriber = node.subscriber("/scans", Scan, policy=reliable(8, 10.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     sizes = [1, 1, 1, LARGE, 1, LARGE, LARGE, 1, 4096, 4097, 20_000, 1]
     received = []
 
     def take():
         while len(received) < 240:
-            message, info = subscriber.recv_with_info(10.0)
+            message, info = subscriber.recv_with_info(SOON_S)
             assert (message.ranges == np.float32(message.stamp_ns)).all()
             received.append((message.stamp_ns, info.sequence, len(message.ranges)))
 
@@ -146,7 +146,7 @@ def test_several_threads_publish(node, coalesce):
     subscriber = node.subscriber(
         "/scans", Scan, lambda m: received.append((m.stamp_ns, len(m.ranges))), policy=reliable(8, 20.0)
     )
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
 
     def publish(thread):
         for k in range(300):
@@ -177,13 +177,13 @@ def test_a_late_subscriber_gets_the_last_message(node, size, policy):
         publisher.publish(scan(number, size))
     for late in range(3):
         subscriber = node.subscriber("/scans", Scan, policy=policy)
-        message, info = subscriber.recv_with_info(5.0)
+        message, info = subscriber.recv_with_info(SOON_S)
         assert (message.stamp_ns, info.sequence) == (4 + late, 4 + late)
         assert (message.ranges == 4.0 + late).all()
         with pytest.raises(TimeoutError):
             subscriber.recv(0.02)
         publisher.publish(scan(5 + late, size))
-        assert subscriber.recv(2.0).stamp_ns == 5 + late
+        assert subscriber.recv(SOON_S).stamp_ns == 5 + late
         assert subscriber.counters.lost == 0
         subscriber.close()
 
@@ -192,19 +192,19 @@ def test_a_latch_that_was_filled_before_anybody_came_and_across_nodes(make_node)
     publisher = make_node("early").publisher("/scans", Scan, latch=True)
     publisher.publish(scan(1, LARGE))
     subscriber = make_node("late").subscriber("/scans", Scan)
-    assert subscriber.recv(5.0).stamp_ns == 1
+    assert subscriber.recv(SOON_S).stamp_ns == 1
 
 
 def test_without_a_latch_a_late_subscriber_gets_nothing(node):
     publisher = node.publisher("/scans", Scan)
     publisher.publish(scan(1))
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv(0.05)
     empty = node.publisher("/empty", Scan, latch=True)
     subscriber = node.subscriber("/empty", Scan)
-    assert empty.wait_for_subscribers()
+    assert empty.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv(0.05)
 
@@ -216,7 +216,7 @@ def test_a_loan_is_latched_too(node):
             draft.stamp_ns = size
             draft.ranges[:] = 7.0
         subscriber = node.subscriber("/scans", Scan)
-        message = subscriber.recv(5.0)
+        message = subscriber.recv(SOON_S)
         assert message.stamp_ns == size
         assert (message.ranges == 7.0).all()
 
@@ -272,7 +272,7 @@ def test_a_burst_travels_together(node):
     """Frames are as full as the times of publishing let them be; every message comes, in order."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
     subscriber = node.subscriber("/numbers", Number, policy=keep_last(20_000))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     socket = listen(node)
     try:
         before = connect(publisher, socket)[-1:]
@@ -307,7 +307,7 @@ def test_the_tail_of_a_burst_does_not_wait(node):
     """It is sent when nothing more comes: within 0.15 ms, when the machine lets it."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
     subscriber = node.subscriber("/numbers", Number, policy=keep_last(2000))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     delays_s = []
     for burst in range(30):
         for k in range(7):
@@ -323,7 +323,7 @@ def test_a_lone_message_is_not_held_back(node):
     """It goes as a plain message, and not in a batch that waits for others."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
     node.subscriber("/numbers", Number)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     socket = listen(node)
     try:
         connect(publisher, socket)
@@ -341,11 +341,11 @@ def test_closing_sends_what_is_held_back(make_node):
     for close_node in (False, True):
         node = make_node("sender")
         publisher = node.publisher("/numbers", Number, coalesce=True)
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for value in range(50):
             publisher.publish(Number(0, value))
         (node if close_node else publisher).close()
-        assert [subscriber.recv(2.0).value for _ in range(50)] == list(range(50))
+        assert [subscriber.recv(SOON_S).value for _ in range(50)] == list(range(50))
 
 
 # Coming and going
@@ -354,7 +354,7 @@ def test_closing_sends_what_is_held_back(make_node):
 def test_subscribers_are_counted(node):
     publisher = node.publisher("/numbers", Number)
     subscribers = [node.subscriber("/numbers", Number) for _ in range(3)]
-    assert publisher.wait_for_subscribers(3)
+    assert publisher.wait_for_subscribers(3, SOON_S)
     assert publisher.subscriber_count == 3
     for left in (2, 1, 0):
         subscribers.pop().close()
@@ -366,16 +366,16 @@ def test_attached_means_that_nothing_is_missed(node):
     for round_ in range(20):
         publisher = node.publisher(f"/round{round_}", Number)
         subscriber = node.subscriber(f"/round{round_}", Number)
-        assert publisher.wait_for_subscribers()
+        assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for value in range(3):
             publisher.publish(Number(0, value))
-        assert [subscriber.recv(1.0).value for _ in range(3)] == [0, 1, 2]
+        assert [subscriber.recv(SOON_S).value for _ in range(3)] == [0, 1, 2]
 
 
 def test_counters(node):
     publisher = node.publisher("/scans", Scan)
     node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(scan(1, 10))
     publisher.publish(scan(2, LARGE))
     counters = publisher.counters
@@ -387,7 +387,7 @@ def test_counters(node):
 def test_use_after_close(node, options):
     publisher = node.publisher("/scans", Scan, **options)
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(scan(0))
     publisher.close()
     publisher.close()
@@ -397,8 +397,8 @@ def test_use_after_close(node, options):
         with pytest.raises(Closed, match="the publisher of /scans is closed"), publisher.loan(n=size):
             pass
     with pytest.raises(Closed):
-        publisher.wait_for_subscribers()
-    assert subscriber.recv(1.0).stamp_ns == 0
+        publisher.wait_for_subscribers(timeout_s=SOON_S)
+    assert subscriber.recv(SOON_S).stamp_ns == 0
     with pytest.raises(TimeoutError):
         subscriber.recv(0.02)
     assert publisher.counters.published == 1
@@ -408,7 +408,7 @@ def test_closing_while_another_thread_is_held_up(node):
     """It gets out at once, with `Closed`."""
     publisher = node.publisher("/numbers", Number)
     node.subscriber("/numbers", Number, policy=reliable(1, 30.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     ended = []
 
     def publish():
@@ -435,7 +435,7 @@ def test_closing_while_another_thread_is_held_up(node):
 def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(1, 30.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     done = threading.Event()
 
     def publish():
@@ -456,7 +456,7 @@ def test_a_log_that_travels_over_cortex(node):
     log = node.publisher("/log", Number)
     slow = node.publisher("/numbers", Number)
     node.subscriber("/numbers", Number, policy=reliable(1, 0.01))
-    assert slow.wait_for_subscribers()
+    assert slow.wait_for_subscribers(timeout_s=SOON_S)
 
     class Handler(logging.Handler):
         def emit(self, record):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Block, Number, OtherNumber, Scan, is_whole, make_block
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from cortex import keep_last, reliable
 from cortex.codec import codec_of
@@ -33,7 +33,7 @@ def node(make_node):
 def numbers(node):
     publisher = node.publisher("/numbers", Number)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     return publisher, subscriber
 
 
@@ -63,7 +63,7 @@ def test_a_message_wakes_who_waits(numbers):
     def receive():
         for _ in range(20):
             ready.set()
-            sent_ns = subscriber.recv(5.0).stamp_ns
+            sent_ns = subscriber.recv(SOON_S).stamp_ns
             delays.append(time.monotonic_ns() - sent_ns)
 
     thread = threading.Thread(target=receive)
@@ -85,7 +85,7 @@ def test_what_is_known_of_a_message(node, numbers):
     for k in range(3):
         publisher.publish(Number(1000 + k, k))
     for k in range(3):
-        message, info = subscriber.recv_with_info(1.0)
+        message, info = subscriber.recv_with_info(SOON_S)
         assert message == Number(1000 + k, k)
         assert (info.topic, info.source, info.sequence, info.stamp_ns) == (
             "/numbers",
@@ -101,11 +101,11 @@ def test_what_is_known_of_a_message(node, numbers):
 def test_a_type_without_a_stamp_has_none(node):
     publisher = node.publisher("/blocks", Block)
     subscriber = node.subscriber("/blocks", Block)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(make_block(1, 10))
     publisher.publish(make_block(2, LARGE))
     for number in (1, 2):
-        message, info = subscriber.recv_with_info(1.0)
+        message, info = subscriber.recv_with_info(SOON_S)
         assert (message.number, info.stamp_ns) == (number, None)
         assert is_whole(message)
 
@@ -113,10 +113,10 @@ def test_a_type_without_a_stamp_has_none(node):
 def test_arrays_cannot_be_written(node):
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for size in (10, LARGE):
         publisher.publish(scan(1, size))
-        ranges = subscriber.recv(1.0).ranges
+        ranges = subscriber.recv(SOON_S).ranges
         with pytest.raises(ValueError, match="read-only"):
             ranges[0] = 1.0
         with pytest.raises(ValueError, match="WRITEABLE"):
@@ -131,7 +131,7 @@ def test_several_threads_share_a_stream(numbers):
     def receive(values):
         while True:
             try:
-                values.append(subscriber.recv(10.0).value)
+                values.append(subscriber.recv(SOON_S).value)
             except Closed:
                 return
 
@@ -157,14 +157,14 @@ def test_several_threads_share_a_stream(numbers):
 def test_a_batch_holds_what_is_there(node, coalesce):
     publisher = node.publisher("/numbers", Number, coalesce=coalesce)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     values, stamps, sizes = [], [], []
     for start in range(0, 1000, 200):
         for value in range(start, start + 200):
             publisher.publish(Number(10 * value, value))
         publisher.flush()
         while len(values) < start + 200:
-            batch = subscriber.recv_batch(2.0)
+            batch = subscriber.recv_batch(SOON_S)
             assert batch.dtype == codec_of(Number).record_dtype
             assert not batch.flags.writeable
             values += batch["value"].tolist()
@@ -182,14 +182,14 @@ def test_single_messages_after_batches(node):
     """Who has asked for batches may go on one by one, in order."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv_batch(0.0)
     for value in range(100):
         publisher.publish(Number(value, value))
     publisher.flush()
-    first = subscriber.recv_batch(1.0)["value"].tolist()
-    rest = [subscriber.recv_with_info(1.0) for _ in range(100 - len(first))]
+    first = subscriber.recv_batch(SOON_S)["value"].tolist()
+    rest = [subscriber.recv_with_info(SOON_S) for _ in range(100 - len(first))]
     assert first + [message.value for message, _ in rest] == list(range(100))
     assert [info.sequence for _, info in rest] == list(range(len(first), 100))
     assert subscriber.counters.received == 100
@@ -200,7 +200,7 @@ def test_batches_are_bounded_by_the_policy(node, depth):
     """keep_last counts messages, not frames: of a thousand, the last ones wait."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
     subscriber = node.subscriber("/numbers", Number, policy=keep_last(depth))
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv_batch(0.0)
     for value in range(1000):
@@ -208,7 +208,7 @@ def test_batches_are_bounded_by_the_policy(node, depth):
     publisher.flush()
     values = []
     while not values or values[-1] < 999:
-        values += subscriber.recv_batch(1.0)["value"].tolist()
+        values += subscriber.recv_batch(SOON_S)["value"].tolist()
     assert values == list(range(1000 - depth, 1000))
     counters = subscriber.counters
     assert (counters.received, counters.overtaken) == (depth, 1000 - depth)
@@ -230,7 +230,7 @@ def test_raw_bodies(node, size):
     """What echo and record read: bytes and schema, enough to decode."""
     publisher = node.publisher("/scans", Scan)
     subscriber = node.subscriber("/scans", None)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(scan(5, size))
     info, body, schema = subscriber.recv_raw(1.0)
     assert schema == schema_of(Scan)
@@ -243,11 +243,11 @@ def test_raw_bodies_are_published_as_they_are(node):
     codec = codec_of(Scan)
     publisher = node.raw_publisher("/scans", codec.schema)
     subscriber = node.subscriber("/scans", Scan)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for size in (3, LARGE):
         body = codec.encode(scan(6, size), 1 << 30)
         publisher.publish(RawMessage(body, 6))
-        message, info = subscriber.recv_with_info(1.0)
+        message, info = subscriber.recv_with_info(SOON_S)
         assert message == scan(6, size)
         assert info.stamp_ns == 6
 
@@ -256,14 +256,14 @@ def test_any_type_is_understood(node):
     """A subscriber without a type takes each publisher's own."""
     subscriber = node.subscriber("/mixed", None)
     first, second = node.publisher("/mixed", Number), node.publisher("/mixed", Scan)
-    assert first.wait_for_subscribers()
-    assert second.wait_for_subscribers()
+    assert first.wait_for_subscribers(timeout_s=SOON_S)
+    assert second.wait_for_subscribers(timeout_s=SOON_S)
     first.publish(Number(1, 2))
-    got = subscriber.recv(1.0)
+    got = subscriber.recv(SOON_S)
     assert (type(got).__name__, got.stamp_ns, got.value) == ("Number", 1, 2)
     for size in (4, LARGE):
         second.publish(scan(3, size))
-        got = subscriber.recv(1.0)
+        got = subscriber.recv(SOON_S)
         assert (type(got).__name__, got.stamp_ns) == ("Scan", 3)
         np.testing.assert_array_equal(got.ranges, scan(3, size).ranges)
 
@@ -275,7 +275,7 @@ def test_another_type_is_told_once_with_both_structures(node):
     node.publisher("/numbers", OtherNumber)
     subscriber = node.subscriber("/numbers", Number)
     with pytest.raises(TypeMismatch) as caught:
-        subscriber.recv(2.0)
+        subscriber.recv(SOON_S)
     text = str(caught.value)
     assert "/numbers" in text
     assert "expected" in text
@@ -287,9 +287,9 @@ def test_another_type_is_told_once_with_both_structures(node):
     with pytest.raises(TimeoutError):
         subscriber.recv(0.05)
     right = node.publisher("/numbers", Number)
-    assert right.wait_for_subscribers()
+    assert right.wait_for_subscribers(timeout_s=SOON_S)
     right.publish(Number(1, 1))
-    assert subscriber.recv(1.0) == Number(1, 1)
+    assert subscriber.recv(SOON_S) == Number(1, 1)
 
 
 def test_a_new_subscriber_is_not_taken_for_a_dead_one(node):
@@ -298,14 +298,14 @@ def test_a_new_subscriber_is_not_taken_for_a_dead_one(node):
     for value in range(20):
         wrong = node.subscriber("/numbers", OtherNumber)
         with pytest.raises(TypeMismatch):
-            wrong.recv(2.0)
+            wrong.recv(SOON_S)
         wrong.close()
         del wrong
         gc.collect()
         right = node.subscriber("/numbers", Number)
-        assert publisher.wait_for_subscribers(1, 2.0)
+        assert publisher.wait_for_subscribers(1, SOON_S)
         publisher.publish(Number(0, value))
-        assert right.recv(2.0).value == value
+        assert right.recv(SOON_S).value == value
         right.close()
         del right
         gc.collect()
@@ -385,10 +385,10 @@ def test_what_was_sent_before_a_publisher_left_still_comes(node):
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
     for round_ in range(3):
         with node.publisher("/numbers", Number, coalesce=True) as publisher:
-            assert publisher.wait_for_subscribers()
+            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
             for value in range(100):
                 publisher.publish(Number(round_, value))
-        assert [subscriber.recv(2.0).value for _ in range(100)] == list(range(100))
+        assert [subscriber.recv(SOON_S).value for _ in range(100)] == list(range(100))
     counters = subscriber.counters
     assert (counters.received, counters.lost) == (300, 0)
 
@@ -396,14 +396,14 @@ def test_what_was_sent_before_a_publisher_left_still_comes(node):
 def test_many_publishers_of_a_topic(node):
     publishers = [node.publisher("/numbers", Number) for _ in range(5)]
     subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
-    assert all(publisher.wait_for_subscribers() for publisher in publishers)
+    assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
     wait_for(lambda: subscriber.wait_for_publisher() and subscriber.publisher_count == 5)
     for value in range(40):
         for number, publisher in enumerate(publishers):
             publisher.publish(Number(number, value))
     streams = {publisher.source: [] for publisher in publishers}
     for _ in range(200):
-        message, info = subscriber.recv_with_info(1.0)
+        message, info = subscriber.recv_with_info(SOON_S)
         streams[info.source].append((message.stamp_ns, message.value, info.sequence))
     for number, publisher in enumerate(publishers):
         assert streams[publisher.source] == [(number, value, value) for value in range(40)]
@@ -424,7 +424,7 @@ def test_no_publisher_starves_another(node, policy, how):
 
     publishers = [node.publisher("/numbers", Number) for _ in range(2)]
     subscriber = node.subscriber("/numbers", Number, take if how == "callback" else None, policy=policy)
-    assert all(publisher.wait_for_subscribers() for publisher in publishers)
+    assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
     wait_for(lambda: subscriber.wait_for_publisher() and subscriber.publisher_count == 2)
 
     def publish(number):
@@ -444,9 +444,9 @@ def test_no_publisher_starves_another(node, policy, how):
             if how == "callback":
                 done.wait(0.01)
             elif how == "recv":
-                take(subscriber.recv(1.0))
+                take(subscriber.recv(SOON_S))
             else:
-                for stamp_ns, value in subscriber.recv_batch(1.0).tolist():
+                for stamp_ns, value in subscriber.recv_batch(SOON_S).tolist():
                     take(Number(stamp_ns, value))
     finally:
         starved = not done.is_set()
@@ -467,7 +467,7 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
     subscriber = node.subscriber("/numbers", Number, callback, policy=policy)
     for _ in range(3):
         with node.publisher("/numbers", Number) as publisher:
-            assert publisher.wait_for_subscribers()
+            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
 
     def closed():
         with contextlib.suppress(TimeoutError):
@@ -484,7 +484,7 @@ def test_iteration_goes_on_after_a_mismatch(node):
     """One publisher of another type is an error once; the others' messages still come."""
     subscriber = node.subscriber("/numbers", Number)
     good, bad = node.publisher("/numbers", Number), node.publisher("/numbers", OtherNumber)
-    assert good.wait_for_subscribers()
+    assert good.wait_for_subscribers(timeout_s=SOON_S)
     good.publish(Number(0, 7))
     messages = iter(subscriber)
     with pytest.raises(TypeMismatch):
@@ -503,9 +503,9 @@ def test_messages_for_a_callback_are_not_to_be_fetched(node):
 def test_a_deadline_holds_while_what_comes_cannot_be_read(node, monkeypatch, how):
     """A publisher that only sends what is malformed does not keep a control loop waiting."""
     publisher, subscriber = node.publisher("/number", Number), node.subscriber("/number", Number)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(Number(1, 1))
-    assert subscriber.recv(5.0) == Number(1, 1)
+    assert subscriber.recv(SOON_S) == Number(1, 1)
     (link,) = subscriber._links
     end_s = time.monotonic() + 20.0
 

@@ -57,7 +57,7 @@ def keys_of(base, names):
 def test_inproc(make_node, policy):
     publisher = make_node("one").publisher("/blocks", Block)
     subscriber = make_node("two").subscriber("/blocks", Block, policy=policy)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     exchange(publisher, subscriber)
     assert addresses(subscriber) == ["inproc"]
 
@@ -147,7 +147,7 @@ def test_near_and_far_subscribers_of_one_topic(make_node, start_child):
         child.say(do="receive", topic="/blocks", until=39)
     for number in range(40):
         assert publisher.publish(make_block(number, SIZES[number % len(SIZES)]))
-        assert is_whole(own.recv(5.0))
+        assert is_whole(own.recv(SOON_S))
     for child in (near, far):
         assert child.hear() == {"count": 40, "first": 0, "last": 39, "ordered": True, "whole": True}
     with publisher.loan(n=200_000) as draft:
@@ -251,7 +251,7 @@ def test_a_subscription_has_a_limit(make_node, size):
         cut = disconnected(socket, lambda: socket.subscribe(b"x" * size))
     assert cut == (size > 33)
     publisher, subscriber = node.publisher("/n", Number), node.subscriber("/n", Number)
-    assert publisher.wait_for_subscribers()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(Number(1, 1))
     assert subscriber.recv(SOON_S) == Number(1, 1)
 
@@ -283,7 +283,7 @@ def test_static_peers(make_node, start_child, transport, runtime):
         assert publisher.publish(make(Scan, number, size))
         assert child.ask(do="receive", topic="/ours", until=number)["count"] == 1
         child.ask(do="publish", topic="/theirs", count=1, start=number, size=size)
-        assert subscriber.recv(5.0) == make(Scan, number, size)
+        assert subscriber.recv(SOON_S) == make(Scan, number, size)
     assert node.wait_for_registry(5.0)
     assert not (runtime / "0" / "registry").exists()
     child.finish()

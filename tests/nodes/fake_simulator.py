@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from processes import SOON_S
 
 from cortex import Node, Publisher
 from cortex import messages as msg
@@ -97,14 +98,14 @@ class FakeSimulator:
         if not wait:
             return
         for publisher in (self.odometry, self.rotor_speeds, self.statuses, self.path, self.collisions):
-            assert publisher.wait_for_subscribers(timeout_s=15.0)
+            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
         for publisher in self.commands.values():
-            assert publisher.wait_for_subscribers(timeout_s=15.0)
+            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
 
     def wait_for_cameras(self) -> None:
         """Wait until the viewer listens to every sensor, and to the state."""
         for publisher in (*self.sensors.values(), self.odometry, self.rotor_speeds):
-            assert publisher.wait_for_subscribers(timeout_s=15.0)
+            assert publisher.wait_for_subscribers(timeout_s=SOON_S)
 
     def state(self, k: int) -> None:
         """Publish odometry, rotor speeds and a sample of the IMU at 5 k ms."""

@@ -124,8 +124,8 @@ def test_every_odometry_is_answered(shared_runtime, start_pilot, mode):
     with Node("simulator") as node:
         stage = Stage(node, mode=mode)
         pilot = start_pilot(mode=mode)
-        stage.odometry.wait_for_subscribers()
-        stage.rotor_speeds.wait_for_subscribers()
+        stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
+        stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
         for tick in range(40):
             stage.send(tick)
         assert [stage.hear() for _ in range(40)] == [expected(tick, mode) for tick in range(40)]
@@ -147,8 +147,8 @@ def test_who_comes_late_answers_what_was_said_last(stage, start_pilot):
 def test_who_is_asked_twice_answers_twice_the_same(stage, start_pilot):
     """As a simulator asks again while it waits for a command, and somebody new has come."""
     pilot = start_pilot()
-    stage.odometry.wait_for_subscribers()
-    stage.rotor_speeds.wait_for_subscribers()
+    stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
+    stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
     for tick in (0, 0, 1):
         stage.send(tick)
     assert [stage.hear() for _ in range(3)] == [expected(tick) for tick in (0, 0, 1)]
@@ -158,8 +158,8 @@ def test_who_is_asked_twice_answers_twice_the_same(stage, start_pilot):
 def test_a_reset_is_answered_like_the_rest(stage, start_pilot):
     """Stamps and sequence begin again, also with rotor speeds of before still on their way."""
     start_pilot()
-    stage.odometry.wait_for_subscribers()
-    stage.rotor_speeds.wait_for_subscribers()
+    stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
+    stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
     for tick in (0, 1, 2):
         stage.send(tick)
     speed = a_state(3)["rotor_speed"]
@@ -184,7 +184,7 @@ def test_missing_rotor_speeds_are_said_and_replaced(stage, start_pilot, caplog, 
     pilot = start_pilot(lockstep=False)
     stage.send(1, rotors=False)
     assert stage.hear() == expected(1, rotor_speed=HOVER)
-    stage.rotor_speeds.wait_for_subscribers()
+    stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
     stage.send(2)
     assert stage.hear() == expected(2)
     for tick in range(3, 30):
@@ -207,8 +207,8 @@ def test_in_streaming_the_newest_counts(stage, start_pilot, monkeypatch):
     """A pilot that is slow answers what is new when it looks again."""
     monkeypatch.setitem(controller._PATIENCE_S, "streaming", SOON_S)
     start_pilot(lockstep=False, delay_s=0.3)
-    stage.odometry.wait_for_subscribers()
-    stage.rotor_speeds.wait_for_subscribers()
+    stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
+    stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
     for tick in range(5):
         stage.send(tick)
     answered = [stage.hear()]

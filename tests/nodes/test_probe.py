@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from processes import SOON_S
 
 from cortex import Node, reliable
 from cortex.messages import Events, Image, Imu, MotorCommand, RotorSpeeds, SimulatorStatus
@@ -153,7 +154,7 @@ def test_a_stream_is_noted_with_all_its_gaps(runtime):
 
     def send() -> None:
         for publisher in (imu, events, statuses):
-            assert publisher.wait_for_subscribers(1, timeout_s=15.0)
+            assert publisher.wait_for_subscribers(1, SOON_S)
         statuses.publish(status)
         for sequence in (0, 2):
             none = np.zeros(3, np.uint16)

@@ -192,7 +192,7 @@ def test_a_link_that_is_set_in_flight_is_shown(tmp_path, box, start, monkeypatch
         simulator.announce()
         simulator.change({"links.imu.latency_s": 0.008})
         deliveries = simulator.node.publisher("/drone/imu/delivery", msg.Delivery)
-        assert deliveries.wait_for_subscribers(timeout_s=15.0)
+        assert deliveries.wait_for_subscribers(timeout_s=SOON_S)
         delivery = msg.Delivery(stamp_ns=5 * MS, delivered_ns=13 * MS, size_bytes=48, sequence=0)
         deliveries.publish(delivery)
         simulator.state(1)
