@@ -14,6 +14,7 @@
 #include <vector>
 
 #include <cortex/ring.hpp>
+#include <cortex/ring_view.hpp>
 
 namespace {
 

@@ -11,8 +11,9 @@
 #include <utility>
 #include <vector>
 
+#include "cortex/pipe.hpp"
 #include "cortex/policy.hpp"
-#include "cortex/ring.hpp"
+#include "cortex/ring_view.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/socket.hpp"
 #include "cortex/wire.hpp"
@@ -64,32 +65,38 @@ class Link {
     attach(shared_memory);
   }
 
-  ~Link() {
-    // Leases are given back before the end of the socket tells the publisher to free the column.
-    for (auto& ring : rings_) ring.second->close();
-  }
+  ~Link() { close_rings(); }  // before the end of the socket tells the publisher to free the column
   Link(const Link&) = delete;
   Link& operator=(const Link&) = delete;
 
+  // Becomes readable, as the pipe does, when something may have come.
   int fd() const noexcept { return fd_; }
+  // That of the pipe, -1 if there is none.
+  int pipe_fd() const noexcept { return offer_ == nullptr ? -1 : offer_->fd(); }
   std::uint64_t source() const noexcept { return source_; }
   const std::string& address() const noexcept { return address_; }
   bool attached() const noexcept { return attached_; }
   std::int64_t leaving_ns = 0;  // when the publisher was seen to have left; 0: it is there
 
-  // Reads at most `budget` frames into the queue; false if there may be more.
+  // Reads at most `budget` frames into the queue, those of the pipe first; false if there may be more.
   bool drain(std::deque<Item>& queue, std::size_t budget) {
     for (; budget > 0; --budget) {
-      zmq::message_t frame;
-      if (!socket_.recv(frame, zmq::recv_flags::dontwait)) return true;
-      const bool more = frame.more();
-      try {
-        accept(frame, queue);
-        if (more && net::drop_parts(socket_) > 0) reject("parts after the end of a message");
-      } catch (const std::exception& error) {  // MalformedMessage, or no memory for what it says
-        reject(error.what());
-        if (more) net::drop_parts(socket_);
+      if (pipe_ != nullptr) {
+        const auto bytes = pipe_->next();
+        if (!bytes.empty()) {
+          take_in({bytes, nullptr}, queue);
+          continue;
+        }
+        if (pipe_->broken()) {
+          reject("something in the pipe is no frame");
+          go_without_memory("its pipe cannot be read");
+        }
       }
+      zmq::message_t message;
+      if (!socket_.recv(message, zmq::recv_flags::dontwait)) return true;
+      const bool more = message.more();
+      const bool taken = take_in({net::bytes(message), &message}, queue);
+      if (more && net::drop_parts(socket_) > 0 && taken) reject("parts after the end of a message");
     }
     return false;
   }
@@ -107,6 +114,16 @@ class Link {
   }
   std::uint8_t flags() const noexcept { return type_.stamped ? wire::flag_stamp : 0; }
 
+  // A frame where it lies: in a message of ZeroMQ, or in the pipe's buffer (null) until the next is read.
+  struct Arrival {
+    Span<const std::uint8_t> bytes;
+    zmq::message_t* message;
+    // Has 64 bytes or more, so that ZeroMQ does not keep it within the object, which moves.
+    zmq::message_t keep() const {
+      return message == nullptr ? zmq::message_t(bytes.data(), bytes.size()) : std::move(*message);
+    }
+  };
+
   void attach(bool shared_memory) {
     wire::AttachKey key;
     key.source = source_;
@@ -116,31 +133,53 @@ class Link {
     key.quota = static_cast<std::uint8_t>(std::min<std::size_t>(policy_.depth + 2, 255));
     key.timeout_ms = static_cast<std::uint32_t>(policy_.timeout.count());
     key_ = wire::pack_key(key, flags());
+    if (shared_memory && net::is_ipc(address_)) {
+      try {
+        offer_ = std::make_unique<pipe::Offer>(net::folder_of(address_), reader_);
+      } catch (const std::system_error& error) {
+        complaints_->once("pipe " + address_, "no pipe for " + address_ + ": " + error.what());
+      }
+    }
     socket_.set(zmq::sockopt::subscribe, key_);
   }
 
-  void accept(zmq::message_t& frame, std::deque<Item>& queue) {
-    const auto bytes = net::bytes(frame);
-    const wire::Header header = wire::read_header(bytes);
+  // False if it was rejected.
+  bool take_in(const Arrival& arrival, std::deque<Item>& queue) {
+    wire::Header header;
+    try {
+      header = wire::read_header(arrival.bytes);
+      accept(header, arrival, queue);
+      return true;
+    } catch (const std::exception& error) {  // MalformedMessage, or no memory for what it says
+      reject(error.what());
+      // A message that was rejected is accounted for, if it is the one that was to come.
+      const bool large = (header.kind == 'L' || header.kind == 'S') && header.source == source_;
+      if (large && known_ && header.sequence == expected_) ++expected_;
+      return false;
+    }
+  }
+
+  void accept(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
     if (header.source != source_ || header.flags != flags()) throw MalformedMessage("not a frame of this publisher");
-    if (header.kind == 'A') return on_answer(bytes, queue);
+    if (header.kind == 'A') return on_answer(arrival.bytes, queue);
+    if (pipe_ != nullptr && arrival.message != nullptr && header.kind != 'L') return;  // it came through the pipe
     if (header.fingerprint != type_.fingerprint) throw MalformedMessage("a message of another type");
     if (header.body_size > wire::body_limit) throw MalformedMessage("a body over the limit of 1 GiB");
     switch (header.kind) {
       case 'M': {
-        const auto body = wire::body_of(header, bytes, wire::body_limit);
+        wire::body_of(header, arrival.bytes, wire::body_limit);
         if (!advance(header.sequence, 1)) return;
         Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
-        item.body = body;  // a frame has 64 bytes or more, so ZeroMQ does not keep it within `frame` itself
-        item.frame = std::move(frame);
+        item.frame = arrival.keep();
+        item.body = {net::bytes(item.frame).data() + wire::header_size, static_cast<std::size_t>(header.body_size)};
         return;
       }
       case 'B':
-        return on_batch(header, frame, queue);
+        return on_batch(header, arrival, queue);
       case 'L':
-        return on_large(header, frame, queue);
+        return on_large(header, *arrival.message, queue);  // none comes through a pipe
       case 'S':
-        return on_slot(header, bytes, queue);
+        return on_slot(header, arrival.bytes, queue);
       default:
         throw MalformedMessage(std::string("kind '") + header.kind + "' is unknown");
     }
@@ -201,14 +240,14 @@ class Link {
     }
   }
 
-  void on_batch(const wire::Header& header, zmq::message_t& frame, std::deque<Item>& queue) {
-    wire::body_of(header, net::bytes(frame), wire::body_limit);
+  void on_batch(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
+    wire::body_of(header, arrival.bytes, wire::body_limit);
     if (header.aux == 0) {  // tells which number comes next, so that a loss at the end of a burst is known
       if (header.body_size != 0) throw MalformedMessage("a batch of bytes without records");
       advance(header.sequence, 0);
       return;
     }
-    const auto shared = std::make_shared<zmq::message_t>(std::move(frame));
+    const auto shared = std::make_shared<zmq::message_t>(arrival.keep());
     const auto records = wire::batch_records(header, net::bytes(*shared));
     if (!advance(header.sequence, header.aux)) return;
     for (std::size_t index = 0; index < records.size(); ++index) {
@@ -219,40 +258,100 @@ class Link {
   }
 
   void on_slot(const wire::Header& header, Span<const std::uint8_t> bytes, std::deque<Item>& queue) {
-    if (bytes.size() != wire::header_size + 8 + wire::place_size) throw MalformedMessage("a descriptor of another size");
+    if (bytes.size() != wire::slot_frame_size) throw MalformedMessage("a descriptor of another size");
     const auto mask = wire::load<std::uint64_t>(bytes.data() + wire::header_size);
-    auto ring = rings_.find(static_cast<std::uint32_t>(header.aux >> 32));
-    if (ring == rings_.end() && column_ != wire::no_column) {
-      const wire::RingPlace place = wire::load_place(bytes.data() + wire::header_size + 8);
-      if (place.ring != header.aux >> 32) throw MalformedMessage("a descriptor that places another ring");
-      try {
-        ring = rings_.emplace(place.ring, std::make_shared<RingView>(source_, place, column_)).first;
-      } catch (const ShmUnavailable& error) {
-        go_without_memory(error.what());
-        return;
-      }
-    }
+    const auto number = static_cast<std::uint32_t>(header.aux >> 32);
     const auto slot = static_cast<std::uint32_t>(header.aux);
-    const bool leased = column_ != wire::no_column && (mask >> column_ & 1) != 0;
-    if (ring == rings_.end() || !leased) {
-      // While `L` is subscribed the message comes that way. A reliable reader that was left out had its share of
-      // slots: the gap is counted with the next message.
-      if (large_subscribed_ || (known_ && header.sequence < expected_) || ring == rings_.end() || policy_.is_reliable) {
+    const auto view = ring_of(number, bytes.data() + wire::header_size + 8);
+    if (rings_.size() > 1) forget_rings(number);
+    if (view == nullptr || (mask >> column_ & 1) == 0) {
+      // While `L` is subscribed the message comes that way.
+      if (large_subscribed_ || (known_ && header.sequence < expected_)) return;
+      if (view != nullptr && !view->has(slot, header.body_size)) {
+        throw MalformedMessage("a descriptor of slot " + std::to_string(slot) + ": the ring has no such");
+      }
+      if (!advance(header.sequence, 1)) return;
+      if (view == nullptr || policy_.is_reliable) {  // left out on purpose: the publisher held us to our share
+        ++counters_->lost;
         return;
       }
-      advance(header.sequence, 1);
       Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
       item.body = {nullptr, static_cast<std::size_t>(header.body_size)};
-      item.unleased = ring->second;
+      item.unleased = view;
       item.slot = slot;
       return;
     }
     std::shared_ptr<const void> owner;
-    const auto body = ring->second->take(slot, header.sequence, header.body_size, owner);
+    const auto body = view->take(slot, header.sequence, header.body_size, owner);
     if (!advance(header.sequence, 1)) return;  // it was latched, or came as `L`: `owner` gives the slot back
     Item& item = append(queue, header.sequence, header.stamp_ns, header.publish_ns);
     item.body = body;
     item.owner = std::move(owner);
+  }
+
+  // The ring of a descriptor, mapped if need be; null where that cannot be done.
+  std::shared_ptr<RingView> ring_of(std::uint32_t number, const std::uint8_t* place_at) {
+    if (column_ == wire::no_column) return nullptr;
+    const auto known = rings_.find(number);
+    if (known != rings_.end()) return known->second;
+    const wire::RingPlace place = wire::load_place(place_at);
+    if (place.ring != number) throw MalformedMessage("a descriptor that places another ring");
+    try {
+      return map_ring(place);
+    } catch (const RingGone& error) {  // the lease of a message keeps its ring; that of one that was left out may be gone
+      if (number >= newest_ring_) go_without_memory(error.what());
+    } catch (const ShmUnavailable& error) {
+      go_without_memory(error.what());
+    }
+    return nullptr;
+  }
+
+  std::shared_ptr<RingView> map_ring(const wire::RingPlace& place) {
+    auto view = std::make_shared<RingView>(source_, place, column_);
+    rings_[place.ring] = view;
+    newest_ring_ = std::max(newest_ring_, static_cast<std::int64_t>(place.ring));
+    return view;
+  }
+
+  // Maps the newest ring that is announced, and forgets those that are given up; false if there is no shared memory
+  // from now on. An announcement comes through the socket, descriptors through the pipe: it may be old news.
+  bool take_rings(const std::vector<wire::RingPlace>& places) {
+    const auto by_number = [](const wire::RingPlace& a, const wire::RingPlace& b) { return a.ring < b.ring; };
+    const auto [oldest, newest] = std::minmax_element(places.begin(), places.end(), by_number);
+    given_up_ = std::max(given_up_, oldest->ring);
+    if (newest->ring > newest_ring_) {
+      try {
+        map_ring(*newest);
+      } catch (const RingGone&) {  // replaced meanwhile: descriptors say which ring there is
+      } catch (const ShmUnavailable& error) {
+        go_without_memory(error.what());
+        return false;
+      }
+    }
+    forget_rings(newest_ring_);
+    return true;
+  }
+
+  // Unmaps older rings that are not in use; one that is needed after all is mapped again. Of a ring that the publisher
+  // has given up only messages on their way are waited for: those in use become private copies.
+  void forget_rings(std::int64_t newest) {
+    for (auto entry = rings_.begin(); entry != rings_.end();) {
+      const auto& [number, view] = *entry;
+      const bool surplus = rings_.size() > rings_max;  // whoever lets us wait for so many sends us nonsense
+      const bool given_up = number < given_up_ && !view->is_awaited();
+      if (number < newest && (surplus || given_up || view->idle())) {
+        view->close();
+        entry = rings_.erase(entry);
+      } else {
+        ++entry;
+      }
+    }
+  }
+
+  void close_rings() noexcept {
+    for (auto& ring : rings_) ring.second->close();
+    rings_.clear();
+    newest_ring_ = -1;
   }
 
   void on_answer(Span<const std::uint8_t> bytes, std::deque<Item>& queue) {
@@ -263,36 +362,37 @@ class Link {
     const bool first = !attached_;
     attached_ = true;
     column_ = answer.column;
-    if (column_ != wire::no_column) {
-      try {
-        // The newest: a descriptor tells of an older one, and the publisher may have let go of that.
-        if (!answer.rings.empty()) map_ring(answer.rings.back());
-      } catch (const ShmUnavailable& error) {
-        const std::string descriptors = "/proc/" + std::to_string(answer.rings.back().pid) + "/fd";
-        if (::access(descriptors.c_str(), R_OK | X_OK) != 0) {
-          go_without_memory(error.what());
-          return;
-        }  // it was replaced before we came: the next descriptor says by what
-      }
-      while (rings_.size() > wire::rings_alive) rings_.erase(rings_.begin());  // leases keep their ring alive
-      if (large_subscribed_) {
-        socket_.set(zmq::sockopt::unsubscribe, prefix('L'));
-        large_subscribed_ = false;
-      }
-    } else if (!large_subscribed_) {  // the publisher cannot share memory any more
-      socket_.set(zmq::sockopt::subscribe, prefix('L'));
-      large_subscribed_ = true;
+    if (column_ == wire::no_column) {
+      subscribe_large(true);  // the publisher cannot share memory any more
+    } else {
+      if (!answer.rings.empty() && !take_rings(answer.rings)) return;
+      subscribe_large(false);
     }
+    if (first && offer_ != nullptr && offer_->taken()) use_pipe();
     if (!first || known_) return;
     if (!answer.latched.empty()) latched(answer.latched, queue);
     known_ = true;
     expected_ = answer.sequence;
   }
 
-  void map_ring(const wire::RingPlace& place) {
-    if (rings_.count(place.ring) == 0) {
-      rings_.emplace(place.ring, std::make_shared<RingView>(source_, place, column_));
+  void subscribe_large(bool wanted) {
+    if (large_subscribed_ == wanted) return;
+    large_subscribed_ = wanted;
+    subscribe('L', wanted);
+  }
+
+  void subscribe(char kind, bool wanted) {
+    if (wanted) {
+      socket_.set(zmq::sockopt::subscribe, prefix(kind));
+    } else {
+      socket_.set(zmq::sockopt::unsubscribe, prefix(kind));
     }
+  }
+
+  // The publisher sends all that follows through our pipe.
+  void use_pipe() {
+    pipe_ = std::make_unique<pipe::Reader>(offer_->fd());
+    for (const char kind : {'M', 'B', 'S'}) subscribe(kind, false);
   }
 
   void latched(Span<const std::uint8_t> frame, std::deque<Item>& queue) {
@@ -308,16 +408,25 @@ class Link {
     item.owner = std::move(copy);
   }
 
+  // Attaches anew, as another reader: what follows comes through the socket.
   void go_without_memory(const std::string& why) {
     complaints_->once("memory " + address_, "cannot share memory with " + address_ + ": " + why);
-    if (!large_subscribed_) socket_.set(zmq::sockopt::subscribe, prefix('L'));
-    large_subscribed_ = true;
-    socket_.set(zmq::sockopt::unsubscribe, prefix('S'));
+    close_rings();  // before the publisher can learn that our column is free
+    if (pipe_ == nullptr) {
+      subscribe('S', false);
+    } else {
+      for (const char kind : {'M', 'B'}) subscribe(kind, true);
+    }
+    subscribe_large(true);
+    pipe_.reset();
+    offer_.reset();
     socket_.set(zmq::sockopt::unsubscribe, key_);
     column_ = wire::no_column;
     attached_ = false;
     attach(false);
   }
+
+  static constexpr std::size_t rings_max = 8;  // most rings of one publisher that are kept mapped
 
   std::string address_;
   std::uint64_t source_;
@@ -337,6 +446,10 @@ class Link {
   std::uint64_t sample_ = 0;
   std::uint32_t column_ = wire::no_column;
   std::map<std::uint32_t, std::shared_ptr<RingView>> rings_;
+  std::int64_t newest_ring_ = -1;  // the highest number of a ring that was mapped
+  std::uint32_t given_up_ = 0;     // the publisher writes to no ring of a lower number any more
+  std::unique_ptr<pipe::Offer> offer_;
+  std::unique_ptr<pipe::Reader> pipe_;  // null: everything comes through the socket
 };
 
 }  // namespace cortex::detail

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rings of message slots in shared memory (WIRE.md, section 6): the publisher's side and the reader's.
+// Rings of message slots in shared memory (WIRE.md, section 6): the publisher's side.
 #pragma once
 
 #include <atomic>
@@ -7,118 +7,15 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
-#include <cstring>
-#include <memory>
-#include <mutex>
 #include <stdexcept>
 #include <string>
-#include <utility>
 #include <vector>
 
 #include "cortex/array.hpp"
+#include "cortex/memory.hpp"
 #include "cortex/wire.hpp"
 
-#if defined(__linux__)
-#include <fcntl.h>
-#include <sys/mman.h>
-#include <sys/stat.h>
-#include <unistd.h>
-#endif
-
 namespace cortex {
-
-// This memory cannot be made or cannot be trusted; messages still go through sockets.
-class ShmUnavailable : public std::runtime_error {
- public:
-  using std::runtime_error::runtime_error;
-};
-
-namespace ring {
-
-constexpr std::size_t page = 4096;
-constexpr std::size_t slot_head = 64;  // bytes of a slot's header
-constexpr std::uint32_t slots_max = 4096;
-constexpr std::uint64_t slot_bytes_max = std::uint64_t{1} << 32;
-constexpr std::size_t header_bytes = 72;
-
-struct Layout {
-  std::uint64_t leases, headers, slots, total;
-};
-
-inline Layout layout(std::uint32_t slots, std::uint64_t slot_bytes) noexcept {
-  Layout result{};
-  result.leases = page;
-  result.headers = page + std::uint64_t{slots} * wire::column_count;
-  result.slots = wire::round_up(result.headers + std::uint64_t{slots} * slot_head, page);
-  result.total = result.slots + slots * slot_bytes;
-  return result;
-}
-
-inline void write_header(std::uint8_t* out, std::uint32_t ring, std::uint64_t source, std::uint32_t slots,
-                         std::uint64_t slot_bytes) noexcept {
-  const Layout places = layout(slots, slot_bytes);
-  std::memcpy(out, "CTXRING1", 8);
-  wire::store<std::uint32_t>(out + 8, 1);
-  wire::store(out + 12, ring);
-  wire::store(out + 16, source);
-  wire::store(out + 24, slots);
-  wire::store(out + 28, wire::column_count);
-  wire::store(out + 32, slot_bytes);
-  wire::store(out + 40, places.leases);
-  wire::store(out + 48, places.headers);
-  wire::store(out + 56, places.slots);
-  wire::store(out + 64, places.total);
-}
-
-#if defined(__linux__)
-
-[[noreturn]] inline void unavailable(const std::string& what) { throw ShmUnavailable(what + ": " + std::strerror(errno)); }
-
-class Descriptor {
- public:
-  explicit Descriptor(int fd = -1) noexcept : fd_(fd) {}
-  Descriptor(Descriptor&& other) noexcept : fd_(std::exchange(other.fd_, -1)) {}
-  Descriptor& operator=(Descriptor&& other) noexcept {
-    std::swap(fd_, other.fd_);
-    return *this;
-  }
-  ~Descriptor() {
-    if (fd_ >= 0) ::close(fd_);
-  }
-  int get() const noexcept { return fd_; }
-
- private:
-  int fd_;
-};
-
-class Mapping {
- public:
-  Mapping() noexcept = default;
-  Mapping(int fd, std::uint64_t offset, std::uint64_t size, bool writable) : size_(static_cast<std::size_t>(size)) {
-    void* at = ::mmap(nullptr, size_, writable ? PROT_READ | PROT_WRITE : PROT_READ, MAP_SHARED | MAP_POPULATE, fd,
-                      static_cast<off_t>(offset));
-    if (at == MAP_FAILED) unavailable("cannot map " + std::to_string(size) + " bytes");
-    data_ = static_cast<std::uint8_t*>(at);
-  }
-  Mapping(Mapping&& other) noexcept : data_(std::exchange(other.data_, nullptr)), size_(other.size_) {}
-  Mapping& operator=(Mapping&& other) noexcept {
-    std::swap(data_, other.data_);
-    std::swap(size_, other.size_);
-    return *this;
-  }
-  ~Mapping() {
-    if (data_ != nullptr) ::munmap(data_, size_);
-  }
-  std::uint8_t* data() const noexcept { return data_; }
-
- private:
-  std::uint8_t* data_ = nullptr;
-  std::size_t size_ = 0;
-};
-
-#endif
-
-}  // namespace ring
 
 #if defined(__linux__)
 
@@ -142,7 +39,7 @@ class Ring {
     }
     char name[64];
     std::snprintf(name, sizeof name, "cortex-%016llx-%u", static_cast<unsigned long long>(source), number);
-    fd_ = ring::Descriptor(::memfd_create(name, MFD_CLOEXEC | MFD_ALLOW_SEALING));
+    fd_ = runtime::Descriptor(::memfd_create(name, MFD_CLOEXEC | MFD_ALLOW_SEALING));
     if (fd_.get() < 0) ring::unavailable("memfd_create");
     const auto total = static_cast<off_t>(layout_.total);
     // The pages are taken now: one that is missing is an error here, instead of SIGBUS later.
@@ -276,7 +173,7 @@ class Ring {
   std::uint32_t slots_;
   std::uint64_t slot_bytes_;
   ring::Layout layout_;
-  ring::Descriptor fd_;
+  runtime::Descriptor fd_;
   ring::Mapping memory_;
   std::uint32_t last_ = 0;
   std::vector<std::uint8_t> busy_;
@@ -285,160 +182,6 @@ class Ring {
   std::vector<std::uint32_t> held_;     // slots of a column, some given back
   std::vector<std::atomic<std::uint32_t>> pins_;
   std::atomic<std::uint32_t> pinned_{0};
-};
-
-// The reader's side: slots are mapped read-only. Thread-safe; leases may end in any thread.
-class RingView : public std::enable_shared_from_this<RingView> {
- public:
-  RingView(std::uint64_t source, const wire::RingPlace& place, std::uint32_t column)
-      : slots_(place.slots), slot_bytes_(place.slot_bytes), column_(column), layout_{} {
-    if (place.slots == 0 || place.slots > ring::slots_max || place.slot_bytes == 0 ||
-        place.slot_bytes > ring::slot_bytes_max || place.slot_bytes % ring::page != 0 ||
-        column >= wire::column_count || place.pid == 0 || place.fd < 0) {
-      throw ShmUnavailable("a ring of " + std::to_string(place.slots) + " slots of " +
-                           std::to_string(place.slot_bytes) + " bytes is not possible");
-    }
-    held_.assign(slots_, false);
-    layout_ = ring::layout(slots_, slot_bytes_);
-    const ring::Descriptor fd = open(place, layout_.total);
-    std::uint8_t expected[ring::header_bytes];
-    std::uint8_t found[ring::header_bytes];
-    ring::write_header(expected, place.ring, source, slots_, slot_bytes_);
-    if (::pread(fd.get(), found, sizeof found, 0) != static_cast<ssize_t>(sizeof found) ||
-        std::memcmp(found, expected, sizeof found) != 0) {
-      throw ShmUnavailable("ring " + std::to_string(place.ring) + " has another header than announced");
-    }
-    head_ = ring::Mapping(fd.get(), 0, layout_.slots, true);
-    body_ = ring::Mapping(fd.get(), layout_.slots, layout_.total - layout_.slots, false);
-  }
-
-  ~RingView() { close(); }
-  RingView(const RingView&) = delete;
-  RingView& operator=(const RingView&) = delete;
-
-  // The message in a slot that was granted to this reader; it is given back with the last copy of `owner`.
-  Span<const std::uint8_t> take(std::uint32_t slot, std::uint64_t sequence, std::uint64_t size,
-                                std::shared_ptr<const void>& owner) {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    check(slot, size);
-    if (held_[slot] || __atomic_load_n(lease(slot), __ATOMIC_ACQUIRE) != 1 ||
-        __atomic_load_n(word(slot, 1), __ATOMIC_RELAXED) != sequence ||
-        __atomic_load_n(word(slot, 2), __ATOMIC_RELAXED) != size) {
-      throw MalformedMessage("slot " + std::to_string(slot) + " does not hold message " + std::to_string(sequence) +
-                             " of " + std::to_string(size) + " bytes for this reader");
-    }
-    owner = std::make_shared<Lease>(shared_from_this(), slot);
-    held_[slot] = true;
-    return {body_.data() + slot * slot_bytes_, static_cast<std::size_t>(size)};
-  }
-
-  // Gives back the slots of messages older than one that has arrived, and which therefore never come.
-  void heal(std::uint64_t before_sequence) {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    if (closed_) return;
-    for (std::uint32_t slot = 0; slot < slots_; ++slot) {
-      if (!held_[slot] && __atomic_load_n(lease(slot), __ATOMIC_ACQUIRE) == 1 &&
-          __atomic_load_n(word(slot, 1), __ATOMIC_RELAXED) < before_sequence) {
-        __atomic_store_n(lease(slot), std::uint8_t{0}, __ATOMIC_RELEASE);
-      }
-    }
-  }
-
-  // Copies a message that is not leased to this reader; false if it is gone, or goes meanwhile.
-  bool copy(std::uint32_t slot, std::uint64_t sequence, std::uint64_t size, std::uint8_t* out) {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    check(slot, size);
-    const std::uint64_t state = __atomic_load_n(word(slot, 0), __ATOMIC_ACQUIRE);
-    if (state == 0 || (state & 1) != 0 || __atomic_load_n(word(slot, 1), __ATOMIC_RELAXED) != sequence ||
-        __atomic_load_n(word(slot, 2), __ATOMIC_RELAXED) != size) {
-      return false;
-    }
-    std::memcpy(out, body_.data() + slot * slot_bytes_, static_cast<std::size_t>(size));
-    std::atomic_thread_fence(std::memory_order_acquire);
-    return __atomic_load_n(word(slot, 0), __ATOMIC_RELAXED) == state;
-  }
-
-  // Gives everything back, before the publisher is told to free the column. Messages that are still in use stay
-  // valid: their slots become private copies in place.
-  void close() noexcept {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    if (closed_) return;
-    closed_ = true;
-    for (std::uint32_t slot = 0; slot < slots_; ++slot) {
-      if (held_[slot] && !make_private(slot)) continue;  // no memory: the slot stays leased, rather than change
-      __atomic_store_n(lease(slot), std::uint8_t{0}, __ATOMIC_RELEASE);
-    }
-  }
-
- private:
-  struct Lease {
-    Lease(std::shared_ptr<RingView> from, std::uint32_t index) noexcept : view(std::move(from)), slot(index) {}
-    Lease(const Lease&) = delete;
-    Lease& operator=(const Lease&) = delete;
-    ~Lease() { view->give_back(slot); }
-    std::shared_ptr<RingView> view;
-    std::uint32_t slot;
-  };
-
-  static ring::Descriptor open(const wire::RingPlace& place, std::uint64_t total) {
-    const std::string path = "/proc/" + std::to_string(place.pid) + "/fd/" + std::to_string(place.fd);
-    struct stat status {};
-    const auto trusted = [&] {
-      return S_ISREG(status.st_mode) && status.st_uid == ::geteuid() &&
-             static_cast<std::uint64_t>(status.st_size) == total;
-    };
-    if (::stat(path.c_str(), &status) != 0) ring::unavailable(path);
-    if (!trusted()) throw ShmUnavailable(path + " is not memory of ours in this size");
-    ring::Descriptor fd(::open(path.c_str(), O_RDWR | O_CLOEXEC | O_NOCTTY | O_NONBLOCK));
-    if (fd.get() < 0 || ::fstat(fd.get(), &status) != 0) ring::unavailable(path);
-    if (!trusted()) throw ShmUnavailable(path + " is not memory of ours in this size");
-    const int wanted = F_SEAL_SHRINK | F_SEAL_GROW;
-    const int seals = ::fcntl(fd.get(), F_GET_SEALS);
-    if (seals < 0 || (seals & wanted) != wanted) throw ShmUnavailable(path + " is not sealed: its size could change");
-    return fd;
-  }
-
-  void give_back(std::uint32_t slot) noexcept {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    held_[slot] = false;
-    if (!closed_) __atomic_store_n(lease(slot), std::uint8_t{0}, __ATOMIC_RELEASE);
-  }
-
-  bool make_private(std::uint32_t slot) noexcept {
-    const auto size = static_cast<std::size_t>(slot_bytes_);
-    void* copy = ::mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
-    if (copy == MAP_FAILED) return false;
-    std::uint8_t* place = body_.data() + slot * slot_bytes_;
-    std::memcpy(copy, place, size);
-    if (::mremap(copy, size, size, MREMAP_MAYMOVE | MREMAP_FIXED, place) == MAP_FAILED) {
-      ::munmap(copy, size);
-      return false;
-    }
-    return true;
-  }
-
-  void check(std::uint32_t slot, std::uint64_t size) const {
-    if (closed_ || slot >= slots_ || size > slot_bytes_) {
-      throw MalformedMessage("slot " + std::to_string(slot) + " of " + std::to_string(slots_) + " cannot hold " +
-                             std::to_string(size) + " bytes");
-    }
-  }
-  std::uint8_t* lease(std::uint32_t slot) const noexcept {
-    return head_.data() + layout_.leases + slot * wire::column_count + column_;
-  }
-  std::uint64_t* word(std::uint32_t slot, std::uint32_t index) const noexcept {
-    return reinterpret_cast<std::uint64_t*>(head_.data() + layout_.headers + slot * ring::slot_head) + index;
-  }
-
-  std::uint32_t slots_;
-  std::uint64_t slot_bytes_;
-  std::uint32_t column_;
-  ring::Layout layout_;
-  std::vector<bool> held_;
-  ring::Mapping head_;
-  ring::Mapping body_;
-  std::mutex mutex_;
-  bool closed_ = false;
 };
 
 #else
@@ -462,17 +205,6 @@ class Ring {
   std::uint32_t outstanding(std::uint32_t, std::uint32_t) noexcept { return 0; }
   void free_column(std::uint32_t) noexcept {}
   bool idle() noexcept { return true; }
-};
-
-class RingView {
- public:
-  RingView(std::uint64_t, const wire::RingPlace&, std::uint32_t) { throw ShmUnavailable("memfd needs Linux"); }
-  Span<const std::uint8_t> take(std::uint32_t, std::uint64_t, std::uint64_t, std::shared_ptr<const void>&) {
-    return {};
-  }
-  void heal(std::uint64_t) {}
-  bool copy(std::uint32_t, std::uint64_t, std::uint64_t, std::uint8_t*) { return false; }
-  void close() noexcept {}
 };
 
 #endif

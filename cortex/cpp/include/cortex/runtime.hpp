@@ -96,6 +96,31 @@ inline std::array<std::uint8_t, 8> blake2b_8(const std::string& data) {
 
 namespace runtime {
 
+// A file descriptor that is closed with its owner.
+class Descriptor {
+ public:
+  explicit Descriptor(int fd = -1) noexcept : fd_(fd) {}
+  Descriptor(Descriptor&& other) noexcept : fd_(std::exchange(other.fd_, -1)) {}
+  Descriptor& operator=(Descriptor&& other) noexcept {
+    std::swap(fd_, other.fd_);
+    return *this;
+  }
+  ~Descriptor() {
+    if (fd_ >= 0) ::close(fd_);
+  }
+  int get() const noexcept { return fd_; }
+
+ private:
+  int fd_;
+};
+
+inline std::string hexadecimal(std::uint64_t number) {
+  static constexpr char digits[] = "0123456789abcdef";
+  std::string text;
+  for (int shift = 60; shift >= 0; shift -= 4) text += digits[number >> shift & 15];
+  return text;
+}
+
 inline std::string environment(const char* name) {
   const char* value = std::getenv(name);
   return value == nullptr ? "" : value;
@@ -184,9 +209,7 @@ inline std::string host_id() {
 class NodeFiles {
  public:
   NodeFiles(const std::string& directory, std::uint64_t node) {
-    static constexpr char digits[] = "0123456789abcdef";
-    stem_ = directory + "/";
-    for (int shift = 60; shift >= 0; shift -= 4) stem_ += digits[node >> shift & 15];
+    stem_ = directory + "/" + hexadecimal(node);
     const std::int64_t deadline_ns = monotonic_ns() + 1'000'000'000;
     while (!lock()) {
       // A sweep may hold the new file for a moment, before it sees that there is nothing to remove.

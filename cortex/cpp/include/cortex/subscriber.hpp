@@ -150,7 +150,7 @@ class SubscriptionCore {
           problems_.pop_front();
           throw problem;
         }
-        if (queue_.empty() || (!policy_.is_reliable && (!exhausted_ || policy_.depth < fresh_depth))) drain();
+        if (queue_.empty() || (!policy_.is_reliable && is_stale())) drain();
         if (!queue_.empty()) {
           std::optional<Item> item(std::move(queue_.front()));
           queue_.pop_front();
@@ -159,7 +159,10 @@ class SubscriptionCore {
         }
         if (!exhausted_) continue;
         fds.push_back({waker_.fd(), POLLIN, 0});
-        for (const auto& link : links_) fds.push_back({link->fd(), POLLIN, 0});
+        for (const auto& link : links_) {
+          fds.push_back({link->fd(), POLLIN, 0});
+          if (link->pipe_fd() >= 0) fds.push_back({link->pipe_fd(), POLLIN, 0});
+        }
       }
       const std::int64_t left_ns = deadline_ns - monotonic_ns();
       if (left_ns <= 0) return std::nullopt;
@@ -223,10 +226,18 @@ class SubscriptionCore {
   }
 
  private:
-  static constexpr std::size_t drain_max = 64;
-  static constexpr std::size_t fresh_depth = 16;  // shorter queues are topped up before every message
+  static constexpr std::size_t drain_count = 64;        // frames that are read at a time
+  static constexpr std::size_t drain_lossy_count = 4096;  // more than a socket or a pipe holds of small ones
+  static constexpr std::size_t fresh_depth = 64;         // shorter queues are topped up before every message
+  static constexpr std::int64_t fresh_ns = 1'000'000;    // and longer ones if they were filled so long ago
   static constexpr std::int64_t tend_ns = 20'000'000;
   static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way
+
+  // Whether newer messages than those in the queue are to be looked for.
+  bool is_stale() const {
+    return !exhausted_ || policy_.depth < fresh_depth ||
+           monotonic_ns() - drained_ns_.load(std::memory_order_relaxed) > fresh_ns;
+  }
 
   void drain() {
     drained_ns_.store(monotonic_ns(), std::memory_order_relaxed);
@@ -235,19 +246,23 @@ class SubscriptionCore {
       if (policy_.is_reliable) {
         if (queue_.size() >= policy_.depth) break;
         exhausted_ &= link->drain(queue_, policy_.depth - queue_.size());
-        continue;
-      }
-      // The newest is wanted: read on, but not for ever.
-      for (int rounds = policy_.depth < fresh_depth ? 16 : 1; rounds > 0; --rounds) {
-        const bool empty = link->drain(queue_, drain_max);
-        while (queue_.size() > policy_.depth) {
-          queue_.pop_front();
-          ++counters_->overtaken;
-        }
-        if (empty) break;
-        if (rounds == 1) exhausted_ = false;
+      } else {
+        exhausted_ &= drain_lossy(*link);
       }
     }
+  }
+
+  // Reads all that has arrived, but not for ever, and keeps the last of it; whether nothing is left.
+  bool drain_lossy(Link& link) {
+    for (std::size_t read = 0; read < drain_lossy_count; read += drain_count) {
+      const bool empty = link.drain(queue_, drain_count);
+      while (queue_.size() > policy_.depth) {
+        queue_.pop_front();
+        ++counters_->overtaken;
+      }
+      if (empty) return true;
+    }
+    return false;
   }
 
   void complain(const Source& source) {

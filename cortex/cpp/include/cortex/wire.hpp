@@ -216,6 +216,7 @@ struct AttachAnswer {
 };
 
 constexpr std::size_t place_size = 32;
+constexpr std::size_t slot_frame_size = header_size + 8 + place_size;  // of a descriptor: header, mask, place
 
 inline void store_place(std::uint8_t* out, const RingPlace& ring) noexcept {
   store(out, ring.ring);
