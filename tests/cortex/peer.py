@@ -104,6 +104,7 @@ class Peer:
         self.publishers: dict[str, Any] = {}
         self.subscribers: dict[str, Any] = {}
         self.kept: list[Any] = []
+        self.served_count = 0
 
     def publisher(self, topic: str, type: str, **options: Any) -> dict[str, Any]:
         self.publishers[topic] = self.node.publisher(topic, TYPES[type], **options)
@@ -176,6 +177,7 @@ class Peer:
         """Offer a service that doubles a number, after as many milliseconds as its stamp says."""
 
         def double(request: Number) -> Number:
+            self.served_count += 1
             time.sleep(request.stamp_ns * 1e-3)
             if request.value < 0:
                 raise ValueError(f"{request.value} is negative")
@@ -183,6 +185,10 @@ class Peer:
 
         self.node.service(name, Number, Number, double)
         return {}
+
+    def served(self) -> dict[str, Any]:
+        """How many calls have come."""
+        return {"count": self.served_count}
 
     def memory(self) -> dict[str, Any]:
         """Resident memory now, and what a ring may use is part of it."""

@@ -8,7 +8,7 @@ import time
 import pytest
 import zmq
 from peer import Number, OtherNumber, Scan
-from processes import wait_for
+from processes import SOON_S, in_time, wait_for
 
 from cortex import Closed, ServiceFailed, ServiceTimeout, ServiceUnavailable
 from cortex.codec import codec_of
@@ -58,7 +58,7 @@ def test_a_call_is_answered(node):
     with node.client("/double", Number, Number) as client:
         assert client.available()
         for value in range(50):
-            assert client.call(Number(value, value)) == Number(value, 2 * value)
+            assert client.call(Number(value, value), SOON_S) == Number(value, 2 * value)
 
 
 def test_a_call_between_processes(make_node, start_child):
@@ -66,7 +66,7 @@ def test_a_call_between_processes(make_node, start_child):
     child = start_child("peer")
     served(child)
     client = make_node().client("/double", Number, Number)
-    assert client.call(Number(0, 21), timeout_s=10.0) == Number(child.pid, 42)
+    assert client.call(Number(0, 21), timeout_s=SOON_S) == Number(child.pid, 42)
     assert child.ask(do="serve", name="/other") == {}
     client.close()
 
@@ -75,7 +75,7 @@ def test_request_and_reply_of_different_types(node):
     node.service("/bulk", Number, Bulk, lambda request: Bulk(bytes(request.value)))
     with node.client("/bulk", Number, Bulk) as client:
         for size in (0, 1, 1000, 10_000_000):
-            assert client.call(Number(0, size), timeout_s=10.0).data == bytes(size)
+            assert client.call(Number(0, size), timeout_s=SOON_S).data == bytes(size)
 
 
 # Failures
@@ -91,7 +91,7 @@ def test_a_handler_that_raises(node, caplog):
     with node.client("/fail", Number, Number) as client:
         for value in range(3):
             with pytest.raises(ServiceFailed, match=f"/fail: KeyError: 'no {value}'"):
-                client.call(Number(0, value))
+                client.call(Number(0, value), SOON_S)
     assert sum(record.exc_info is not None for record in caplog.records) == 3
 
 
@@ -102,38 +102,42 @@ def test_a_handler_that_returns_something_else(node, caplog):
         node.client("/wrong", Number, Number) as client,
         pytest.raises(ServiceFailed, match="must return Number"),
     ):
-        client.call(Number(0, 0))
+        client.call(Number(0, 0), SOON_S)
     with node.client("/value", Number, Number) as client, pytest.raises(ServiceFailed, match="stamp_ns"):
-        client.call(Number(0, 0))
+        client.call(Number(0, 0), SOON_S)
 
 
 def test_nobody_offers_it(node):
     with node.client("/nobody", Number, Number) as client:
         assert not client.available()
-        begin = time.monotonic()
-        with pytest.raises(ServiceUnavailable, match=r"nobody offers /nobody \(waited 0\.1 s\)"):
-            client.call(Number(0, 0), timeout_s=0.1)
-        assert 0.1 <= time.monotonic() - begin < 1.0
+
+        def call():
+            begin = time.monotonic()
+            with pytest.raises(ServiceUnavailable, match=r"nobody offers /nobody \(waited 0\.1 s\)"):
+                client.call(Number(0, 0), timeout_s=0.1)
+            assert time.monotonic() - begin >= 0.1
+
+        in_time(call, 1.0)
 
 
 def test_it_comes_in_time(node):
     with node.client("/late", Number, Number) as client:
         timer = threading.Timer(0.1, node.service, ("/late", Number, Number, double))
         timer.start()
-        assert client.call(Number(0, 4), timeout_s=5.0).value == 8
+        assert client.call(Number(0, 4), timeout_s=SOON_S).value == 8
         timer.join()
 
 
 def test_it_is_withdrawn(node):
     withdraw = node.service("/double", Number, Number, double)
     with node.client("/double", Number, Number) as client:
-        assert client.call(Number(0, 4)).value == 8
+        assert client.call(Number(0, 4), SOON_S).value == 8
         withdraw()
         withdraw()
         with pytest.raises(ServiceUnavailable):
             client.call(Number(0, 4), timeout_s=0.05)
         node.service("/double", Number, Number, lambda request: Number(0, 3 * request.value))
-        assert client.call(Number(0, 4)).value == 12
+        assert client.call(Number(0, 4), SOON_S).value == 12
 
 
 def test_other_types(node):
@@ -144,7 +148,7 @@ def test_other_types(node):
     assert "/double" in text
     assert text.index("float64") < text.index("int64", text.index("actual"))
     with node.client("/double", Number, Scan) as client, pytest.raises(TypeMismatch):
-        client.call(Number(0, 1))
+        client.call(Number(0, 1), SOON_S)
 
 
 def test_wrong_use(node):
@@ -168,18 +172,18 @@ def test_a_request_has_a_limit(node, excess):
     with node.client("/bulk", Bulk, Number) as client:
         if excess > 0:
             with pytest.raises(ValueError, match="over the limit"):
-                client.call(Bulk(bytes(size)), timeout_s=5.0)
+                client.call(Bulk(bytes(size)), timeout_s=SOON_S)
         else:
-            assert client.call(Bulk(bytes(size)), timeout_s=10.0).value == size
-        assert client.call(Bulk(b"123")).value == 3
+            assert client.call(Bulk(bytes(size)), timeout_s=SOON_S).value == size
+        assert client.call(Bulk(b"123"), SOON_S).value == 3
 
 
 def test_a_reply_has_a_limit(node, caplog):
     node.service("/bulk", Number, Bulk, lambda request: Bulk(bytes(request.value)))
     with node.client("/bulk", Number, Bulk) as client:
         with pytest.raises(ServiceFailed, match="over the limit"):
-            client.call(Number(0, CONTROL_LIMIT + 1), timeout_s=10.0)
-        assert client.call(Number(0, 3)).data == bytes(3)
+            client.call(Number(0, CONTROL_LIMIT + 1), timeout_s=SOON_S)
+        assert client.call(Number(0, 3), SOON_S).data == bytes(3)
 
 
 # Deadlines
@@ -187,35 +191,40 @@ def test_a_reply_has_a_limit(node, caplog):
 
 def test_a_handler_that_takes_too_long(node):
     """An error in time; the reply that comes later is not taken for that of the next call."""
-    node.service(
-        "/slow", Number, Number, lambda request: (time.sleep(request.stamp_ns * 1e-3), double(request))[1]
-    )
+    release = threading.Event()
+
+    def handle(request):
+        if request.stamp_ns:
+            release.wait(SOON_S)
+        return double(request)
+
+    node.service("/slow", Number, Number, handle)
     with node.client("/slow", Number, Number) as client:
-        begin = time.monotonic()
         with pytest.raises(ServiceTimeout, match=r"/slow: no reply within 0\.05 s"):
-            client.call(Number(200, 1), timeout_s=0.05)
-        assert time.monotonic() - begin < 0.19
-        assert client.call(Number(0, 5), timeout_s=5.0).value == 10
+            client.call(Number(1, 1), timeout_s=0.05)
+        release.set()
+        assert client.call(Number(0, 5), timeout_s=SOON_S).value == 10
 
 
 def test_a_request_whose_time_is_over_is_not_acted_upon(node):
     """It waited behind another one until its caller had given up."""
-    seen = []
+    seen, release = [], threading.Event()
 
     def handle(request):
         seen.append(request.value)
-        time.sleep(request.stamp_ns * 1e-3)
+        release.wait(SOON_S)
         return request
 
     node.service("/slow", Number, Number, handle)
     clients = [node.client("/slow", Number, Number) for _ in range(2)]
-    first = threading.Thread(target=lambda: clients[0].call(Number(300, 1), timeout_s=5.0))
+    first = threading.Thread(target=lambda: clients[0].call(Number(0, 1), timeout_s=SOON_S))
     first.start()
     wait_for(lambda: seen)
     with pytest.raises(ServiceTimeout):
         clients[1].call(Number(0, 2), timeout_s=0.05)
+    release.set()
     first.join()
-    assert clients[1].call(Number(0, 3), timeout_s=5.0).value == 3
+    assert clients[1].call(Number(0, 3), timeout_s=SOON_S).value == 3
     assert seen == [1, 3]
     for client in clients:
         client.close()
@@ -245,14 +254,21 @@ def test_the_deadline_goes_along_within_a_host(runtime, local):
     with new_socket(zmq.ROUTER) as socket:
         socket.bind("tcp://127.0.0.1:*")
         address = socket.getsockopt_string(zmq.LAST_ENDPOINT)
-        begin_ns = time.monotonic_ns()
         client = Client("/double", Number, Number, lambda: Place(1, address, local, None))
-        with client, pytest.raises(ServiceTimeout):
-            client.call(Number(0, 0), timeout_s=0.3)
-        assert socket.poll(5000)
-        header = unpack_header(socket.recv_multipart()[1])
+
+        def ask():
+            """When a call began and had ended, and what came: nothing, if it was stopped before it sent."""
+            begin_ns = time.monotonic_ns()
+            with pytest.raises(ServiceTimeout):
+                client.call(Number(0, 0), timeout_s=0.3)
+            end_ns = time.monotonic_ns()
+            return socket.poll(200) and (begin_ns, end_ns, socket.recv_multipart()[1])
+
+        with client:
+            begin_ns, end_ns, frame = wait_for(ask)
+        header = unpack_header(frame)
     if local:
-        assert 0 <= header.stamp_ns - begin_ns - 300_000_000 < 200_000_000
+        assert begin_ns + 300_000_000 <= header.stamp_ns <= end_ns
     else:
         assert header.stamp_ns is None
 
@@ -264,33 +280,31 @@ def test_a_client_that_is_closed(make_node):
 
     def handle(request):
         entered.set()
-        release.wait(10.0)
+        release.wait(SOON_S)
         return request
 
     server.service("/hold", Number, Number, handle)
     client, other = caller.client("/hold", Number, Number), caller.client("/hold", Number, Number)
     other.close()
     with pytest.raises(Closed, match="/hold"):
-        other.call(Number(0, 0))
+        other.call(Number(0, 0), SOON_S)
     ended = []
 
     def call():
         try:
-            client.call(Number(0, 0), timeout_s=20.0)
+            client.call(Number(0, 0), timeout_s=SOON_S)
         except Closed:
             ended.append(True)
 
     thread = threading.Thread(target=call)
     thread.start()
-    assert entered.wait(10.0)
-    begin = time.monotonic()
+    assert entered.wait(SOON_S)
     caller.close()
-    thread.join(10.0)
-    release.set()
+    thread.join(SOON_S / 2)
     assert ended == [True]
-    assert time.monotonic() - begin < 5.0
+    release.set()
     with pytest.raises(Closed, match="/hold"):
-        client.call(Number(0, 0))
+        client.call(Number(0, 0), SOON_S)
 
 
 def test_an_answer_to_another_call_is_not_taken(runtime):
@@ -301,7 +315,7 @@ def test_an_answer_to_another_call_is_not_taken(runtime):
     client = Client("/double", Number, Number, lambda: Place(1, address, False, None))
 
     def answer():
-        assert socket.poll(5000)
+        assert socket.poll(1e3 * SOON_S)
         identity, frame = socket.recv_multipart()
         header = unpack_header(frame)._replace(kind=REPLY)
         others = ({"sequence": header.sequence - 1}, {"source": header.source ^ 1}, {"sequence": 2**40})
@@ -314,7 +328,7 @@ def test_an_answer_to_another_call_is_not_taken(runtime):
         for _ in range(2):
             thread = threading.Thread(target=answer)
             thread.start()
-            assert client.call(Number(0, 0), timeout_s=5.0).value == 3
+            assert client.call(Number(0, 0), timeout_s=SOON_S).value == 3
             thread.join()
     finally:
         client.close()
@@ -322,26 +336,32 @@ def test_an_answer_to_another_call_is_not_taken(runtime):
 
 
 def test_calls_of_several_threads_share_their_time(node):
-    """One client: the calls follow one another; who waits too long gets an error."""
-    node.service("/slow", Number, Number, lambda request: (time.sleep(0.1), request)[1])
+    """One client: the calls follow one another; who waits too long for its turn gets an error."""
+    release, entered = threading.Event(), threading.Event()
+
+    def handle(request):
+        entered.set()
+        release.wait(SOON_S)
+        return request
+
+    node.service("/slow", Number, Number, handle)
     with node.client("/slow", Number, Number) as client:
         outcomes = []
 
         def call(value):
-            try:
-                outcomes.append(client.call(Number(0, value), timeout_s=0.25).value == value)
-            except ServiceTimeout:
-                outcomes.append(None)
+            outcomes.append(client.call(Number(0, value), timeout_s=SOON_S).value == value)
 
         threads = [threading.Thread(target=call, args=(value,)) for value in range(5)]
-        begin = time.monotonic()
         for thread in threads:
             thread.start()
+        assert entered.wait(SOON_S)
+        with pytest.raises(ServiceTimeout):
+            client.call(Number(0, 5), timeout_s=0.1)
+        assert not outcomes
+        release.set()
         for thread in threads:
             thread.join()
-        assert time.monotonic() - begin < 1.0
-        assert set(outcomes) == {True, None}
-        assert outcomes.count(True) in (1, 2, 3)
+        assert outcomes == [True] * 5
 
 
 def test_several_clients(node):
@@ -351,14 +371,14 @@ def test_several_clients(node):
     def run(number):
         with node.client("/double", Number, Number) as client:
             for k in range(50):
-                if client.call(Number(number, k), timeout_s=10.0) != Number(number, 2 * k):
+                if client.call(Number(number, k), timeout_s=SOON_S) != Number(number, 2 * k):
                     wrong.append((number, k))
 
     threads = [threading.Thread(target=run, args=(number,)) for number in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20.0)
+        thread.join(SOON_S)
     assert not wrong
 
 
@@ -368,7 +388,7 @@ def test_too_many_requests(node):
 
     def handle(request):
         entered.set()
-        release.wait(10.0)
+        release.wait(SOON_S)
         return request
 
     node.service("/busy", Number, Number, handle)
@@ -377,13 +397,13 @@ def test_too_many_requests(node):
     def call(number):
         with node.client("/busy", Number, Number) as client:
             try:
-                outcomes.append(client.call(Number(0, number), timeout_s=20.0).value)
+                outcomes.append(client.call(Number(0, number), timeout_s=SOON_S).value)
             except ServiceUnavailable as error:
                 outcomes.append(str(error))
 
     first = threading.Thread(target=call, args=(0,))
     first.start()
-    assert entered.wait(5.0)
+    assert entered.wait(SOON_S)
     count = PENDING_MAX + 5
     threads = [threading.Thread(target=call, args=(number,)) for number in range(1, count + 1)]
     for thread in threads:
@@ -392,7 +412,7 @@ def test_too_many_requests(node):
     assert outcomes == [f"/busy: {PENDING_MAX} requests wait already"] * 5
     release.set()
     for thread in (first, *threads):
-        thread.join(20.0)
+        thread.join(SOON_S)
     assert sum(isinstance(outcome, int) for outcome in outcomes) == PENDING_MAX + 1
 
 
@@ -408,10 +428,10 @@ def test_a_handler_that_calls_back(make_node):
         "/add",
         Number,
         Number,
-        lambda request: Number(0, request.value + back.call(request, timeout_s=5.0).value),
+        lambda request: Number(0, request.value + back.call(request, timeout_s=SOON_S).value),
     )
     with one.client("/add", Number, Number) as client:
-        assert client.call(Number(0, 7), timeout_s=10.0).value == 107
+        assert client.call(Number(0, 7), timeout_s=SOON_S).value == 107
     back.close()
 
 
@@ -424,8 +444,8 @@ def test_a_handler_that_calls_its_own_node(node, caplog):
         node.client("/outer", Number, Number) as client,
         pytest.raises(ServiceFailed, match="its own node"),
     ):
-        client.call(Number(0, 1), timeout_s=5.0)
-    assert inner.call(Number(0, 1), timeout_s=5.0).value == 2
+        client.call(Number(0, 1), timeout_s=SOON_S)
+    assert inner.call(Number(0, 1), timeout_s=SOON_S).value == 2
     inner.close()
 
 
@@ -434,13 +454,17 @@ def test_a_server_that_is_stopped(make_node, start_child):
     child = start_child("peer")
     served(child)
     with make_node().client("/double", Number, Number) as client:
-        assert client.call(Number(0, 1), timeout_s=10.0).value == 2
+        assert client.call(Number(0, 1), timeout_s=SOON_S).value == 2
         with child.stopped():
-            begin = time.monotonic()
-            with pytest.raises(ServiceTimeout):
-                client.call(Number(0, 1), timeout_s=0.3)
-            assert 0.3 <= time.monotonic() - begin < 1.0
-        assert client.call(Number(0, 2), timeout_s=10.0).value == 4
+
+            def call():
+                begin = time.monotonic()
+                with pytest.raises(ServiceTimeout):
+                    client.call(Number(0, 1), timeout_s=0.3)
+                assert time.monotonic() - begin >= 0.3
+
+            in_time(call, 1.0)
+        assert client.call(Number(0, 2), timeout_s=SOON_S).value == 4
 
 
 def test_a_server_that_is_killed_during_a_call(make_node, start_child):
@@ -448,17 +472,20 @@ def test_a_server_that_is_killed_during_a_call(make_node, start_child):
     child = start_child("peer")
     served(child)
     with make_node().client("/double", Number, Number) as client:
-        assert client.call(Number(0, 1), timeout_s=10.0).value == 2
-        killer = threading.Timer(0.1, child.process.kill)
+        assert client.call(Number(0, 1), timeout_s=SOON_S).value == 2
+
+        def kill():
+            wait_for(lambda: child.ask(do="served")["count"] == 2)  # the call is under way
+            child.process.kill()
+
+        killer = threading.Thread(target=kill)
         killer.start()
-        begin = time.monotonic()
         with pytest.raises(ServiceUnavailable, match="the server of /double has gone"):
-            client.call(Number(10_000, 1), timeout_s=15.0)
-        assert time.monotonic() - begin < 5.0
+            client.call(Number(100_000, 1), timeout_s=SOON_S)
         killer.join()
         other = start_child("peer")
         served(other)
-        assert client.call(Number(0, 3), timeout_s=10.0) == Number(other.pid, 6)
+        assert client.call(Number(0, 3), timeout_s=SOON_S) == Number(other.pid, 6)
 
 
 def test_a_server_that_closes_during_a_call(make_node):
@@ -467,7 +494,7 @@ def test_a_server_that_closes_during_a_call(make_node):
 
     def handle(request):
         entered.set()
-        release.wait(10.0)
+        release.wait(SOON_S)
         return request
 
     server.service("/hold", Number, Number, handle)
@@ -475,19 +502,17 @@ def test_a_server_that_closes_during_a_call(make_node):
 
     def call():
         with caller.client("/hold", Number, Number) as client:
-            begin = time.monotonic()
             try:
-                client.call(Number(0, 0), timeout_s=20.0)
+                client.call(Number(0, 0), timeout_s=SOON_S)
             except ServiceUnavailable:
-                ended.append(time.monotonic() - begin)
+                ended.append(True)
 
     thread = threading.Thread(target=call)
     thread.start()
-    assert entered.wait(10.0)
+    assert entered.wait(SOON_S)
     closing = threading.Thread(target=server.close)
     closing.start()
-    thread.join(10.0)
+    thread.join(SOON_S / 2)
+    assert ended == [True]
     release.set()
-    closing.join(10.0)
-    assert len(ended) == 1
-    assert ended[0] < 8.0
+    closing.join(SOON_S)
