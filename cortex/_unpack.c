@@ -94,7 +94,7 @@ static PyObject *unpack_variable(Body *body, const Array *known, Py_ssize_t at, 
         if (shape[axis] == 0) {
             is_empty = 1;
         } else {
-            if (bytes > BODY_LIMIT / shape[axis]) return NULL;
+            if (bytes > PY_SSIZE_T_MAX / shape[axis]) return NULL; /* NumPy refuses it, too */
             bytes *= shape[axis];
         }
     }

@@ -1,0 +1,480 @@
+"""Every kind of field in C against the Python packer: the same bytes, the same objects, the same refusals."""
+
+from __future__ import annotations
+
+import gc
+import struct
+import sys
+import weakref
+from enum import Enum, IntEnum
+from typing import Any
+
+import numpy as np
+import pytest
+from fuzz_decode import outcome
+from hypothesis import given
+from hypothesis import strategies as st
+from processes import SOON_S, wait_for
+from random_schemas import any_message, schemas
+from test_large import connected, slots_held
+
+from cortex import reliable
+from cortex.codec import MalformedMessage, codec_of
+from cortex.compiled import native
+from cortex.encoder import join
+from cortex.message import Array, Float32, Int8, Int32, message
+from cortex.messages import Image
+from cortex.native import make_coder
+from cortex.schema import schema_of, type_from_schema
+from cortex.vectors import load_vectors
+from cortex.vectors.catalogue import CATALOGUE
+
+pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
+
+
+class Mode(Enum):
+    LAST = 2**31 - 1
+    OFF = 0
+    FIRST = -(2**31)
+    ALIAS = 0
+
+
+class Level(IntEnum):
+    LOW = 1
+    HIGH = 2
+
+
+@message
+class Point:
+    x: float
+    ok: bool = False
+
+
+@message
+class Everything:
+    stamp_ns: int
+    mode: Mode
+    level: Level | None
+    maybe: Float32 | None
+    point: Point | None
+    points: list[Point]
+    modes: list[Mode]
+    flags: list[bool]
+    sizes: list[Int8]
+    names: list[str]
+    open_: Array["any", "h", "w"]
+    mask: Array["bool", "h", "w"] | None
+    large: Array["uint8", 40, 40] | None
+    ragged: list[Array["any", "n", "n"]]
+    deep: list[list[Int32]]
+
+
+def everything(**changes: Any) -> Everything:
+    fields: dict[str, Any] = {
+        "stamp_ns": 1,
+        "mode": Mode.FIRST,
+        "level": Level.HIGH,
+        "maybe": 0.5,
+        "point": Point(1.5, True),
+        "points": [Point(1.0), Point(2.0, True)],
+        "modes": [Mode.OFF, Mode.LAST],
+        "flags": [True, False, True],
+        "sizes": [-128, 127],
+        "names": ["", "hé", "z" * 100],
+        "open_": np.eye(3, dtype=np.complex128),
+        "mask": np.eye(3, dtype=bool),
+        "large": np.arange(1600, dtype=np.uint8).reshape(40, 40),
+        "ragged": [np.ones((2, 2), np.float16), np.zeros((0, 0)), np.ones((16, 16), np.int64)],
+        "deep": [[], [1, 2], [3]],
+    }
+    return Everything(**(fields | changes))
+
+
+def python_body(value: Any) -> bytes:
+    """The body as the Python packer writes it."""
+    return join(codec_of(type(value))._encoder.layout(value)[0])
+
+
+def coder_of(cls: type) -> Any:
+    return make_coder(schema_of(cls), cls)
+
+
+def assert_same(left: Any, right: Any) -> None:
+    """Both are of the same classes throughout and hold the same bits; nan is nan."""
+    assert type(left) is type(right)
+    if isinstance(left, np.ndarray):
+        assert (left.dtype, left.shape, left.flags.writeable) == (
+            right.dtype,
+            right.shape,
+            right.flags.writeable,
+        )
+        assert left.tobytes() == right.tobytes()
+    elif isinstance(left, list):
+        assert len(left) == len(right)
+        for pair in zip(left, right, strict=True):
+            assert_same(*pair)
+    elif isinstance(left, float):
+        assert struct.pack("<d", left) == struct.pack("<d", right)
+    elif hasattr(left, "__cortex_names__"):
+        for name in left.__cortex_names__:
+            assert_same(getattr(left, name), getattr(right, name))
+    else:
+        assert left == right
+
+
+def check_decoding(cls: type, body: bytes) -> bool:
+    """C takes a body if and only if Python does, as the same message; return whether they do."""
+    expected = outcome(codec_of(cls)._decoder.decode, body)
+    found = coder_of(cls).decode(body, 0, len(body))
+    assert (found is None) == (expected is None)
+    if found is not None:
+        assert_same(found, expected)
+    return found is not None
+
+
+@given(any_message())
+def test_all_messages_are_served(value):
+    coder, body = coder_of(type(value)), python_body(value)
+    assert coder.encode(value, len(body)) == body
+    assert coder.encode(value, len(body) - 1) is None
+    assert check_decoding(type(value), body)
+
+
+@given(any_message(), st.data())
+def test_damaged_bodies_are_refused_alike(value, data):
+    body = bytearray(python_body(value))
+    words = st.sampled_from([0, 1, 2, 8, 255, 2**16, 2**31, 2**32 - 8, 2**32 - 1]).map(
+        lambda n: n.to_bytes(4, "little")
+    )
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(body)))
+        if data.draw(st.booleans()):
+            place -= place % 4
+        body[place : place + 4] = data.draw(words | st.binary(max_size=8))
+    check_decoding(type(value), bytes(body))
+
+
+@given(schemas, st.binary(max_size=300))
+def test_random_bytes_are_refused_alike(schema, data):
+    check_decoding(type_from_schema(schema), data)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_vectors(name):
+    """The bodies of the test vectors, and the malformed ones."""
+    vector, cls = load_vectors()[name], CATALOGUE[name].type
+    coder = coder_of(cls)
+    for case in vector["cases"]:
+        body = bytes.fromhex(case["body"])
+        assert check_decoding(cls, body)
+        assert coder.encode(coder.decode(body, 0, len(body)), len(body)) == body
+    for case in vector["malformed"]:
+        assert not check_decoding(cls, bytes.fromhex(case["body"]))
+
+
+def test_everything_damaged_word_by_word():
+    body = python_body(everything())
+    assert coder_of(Everything).encode(everything(), 1 << 20) == body
+    taken = 0
+    for place in range(0, 1000, 4):
+        for word in (0, 1, 2, 64, 2**31, 2**32 - 1):
+            damaged = body[:place] + word.to_bytes(4, "little") + body[place + 4 :]
+            taken += check_decoding(Everything, damaged)
+    assert 0 < taken < 1500
+
+
+def test_absent_is_none_and_empty_is_nothing():
+    absent = dict.fromkeys(("level", "maybe", "point", "mask", "large"))
+    empty = {name: [] for name in ("points", "modes", "flags", "sizes", "names", "ragged", "deep")}
+    value = everything(**absent, **empty)
+    coder, body = coder_of(Everything), python_body(value)
+    assert coder.encode(value, len(body)) == body
+    assert coder.decode(body, 0, len(body)) == value
+    assert check_decoding(Everything, body)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"mode": 0},
+        {"mode": Level.LOW},
+        {"level": 1},
+        {"maybe": 1e300},
+        {"maybe": "x"},
+        {"point": (1.0, True)},
+        {"point": Point(None)},
+        {"points": Point(1.0)},
+        {"points": [Point(1.0), None]},
+        {"modes": [0]},
+        {"flags": [None]},
+        {"sizes": [1, 128]},
+        {"names": ["a", b"b"]},
+        {"names": ["\ud800"]},
+        {"open_": np.zeros((3, 3), "M8[s]")},
+        {"open_": np.zeros((3, 3), ">f8")},
+        {"open_": np.zeros(3)},
+        {"open_": np.zeros((3, 4))},
+        {"mask": np.zeros((3, 4), bool)},
+        {"large": np.zeros((40, 41), np.uint8)},
+        {"ragged": [np.zeros((2, 3))]},
+        {"deep": [[1], 2]},
+        {"deep": [["x"]]},
+    ],
+    ids=str,
+)
+def test_wrong_values_are_left_to_python(changes):
+    """C neither writes nor raises; the codec's words are those of Python."""
+    wrong = everything(**changes)
+    assert coder_of(Everything).encode(wrong, 1 << 20) is None
+    with pytest.raises((TypeError, ValueError), match=r"Everything\.") as through_c:
+        codec_of(Everything).encode(wrong, 1 << 20)
+    with pytest.raises(type(through_c.value)) as by_python:
+        codec_of(Everything).plan(wrong)
+    assert str(through_c.value) == str(by_python.value)
+
+
+class Count(int):
+    """A number of a class of its own."""
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"stamp_ns": True},
+        {"stamp_ns": Level.HIGH},
+        {"stamp_ns": Count(7)},
+        {"maybe": 3},
+        {"maybe": np.float64(0.1)},
+        {"point": Point(2**60)},
+        {"mode": Mode.ALIAS},
+        {"points": (Point(1.0),)},
+        {"sizes": [True, Count(5)]},
+        {"deep": ([1], (2, 3))},
+    ],
+    ids=str,
+)
+def test_values_that_stand_for_the_usual_ones(changes):
+    """An int where a float is due, a subclass of int, a tuple: C writes what Python does."""
+    value = everything(**changes)
+    assert coder_of(Everything).encode(value, 1 << 20) == python_body(value)
+
+
+def test_dimensions_that_no_array_can_have():
+    """NumPy raises for some shapes of no items; to a subscriber they are malformed like others."""
+
+    @message
+    class Cube:
+        data: Array["float64", "a", "b", "c"]
+
+    good = python_body(Cube(np.zeros((0, 5, 5))))
+    assert check_decoding(Cube, good)
+    for shape in ((0, 2**32 - 1, 2**32 - 1), (2**32 - 1, 0, 2**32 - 1), (2**32 - 1, 2**32 - 1, 0)):
+        body = good[:8] + struct.pack("<3I", *shape) + good[20:]
+        assert not check_decoding(Cube, body)
+        with pytest.raises(MalformedMessage):
+            codec_of(Cube).decode(body)
+    assert check_decoding(Cube, good[:8] + struct.pack("<3I", 0, 2**31, 2**28) + good[20:])
+
+
+def test_names_of_one_scope():
+    """A name says the same within a message, nothing from element to element, nothing where it is absent."""
+    coder = coder_of(Everything)
+    for changes in ({"mask": None}, {"open_": np.zeros((2, 5)), "mask": np.zeros((2, 5), bool)}):
+        body = python_body(everything(**changes))
+        assert coder.encode(everything(**changes), len(body)) == body
+        assert check_decoding(Everything, body)
+    assert coder.encode(everything(open_=np.zeros((2, 5))), 1 << 20) is None
+
+
+def many_names(count: int) -> type:
+    annotations = {f"{array}{k}": Array["uint8", f"n{k}"] for k in range(count) for array in "ab"}
+    return message(type("Names", (), {"__annotations__": annotations}))
+
+
+def test_more_names_than_there_is_room_for():
+    """Dimensions that must agree: 64 in one message, else Python does the work."""
+    assert coder_of(many_names(64)) is not None
+    cls = many_names(65)
+    assert coder_of(cls) is None
+    value = cls(*[np.full(k // 2, k, np.uint8) for k in range(130)])
+    assert codec_of(cls).decode(codec_of(cls).encode(value, 1 << 20)) == value
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        (Point, 16, 0, (("x", (0, "d", 9, None)),)),
+        (Point, 16, 0, (("x", (0, "d", -1, None)),)),
+        (Point, 16, 0, (("x", (0, "?", 0, None)),)),
+        (Point, 16, 0, (("x", (10, "-", 0, None)),)),
+        (Point, 16, 0, (("x", (-1, "-", 0, None)),)),
+        (Point, 16, 0, (("nothing", (0, "d", 0, None)),)),
+        (Point, -1, 0, ()),
+        (Point, 2**32, 0, ()),
+        (Point, 16, 65, ()),
+        (Point, 16, 0, (("x", (3, "-", 0, ((np.dtype("f8"),), (3,), (-1,), 0)),),)),
+        (Point, 16, 0, (("x", (3, "-", 0, ((np.dtype("f8"),), (-1,), (-1,), 0)),),)),
+        (Point, 16, 0, (("x", (4, "-", 0, ((), (-1,), (-1,), 0)),),)),
+        (Point, 16, 0, (("x", (4, "-", 0, (("f8",), (-1,), (-1,), 0)),),)),
+        (Point, 16, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,) * 3, (-1,) * 3, 0)),),)),
+        (Point, 16, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,), (0,), 0)),),)),
+        (Point, 16, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,), (), 0)),),)),
+        (Point, 999, 0, (("x", (4, "-", 0, ((np.dtype("f8"),), (-1,) * 33, (-1,) * 33, 0)),),)),
+        (Point, 16, 0, (("x", (7, "-", 0, (0, "d", 0, None))),)),
+        (Point, 16, 0, (("x", (7, "-", 8, (0, "d", 8, None))),)),
+        (Point, 16, 0, (("x", (8, "-", 0, ((0, "d", 0, None), 4, 8, 0))),)),
+        (Point, 16, 0, (("x", (8, "-", 0, ((0, "d", 0, None), 0, 8, 0))),)),
+        (Point, 16, 0, (("x", (8, "-", 0, ((0, "d", 0, None), 8, 3, 0))),)),
+        (Point, 16, 0, (("x", (9, "-", 8, (Point, 16, 0, ()))),)),
+        (Point, 16, 0, (("x", (2, "-", 0, ((2**31, Mode.OFF),))),)),
+    ],
+)  # fmt: skip
+def test_rows_that_are_not_as_they_should_be(row):
+    """What memory safety rests on is checked in C, too."""
+    with pytest.raises((TypeError, ValueError, OverflowError, AttributeError)):
+        native.Coder(row, -1, b"")
+
+
+def test_types_come_and_go():
+    """A coder keeps its classes and enums, and no longer than somebody keeps it."""
+
+    def make() -> list[weakref.ref[Any]]:
+        class Kind(Enum):
+            ONE = 1
+
+        @message
+        class Inner:
+            kind: Kind
+
+        @message
+        class Outer:
+            inners: list[Inner] | None
+
+        codec = codec_of(Outer)
+        value = Outer([Inner(Kind.ONE)])
+        assert codec.decode(codec.encode(value, 100)) == value
+        return [weakref.ref(cls) for cls in (Kind, Inner, Outer)]
+
+    gone = make()
+    gc.collect()
+    assert [ref() for ref in gone] == [None] * 3
+
+
+def test_nothing_of_any_kind_is_leaked():
+    coder, value = coder_of(Everything), everything()
+    body = coder.encode(value, 1 << 20)
+    wrong = everything(deep=[[1], ["x"]])
+    damaged = [body[:place] + b"\xff" * 4 + body[place + 4 :] for place in range(0, 160, 4)]
+
+    def use() -> None:
+        for _ in range(50):
+            coder.encode(value, 1 << 20)
+            coder.encode(wrong, 1 << 20)
+            coder.decode(body, 0, len(body))
+            for other in damaged:
+                coder.decode(other, 0, len(other))
+
+    def counts() -> list[int]:
+        gc.collect()
+        shared = (None, Mode.OFF, Mode.FIRST, Level.HIGH, Point, Everything, np.dtype("complex128"), body)
+        return [sys.getrefcount(item) for item in shared]
+
+    use()
+    before, blocks = counts(), sys.getallocatedblocks()
+    use()
+    after, grown = counts(), sys.getallocatedblocks() - blocks
+    assert grown < 200
+    assert all(abs(now - then) < 40 for then, now in zip(before, after, strict=True))  # 50 rounds would be 50
+
+
+# Through a ring
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+@message
+class Frames:
+    """Nothing in it is of a size known in advance."""
+
+    stamp_ns: int
+    frames: list[Array["any", "h", "w"]]
+    numbers: list[float]
+    thumbnail: Array["uint8", "h", "w"] | None = None
+
+
+def opened(node, kind, value):
+    """A publisher and a subscriber that are past the ring's first messages."""
+    publisher, subscriber = connected(node, kind, reliable(64, SOON_S))
+    for _ in range(3):
+        publisher.publish(value)
+        subscriber.recv(SOON_S)
+    assert publisher._gate.ledger is not None
+    return publisher, subscriber
+
+
+def picture(stamp_ns, height=480, width=640, channels=3, dtype="uint8"):
+    data = np.arange(height * width * channels, dtype=np.int64) + stamp_ns
+    return Image(stamp_ns, data.astype(dtype).reshape(height, width, channels), "any", "camera", stamp_ns)
+
+
+def test_pictures_take_the_short_cut_into_a_slot(node, monkeypatch):
+    """Copied at once, deferred, without the lock: the slot has the bytes that Python writes."""
+    publisher, subscriber = opened(node, Image, picture(0))
+    monkeypatch.setattr(publisher, "_publish_slowly", None)
+    for number, (height, dtype) in enumerate(
+        [(12, "uint8"), (40, "float32"), (480, "uint8"), (480, "float32")]
+    ):
+        value = picture(number, height, dtype=dtype)
+        assert publisher.publish(value)
+        info, body, _ = subscriber.recv_raw(SOON_S)
+        assert bytes(body) == python_body(value)
+        assert info.stamp_ns == number
+        del body
+        assert publisher.publish(value)
+        assert_same(subscriber.recv(SOON_S).copy(), value.copy())
+    wait_for(lambda: slots_held(publisher) == 0)
+
+
+def test_more_large_arrays_than_are_deferred(node, monkeypatch):
+    """A list of arrays, some of which are copied with the lock held."""
+    frames = [np.full((90, 100 + k), k, "<u4" if k % 2 else "<f8") for k in range(20)]
+    value = Frames(5, frames, [1.0, 2.0], np.ones((200, 200), np.uint8))
+    publisher, subscriber = opened(node, Frames, value)
+    monkeypatch.setattr(publisher, "_publish_slowly", None)
+    assert publisher.publish(value)
+    _, body, _ = subscriber.recv_raw(SOON_S)
+    assert bytes(body) == python_body(value)
+
+
+@pytest.mark.parametrize("change", ["longer", "shorter", "wrong"])
+def test_a_list_that_changes_between_measuring_and_writing(node, change):
+    """Another thread may have the GIL there: what arrives is whole, and the slot is not overrun."""
+    numbers = [float(k) for k in range(20_000)]
+    value = Frames(5, [], numbers)
+    publisher, subscriber = opened(node, Frames, value)
+    acquire, changed = publisher._gate.large_acquire, []
+
+    def change_and_acquire(may_wait: bool) -> bool:
+        if not changed:
+            changed.append(True)
+            if change == "longer":
+                numbers.extend(numbers)
+            elif change == "shorter":
+                del numbers[100:]
+            else:
+                numbers[7] = "seven"
+        return acquire(may_wait)
+
+    publisher._gate.large_acquire = change_and_acquire
+    if change == "wrong":
+        with pytest.raises(TypeError, match=r"numbers\[7\]"):
+            publisher.publish(value)
+    else:
+        assert publisher.publish(value)
+        assert subscriber.recv(SOON_S).numbers == numbers
+    assert changed
+    wait_for(lambda: slots_held(publisher) == 0)
+    assert not any(ring.in_writing for ring in publisher._large._rings)
