@@ -74,7 +74,7 @@ static int write_frame(PipeWriter *writer, PyObject *frame) {
     return 1;
 }
 
-static PyObject *frame_argument(PyObject *const *arguments, Py_ssize_t count) {
+PyObject *frame_argument(PyObject *const *arguments, Py_ssize_t count) {
     if (count < 1 || count > 2 || !PyBytes_CheckExact(arguments[0])) {
         PyErr_SetString(PyExc_TypeError, "expected a frame as bytes, and flags");
         return NULL;
@@ -111,14 +111,15 @@ static PyObject *writer_close(PipeWriter *writer, PyObject *unused) {
 }
 
 static PyObject *writer_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"fd", "again", NULL};
+    static char *names[] = {"fd", "again", "left", NULL};
     int fd;
-    PyObject *again;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "iO:PipeWriter", names, &fd, &again)) return NULL;
+    PyObject *again, *left = NULL;
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "iO|S:PipeWriter", names, &fd, &again, &left)) return NULL;
     PipeWriter *writer = (PipeWriter *)type->tp_alloc(type, 0);
     if (writer == NULL) return NULL;
     writer->fd = fd;
     writer->again = Py_NewRef(again);
+    writer->left = Py_XNewRef(left);
     return (PyObject *)writer;
 }
 
@@ -129,10 +130,22 @@ static void writer_dealloc(PipeWriter *writer) {
     Py_TYPE(writer)->tp_free((PyObject *)writer);
 }
 
+static PyObject *writer_detach(PipeWriter *writer, PyObject *unused) {
+    (void)unused;
+    const Py_ssize_t size = writer->left == NULL ? 0 : PyBytes_GET_SIZE(writer->left) - writer->written;
+    const char *data = writer->left == NULL ? "" : PyBytes_AS_STRING(writer->left) + writer->written;
+    PyObject *parts = Py_BuildValue("iy#", writer->fd, data, size);
+    if (parts == NULL) return NULL;
+    writer->fd = -1;
+    Py_CLEAR(writer->left);
+    return parts;
+}
+
 static PyMethodDef writer_methods[] = {
     {"send", (PyCFunction)(void (*)(void))writer_send, METH_FASTCALL, "Write a frame; `again` if there is no room."},
     {"offer", (PyCFunction)(void (*)(void))writer_offer, METH_FASTCALL, "Write a frame if there is room."},
     {"flush", (PyCFunction)writer_flush, METH_NOARGS, "Write the rest of a frame; whether all is written."},
+    {"detach", (PyCFunction)writer_detach, METH_NOARGS, "The descriptor, given up, and what is left of a frame."},
     {"close", (PyCFunction)writer_close, METH_NOARGS, "Write no more."},
     {NULL, NULL, 0, NULL},
 };
@@ -140,7 +153,8 @@ static PyMethodDef writer_methods[] = {
 static PyTypeObject PipeWriterType = {
     PyVarObject_HEAD_INIT(NULL, 0)
     .tp_name = "cortex._native.PipeWriter",
-    .tp_doc = "PipeWriter(fd, again)\n--\n\nThe publisher's end of a pipe, which owns the descriptor.",
+    .tp_doc = "PipeWriter(fd, again, left=b'')\n--\n\n"
+              "The publisher's end of a pipe, which owns the descriptor; what is left is written first.",
     .tp_basicsize = sizeof(PipeWriter),
     .tp_flags = Py_TPFLAGS_DEFAULT,
     .tp_new = writer_new,

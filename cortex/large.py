@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import zmq
 
+from cortex.native import NativeRelay
 from cortex.outlet import DONTWAIT, SNDMORE, Backoff, Outlet, Outlets
 from cortex.pipe import Writer, open_writer
 from cortex.shm import Ring, ShmUnavailable
@@ -45,7 +46,7 @@ RINGS_ALIVE = 4
 RINGS_KEPT = 8
 """Rings with those that are written no more, but not yet read by a reliable reader."""
 PIPES_MAX = 2
-"""A publisher writes each pipe itself; of further readers ZeroMQ takes care, in a thread of its own."""
+"""So many pipes a publisher writes itself; more are written by a thread in C, or without C not used."""
 RETRY_S = 5.0
 """After a ring could not be made, none is tried for so long."""
 _SLOT_REST = struct.Struct(REST.format + "Q")
@@ -62,6 +63,8 @@ class Reader:
     column: int | None
     pipe: Writer | None = None
     """Where its frames go; None: to the outlet."""
+    member: int | None = None
+    """Its number in the relay that writes the pipe, if one does."""
     late: bool = False
     """Its pipe was full for too long: it holds up nothing until it has room again."""
 
@@ -130,7 +133,7 @@ class LargeSender:
         self._has_strict = False
         self._timeout_s = 0.0
         self._slot_outlets: list[Outlet] = []
-        self._piped: list[Reader] = []
+        self._piped = 0
         self._inline_outlets: list[Outlet] = []
 
     def _plan(self) -> None:
@@ -156,7 +159,7 @@ class LargeSender:
         self._inline_strict = any(reader.request.strict for reader in self._inline)
         self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
         self._slot_outlets = list({reader.outlet for reader in self._columns.values() if reader.pipe is None})
-        self._piped = [reader for reader in self._columns.values() if reader.pipe is not None]
+        self._piped = sum(reader.pipe is not None for reader in self._columns.values())
         self._inline_outlets = list({reader.outlet for reader in self._inline})
 
     def admit(self, key: bytes, request: AttachKey, outlet: Outlet) -> Reader:
@@ -164,7 +167,7 @@ class LargeSender:
         column = None
         if request.shared_memory and outlet.local:
             column = next((c for c in range(COLUMNS) if c not in self._columns), None)
-        piped = column is not None and len(self._piped) < PIPES_MAX
+        piped = column is not None and (NativeRelay is not None or self._piped < PIPES_MAX)
         pipe = open_writer(outlet.directory, request.reader) if piped else None
         reader = Reader(key, request, outlet, column, pipe)
         if column is None:
@@ -183,8 +186,6 @@ class LargeSender:
             self._late.discard(reader.column)
             for ring in self._rings:
                 ring.free_column(reader.column)
-        if reader.pipe is not None:
-            reader.pipe.close()
         self._plan()
 
     def answer(self, reader: Reader, sequence: int, latched: bytes) -> bytes:
@@ -333,7 +334,7 @@ class LargeSender:
         mask: int,
         stamps: Stamps,
         send_strict: Callable[[Outlet, bytes, int], bool],
-        send_piped: Callable[[Reader, bytes], bool],
+        send_piped: Callable[[bytes], bool],
     ) -> tuple[bool, bool]:
         """Hand a written slot to all readers; the caller holds the lock.
 
@@ -343,7 +344,7 @@ class LargeSender:
             mask: The columns that get a lease, from `grant`.
             stamps: Number and times of the message.
             send_strict: Sends one frame over a strict outlet with these flags, waiting for room.
-            send_piped: Writes one frame into a reader's pipe, waiting for room if it is a reliable one.
+            send_piped: Writes one frame into all pipes, waiting for room in those of reliable readers.
 
         Returns:
             Whether every reliable reader was served in time, and whether some inline one was passed over.
@@ -357,8 +358,7 @@ class LargeSender:
                 on_time &= sent or not outlet.strict
             if self._piped:
                 frame = self._message_head + REST.pack(*stamps, size, 0) + slot.buffer[:size].tobytes()
-                for reader in self._piped:
-                    on_time &= send_piped(reader, frame)
+                on_time &= send_piped(frame)
             return on_time, passed_over
         ring.commit(slot.number, stamps.sequence, size, mask)
         if self._columns:
@@ -370,8 +370,7 @@ class LargeSender:
                     outlet.send(frame, DONTWAIT)
                 elif not outlet.try_send(frame) and not send_strict(outlet, frame, 0):
                     on_time = False
-            for reader in self._piped:
-                on_time &= send_piped(reader, frame)
+            on_time &= send_piped(frame)
         for outlet in self._inline_outlets:
             sent = self._send_large(outlet, slot, size, REST.pack(*stamps, size, 0), send_strict)
             passed_over |= not sent

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import zmq
 
 from cortex.host import pipe_path
-from cortex.native import NativePipeReader, NativePipeWriter
+from cortex.native import NativePipeReader, NativePipeWriter, NativeRelay
 from cortex.wire import BATCH, BODY_LIMIT, HEADER_SIZE, MASK, MESSAGE, PLACE_SIZE, SLOT
 
 PIPE_BYTES = 1 << 18
@@ -48,8 +48,52 @@ class Writer(Protocol):
         """Write what is left of a frame that did not fit as a whole; whether all is written."""
         ...
 
+    def detach(self) -> tuple[int, bytes]:
+        """Give the pipe up without closing it.
+
+        Returns:
+            Its descriptor, and what is left of a frame.
+        """
+        ...
+
     def close(self) -> None:
         """Write no more."""
+        ...
+
+
+class Relay(Protocol):
+    """Writes frames into the pipes of many readers, in a thread of its own."""
+
+    def add(self, fd: int, left: bytes, strict: bool, /) -> int:
+        """Write to one more pipe; see `_relay.c`."""
+        ...
+
+    def take(self, member: int | None, /) -> tuple[int, bytes]:
+        """Give a pipe back: its descriptor, and what is to be written there first."""
+        ...
+
+    def remove(self, member: int | None, /) -> None:
+        """Write to a pipe no more, and close it."""
+        ...
+
+    def send(self, frame: bytes, flags: int = 0, /) -> bool:
+        """Have a frame written to all; zmq.Again if a reliable reader has no room, or is late."""
+        ...
+
+    def offer(self, frame: bytes, flags: int = 0, /) -> bool:
+        """As `send`, but do not mind who is late; False if somebody is, and loses it."""
+        ...
+
+    def give_up(self, frame: bytes, /) -> None:
+        """Who has no room for a frame is late: it loses what comes until it has read half of what waits."""
+        ...
+
+    def is_idle(self) -> bool:
+        """Whether everything has been written."""
+        ...
+
+    def close(self) -> None:
+        """Write no more, and close the pipes."""
         ...
 
 
@@ -70,12 +114,13 @@ class PyWriter:
     Args:
         fd: Its descriptor, non-blocking; belongs to the writer from now on.
         again: What `send` raises.
+        left: To be written first.
     """
 
-    def __init__(self, fd: int, again: type[BaseException] = zmq.Again) -> None:
+    def __init__(self, fd: int, again: type[BaseException] = zmq.Again, left: bytes = b"") -> None:
         self._fd = fd
         self._again = again
-        self._left = memoryview(b"")
+        self._left = memoryview(left)
 
     def send(self, frame: bytes, flags: int = 0, /) -> None:
         """Write a frame; zmq.Again if there is no room."""
@@ -101,6 +146,12 @@ class PyWriter:
         except OSError:  # the reader is gone: the outlet will say so
             self._left = memoryview(b"")
         return True
+
+    def detach(self) -> tuple[int, bytes]:
+        """Give the pipe up without closing it: its descriptor, and what is left of a frame."""
+        fd, self._fd = self._fd, -1
+        left, self._left = bytes(self._left), memoryview(b"")
+        return fd, left
 
     def close(self) -> None:
         """Write no more."""
@@ -198,9 +249,30 @@ def open_writer(directory: Path | None, number: int) -> Writer | None:
         os.close(fd)
         return None
     _enlarge(fd)
+    return make_writer(fd)
+
+
+def make_writer(fd: int, left: bytes = b"") -> Writer:
+    """Return what writes a pipe.
+
+    Args:
+        fd: Its descriptor, non-blocking; belongs to the writer from now on.
+        left: To be written first.
+    """
     kind: Any = NativePipeWriter or PyWriter
-    writer: Writer = kind(fd, zmq.Again)
+    writer: Writer = kind(fd, zmq.Again, left)
     return writer
+
+
+def make_relay() -> Relay | None:
+    """Return what writes many pipes; None where there is no C, or no more threads."""
+    if NativeRelay is None:
+        return None
+    try:
+        relay: Relay = NativeRelay(zmq.Again)
+    except OSError:
+        return None
+    return relay
 
 
 def _enlarge(fd: int) -> None:

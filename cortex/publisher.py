@@ -18,6 +18,7 @@ from cortex.gate import BATCH_BYTES, BATCH_COUNT, BATCH_NS, Gate, LongGate, make
 from cortex.large import LargeSender, Reader, Slot, Stamps
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
 from cortex.packer import coder_of
+from cortex.pipes import Pipes
 from cortex.stats import PublisherCounters
 from cortex.wire import (
     BATCH,
@@ -92,8 +93,9 @@ class Publisher(Generic[T]):
             flush=self._flush,
         )
         """Sends small messages if nothing special is to be done."""
-        self._targets: dict[Callable[..., Any], Outlet | Reader] = {}
-        """What those of the gate's `sends` belong to that may refuse."""
+        self._retries: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
+        """What to call where one of the gate's `sends` refuses."""
+        self._pipes = Pipes(self._await_room)
         self._large_lock = threading.Lock()
         self._large = LargeSender(
             self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
@@ -101,7 +103,6 @@ class Publisher(Generic[T]):
         self._readers: dict[bytes, Reader] = {}
         self._lossy_sends: tuple[Callable[..., Any], ...] = ()
         self._strict_outlets: tuple[Outlet, ...] = ()
-        self._strict_pipes: tuple[Reader, ...] = ()
         self._latched = b""
         self._was_large = False
         self._crowded = False
@@ -268,45 +269,18 @@ class Publisher(Generic[T]):
                 outlet.send(frame, DONTWAIT)
             except zmq.Again:
                 on_time &= self._send_strict(outlet, frame, 0)
-        for reader in self._strict_pipes:
-            on_time &= self._send_piped(reader, frame)
+        on_time &= self._pipes.send(frame)
         if not on_time:
             self._timeouts += 1
         return on_time
 
     def _send_again(self, frame: bytes, send: Callable[..., Any]) -> bool:
         """Send what the gate could not; the lock is held, and let go while sleeping."""
-        target = self._targets.get(send)  # None: it has left since
-        on_time = True
-        if isinstance(target, Reader):
-            on_time = self._send_piped(target, frame)
-        elif target is not None:
-            on_time = self._send_strict(target, frame, 0)
+        retry = self._retries.get(send)  # None: it has left since
+        on_time = retry is None or retry(frame)
         if not on_time:
             self._timeouts += 1
         return on_time
-
-    def _send_piped(self, reader: Reader, frame: bytes) -> bool:
-        """Write into a reader's pipe, waiting if it is a reliable one; the lock as in `_send_strict`.
-
-        Returns:
-            False if a reliable reader lost the frame.
-        """
-        pipe = reader.pipe
-        assert pipe is not None
-        if not reader.request.strict:
-            pipe.offer(frame)
-            return True
-
-        def send() -> bool:
-            try:
-                pipe.send(frame)
-            except zmq.Again:
-                return reader.key not in self._readers  # it has left
-            return True
-
-        reader.late = not send() and (reader.late or not self._await_room(send, reader.timeout_s))
-        return not reader.late
 
     def _send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
         """Send, waiting for the slowest reliable reader; the lock is held, and let go while sleeping."""
@@ -420,7 +394,7 @@ class Publisher(Generic[T]):
             head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
             self._latched = head + slot.buffer[:size].tobytes()
         sent, inline_passed_over = self._large.send(
-            slot, size, mask, stamps, self._send_strict, self._send_piped
+            slot, size, mask, stamps, self._send_strict, self._pipes.send
         )
         self._skipped += passed_over or inline_passed_over
         on_time &= sent and not self._late
@@ -483,10 +457,14 @@ class Publisher(Generic[T]):
             return
         reader = self._large.admit(key, request, outlet)
         self._readers[key] = reader
-        self._route()
         sequence = self._batch_sequence if self._batch else self._gate.sequence
-        if reader.pipe is not None:  # this tells the reader that all else comes there
+        if reader.pipe is not None:
+            # This tells the reader that all else comes there.
             reader.pipe.offer(self._batch_head + REST.pack(sequence, 0, monotonic_ns(), 0, 0))
+            self._pipes.admit(reader)
+            if not self._blocked:
+                self._pipes.settle()
+        self._route()
         answer = self._large.answer(reader, sequence, self._latched)
         if outlet.strict:
             if not outlet.try_send(answer):
@@ -500,6 +478,7 @@ class Publisher(Generic[T]):
             if reader.request.reader == request.reader and reader.outlet is outlet:
                 del self._readers[key]
                 self._large.dismiss(reader)
+                self._pipes.dismiss(reader)
                 self._late.pop(outlet, None)
                 self._route()
                 return
@@ -514,17 +493,17 @@ class Publisher(Generic[T]):
         """Work out where messages go, when readers or what is sent have changed."""
         readers = self._readers.values()
         outlets = {reader.outlet for reader in readers if reader.pipe is None}
-        pipes = [(reader, reader.pipe) for reader in readers if reader.pipe is not None]
-        lossy = [pipe.offer for reader, pipe in pipes if not reader.request.strict]
         sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
-        self._lossy_sends = (*sends, *lossy)
+        self._lossy_sends = tuple(sends)
         self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
-        self._strict_pipes = tuple(reader for reader, _ in pipes if reader.request.strict)
-        strict = {pipe.send: reader for reader, pipe in pipes if reader.request.strict}
         usual = self._plain and not self._late
-        self._targets = {outlet.send: outlet for outlet in self._strict_outlets} | strict
-        self._gate.sends = (*self._lossy_sends, *self._targets) if usual else ()
+        retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
+        self._retries = retries | self._pipes.strict
+        self._gate.sends = (*self._lossy_sends, *self._pipes.lossy, *self._retries) if usual else ()
         self._arm()
+
+    def _retry_strict(self, outlet: Outlet) -> Callable[[bytes], bool]:
+        return lambda frame: self._send_strict(outlet, frame, 0)
 
     def _arm(self) -> None:
         """Let the gate send large messages, or not: when readers, the ring, or who is late has changed."""
@@ -541,9 +520,9 @@ class Publisher(Generic[T]):
             try:
                 if not self._closed:
                     self._large.prune()
-                    for reader in self._readers.values():
-                        if reader.pipe is not None:
-                            reader.pipe.flush()
+                    self._pipes.flush()
+                    if not self._blocked and self._pipes.settle():
+                        self._route()
                     if self._told != self._gate.sequence:
                         self._told, self._tell_after_ns = self._gate.sequence, SILENCE_NS
                     if self._readers and now_ns - self._gate.refresh_ns > self._tell_after_ns:
@@ -563,9 +542,7 @@ class Publisher(Generic[T]):
             send(frame, DONTWAIT)
         for outlet in self._strict_outlets:
             outlet.try_send(frame)
-        for reader in self._strict_pipes:
-            if reader.pipe is not None:
-                reader.pipe.offer(frame)
+        self._pipes.offer(frame)
         self._tell_after_ns = min(2 * self._tell_after_ns, now_ns - self._gate.refresh_ns + SILENCE_MAX_NS)
 
     @property
@@ -616,13 +593,11 @@ class Publisher(Generic[T]):
             with self._lock:
                 if not self._outlets.closed:
                     self._outlets.refresh()
-                taken_in = self._outlets.closed or self._large.taken_in
+                taken_in = self._outlets.closed or (self._large.taken_in and self._pipes.is_idle)
             if taken_in or not backoff.wait():
                 break
         with self._lock:
-            for reader in self._readers.values():
-                if reader.pipe is not None:
-                    reader.pipe.close()
+            self._pipes.close()
             self._readers.clear()
             self._route()
             self._large.close()
