@@ -14,6 +14,7 @@ from cortex.message import message
 if TYPE_CHECKING:
     from cortex.codec import MalformedMessage
     from cortex.context import Closed
+    from cortex.loan import Loan
     from cortex.message import (
         Array,
         Float32,
@@ -48,6 +49,7 @@ _HOME = {
     "MalformedMessage": "codec",
     "Node": "node",
     "Policy": "policy",
+    "Loan": "loan",
     "Publisher": "publisher",
     "ServiceFailed": "service",
     "ServiceTimeout": "service",
@@ -74,6 +76,7 @@ __all__ = [
     "Int16",
     "Int32",
     "Int64",
+    "Loan",
     "MalformedMessage",
     "Node",
     "Policy",

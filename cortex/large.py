@@ -128,6 +128,7 @@ class LargeSender:
         self._ring: Ring | None = None
         self._pin_quota = 0
         self._slots_wanted = 4
+        self._is_deep = False
         self._grants: list[tuple[int, int, int, bool]] = []
         self._inline_strict = False
         self._has_strict = False
@@ -141,9 +142,8 @@ class LargeSender:
         inline = {reader.request.strict for reader in self._inline}  # lossy and strict ones have a share each
         self._shares = max(1, len(self._columns) + len(inline))
         ring = self._ring = self._rings[-1] if self._rings else None
-        self._slots_wanted = 2 * self._shares + 2
-        if ring is not None and any(r.request.quota >= DEEP_QUOTA for r in self._columns.values()):
-            self._slots_wanted = max(self._slots_wanted, min(DEEP_SLOTS, DEEP_RING_BYTES // ring.slot_bytes))
+        self._is_deep = any(reader.request.quota >= DEEP_QUOTA for reader in self._columns.values())
+        self._slots_wanted = self._wanted(ring.slot_bytes if ring is not None else DEEP_RING_BYTES)
         self._pin_quota = 0 if ring is None else max(1, (ring.slots - 1) // self._shares)
 
         def quota(reader: Reader) -> int:
@@ -161,6 +161,11 @@ class LargeSender:
         self._slot_outlets = list({reader.outlet for reader in self._columns.values() if reader.pipe is None})
         self._piped = sum(reader.pipe is not None for reader in self._columns.values())
         self._inline_outlets = list({reader.outlet for reader in self._inline})
+
+    def _wanted(self, slot_bytes: int) -> int:
+        """How many slots of a size [bytes] the readers want: who keeps many gets more, in bounded memory."""
+        wanted = 2 * self._shares + 2
+        return max(wanted, min(DEEP_SLOTS, DEEP_RING_BYTES // slot_bytes)) if self._is_deep else wanted
 
     def admit(self, key: bytes, request: AttachKey, outlet: Outlet) -> Reader:
         """Take a reader in, with a column of the lease table if it can map memory."""
@@ -465,7 +470,7 @@ class LargeSender:
         return any(strict and ring.outstanding(column) for column, _, _, strict in self._grants)
 
     def _ring_for(self, size: int, sequence: int, *, exact: bool) -> Ring | None:
-        current, wanted, page = self._ring, self._slots_wanted, mmap.PAGESIZE
+        current, page = self._ring, mmap.PAGESIZE
         crowded = len(self._rings) >= RINGS_KEPT and self._is_awaited(self._rings[0])
         if crowded or time.monotonic() < self._unavailable_until_s:
             return current if current is not None and current.slot_bytes >= size else None
@@ -473,7 +478,7 @@ class LargeSender:
         if current is not None:
             slot_bytes = max(slot_bytes, current.slot_bytes)
         slot_bytes = max(page, -(-slot_bytes // page) * page)
-        slots = max(min(max(RING_BYTES // slot_bytes, 4), 64), wanted)
+        slots = max(min(max(RING_BYTES // slot_bytes, 4), 64), self._wanted(slot_bytes))
         slots = max(4, min(slots, RING_BYTES_MAX // slot_bytes))
         if current is not None and current.slot_bytes >= size and current.slots >= slots:
             return current

@@ -16,6 +16,7 @@ from cortex.codec import Codec
 from cortex.context import Closed
 from cortex.gate import BATCH_BYTES, BATCH_COUNT, BATCH_NS, Gate, LongGate, make_gate
 from cortex.large import LargeSender, Reader, Slot, Stamps
+from cortex.loan import Loan
 from cortex.outlet import DONTWAIT, Backoff, Outlet, Outlets
 from cortex.packer import coder_of
 from cortex.pipes import Pipes
@@ -210,6 +211,28 @@ class Publisher(Generic[T]):
         Raises:
             RuntimeError: All slots are out on loan.
         """
+        loan = self.try_loan(dtypes, **dims)
+        if loan is None:
+            with self._lock:
+                self._skip()
+            raise RuntimeError(f"{self.topic}: every slot is out on loan; publish or drop one first")
+        try:
+            yield loan.draft
+        except BaseException:
+            loan.drop()
+            raise
+        loan.publish()
+
+    def try_loan(self, dtypes: Mapping[str, Any] | None = None, /, **dims: int) -> Loan | None:
+        """Begin a message as `loan` does, to be published or dropped later, by any thread.
+
+        Args:
+            dtypes: The dtype of each array field that is declared as `any`.
+            **dims: The size of every named dimension of the type's arrays.
+
+        Returns:
+            The message; None if there is no slot for it now.
+        """
         size = self.codec.draft_size(dims, dtypes)
         inline = size <= self._inline_max
         slot: Slot | None
@@ -219,31 +242,42 @@ class Publisher(Generic[T]):
         else:
             with self._large_lock, self._lock:
                 self._prepare(monotonic_ns())
-                slot = self._acquire_slot(size)
+                exact = self.codec.fixed_size is not None
+                slot = self._large.acquire(size, self._gate.sequence, exact=exact)
             if slot is None:
-                raise RuntimeError(f"{self.topic}: every slot is out on loan; publish or drop one first")
+                return None
         try:
             draft = self.codec.draft(slot.buffer, dims, dtypes)
-            yield draft
-            size = self.codec.finish(draft)
         except BaseException:
-            with self._lock:
-                self._large.abandon(slot)
+            self._abandon(slot)
             raise
-        stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
+        return Loan(draft, slot, inline=inline, publish=self._publish_loan, drop=self._abandon)
+
+    def _abandon(self, slot: Slot) -> None:
+        with self._lock:
+            self._large.abandon(slot)
+
+    def _publish_loan(self, draft: Any, slot: Slot | None, inline: bool) -> bool:
+        """Send what was written on loan; as `publish`, but for RuntimeError where its slot was given up."""
+        assert slot is not None
+        try:
+            size = self.codec.finish(draft)
+            stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
+        except BaseException:
+            self._abandon(slot)
+            raise
         if inline:
             with self._lock:
                 now_ns = monotonic_ns()
                 self._prepare(now_ns)
-                self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
-        else:
-            with self._large_lock, self._lock:
-                now_ns = monotonic_ns()
-                self._prepare(now_ns)
-                slot = self._large.renew(slot, size, self._gate.sequence)
-                if slot is None:
-                    raise RuntimeError(f"{self.topic}: every slot is out on loan; the message is lost")
-                self._publish_slot(slot, size, stamp_ns, now_ns)
+                return self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
+        with self._large_lock, self._lock:
+            now_ns = monotonic_ns()
+            self._prepare(now_ns)
+            slot = self._large.renew(slot, size, self._gate.sequence)
+            if slot is None:
+                raise RuntimeError(f"{self.topic}: every slot is out on loan; the message is lost")
+            return self._publish_slot(slot, size, stamp_ns, now_ns)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send or collect a small message; the lock is held."""
@@ -375,10 +409,14 @@ class Publisher(Generic[T]):
         exact = self.codec.fixed_size is not None
         slot = self._large.acquire(size, self._gate.sequence, exact=exact, spare=spare)
         if slot is None:
-            self._flush()
-            self._gate.sequence += 1
-            self._skipped += 1
+            self._skip()
         return slot
+
+    def _skip(self) -> None:
+        """Count a message that finds no slot: its readers see the gap. The lock is held."""
+        self._flush()
+        self._gate.sequence += 1
+        self._skipped += 1
 
     def _publish_slot(self, slot: Slot, size: int, stamp_ns: int, now_ns: int) -> bool:
         """Send what was written into a slot; both locks are held."""

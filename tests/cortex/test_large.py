@@ -154,25 +154,29 @@ def test_a_reader_that_hoards_hurts_only_itself(node):
     other = node.subscriber("/large", Scan, policy=keep_last(64))
     assert publisher.wait_for_subscribers(2, SOON_S)
     kept = []
-    slowest_s = 0.0
+    took_s = []
+
+    def take():
+        if (message := _try(hoarder)) is not None:
+            kept.append(message)
+
     for number in range(100):
         begin = time.monotonic()
         assert publisher.publish(scan(number))
-        slowest_s = max(slowest_s, time.monotonic() - begin)
+        took_s.append(time.monotonic() - begin)
         assert other.recv(SOON_S).stamp_ns == number
-        if (message := _try(hoarder)) is not None:
-            kept.append(message)
-    assert slowest_s < 0.5
+        take()
+    assert sorted(took_s)[80] < 0.05  # the last 60 of them are those that it could wait for
+    counters = hoarder.counters
+    wait_for(lambda: take() or counters.received + counters.lost + counters.overtaken == 100)
     assert [message.stamp_ns for message in kept] == sorted({message.stamp_ns for message in kept})
     assert all((message.ranges == message.stamp_ns).all() for message in kept)
-    counters = hoarder.counters
-    assert counters.received + counters.lost + counters.overtaken == 100
     assert (other.counters.received, other.counters.lost) == (100, 0)
     leased = [message for message in kept if is_shared(message)]
     assert 1 <= len(leased) <= 32
     assert publisher.counters.skipped > 0
     kept.clear()
-    del leased, message
+    del leased
     publisher.publish(scan(100))
     message = hoarder.recv(SOON_S)
     assert is_shared(message)
@@ -187,7 +191,7 @@ def test_a_reader_that_was_passed_over_knows_at_once(node):
     assert [subscriber.recv(SOON_S).stamp_ns for _ in range(count)] == list(range(count))
     with pytest.raises(TimeoutError):
         subscriber.recv(0.1)
-    assert subscriber.counters.lost == 20 - count
+    wait_for(lambda: subscriber.counters.lost == 20 - count)
 
 
 @pytest.mark.parametrize("count", [3, 70])
@@ -210,7 +214,7 @@ def test_many_readers(node, count):
 # Rings
 
 
-@pytest.mark.parametrize("policy", [reliable(4, 5.0), keep_last(4)], ids=str)
+@pytest.mark.parametrize("policy", [reliable(4, 60.0), keep_last(4)], ids=str)
 def test_messages_that_grow_and_shrink(node, policy):
     publisher, subscriber = connected(node, Scan, policy)
     sizes = [5_000, 10, 20_000, 80_000, 320_000, 1_280_000, 5_000, 2_000_000, 10, 4_200, 2_000_001]
@@ -246,7 +250,7 @@ def test_memory_stays_flat(node):
     def resident():
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * mmap.PAGESIZE
 
-    publisher, subscriber = connected(node, Scan, reliable(8, 5.0))
+    publisher, subscriber = connected(node, Scan, reliable(8, 60.0))
     small, large = scan(1, 10), scan(2, 50_000)
 
     def run(count):
@@ -266,7 +270,7 @@ def test_memory_stays_flat(node):
 
 def test_a_reader_without_shared_memory(node, monkeypatch):
     """It gets the same bytes; one that can share goes on sharing."""
-    publisher, sharing = connected(node, Scan, reliable(8, 5.0))
+    publisher, sharing = connected(node, Scan, reliable(8, 60.0))
     publisher.publish(scan(0))
     assert is_shared(sharing.recv(SOON_S))
 
@@ -275,12 +279,14 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(cortex.link, "RingView", refuse)
-        plain = node.subscriber("/large", Scan, policy=reliable(8, 5.0))
+        plain = node.subscriber("/large", Scan, policy=reliable(8, 60.0))
         assert publisher.wait_for_subscribers(2, SOON_S)
-        assert plain.wait_for_publisher()
+        assert plain.wait_for_publisher(SOON_S)
         wait_for(lambda: publisher.publish(scan(1)) and _try(plain))
-    while _try(sharing) or _try(plain):
-        pass
+    publisher.publish(scan(-1))
+    for subscriber in (sharing, plain):
+        while subscriber.recv(SOON_S).stamp_ns != -1:
+            pass
     for number, size in enumerate((10, LARGE, 5_000, 10, 300_000)):
         publisher.publish(scan(number, size))
         first, second = sharing.recv(SOON_S), plain.recv(SOON_S)
@@ -297,7 +303,7 @@ def _try(subscriber):
         return None
 
 
-@pytest.mark.parametrize("policy", [reliable(8, 5.0), keep_last(8)], ids=str)
+@pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
 def test_a_publisher_without_shared_memory(node, monkeypatch, policy, caplog):
     def refuse(*args, **options):
         raise ShmUnavailable(28, "no memory")
@@ -399,6 +405,50 @@ def test_several_loans_at_once(node):
     assert all((message.ranges == message.stamp_ns).all() for message, _ in received)
 
 
+@pytest.mark.parametrize("size", [3, LARGE])
+def test_a_loan_may_be_published_by_another_thread(node, size):
+    publisher, subscriber = connected(node, Scan, keep_last())
+    loan = publisher.try_loan(n=size)
+    loan.draft.ranges[:] = 3.0
+    loan.draft.stamp_ns = 4
+    sent = []
+    thread = threading.Thread(target=lambda: sent.append(loan.publish()))
+    thread.start()
+    thread.join()
+    message = subscriber.recv(SOON_S)
+    assert sent == [True]
+    assert message.stamp_ns == 4
+    assert (message.ranges == 3.0).all()
+    with pytest.raises(RuntimeError, match="published or dropped before"):
+        loan.publish()
+    loan.drop()  # nothing is left to be given back
+    assert publisher.counters.published == 1
+
+
+def test_a_loan_that_is_not_to_be_had_counts_for_nothing(node):
+    """Unlike `loan`, which is a message that is lost: whoever tries has another way to publish it."""
+    publisher, subscriber = connected(node, Scan, keep_last(64))
+    loans = []
+    while len(loans) < 200 and (loan := publisher.try_loan(n=1_000_000)) is not None:
+        loans.append(loan)
+    assert 3 <= len(loans) < 200
+    for loan in loans:
+        loan.drop()
+    assert publisher.publish(scan(5))
+    assert subscriber.recv(SOON_S).stamp_ns == 5
+    assert (subscriber.counters.lost, publisher.counters.skipped) == (0, 0)
+
+
+def test_rings_of_a_deep_reader_stay_within_their_bound(node):
+    """Messages that grow slowly get larger rings, and none takes more than is meant for it."""
+    publisher, subscriber = connected(node, Scan, keep_last(256))
+    for size in range(100_000, 400_000, 30_000):
+        publisher.publish(scan(size, size))
+        assert subscriber.recv(SOON_S).stamp_ns == size
+        ring = publisher._large._ring
+        assert ring.slots * ring.slot_bytes <= cortex.large.DEEP_RING_BYTES
+
+
 def test_too_many_loans(node):
     publisher, subscriber = connected(node, Scan, keep_last(64))
     loans = []
@@ -469,7 +519,7 @@ def test_a_fixed_type_has_nothing_to_declare(node):
 
 def test_a_ring_whose_announcement_was_dropped_is_found(make_node):
     """The queue is full at the very moment when the first large message makes a ring."""
-    publisher, subscriber = connected(make_node(registry="off"), Scan, reliable(8, 10.0))
+    publisher, subscriber = connected(make_node(registry="off"), Scan, reliable(8, 60.0))
     subscriber._turn.lock.acquire()  # a reader that is busy, control thread and all
     small, done = scan(0, 3), []
 
@@ -485,7 +535,7 @@ def test_a_ring_whose_announcement_was_dropped_is_found(make_node):
     finally:
         subscriber._turn.lock.release()
     received = [len(subscriber.recv(SOON_S).ranges) for _ in range(1500)]
-    thread.join(10.0)
+    thread.join(SOON_S)
     assert done
     assert sum(length == LARGE for length in received) == 50
     assert subscriber.counters.lost == 0
