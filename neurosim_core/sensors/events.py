@@ -38,6 +38,11 @@ _log = logging.getLogger(__name__)
 
 _BLOCK_SIZE = 256
 _PIXELS_PER_THREAD_MIN = 16_384
+_ROOM_PER_PIXEL = 16
+"""Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
+and memory follows the events, in place of doubling in the middle of a run."""
+_TOUCHED_COUNT_MAX = 1 << 18
+"""Keys of that room that are written to at once: the first busy moment of a run needs no new pages."""
 _COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
 """Types of the times, columns, rows and polarities that are handed out."""
 
@@ -403,11 +408,14 @@ class EventCamera:
     def _make_scan(self, frame_count: int) -> _Scan:
         """Return buffers for stacks of at most `frame_count` frames."""
         chunks = []
-        for first, end in self._chunk_bounds():
+        bounds = self._chunk_bounds()
+        for first, end in bounds:
             counters = self._empty(3, wp.int64)
-            chunks.append(
-                _Chunk(first, end, self._empty(2 * (end - first), wp.int64), counters, HostCopy(counters))
-            )
+            if self.device.is_cpu:
+                keys = self._roomy_keys(_ROOM_PER_PIXEL * (end - first), _TOUCHED_COUNT_MAX // len(bounds))
+            else:
+                keys = self._empty(2 * (end - first), wp.int64)
+            chunks.append(_Chunk(first, end, keys, counters, HostCopy(counters)))
         stamps = self._empty(frame_count + 1, wp.int64)
         return _Scan(
             chunks=chunks,
@@ -585,12 +593,22 @@ class EventCamera:
         keys: wp.array[wp.int64] = self._empty(2 * count if self.device.is_cuda else count, wp.int64)
         return keys
 
+    def _roomy_keys(self, count: int, touched_count: int) -> wp.array[wp.int64]:
+        """Return a buffer on a CPU for more keys than will come, the first of which have pages already."""
+        keys: wp.array[wp.int64] = self._empty(count, wp.int64)
+        keys.numpy()[:touched_count] = 0
+        return keys
+
     def _reserve_keys(self, *, kept: int) -> None:
         """Make room for the keys there are now, of which the first `kept` are in the buffer."""
         if self._key_count * (2 if self.device.is_cuda else 1) <= self._keys.shape[0]:
             return
         room = 1 << (self._key_count - 1).bit_length()
-        keys = self._key_buffer(room)
+        if self.device.is_cpu:
+            room = max(room, _ROOM_PER_PIXEL * self.width * self.height)
+            keys = self._roomy_keys(room, _TOUCHED_COUNT_MAX)
+        else:
+            keys = self._key_buffer(room)
         if kept > 0:
             wp.copy(keys, self._keys, count=kept)
         self._keys = keys

@@ -546,7 +546,7 @@ def test_overflow_of_every_row(device):
 
 
 def test_buffer_grows_instead_of_losing(device):
-    """The buffer begins with 2 events per pixel; 301 per pixel are all there, and the state is right."""
+    """The buffer begins with 16 events per pixel or less; 301 of each are all there, the state is right."""
     frames = np.zeros((3, 6, 7), np.float32)
     frames[1] = 3.0
     frames[2] = 2.985
