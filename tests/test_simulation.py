@@ -340,6 +340,34 @@ def test_cameras_in_another_thread_yield_the_same(outside_model):
     assert simulation.observe(apart).position.tobytes() == simulation.observe(together).position.tobytes()
 
 
+def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
+    """Whoever gives memory for some of the pictures finds there what it would have got otherwise."""
+    model, command = outside_model, 1.01 * hover(outside_model)
+    rooms: list[np.ndarray] = []
+    asked: list[str] = []
+
+    def make_room(name: str, picture: np.ndarray) -> np.ndarray | None:
+        asked.append(name)
+        if len(asked) % 2:
+            return None
+        rooms.append(np.full_like(picture, 77))
+        return rooms[-1]
+
+    def fly_all(state: simulation.State) -> list[Packet]:
+        packets = []
+        for _ in range(10):
+            _, batches = simulation.fly_period(model, state, command)
+            packets += [packet for batch in batches for packet in simulation.see(model, state, batch)]
+        return packets
+
+    expected = fly_all(simulation.make_state(model, flight_lane_count=32))
+    packets = fly_all(simulation.make_state(model, flight_lane_count=32, make_room=make_room))
+    assert content(packets) == content(expected)
+    pictures = [packet for packet in packets if isinstance(packet, Image)]
+    assert len(pictures) == len(asked) > 4
+    assert sum(any(picture.data is room for room in rooms) for picture in pictures) == len(asked) // 2
+
+
 def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
     state = simulation.make_state(outside_model, flight_lane_count=3)
     simulation.fly_period(outside_model, state, None)  # the start and one period

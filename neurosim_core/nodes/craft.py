@@ -92,6 +92,7 @@ class Craft:
             lane_count=1,
             flight_lane_count=1 if live.mode == "lockstep" else self.lanes.count,
             borrow_pictures=live.mode == "lockstep",
+            make_room=None if live.mode == "lockstep" else self.outlet.make_room,
             seed=seed,
             start=start,
         )

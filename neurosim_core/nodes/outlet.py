@@ -8,12 +8,14 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortex import Node, Publisher
 from cortex import messages as msg
 from neurosim_core.live import LinkConfig
 from neurosim_core.nodes import topics, translate
 from neurosim_core.nodes.channel import Channel, payload_bytes
+from neurosim_core.nodes.loans import PictureLoan
 from neurosim_core.pacing import Timings
 from neurosim_core.packets import Delivery, Image, Odometry, Packet
 from neurosim_core.record import describe_sensors
@@ -39,10 +41,15 @@ class Post:
         self._told_count = 0
         self._held_ns = 0
 
-    def publish(self, message: Any) -> None:
-        """Publish a message, and count it if a reader that holds us up loses it."""
+    def publish(self, message: Any, send: Callable[[Any], bool] | None = None) -> None:
+        """Publish a message, and count it if a reader that holds us up loses it.
+
+        Args:
+            message: What to publish.
+            send: How; None: as usual.
+        """
         begin_ns = time.monotonic_ns()
-        if not self.publisher.publish(message):
+        if not (send or self.publisher.publish)(message):
             self.undelivered_count += 1
         self._held_ns += time.monotonic_ns() - begin_ns
 
@@ -63,6 +70,7 @@ class Stream(Post):
     Attributes:
         name: Of the sensor, or odometry, rotor_speeds, collision.
         channel: What is under way.
+        loan: Room for the next picture, where these are pictures.
         late_times: How late by the wall clock messages were published, since somebody last looked [ns].
         subscriber_count: As of the last look.
         published_count: Messages since the last reset.
@@ -89,6 +97,7 @@ class Stream(Post):
         self.name = name
         self.channel = channel
         self.late_times = Timings()
+        self.loan = PictureLoan(publisher)
         self.subscriber_count = 0
         self.published_count = 0
         self.delivered_ns: int | None = None
@@ -114,7 +123,8 @@ class Stream(Post):
             return False
         message = self._translate(packet, config.clock_ns if clocked else None)
         self._kept = None
-        self.publish(message)
+        lent = isinstance(packet, Image) and self.loan.holds(packet.data)
+        self.publish(message, self.loan.publish if lent else None)
         self.published_count += 1
         if self.publisher.latch:
             self._last = message
@@ -206,6 +216,20 @@ class Outlet:
     def look(self) -> tuple[int, ...]:
         """See who listens, and return how many subscribers each topic has."""
         return tuple(stream.look() for stream in self.streams.values())
+
+    def make_room(self, name: str, picture: NDArray[Any]) -> NDArray[Any] | None:
+        """Return where a picture can be written so that it is not copied again; None if that makes no sense.
+
+        May be called from another thread than all else.
+
+        Args:
+            name: Of the camera.
+            picture: Of the shape and dtype that is needed.
+        """
+        stream = self.streams[name]
+        if self.record is not None or not stream.subscriber_count or not stream.channel.delivers_at_once:
+            return None
+        return stream.loan.lend(picture)
 
     def active(self) -> frozenset[str]:
         """Return the sensors that are listened to or recorded, as of the last look."""

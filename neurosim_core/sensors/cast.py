@@ -103,11 +103,6 @@ class Instants:
     events: tuple[str, ...]
     """Event cameras that see them."""
 
-    @property
-    def picture_slot_count(self) -> int:
-        """Image slots in use."""
-        return max((slot for _, slot, _ in self.pictures), default=-1) + 1
-
 
 def make_cast_state(
     cast: Cast,
@@ -392,28 +387,45 @@ def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     return packets
 
 
-def read_images(cast: CastState, instants: Instants, *, borrow: bool = False) -> list[Packet]:
+MakeRoom = Callable[[str, NDArray[Any]], NDArray[Any] | None]
+"""Returns memory for a camera's picture, like the one that is given; None: there is none."""
+
+
+def read_images(
+    cast: CastState, instants: Instants, *, borrow: bool = False, make_room: MakeRoom | None = None
+) -> list[Packet]:
     """Return the pictures of a batch that the device has finished with.
 
     Args:
         cast: Which cameras.
         instants: What they have seen.
         borrow: Return views that are valid until the lane's buffers are overwritten, not copies.
+        make_room: Gives memory that pictures are copied to; where it does not, they are as `borrow` says.
     """
-    read: dict[str, NDArray[Any]] = {}
+    copies: dict[tuple[str, int], NDArray[Any]] = {}
+
+    def copy_of(image: ImageChannel, slot: int, name: str) -> NDArray[Any]:
+        picture: NDArray[Any] = cast.picture_copies[instants.lane][image.output].view(slot, 1)[0]
+        room = None if make_room is None else make_room(name, picture)
+        if room is not None:
+            np.copyto(room, picture)
+            return room
+        if borrow:
+            return picture
+        key = (image.output, slot)  # cameras that take the same picture share the copy
+        if key not in copies:
+            copies[key] = np.array(picture)
+        return copies[key]
+
     packets: list[Packet] = []
     for stamp_ns, slot, name in instants.pictures:
         image = cast.images[name]
-        if image.output not in read:
-            copy = cast.picture_copies[instants.lane][image.output]
-            take = copy.view if borrow else copy.rows
-            read[image.output] = take(0, instants.picture_slot_count)
         packets.append(
             Image(
                 stamp_ns=stamp_ns,
                 sequence=image.sequence,
                 sensor=name,
-                data=read[image.output][slot],
+                data=copy_of(image, slot, name),
                 encoding=_ENCODING[image.output],
             )
         )

@@ -326,6 +326,41 @@ def test_pictures_that_are_kept_are_copied(make_stand: Callable[..., Stand]):
     assert (picture.encoding, picture.frame_id) == ("rgb8", "drone/rgb_optical_frame")
 
 
+def test_a_picture_has_room_where_its_reader_finds_it(make_stand: Callable[..., Stand]):
+    """What is written there is published without a copy, the same as any other picture."""
+    stand = make_stand()
+    pictures = stand.listen("/drone/rgb", Image)
+    like = np.arange(160 * 150 * 3, dtype=np.uint64).astype(np.uint8).reshape(160, 150, 3)
+    room = stand.outlet.make_room("rgb", like)
+    assert room is not None
+    room[:] = like
+    for sequence, data in enumerate((room, like)):
+        stamp_ns = sequence * MS
+        packet = ImagePacket(sensor="rgb", stamp_ns=stamp_ns, sequence=sequence, data=data, encoding="rgb8")
+        stand.outlet.offer([packet])
+    stand.outlet.publish_due(MS)
+    found = take(pictures, 2)
+    assert [(p.stamp_ns, p.sequence) for p in found] == [(0, 0), (MS, 1)]
+    for picture in found:
+        assert picture.data.tobytes() == like.tobytes()
+        assert (picture.encoding, picture.frame_id) == ("rgb8", "drone/rgb_optical_frame")
+    room[5, 6, 1] += 1
+    assert found[0].data[5, 6, 1] == room[5, 6, 1]  # the same memory
+    assert stand.outlet.streams["rgb"].published_count == 2
+
+
+def test_no_room_for_a_picture_that_is_kept_or_that_nobody_sees(make_stand: Callable[..., Stand]):
+    like = np.zeros((160, 150, 3), np.uint8)
+    stand = make_stand()
+    assert stand.outlet.make_room("rgb", like) is None
+    stand.listen("/drone/rgb", Image)
+    stand.record()
+    assert stand.outlet.make_room("rgb", like) is None
+    late = make_stand(links={"rgb": {"latency_s": 0.01}})
+    late.listen("/drone/rgb", Image)
+    assert late.outlet.make_room("rgb", like) is None
+
+
 def test_collisions_are_published(make_stand: Callable[..., Stand]):
     stand = make_stand()
     collisions = stand.listen("/drone/collision", Collision)

@@ -197,7 +197,7 @@ def test_a_run_counts_redone_intervals(caplog, device):
         config = load_config(settings if stiff else {**settings, "vehicle": {}})
         model = simulation.make_model(config)
         state = simulation.make_state(model)
-        with caplog.at_level(logging.INFO, logger="neurosim_core.simulation"):
+        with caplog.at_level(logging.INFO, logger="neurosim_core"):
             for _ in range(3):
                 simulation.step(model, state, [500.0, 520.0, 480.0, 510.0])
         assert (state.counts["redone intervals"] > 0) == stiff
