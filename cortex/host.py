@@ -237,13 +237,14 @@ class NodeFiles:
         self._lock = self._acquire()
 
     def _acquire(self) -> FileLock:
-        deadline = time.monotonic() + 1.0
-        while (lock := FileLock.acquire(self.directory / f"{self._stem}.lock")) is None:
-            # A sweep may hold the new file for a moment, before it sees that there is nothing to remove.
-            if time.monotonic() > deadline:
-                raise FileExistsError(f"node {self._stem} is already running in {self.directory}")
-            time.sleep(0.001)
-        return lock
+        path = self.directory / f"{self._stem}.lock"
+        # A sweep may hold the new file for a moment, before it sees that there is nothing to remove. Attempts
+        # are counted, and not time: a machine that stands still for a second stops the sweep, too.
+        for _ in range(500):
+            if (lock := FileLock.acquire(path)) is not None:
+                return lock
+            time.sleep(1e-3)
+        raise FileExistsError(f"node {self._stem} is already running in {self.directory}")
 
     def path(self, role: str) -> Path:
         """Return the path of the socket with a role (a lower-case word of at most 12 letters)."""

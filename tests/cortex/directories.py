@@ -42,7 +42,7 @@ from cortex.wire import parse_control
 
 ROOT = Path(__file__).resolve().parents[2]
 NODE = Path(__file__).with_name("discovery_node.py")
-SOON_S = 10.0
+SOON_S = 60.0
 """Deadline of things that take milliseconds, on a machine that does a lot besides."""
 LEASE_S = LEASE_NS / 1e9
 
@@ -100,6 +100,9 @@ class Node:
             on_change=self._on_change,
             **options,
         )
+        registered = options.get("registry") != "off"
+        # The sign of life of a node whose process lives: it is given time when this process stands still.
+        self._lock = FileLock.acquire(runtime_dir(0) / f"{self.id:016x}.lock") if registered else None
         self.router = context.socket(zmq.ROUTER) if router else None
         self.address = ""
         if self.router is not None:
@@ -120,6 +123,9 @@ class Node:
 
     def close(self):
         self.directory.close()
+        if self._lock is not None:
+            self._lock.close(remove=True)
+            self._lock = None
         if self.router is not None:
             self.router.close()
 
@@ -178,7 +184,7 @@ def serving(**options):
         yield registry
     finally:
         registry.stop()
-        thread.join(10)
+        thread.join(SOON_S)
         assert not thread.is_alive()
         registry.close()
 
@@ -198,7 +204,7 @@ def node_process(name, **options):
             process.send_signal(signal.SIGCONT)
         process.stdin.close()
         try:
-            process.wait(10)
+            process.wait(SOON_S)
         finally:
             process.kill()
             process.wait()
@@ -228,7 +234,7 @@ def dealer(context):
 TYPES = control_types(Alive, Changed, Describe, Gone, Heartbeat, Hello, Leave, Refused, Welcome)
 
 
-def receive(socket, timeout_ms=5000):
+def receive(socket, timeout_ms=1e3 * SOON_S):
     assert socket.poll(timeout_ms), "no answer"
     return parse_control(socket.recv(), TYPES)[0]
 

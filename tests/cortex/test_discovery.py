@@ -32,7 +32,7 @@ from directories import (
 )
 
 from cortex.codec import MalformedMessage
-from cortex.control import HEARTBEAT_NS, RECORD_BYTES_MAX
+from cortex.control import HEARTBEAT_NS, LEASE_NS, RECORD_BYTES_MAX
 from cortex.discovery import Directory
 from cortex.host import REGISTRY_LOCK, REGISTRY_SOCKET, NodeFiles, runtime_dir
 from cortex.records import (
@@ -66,11 +66,22 @@ def make(context):
         yield make_node
 
 
+@pytest.fixture
+def long_leases(monkeypatch):
+    """No lease of this process runs out during a test: what ends before has another reason."""
+    for name in ("discovery", "registry"):
+        monkeypatch.setattr(f"cortex.{name}.LEASE_NS", 10 * LEASE_NS * round(SOON_S))
+
+
 # Seeing each other
 
 
-def test_two_nodes_see_each_other_change_and_leave(make):
-    one, two = make("one"), make("two")
+def test_two_nodes_see_each_other_change_and_leave(make, long_leases):
+    with serving():
+        change_and_leave(make("one"), make("two"))
+
+
+def change_and_leave(one, two):
     drive([one, two], lambda: one.names == ["two"] and two.names == ["one"])
     assert one.directory.nodes[two.id] == dataclasses.replace(two.record, revision=1)
     assert one.changes == [frozenset({two.id})]
@@ -79,9 +90,7 @@ def test_two_nodes_see_each_other_change_and_leave(make):
     drive([one, two], lambda: one.directory.nodes[two.id].publishers)
     assert one.directory.nodes[two.id] == dataclasses.replace(two.record, revision=2)
     two.close()
-    drive(
-        [one], lambda: not one.directory.nodes, timeout_s=LEASE_S * 0.9
-    )  # it says so, no lease has to run out
+    drive([one], lambda: not one.directory.nodes)
     assert one.changes == [frozenset({two.id})] * 3
 
 
@@ -109,7 +118,7 @@ def test_two_hundred_topics_with_large_schemas(make):
 
 def test_fifty_nodes_see_each_other(make):
     nodes = [make(f"node {k:02}") for k in range(50)]
-    drive(nodes, lambda: all(len(node.directory.nodes) == 49 for node in nodes), timeout_s=30)
+    drive(nodes, lambda: all(len(node.directory.nodes) == 49 for node in nodes))
     drive_for(nodes, 2.2 * LEASE_S)  # and go on doing so
     assert all(len(node.directory.nodes) == 49 and not node.ever_lost for node in nodes)
     for node in nodes[1:]:
@@ -123,7 +132,7 @@ def test_a_node_that_is_started_before_the_registry(make, base):
     drive_for(early, 0.3)
     assert not early[0].directory.connected
     with serving():
-        drive(early, lambda: early[0].names == ["two"] and early[1].names == ["one"], timeout_s=1.0)
+        drive(early, lambda: early[0].names == ["two"] and early[1].names == ["one"])
 
 
 def test_domains_are_apart(make, context):
@@ -150,25 +159,21 @@ def test_domains_are_apart(make, context):
 # Death
 
 
-def test_a_killed_registry_is_replaced_within_a_second(make):
+def test_a_killed_registry_is_replaced(make):
     """Nodes start another, register by themselves, and meanwhile nobody is forgotten."""
     nodes = [make(f"node {k}") for k in range(5)]
     drive(nodes, lambda: all(len(node.directory.nodes) == 4 for node in nodes))
-    took_s = []
     for _ in range(3):
         old = registry_pid()
         os.kill(old, signal.SIGKILL)
-        killed = time.monotonic()
         drive(nodes, lambda old=old: registry_pid() not in (None, old))
         newcomer = make("newcomer")
         drive([*nodes, newcomer], lambda newcomer=newcomer: len(newcomer.directory.nodes) == 5)
-        took_s.append(time.monotonic() - killed)
         drive([*nodes, newcomer], lambda: all("newcomer" in node.names for node in nodes))
         drive_for([*nodes, newcomer], 1.3 * LEASE_S)  # past the lease of grace
         newcomer.close()
         drive(nodes, lambda: all(len(node.directory.nodes) == 4 for node in nodes))
         assert not {node.id for node in nodes} & set().union(*(node.ever_lost for node in nodes))
-    assert min(took_s) < 1.0  # a busy machine may need longer at times
 
 
 def test_a_registry_whose_files_were_removed_makes_way(make):
@@ -194,34 +199,32 @@ def test_who_died_with_the_registry_is_dropped_after_a_lease(make):
     os.kill(registry_pid(), signal.SIGKILL)
     drive([one, two], lambda: registry_pid() is not None and one.directory.connected)
     assert dead.id in one.directory.nodes
-    drive([one, two], lambda: one.names == ["two"] and two.names == ["one"], timeout_s=3 * LEASE_S)
+    drive([one, two], lambda: one.names == ["two"] and two.names == ["one"])
     assert one.ever_lost == {dead.id}
 
 
 def test_a_killed_node_disappears_with_its_files(make):
-    watcher = make("watcher")
-    with node_process("victim", node=0xBAD) as victim:
+    """Long before it would, were it alive and silent."""
+    with serving(stalled_s=1e6), node_process("victim", node=0xBAD) as victim:
+        watcher = make("watcher")
         drive([watcher], lambda: watcher.names == ["victim"])
         directory = runtime_dir(0)
         assert (directory / f"{0xBAD:016x}.control").is_socket()
         victim.kill()
-        killed = time.monotonic()
         drive([watcher], lambda: not watcher.directory.nodes)
-        # The lease, the registry's period of 0.1 s, and what the machine needs to get round to it.
-        assert time.monotonic() - killed < LEASE_S + 0.4
         wait_for(lambda: not list(directory.glob(f"{0xBAD:016x}.*")))
 
 
 def test_a_node_whose_process_lives_is_given_time(make):
     """A long call that holds Python's lock must not cut its streams."""
-    watcher = make("watcher")
-    with node_process("sleeper") as sleeper:
+    with serving(stalled_s=1e6), node_process("sleeper") as sleeper:
+        watcher = make("watcher")
         drive([watcher], lambda: watcher.names == ["sleeper"])
         sleeper.send_signal(signal.SIGSTOP)
         drive_for([watcher], 2 * LEASE_S)
         assert watcher.names == ["sleeper"]
         sleeper.kill()  # but not once it is dead
-        drive([watcher], lambda: not watcher.directory.nodes, timeout_s=0.5)
+        drive([watcher], lambda: not watcher.directory.nodes)
 
 
 def test_a_node_that_was_stopped_for_too_long_comes_back(make):
@@ -233,7 +236,7 @@ def test_a_node_that_was_stopped_for_too_long_comes_back(make):
             drive([watcher], lambda: not watcher.directory.nodes)
             assert (runtime_dir(0) / f"{0xBED:016x}.control").is_socket()  # it lives: nothing of it is swept
             sleeper.send_signal(signal.SIGCONT)
-            drive([watcher], lambda: watcher.names == ["sleeper"], timeout_s=3)
+            drive([watcher], lambda: watcher.names == ["sleeper"])
 
 
 def test_a_stopped_registry_disturbs_nobody(make):
@@ -247,7 +250,7 @@ def test_a_stopped_registry_disturbs_nobody(make):
     finally:
         os.kill(pid, signal.SIGCONT)
     newcomer = make("newcomer")
-    drive([*nodes, newcomer], lambda: len(newcomer.directory.nodes) == 2, timeout_s=3)
+    drive([*nodes, newcomer], lambda: len(newcomer.directory.nodes) == 2)
     drive_for(nodes, 0.5)
     assert not any(node.ever_lost for node in nodes)
 
@@ -326,13 +329,11 @@ def test_a_new_registry_must_confirm_within_a_lease(played):
     played.expect(Heartbeat)
     played.say(Alive(77, 0, 0))  # another registry
     played.expect(Hello)
-    played.say(Welcome(77, 1, [played.node.id], [1]))
     begin = time.monotonic()
-    drive_for([played.node], 0.5 * LEASE_S)
-    assert played.node.names == ["doubted", "kept"]
-    played.say(Changed(2, kept))
+    played.say(Welcome(77, 1, [played.node.id], [1]), Changed(2, kept))
     drive([played.node], lambda: played.node.names == ["kept"])
-    assert 0.9 * LEASE_S < time.monotonic() - begin < LEASE_S + 0.5
+    assert time.monotonic() - begin > LEASE_S
+    assert played.node.ever_lost == {doubted.node}
 
 
 # Without a registry
@@ -346,12 +347,12 @@ def test_static_peers_see_each_other_and_vanish_after_a_lease(make):
     for node in nodes:
         node.record = dataclasses.replace(node.record, publishers=[publisher("/new")])
         node.directory.announce()
-    drive(nodes, lambda: all(next(iter(n.directory.nodes.values())).publishers for n in nodes), timeout_s=1.0)
+    drive(nodes, lambda: all(next(iter(n.directory.nodes.values())).publishers for n in nodes))
     drive_for(nodes, 1.5 * LEASE_S)
     assert not listed.ever_lost | lister.ever_lost
     silent = time.monotonic()
     drive([listed], lambda: not listed.directory.nodes)  # the other is not driven: as if it were dead
-    assert LEASE_S - 0.3 < time.monotonic() - silent < LEASE_S + 0.5
+    assert time.monotonic() - silent > LEASE_S - 2 * HEARTBEAT_NS / 1e9
 
 
 def test_a_static_peer_that_dies_vanishes_and_its_successor_is_found(make, context):
@@ -360,31 +361,29 @@ def test_a_static_peer_that_dies_vanishes_and_its_successor_is_found(make, conte
     drive([listed, lister], lambda: lister.names == ["first"])
     address = listed.address
     listed.close()
-    begin = time.monotonic()
     drive([lister], lambda: not lister.directory.nodes)
-    assert time.monotonic() - begin < LEASE_S + 0.5
     successor = make("second", registry="off", router=True)
     successor.router.unbind(successor.address)
     successor.router.bind(address)
     drive([successor, lister], lambda: lister.names == ["second"] and successor.names == ["lister"])
 
 
-def test_who_takes_over_the_address_of_a_peer_replaces_it(make):
+def test_who_takes_over_the_address_of_a_peer_replaces_it(make, long_leases):
     """At once, although the lease of the first is renewed by nobody and ended by nobody."""
     listed = make("first", registry="off", router=True)
     lister = make("lister", registry="off", peers=[listed.address])
     drive([listed, lister], lambda: lister.names == ["first"])
     successor = make("second", registry="off")
     listed.directory, successor.directory = successor.directory, listed.directory
-    drive([listed, lister], lambda: lister.names == ["second"], timeout_s=0.8 * LEASE_S)
+    drive([listed, lister], lambda: lister.names == ["second"])
 
 
-def test_a_peer_that_leaves_is_dropped_at_once(make):
+def test_a_peer_that_leaves_is_dropped_at_once(make, long_leases):
     listed = make("listed", registry="off", router=True)
     lister = make("lister", registry="off", peers=[listed.address])
     drive([listed, lister], lambda: listed.names == ["lister"] and lister.names == ["listed"])
     lister.close()
-    drive([listed], lambda: not listed.directory.nodes, timeout_s=0.8 * LEASE_S)
+    drive([listed], lambda: not listed.directory.nodes)
 
 
 def test_a_node_known_twice_stays_while_either_knows_it(make):
@@ -447,7 +446,8 @@ def test_silence_is_said_once(make, caplog, monkeypatch):
     monkeypatch.setattr("cortex.discovery._SILENCE_NS", 200_000_000)
     node = make("one", registry="tcp://127.0.0.1:9", peers=["ipc:///nonexistent/x"])
     with caplog.at_level(logging.WARNING, "cortex.discovery"):
-        drive_for([node], 0.6)
+        drive([node], lambda: caplog.text.count("no answer of") == 2)
+        drive_for([node], 0.4)
     assert caplog.text.count("no answer of the registry at tcp://127.0.0.1:9") == 1
     assert caplog.text.count("no answer of the peer at ipc:///nonexistent/x") == 1
 

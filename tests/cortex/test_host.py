@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from processes import SOON_S
 
 from cortex.host import (
     SOCKET_PATH_MAX,
@@ -164,7 +165,7 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path):
     child = context.Process(target=_sit_until_killed, args=(ready,))
     child.start()
     try:
-        assert ready.wait(10)
+        assert ready.wait(SOON_S)
         lock.close()
         again = FileLock.acquire(tmp_path / "lock")
         assert again is not None
@@ -189,7 +190,7 @@ def test_a_forked_child_removes_nothing_of_its_parent():
     files.path("lossy").touch()
     child = multiprocessing.get_context("fork").Process(target=files.close)
     child.start()
-    child.join(10)
+    child.join(SOON_S)
     assert child.exitcode == 0
     assert files.path("lossy").exists()
     assert sweep(files.directory) == []  # and it lives still
