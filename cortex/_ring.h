@@ -1,4 +1,4 @@
-/* Slots of a ring, for the short cuts of `_native.c`; see `_ring.c`. */
+/* Slots of a ring, for the short cuts of `_gate.c` and `_coder.c`; see `_ring.c`. */
 
 #ifndef CORTEX_RING_H
 #define CORTEX_RING_H
