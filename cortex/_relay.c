@@ -230,15 +230,6 @@ static int any_late(const Relay *relay) {
     return 0;
 }
 
-/* Detach the members of a kind that leave no room for a frame; 0: no memory. */
-static int detach_slow(Relay *relay, size_t size, int strict) {
-    for (int place = 0; place < relay->used; ++place) {
-        Member *member = &relay->members[place];
-        if (member->strict == strict && is_in_the_way(relay, member, size) && !detach(relay, member)) return 0;
-    }
-    return 1;
-}
-
 /* Another ring for an unusual frame, or the usual one again; it must be empty. 0: no memory. */
 static int resize(Relay *relay, size_t size) {
     const size_t wanted = size > RING_BYTES ? size : RING_BYTES;
@@ -265,7 +256,10 @@ static int make_room(Relay *relay, size_t size) {
         const Member *member = &relay->members[place];
         if (member->strict && is_in_the_way(relay, member, size)) return 0;
     }
-    if (!detach_slow(relay, size, 0)) return -1;
+    for (int place = 0; place < relay->used; ++place) {
+        Member *member = &relay->members[place];
+        if (is_in_the_way(relay, member, size) && !detach(relay, member)) return -1;
+    }
     if (size <= relay->capacity && relay->capacity <= RING_BYTES) return 1;
     return !is_empty(relay) || resize(relay, size) ? 1 : -1;
 }
@@ -318,19 +312,6 @@ PyDoc_STRVAR(offer_doc,
 static PyObject *relay_offer(Relay *relay, PyObject *const *arguments, Py_ssize_t count) {
     PyObject *frame = frame_argument(arguments, count);
     return frame == NULL ? NULL : put(relay, frame, 1);
-}
-
-PyDoc_STRVAR(give_up_doc,
-"give_up($self, frame, /)\n--\n\n"
-"Reliable members that have no room for a frame are late: they lose what comes, until half of what waits is written.");
-
-static PyObject *relay_give_up(Relay *relay, PyObject *frame) {
-    if (frame_argument(&frame, 1) == NULL) return NULL;
-    if (relay->closed) Py_RETURN_NONE;
-    pthread_mutex_lock(&relay->lock);
-    const int done = detach_slow(relay, (size_t)PyBytes_GET_SIZE(frame), 1);
-    pthread_mutex_unlock(&relay->lock);
-    return done ? Py_NewRef(Py_None) : PyErr_NoMemory();
 }
 
 PyDoc_STRVAR(add_doc,
@@ -404,6 +385,39 @@ static PyObject *relay_take(Relay *relay, PyObject *number) {
     }
     pthread_mutex_unlock(&relay->lock);
     return taken;
+}
+
+static PyObject *relay_in_the_way(Relay *relay, PyObject *frame) {
+    if (frame_argument(&frame, 1) == NULL) return NULL;
+    int numbers[MEMBERS_MAX], count = 0;
+    pthread_mutex_lock(&relay->lock);
+    for (int place = 0; place < relay->used; ++place) {
+        const Member *member = &relay->members[place];
+        if (member->strict && is_in_the_way(relay, member, (size_t)PyBytes_GET_SIZE(frame))) numbers[count++] = place;
+    }
+    pthread_mutex_unlock(&relay->lock);
+    PyObject *list = PyList_New(count);
+    for (int index = 0; list != NULL && index < count; ++index) {
+        PyObject *number = PyLong_FromLong(numbers[index]);
+        if (number == NULL) Py_CLEAR(list);
+        else PyList_SET_ITEM(list, index, number);
+    }
+    return list;
+}
+
+PyDoc_STRVAR(give_up_doc,
+"give_up($self, frame, number, /)\n--\n\n"
+"A member that has no room for a frame is late: it loses what comes, until half of what waits is written.");
+
+static PyObject *relay_give_up(Relay *relay, PyObject *const *arguments, Py_ssize_t count) {
+    if (!arguments_are(count, 2) || frame_argument(arguments, 1) == NULL) return NULL;
+    Member *member = member_argument(relay, arguments[1]);
+    if (member == NULL) return NULL;
+    pthread_mutex_lock(&relay->lock);
+    const int slow = is_in_the_way(relay, member, (size_t)PyBytes_GET_SIZE(arguments[0]));
+    const int done = !slow || detach(relay, member);
+    pthread_mutex_unlock(&relay->lock);
+    return done ? Py_NewRef(Py_None) : PyErr_NoMemory();
 }
 
 static PyObject *relay_remove(Relay *relay, PyObject *number) {
@@ -505,7 +519,8 @@ static void relay_dealloc(Relay *relay) {
 static PyMethodDef relay_methods[] = {
     {"send", (PyCFunction)(void (*)(void))relay_send, METH_FASTCALL, send_doc},
     {"offer", (PyCFunction)(void (*)(void))relay_offer, METH_FASTCALL, offer_doc},
-    {"give_up", (PyCFunction)relay_give_up, METH_O, give_up_doc},
+    {"in_the_way", (PyCFunction)relay_in_the_way, METH_O, "Numbers of the reliable members that have no room for a frame."},
+    {"give_up", (PyCFunction)(void (*)(void))relay_give_up, METH_FASTCALL, give_up_doc},
     {"add", (PyCFunction)relay_add, METH_VARARGS, add_doc},
     {"take", (PyCFunction)relay_take, METH_O, take_doc},
     {"remove", (PyCFunction)relay_remove, METH_O, "Write to a member no more, and close its pipe."},

@@ -6,7 +6,7 @@ has one, and none while the reader is busy. So a local reader that shares memory
 its number, before it attaches; a publisher that can open it sends everything but the answer there (WIRE.md,
 section 3.3). Who does not know of this goes on with ZeroMQ.
 
-The ends are in C (`_native.c`) where that was compiled, else the classes here.
+The ends are in C (`_pipe.c`) where that was compiled, else the classes here.
 """
 
 from __future__ import annotations
@@ -84,7 +84,11 @@ class Relay(Protocol):
         """As `send`, but do not mind who is late; False if somebody is, and loses it."""
         ...
 
-    def give_up(self, frame: bytes, /) -> None:
+    def in_the_way(self, frame: bytes, /) -> list[int]:
+        """The reliable readers that have no room for a frame."""
+        ...
+
+    def give_up(self, frame: bytes, member: int, /) -> None:
         """Who has no room for a frame is late: it loses what comes until it has read half of what waits."""
         ...
 

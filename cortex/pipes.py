@@ -8,6 +8,7 @@ frames instead and writes to each reader in turn what has come meanwhile: 8 read
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -125,10 +126,6 @@ class Pipes:
         reader.late = not send() and (reader.late or not self._await_room(send, reader.timeout_s))
         return not reader.late
 
-    @property
-    def _timeout_s(self) -> float:
-        return max((reader.timeout_s for reader in self._relayed), default=0.0)
-
     def _send_relayed(self, frame: bytes) -> bool:
         relay = self._relay
         if relay is None:
@@ -143,10 +140,15 @@ class Pipes:
                 return False
             return True
 
-        if not send() and not self._await_room(send, self._timeout_s):
-            relay.give_up(frame)
-            send()
-            return False
+        begin_s = time.monotonic()
+        while not send():
+            slow = relay.in_the_way(frame)
+            timeout_s = min((r.timeout_s for r in self._relayed if r.member in slow), default=0.0)
+            if self._await_room(send, timeout_s - (time.monotonic() - begin_s)):
+                break
+            for reader in self._relayed:
+                if reader.member in slow and reader.timeout_s <= time.monotonic() - begin_s:
+                    relay.give_up(frame, reader.member)
         return on_time
 
     def flush(self) -> None:
