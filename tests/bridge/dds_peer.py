@@ -26,7 +26,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-SOON_S = 15.0
+SOON_S = 60.0
 
 
 def _struct(name: str, /, **fields: Any) -> Any:

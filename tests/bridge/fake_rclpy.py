@@ -324,7 +324,7 @@ class Node:
                 (service.srv_type.Request(), lambda response: (done.append(response), answered.set()))
             )
             service.node.context.wake.notify_all()
-        assert answered.wait(10.0)
+        assert answered.wait(60.0)
         return done[0]
 
 

@@ -17,7 +17,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-SOON_S = 15.0
+SOON_S = 60.0
 
 
 def _class(type_name: str) -> Any:

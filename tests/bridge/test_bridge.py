@@ -368,7 +368,7 @@ def test_a_bridge_that_is_too_slow_loses_messages_counted_and_holds_nobody_up():
         go_on, publish = threading.Event(), ros.publish
 
         def blocked(data):
-            assert go_on.wait(10.0)
+            assert go_on.wait(SOON_S)
             publish(data)
 
         ros.publish = blocked
@@ -722,7 +722,7 @@ def test_closing_gives_up_a_call_that_is_under_way():
     release = threading.Event()
 
     def answer(request):
-        release.wait(10.0)
+        release.wait(SOON_S)
         return msg.SimulatorReply(True, "", 0, "running")
 
     with rig_of() as rig, Node("services") as server:

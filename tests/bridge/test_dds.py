@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreigners import Foreigner
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo, Trigger
 from cortex_ros2_bridge.backend.cyclone import Fast, Public, Refused, choose_transport, self_test
@@ -442,13 +442,13 @@ def test_a_busy_callback_holds_up_its_own_topic_only(backend: DdsBackend) -> Non
     def callback(message: bytes) -> None:
         slow.append(message)
         entered.set()
-        go.wait(10.0)
+        go.wait(SOON_S)
 
     backend.subscription("/slow", STRING, Qos(depth=2), callback)
     backend.subscription("/quick", STRING, Qos(), quick.append)
     publishers = [backend.publisher(topic, STRING, Qos()) for topic in ("/slow", "/quick")]
     publishers[0].publish(text("0"))
-    assert entered.wait(10.0)
+    assert entered.wait(SOON_S)
     for number in range(1, 6):
         for publisher in publishers:
             publisher.publish(text(str(number)))
@@ -465,20 +465,20 @@ def test_a_closed_subscription_does_not_call(backend: DdsBackend) -> None:
 
     def callback(message: bytes) -> None:
         entered.set()
-        go.wait(10.0)
+        go.wait(SOON_S)
         got.append(message)
 
     subscription = backend.subscription("/words", STRING, Qos(), callback)
     publisher = backend.publisher("/words", STRING, Qos())
     publisher.publish(text("a"))
-    assert entered.wait(10.0)
+    assert entered.wait(SOON_S)
     publisher.publish(text("b"))
     closing = threading.Thread(target=subscription.close)
     closing.start()
     wait_for(lambda: subscription._deliver._closed)
     assert closing.is_alive()
     go.set()
-    closing.join(10.0)
+    closing.join(SOON_S)
     assert len(got) == 1
     assert publisher.subscriber_count == 0
 
@@ -544,7 +544,7 @@ def test_threads_publish_at_once(backend: DdsBackend) -> None:
     for sender in senders:
         sender.start()
     for sender in senders:
-        sender.join(20.0)
+        sender.join(SOON_S)
     wait_for(lambda: counts == [100] * 4)
 
 

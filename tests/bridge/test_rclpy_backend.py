@@ -12,7 +12,7 @@ from typing import Any
 
 import fake_rclpy
 import pytest
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo, Trigger
 from cortex_ros2_bridge.backend.choose import open_backend
@@ -170,7 +170,7 @@ def test_a_slow_service_does_not_hold_up_messages(fake: None) -> None:
     go, got, replies = threading.Event(), [], []
 
     def serve() -> Trigger:
-        assert go.wait(10.0)
+        assert go.wait(SOON_S)
         return Trigger(True, "")
 
     node.service("/reset", serve)
@@ -181,7 +181,7 @@ def test_a_slow_service_does_not_hold_up_messages(fake: None) -> None:
     wait_for(lambda: got)
     assert replies == []
     go.set()
-    asking.join(10.0)
+    asking.join(SOON_S)
     assert replies[0].success
     node.close()
     other.close()

@@ -138,7 +138,7 @@ class Impostor:
     def await_key(self) -> bytes:
         """The attach key of the subscriber."""
         while True:
-            assert self.xpub.poll(10_000)
+            assert self.xpub.poll(1e3 * 60.0)
             event = self.xpub.recv()
             if event[:5] == b"\x01CTXA":
                 return bytes(event[1:])

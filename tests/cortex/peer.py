@@ -119,7 +119,7 @@ class Peer:
         return {"ok": self.publishers[topic].wait_for_subscribers(count, 60.0)}
 
     def await_publisher(self, topic: str) -> dict[str, Any]:
-        return {"ok": self.subscribers[topic].wait_for_publisher(10.0)}
+        return {"ok": self.subscribers[topic].wait_for_publisher(60.0)}
 
     def publish(
         self, topic: str, count: int, start: int = 0, size: int = 0, rate_hz: float = 0.0
@@ -138,7 +138,7 @@ class Peer:
         publisher.flush()
         return {"delivered": delivered, "longest_s": longest_s, "took_s": time.monotonic() - begin_s}
 
-    def receive(self, topic: str, until: int, timeout_s: float = 10.0, keep: bool = False) -> dict[str, Any]:
+    def receive(self, topic: str, until: int, timeout_s: float = 60.0, keep: bool = False) -> dict[str, Any]:
         """Receive until a number has come; says what came."""
         subscriber = self.subscribers[topic]
         count, last, ordered, whole = 0, -1, True, True

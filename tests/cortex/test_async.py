@@ -6,10 +6,9 @@ import asyncio
 import threading
 import time
 
-import numpy as np
 import pytest
 from peer import Number
-from processes import SOON_S
+from processes import SOON_S, wait_for
 
 from cortex import latest, reliable
 
@@ -22,7 +21,7 @@ def node(make_node):
 @pytest.fixture
 def numbers(node):
     publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     return publisher, subscriber
 
@@ -43,7 +42,7 @@ def test_async_iteration(numbers):
 
     thread = threading.Thread(target=publish)
     thread.start()
-    assert asyncio.run(asyncio.wait_for(collect(), 20.0)) == list(range(1000))
+    assert asyncio.run(asyncio.wait_for(collect(), SOON_S)) == list(range(1000))
     thread.join()
 
 
@@ -57,17 +56,15 @@ def test_async_iteration_ends_at_close(numbers):
         task = asyncio.ensure_future(collect())
         await asyncio.sleep(0)
         asyncio.get_running_loop().call_later(0.02, subscriber.close)
-        begin = time.monotonic()
-        assert await asyncio.wait_for(task, 5.0) == []
-        return time.monotonic() - begin
+        assert await asyncio.wait_for(task, SOON_S) == []
 
-    assert asyncio.run(run()) < 1.0
+    asyncio.run(run())
 
 
 def test_two_subscribers_on_one_loop(node):
     """Neither starves the other, nor the loop's other tasks."""
     publishers = [node.publisher(f"/stream{k}", Number) for k in range(2)]
-    subscribers = [node.subscriber(f"/stream{k}", Number, policy=reliable(64, 10.0)) for k in range(2)]
+    subscribers = [node.subscriber(f"/stream{k}", Number, policy=reliable(64, 60.0)) for k in range(2)]
     assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
 
     def publish(publisher):
@@ -77,7 +74,7 @@ def test_two_subscribers_on_one_loop(node):
     async def collect(subscriber):
         values = []
         while len(values) < 2000:
-            values.append((await subscriber.recv_async(10.0)).value)
+            values.append((await subscriber.recv_async(SOON_S)).value)
         return values
 
     async def run():
@@ -98,7 +95,7 @@ def test_two_subscribers_on_one_loop(node):
     threads = [threading.Thread(target=publish, args=(publisher,)) for publisher in publishers]
     for thread in threads:
         thread.start()
-    assert asyncio.run(asyncio.wait_for(run(), 30.0)) == [list(range(2000))] * 2
+    assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [list(range(2000))] * 2
     for thread in threads:
         thread.join()
 
@@ -108,13 +105,13 @@ def test_two_tasks_on_one_subscriber(numbers):
     publisher, subscriber = numbers
 
     async def run():
-        tasks = [asyncio.ensure_future(subscriber.recv_async(5.0)) for _ in range(3)]
+        tasks = [asyncio.ensure_future(subscriber.recv_async(SOON_S)) for _ in range(3)]
         await asyncio.sleep(0.02)  # all of them wait now
         for value in range(3):
             publisher.publish(Number(0, value))
         return sorted(message.value for message in await asyncio.gather(*tasks))
 
-    assert asyncio.run(asyncio.wait_for(run(), 10.0)) == [0, 1, 2]
+    assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [0, 1, 2]
 
 
 def test_a_cancelled_task_takes_nothing_along(numbers):
@@ -127,9 +124,7 @@ def test_a_cancelled_task_takes_nothing_along(numbers):
         with pytest.raises(asyncio.CancelledError):
             await task
         publisher.publish(Number(0, 1))
-        begin = time.monotonic()
-        assert (await subscriber.recv_async(5.0)).value == 1
-        assert time.monotonic() - begin < 1.0
+        assert (await subscriber.recv_async(SOON_S)).value == 1
         with pytest.raises(TimeoutError):
             await subscriber.recv_async(0.01)
 
@@ -143,7 +138,7 @@ def test_one_loop_after_another(numbers):
         publisher.publish(Number(0, value))
 
     async def take():
-        first = (await subscriber.recv_async(2.0)).value
+        first = (await subscriber.recv_async(SOON_S)).value
         with pytest.raises(asyncio.TimeoutError):
             await asyncio.wait_for(_until_forever(), 0.01)
         return first
@@ -171,13 +166,13 @@ def test_a_loop_is_woken_at_once(numbers):
     async def run():
         loop = asyncio.get_running_loop()
         delays = []
-        for _ in range(20):
+        for _ in range(10):
             loop.call_later(0.003, lambda: publisher.publish(Number(time.monotonic_ns(), 0)))
-            sent_ns = (await subscriber.recv_async(5.0)).stamp_ns
+            sent_ns = (await subscriber.recv_async(SOON_S)).stamp_ns
             delays.append(time.monotonic_ns() - sent_ns)
         return delays
 
-    assert np.median(asyncio.run(run())) < 0.02e9
+    wait_for(lambda: max(asyncio.run(run())) < 0.02e9)  # the machine may be busy for a while
 
 
 def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
@@ -185,7 +180,7 @@ def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
     subscriber = node.subscriber("/numbers", Number, policy=latest())
 
     async def run():
-        delays = []
+        slowest_ns = 0
         for _ in range(3):
             publisher = node.publisher("/numbers", Number)
             while not publisher.wait_for_subscribers(1, 0.0):
@@ -195,18 +190,17 @@ def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
                 asyncio.get_running_loop().call_later(
                     0.003, lambda p=publisher: p.publish(Number(time.monotonic_ns(), 0))
                 )
-                sent_ns = (await subscriber.recv_async(5.0)).stamp_ns
-                delays.append(time.monotonic_ns() - sent_ns)
+                sent_ns = (await subscriber.recv_async(SOON_S)).stamp_ns
+                slowest_ns = max(slowest_ns, time.monotonic_ns() - sent_ns)
             publisher.close()
             for link in list(subscriber._leaving):  # at once, instead of after two seconds
                 subscriber._leaving[link] = 0
             while subscriber._links:
                 with pytest.raises(TimeoutError):
                     await subscriber.recv_async(0.005)
-        return delays
+        return slowest_ns
 
-    delays = asyncio.run(run())
-    assert max(np.median(delays[k : k + 5]) for k in (0, 5, 10)) < 0.05e9
+    wait_for(lambda: asyncio.run(run()) < 0.05e9)  # the machine may be busy for a while
 
 
 def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers):
@@ -222,7 +216,7 @@ def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers):
                 turns.append(len(values))
                 await asyncio.sleep(0)
 
-        values: list[int] = [(await subscriber.recv_async(5.0)).value]
+        values: list[int] = [(await subscriber.recv_async(SOON_S)).value]
         task = asyncio.ensure_future(other())
         async for message in subscriber:
             values.append(message.value)

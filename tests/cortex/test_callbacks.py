@@ -29,7 +29,7 @@ def scan(number, size=LARGE):
 def test_callbacks_are_called_in_order(node):
     received = []
     publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, received.append, policy=reliable(64, 5.0))
+    subscriber = node.subscriber("/numbers", Number, received.append, policy=reliable(64, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(3000):
         assert publisher.publish(Number(value, value))
@@ -58,7 +58,7 @@ def test_a_callback_that_raises_is_logged_and_called_again(node, caplog):
 def test_callbacks_of_large_and_small_messages_keep_the_order(node):
     received = []
     publisher = node.publisher("/scans", Scan)
-    node.subscriber("/scans", Scan, lambda m: received.append(m.stamp_ns), policy=reliable(8, 5.0))
+    node.subscriber("/scans", Scan, lambda m: received.append(m.stamp_ns), policy=reliable(8, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for number in range(300):
         assert publisher.publish(scan(number, LARGE if number % 3 == 0 else 5))
@@ -85,7 +85,7 @@ def test_no_callback_after_close(node):
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for value in range(30):
         publisher.publish(Number(value, value))
-    assert started.wait(5.0)
+    assert started.wait(SOON_S)
     subscriber.close()
     running, state["closed"] = state["running"], True
     assert not running
@@ -108,13 +108,13 @@ def test_a_callback_closes_its_subscriber(node):
 
     publisher = node.publisher("/numbers", Number)
     blocker, free = threading.Event(), threading.Event()
-    node.subscriber("/block", Number, lambda message: (blocker.set(), free.wait(5.0)))
+    node.subscriber("/block", Number, lambda message: (blocker.set(), free.wait(SOON_S)))
     block = node.publisher("/block", Number)
     subscribers.append(node.subscriber("/numbers", Number, once))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     assert block.wait_for_subscribers(timeout_s=SOON_S)
     block.publish(Number(0, 0))
-    assert blocker.wait(5.0)
+    assert blocker.wait(SOON_S)
     for value in range(10):
         publisher.publish(Number(0, value))
     free.set()
@@ -134,7 +134,7 @@ def test_a_callback_closes_its_node(make_node):
     node.subscriber("/numbers", Number, close)
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     publisher.publish(Number(0, 0))
-    assert closed.wait(5.0)
+    assert closed.wait(SOON_S)
     with pytest.raises(Closed):
         publisher.publish(Number(0, 0))
 

@@ -44,7 +44,7 @@ def _compile(text: str, tmp_path: Path, body: str = "") -> subprocess.CompletedP
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=60.0,
+        timeout=300.0,
         check=False,
     )
 

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 from peer import Block, Scan, is_whole, make_block
-from processes import wait_for
+from processes import SOON_S, wait_for
 from test_large import connected, scan, slots_held
 
 from cortex import Closed, keep_last, reliable
@@ -33,7 +33,7 @@ def test_the_gate_sends_large_messages_itself(node, monkeypatch):
     publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
     for number in range(3):
         publisher.publish(scan(number))
-        subscriber.recv(1.0)
+        subscriber.recv(SOON_S)
     ledger = publisher._gate.ledger
     assert ledger is not None
     monkeypatch.setattr(publisher, "_publish_slowly", None)
@@ -57,7 +57,7 @@ def test_what_is_not_as_usual_goes_the_long_way(node):
     publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
     for number in range(3):
         publisher.publish(scan(number))
-        subscriber.recv(1.0)
+        subscriber.recv(SOON_S)
     with pytest.raises(TypeError, match="carries Scan"):
         publisher.publish(make_block(0, 100_000))
     with pytest.raises(TypeError, match="float64"):
@@ -65,7 +65,7 @@ def test_what_is_not_as_usual_goes_the_long_way(node):
     with pytest.raises((TypeError, ValueError), match="stamp_ns"):
         publisher.publish(Scan("soon", np.zeros(100_000, np.float32)))
     assert publisher.publish(Scan(5, np.arange(200_000, dtype=np.float32)[::2]))
-    message = subscriber.recv(1.0)
+    message = subscriber.recv(SOON_S)
     assert message.stamp_ns == 5
     assert (message.ranges == np.arange(0, 200_000, 2)).all()
     del message
@@ -108,7 +108,7 @@ def test_publishers_in_several_threads(node):
         worker.start()
     seen = {}
     for _ in range(count * threads):
-        block = subscriber.recv(10.0)
+        block = subscriber.recv(SOON_S)
         assert is_whole(block)
         key = (block.number, len(block.data))
         seen[key] = seen.get(key, 0) + 1
@@ -135,7 +135,7 @@ def test_closing_while_others_publish(node):
 
         thread = threading.Thread(target=publish)
         thread.start()
-        subscriber.recv(5.0)
+        subscriber.recv(SOON_S)
         time.sleep(0.003)
         publisher.close(linger_s=0.0)
         thread.join(10.0)

@@ -76,7 +76,7 @@ def take(subscriber: Subscriber[Scan], *expected: int) -> None:
     assert (counters.lost, counters.rejected, counters.overtaken) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("policy", [reliable(64, 5.0), keep_last(64)], ids=str)
+@pytest.mark.parametrize("policy", [reliable(64, 60.0), keep_last(64)], ids=str)
 def test_a_late_announcement_takes_no_lease_back(node, policy):
     """Messages in a newer ring are on their way at the moment when that of an older ring is read."""
     publisher, subscriber = connected(node, Scan, policy)
@@ -100,7 +100,7 @@ def test_a_late_announcement_takes_no_lease_back(node, policy):
 
 def test_the_announcement_of_a_ring_that_is_gone_means_nothing(node):
     """It was read, given back, replaced and closed before the socket brought the news of it."""
-    publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
+    publisher, subscriber = connected(node, Scan, reliable(64, 60.0))
     with announcements_held(publisher) as release:
         for number, size in enumerate((5_000, 50_000)):
             assert publisher.publish(scan(number, size))
@@ -116,10 +116,10 @@ def test_the_announcement_of_a_ring_that_is_gone_means_nothing(node):
 
 def test_the_ring_of_the_answer_may_be_gone(node):
     """A reader attaches while a ring is replaced: the answer names the old one."""
-    publisher, first = connected(node, Scan, reliable(64, 5.0))
+    publisher, first = connected(node, Scan, reliable(64, 60.0))
     publisher.publish(scan(0, 5_000))
     take(first, 0)
-    subscriber = node.subscriber("/large", Scan, policy=reliable(64, 5.0))
+    subscriber = node.subscriber("/large", Scan, policy=reliable(64, 60.0))
     with subscriber._turn.lock:  # it reads nothing yet
         assert publisher.wait_for_subscribers(2, SOON_S)
         publisher.publish(scan(1, 50_000))
@@ -132,7 +132,7 @@ def test_the_ring_of_the_answer_may_be_gone(node):
     take(subscriber, 2)
 
 
-@pytest.mark.parametrize("policy", [reliable(64, 5.0), keep_last(64)], ids=str)
+@pytest.mark.parametrize("policy", [reliable(64, 60.0), keep_last(64)], ids=str)
 def test_a_loan_in_an_older_ring_comes_after_a_newer_one(node, policy):
     """The reader has mapped the older ring and has no message of it when both are on their way."""
     publisher, subscriber = connected(node, Scan, policy)
@@ -147,7 +147,7 @@ def test_a_loan_in_an_older_ring_comes_after_a_newer_one(node, policy):
 
 def test_rings_wait_for_a_reliable_reader(node):
     """Far more rings than are written at a time, all of them on their way to a reader that sleeps."""
-    publisher, subscriber = connected(node, Scan, reliable(64, 5.0))
+    publisher, subscriber = connected(node, Scan, reliable(64, 60.0))
     sizes = [5_000 * 3**k // 2**k for k in range(12)]
     for number, size in enumerate(sizes):
         assert publisher.publish(scan(number, size))
@@ -176,7 +176,7 @@ def test_who_hoards_every_slot_costs_a_reliable_reader_nothing(node):
     for number in range(slots):
         publisher.publish(scan(number))
         hoard.append(hoarder.recv(SOON_S))
-    subscriber = node.subscriber("/large", Scan, policy=reliable(8, 5.0))
+    subscriber = node.subscriber("/large", Scan, policy=reliable(8, 60.0))
     assert publisher.wait_for_subscribers(2, SOON_S)
     for number in range(100, 110):
         assert publisher.publish(scan(number))
@@ -203,7 +203,7 @@ def accepted_before(error: type[Exception], publisher: Publisher[Scan]) -> int:
 
 def test_an_interrupted_publish_gives_its_slot_back(node, monkeypatch):
     """A reliable reader has no room, and the wait for it is broken off, again and again."""
-    publisher, subscriber = connected(node, Scan, reliable(2, timeout_s=30.0))
+    publisher, subscriber = connected(node, Scan, reliable(2, timeout_s=60.0))
     publisher.publish(scan(0))
     wait_for(lambda: is_shared(subscriber.recv(SOON_S)))
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Number, Scan
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from cortex import keep_last
 from cortex.codec import codec_of
@@ -82,7 +82,7 @@ class Feed:
         answer = shown if shared else AttachAnswer(0, None, (), b"")
         self.answer = answer_frame(self.key, answer)
         self.socket.send(self.answer)
-        assert self.subscriber.wait_for_publisher()
+        assert self.subscriber.wait_for_publisher(SOON_S)
 
     def _attach(self):
         while self.socket.poll(0):

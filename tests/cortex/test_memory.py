@@ -291,7 +291,7 @@ except ShmUnavailable as error:
     print(errno.errorcode[error.errno], end="")
 """
     command = [sys.executable, "-c", script]
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=30)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300.0)
     assert (run.returncode, run.stdout, run.stderr) == (0, code, "")
 
 

@@ -24,11 +24,11 @@ from cortex.security import AUTHORIZED_FILE, Keys, new_keys
 ROOT = Path(__file__).resolve().parents[2]
 NODE = Path(__file__).with_name("discovery_node.py")
 ADDRESSES = ("10.213.7.1", "10.213.7.2")
-SOON_S = 15.0
+SOON_S = 60.0
 
 
 def ip(*arguments: str) -> None:
-    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=10, check=False)
+    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=300.0, check=False)
     if done.returncode:
         raise OSError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 
@@ -114,7 +114,7 @@ class Process:
         if self._process.poll() is None:
             self._process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(5)
+                self._process.wait(60.0)
         self._process.kill()
         self._process.wait()
         self._process.stdout.close()

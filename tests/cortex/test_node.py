@@ -176,7 +176,7 @@ def test_junk_on_the_control_socket(make_node, caplog):
         for parts in junk:
             socket.send_multipart(parts)
         socket.send(control_frame(StatsRequest(0), 8))
-        assert socket.poll(5000)
+        assert socket.poll(1e3 * SOON_S)
         reply, header = parse_control(socket.recv(), control_types(StatsReply))
         assert header.sequence == 8
         assert isinstance(reply, StatsReply)
@@ -237,7 +237,7 @@ def test_closing_in_any_order(make_node):
             things[index].close()
         own.close()
         stop.set()
-        thread.join(5.0)
+        thread.join(SOON_S)
         assert not thread.is_alive()
 
 
@@ -252,7 +252,7 @@ def test_closing_from_several_threads(make_node):
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(10.0)
+            thread.join(SOON_S)
             assert not thread.is_alive()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -171,12 +170,10 @@ def test_a_reader_that_is_gone_takes_everything(ends):
 
 @pytest.mark.parametrize("reader", READERS)
 def test_waiting_ends_with_a_frame_from_either_side_or_in_time(reader):
-    both = Ends(pipe.PyWriter, reader, wait_ms=2000)
-    begin = time.monotonic()
+    both = Ends(pipe.PyWriter, reader, wait_ms=int(1e3 * SOON_S))
     timer = threading.Timer(0.05, both.writer.send, (frame(7),))
     timer.start()
     assert both.reader.receive(0) == frame(7)
-    assert time.monotonic() - begin < 1.5
     timer.join()
     both.close()
     brief = Ends(pipe.PyWriter, reader, wait_ms=10)
@@ -217,7 +214,7 @@ def test_names_of_dead_readers_are_swept(tmp_path: Path):
     living.close()
 
 
-@pytest.mark.parametrize("policy", [reliable(8, 10.0), keep_last(8)], ids=str)
+@pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
 def test_processes_speak_through_pipes(make_node, start_child, runtime, policy):
     """Small and large messages in one order; no name is left where the nodes meet."""
     child = start_child(

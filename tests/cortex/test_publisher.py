@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Number, Scan
-from processes import SOON_S, wait_for
+from processes import SOON_S, in_time, wait_for
 
 from cortex import keep_last, reliable
 from cortex.context import new_socket
@@ -43,7 +43,8 @@ def test_nobody_listens(node):
     assert publisher.subscriber_count == 0
     begin = time.monotonic()
     assert not publisher.wait_for_subscribers(1, 0.05)
-    assert 0.05 <= time.monotonic() - begin < 1.0
+    assert time.monotonic() - begin >= 0.05
+    in_time(lambda: publisher.wait_for_subscribers(1, 0.05), 1.0)
 
 
 @pytest.mark.parametrize("listened", [False, True])
@@ -119,7 +120,7 @@ def test_arrays_that_are_not_contiguous(node):
 @pytest.mark.parametrize("coalesce", [False, True])
 def test_small_and_large_messages_keep_their_order(node, coalesce):
     publisher = node.publisher("/scans", Scan, coalesce=coalesce)
-    subscriber = node.subscriber("/scans", Scan, policy=reliable(8, 10.0))
+    subscriber = node.subscriber("/scans", Scan, policy=reliable(8, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     sizes = [1, 1, 1, LARGE, 1, LARGE, LARGE, 1, 4096, 4097, 20_000, 1]
     received = []
@@ -134,7 +135,7 @@ def test_small_and_large_messages_keep_their_order(node, coalesce):
     thread.start()
     for number, size in zip(range(240), itertools.cycle(sizes), strict=False):
         assert publisher.publish(scan(number, size))
-    thread.join(20.0)
+    thread.join(SOON_S)
     assert received == [(k, k, sizes[k % len(sizes)]) for k in range(240)]
 
 
@@ -144,7 +145,7 @@ def test_several_threads_publish(node, coalesce):
     publisher = node.publisher("/scans", Scan, coalesce=coalesce)
     received = []
     subscriber = node.subscriber(
-        "/scans", Scan, lambda m: received.append((m.stamp_ns, len(m.ranges))), policy=reliable(8, 20.0)
+        "/scans", Scan, lambda m: received.append((m.stamp_ns, len(m.ranges))), policy=reliable(8, 60.0)
     )
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
 
@@ -156,7 +157,7 @@ def test_several_threads_publish(node, coalesce):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(30.0)
+        thread.join(SOON_S)
     wait_for(lambda: len(received) == 1200)
     for thread in range(4):
         assert [n % 1000 for n, _ in received if n // 1000 == thread] == list(range(300))
@@ -358,7 +359,7 @@ def test_subscribers_are_counted(node):
     assert publisher.subscriber_count == 3
     for left in (2, 1, 0):
         subscribers.pop().close()
-        wait_for(lambda left=left: publisher.subscriber_count == left, 1.0)
+        wait_for(lambda left=left: publisher.subscriber_count == left)
 
 
 def test_attached_means_that_nothing_is_missed(node):
@@ -405,9 +406,9 @@ def test_use_after_close(node, options):
 
 
 def test_closing_while_another_thread_is_held_up(node):
-    """It gets out at once, with `Closed`."""
+    """It gets out with `Closed`, not when the reader's time is over."""
     publisher = node.publisher("/numbers", Number)
-    node.subscriber("/numbers", Number, policy=reliable(1, 30.0))
+    node.subscriber("/numbers", Number, policy=reliable(1, 4 * SOON_S))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     ended = []
 
@@ -424,17 +425,15 @@ def test_closing_while_another_thread_is_held_up(node):
     published = -1
     while published != (published := publisher._gate.sequence) or published < 100:
         time.sleep(0.05)
-    begin = time.monotonic()
     publisher.close()
     for thread in threads:
-        thread.join(5.0)
+        thread.join(SOON_S)
     assert ended == ["the publisher of /numbers is closed"] * 2
-    assert time.monotonic() - begin < 1.0
 
 
 def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(1, 30.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(1, 4 * SOON_S))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     done = threading.Event()
 
@@ -447,7 +446,7 @@ def test_a_reader_that_leaves_lets_the_publisher_go_on(node):
     thread.start()
     assert not done.wait(0.1)
     subscriber.close()
-    assert done.wait(5.0)
+    assert done.wait(SOON_S)
     thread.join()
 
 

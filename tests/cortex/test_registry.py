@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 import zmq
 from directories import (
-    LEASE_S,
     ROOT,
     TYPES,
     answers_unknown,
@@ -34,6 +33,7 @@ from directories import (
     serving,
     wait_for,
 )
+from processes import SOON_S
 
 from cortex.codec import MalformedMessage
 from cortex.discovery import main
@@ -92,7 +92,7 @@ def test_many_processes_at_once_start_one_registry(base):
         racer.stdin.close()
     answers = [racer.stdout.read().strip() for racer in racers]
     for racer in racers:
-        assert racer.wait(10) == 0
+        assert racer.wait(SOON_S) == 0
         racer.stdout.close()
     assert sorted(answers) == ["False"] * 5 + ["True"]
     wait_for(registry_pid)
@@ -130,7 +130,7 @@ def test_the_registry_ends_after_the_last_node_even_if_all_were_killed(base):
         two.kill()
         one.wait()
         two.wait()
-    wait_for(lambda: registry_pid() is None, timeout_s=LEASE_S + 2.0 + 2.0)
+    wait_for(lambda: registry_pid() is None)
     wait_for(lambda: not Path(f"/proc/{pid}").exists())
     left = {path.name for path in runtime_dir(0).iterdir()}
     assert left <= {REGISTRY_LOCK, REGISTRY_LOG}
@@ -142,12 +142,17 @@ def test_the_registry_costs_little(base):
     with node_process("one") as one:
         read_until(one, lambda seen: seen["connected"])
         status = Path(f"/proc/{registry_pid()}/schedstat")
-        started_ns = int(status.read_text().split()[0])
-        begin = time.monotonic()
-        wait_for(lambda: time.monotonic() - begin > 2.0)
-        idle = (int(status.read_text().split()[0]) - started_ns) / (time.monotonic() - begin) / 1e9
-    assert started_ns < 500e6  # twice, for a machine that is busy with other things
-    assert idle < 0.01
+
+        def used_ns():
+            return int(status.read_text().split()[0])
+
+        def idles():
+            begin_ns, begin_used_ns = time.monotonic_ns(), used_ns()
+            time.sleep(2.0)
+            return used_ns() - begin_used_ns < 0.01 * (time.monotonic_ns() - begin_ns)
+
+        assert used_ns() < 1e9  # four times, for a machine whose processors do other things, too
+        wait_for(idles)
 
 
 def test_two_registries_cannot_serve_one_domain(base, caplog):
@@ -185,8 +190,9 @@ def test_a_registry_that_cannot_start_is_tried_again_but_not_in_a_loop(make, mon
 
     monkeypatch.setattr("cortex.discovery.ensure_registry", fail)
     node = make("one")
-    drive_for([node], 2.0)
-    assert 2 <= len(tried) <= 3  # at 0 s, 1 s and 3 s
+    drive([node], lambda: len(tried) == 3)  # at 0 s, 1 s and 3 s
+    assert tried[1] - tried[0] > 0.99
+    assert tried[2] - tried[1] > 1.99
     assert caplog.text.count("no process for you") == 1
 
 
@@ -274,11 +280,9 @@ def test_mutated_frames_do_no_harm(context, make, caplog):
             socket.send(control_frame(Heartbeat(12345, 1, 0), sequence))
             drive([one, two], lambda socket=socket: answers_unknown(socket))
             socket.close()
-        drive_for([one, two], 1.3 * LEASE_S)
         assert registry.rejected > 10_000
-        assert registry.node_count == 2  # ghosts have no heartbeat
-        assert one.names == ["two"]
-        assert two.names == ["one"]
+        drive([one, two], lambda: registry.node_count == 2)  # ghosts have no heartbeat
+        drive([one, two], lambda: one.names == ["two"] and two.names == ["one"])
         assert two.id not in one.ever_lost
         said = sum("rejected a frame" in r.getMessage() for r in caplog.records)
         assert 1 <= said <= 20 + 2  # once for each connection, not for each frame
@@ -356,7 +360,7 @@ def test_a_heartbeat_on_another_connection_keeps_nobody_alive(context):
         assert receive(stranger).held == 0
         stranger.send(control_frame(Leave(record.node)))
         mine.send(control_frame(Heartbeat(record.node, 1, 0), 77))
-        assert mine.poll(5000)
+        assert mine.poll(1e3 * SOON_S)
         alive, header = parse_control(mine.recv(), TYPES)
         assert (alive.held, header.sequence) == (1, 77)
         assert registry.node_count == 1

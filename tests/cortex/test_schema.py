@@ -282,7 +282,7 @@ def test_the_fingerprint_is_the_same_in_every_process():
             capture_output=True,
             text=True,
             check=True,
-            timeout=30,
+            timeout=300.0,
         ).stdout
         for seed in ("0", "1")
     }

@@ -8,6 +8,7 @@ import time
 
 import pytest
 import zmq
+from processes import SOON_S
 
 from cortex.security import (
     AUTHORIZED_FILE,
@@ -173,7 +174,7 @@ def test_terminating_the_context_ends_the_thread():
     authenticator = Authenticator.acquire(context)
     worker = threading.Thread(target=context.term)
     worker.start()
-    worker.join(5)
+    worker.join(SOON_S)
     assert not worker.is_alive()
     authenticator.release()
     assert not [t for t in threading.enumerate() if t.name == "cortex-zap"]
@@ -190,7 +191,7 @@ def test_many_threads_share_one_authenticator(context):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join(SOON_S)
     assert not any(thread.is_alive() for thread in threads)
     with pytest.raises(RuntimeError):
         Authenticator.of(context)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import itertools
+import queue
 import threading
 import time
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import zmq
 from peer import Block, Number, OtherNumber, Scan, is_whole, make_block
-from processes import SOON_S, wait_for
+from processes import SOON_S, in_time, wait_for
 
 from cortex import keep_last, reliable
 from cortex.codec import codec_of
@@ -32,7 +33,7 @@ def node(make_node):
 @pytest.fixture
 def numbers(node):
     publisher = node.publisher("/numbers", Number)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     return publisher, subscriber
 
@@ -46,10 +47,14 @@ def scan(number, size=LARGE):
 
 def test_nothing_comes_in_time(numbers):
     _, subscriber = numbers
-    begin = time.monotonic()
-    with pytest.raises(TimeoutError, match=r"/numbers: no message within 0\.05 s"):
-        subscriber.recv(0.05)
-    assert 0.05 <= time.monotonic() - begin < 2.0
+
+    def receive():
+        begin = time.monotonic()
+        with pytest.raises(TimeoutError, match=r"/numbers: no message within 0\.05 s"):
+            subscriber.recv(0.05)
+        assert time.monotonic() - begin >= 0.05
+
+    in_time(receive, 1.0)
     with pytest.raises(TimeoutError):
         subscriber.recv(0.0)
 
@@ -57,26 +62,26 @@ def test_nothing_comes_in_time(numbers):
 def test_a_message_wakes_who_waits(numbers):
     """It does not wait for the next look: a tenth of a second would be that."""
     publisher, subscriber = numbers
-    delays = []
-    ready = threading.Event()
+    asked, answered = queue.SimpleQueue(), queue.SimpleQueue()
 
     def receive():
-        for _ in range(20):
-            ready.set()
+        while asked.get():
             sent_ns = subscriber.recv(SOON_S).stamp_ns
-            delays.append(time.monotonic_ns() - sent_ns)
+            answered.put(time.monotonic_ns() - sent_ns)
+
+    def delay_ns():
+        asked.put(True)
+        time.sleep(2e-3)  # so that it waits, most likely
+        publisher.publish(Number(time.monotonic_ns(), 0))
+        return answered.get(timeout=SOON_S)
 
     thread = threading.Thread(target=receive)
     thread.start()
-    while thread.is_alive():
-        if ready.is_set():
-            ready.clear()
-            wait_until = time.monotonic() + 2e-3  # so that it sleeps again
-            while time.monotonic() < wait_until:
-                time.sleep(1e-4)
-            publisher.publish(Number(time.monotonic_ns(), 0))
-    thread.join()
-    assert np.median(delays) < 0.02e9
+    try:
+        wait_for(lambda: max(delay_ns() for _ in range(10)) < 0.02e9)  # the machine may be busy for a while
+    finally:
+        asked.put(False)
+        thread.join()
 
 
 def test_what_is_known_of_a_message(node, numbers):
@@ -94,7 +99,7 @@ def test_what_is_known_of_a_message(node, numbers):
             1000 + k,
         )
         assert before_ns <= info.publish_ns <= time.monotonic_ns()
-        assert 0 < info.latency_ns < 5e9
+        assert 0 < info.latency_ns < 1e9 * SOON_S
         assert info.size == codec_of(Number).fixed_size
 
 
@@ -143,7 +148,7 @@ def test_several_threads_share_a_stream(numbers):
     wait_for(lambda: sum(map(len, taken)) >= 2000)
     subscriber.close()
     for thread in threads:
-        thread.join(5.0)
+        thread.join(SOON_S)
         assert not thread.is_alive()
     assert sorted(itertools.chain.from_iterable(taken)) == list(range(2000))
     assert all(values == sorted(values) for values in taken)
@@ -156,7 +161,7 @@ def test_several_threads_share_a_stream(numbers):
 @pytest.mark.parametrize("coalesce", [False, True])
 def test_a_batch_holds_what_is_there(node, coalesce):
     publisher = node.publisher("/numbers", Number, coalesce=coalesce)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     values, stamps, sizes = [], [], []
     for start in range(0, 1000, 200):
@@ -181,7 +186,7 @@ def test_a_batch_holds_what_is_there(node, coalesce):
 def test_single_messages_after_batches(node):
     """Who has asked for batches may go on one by one, in order."""
     publisher = node.publisher("/numbers", Number, coalesce=True)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     with pytest.raises(TimeoutError):
         subscriber.recv_batch(0.0)
@@ -335,7 +340,7 @@ def test_an_iterator_ends_at_close(numbers):
         publisher.publish(Number(0, value))
     wait_for(lambda: len(received) == 50)
     subscriber.close()
-    thread.join(2.0)
+    thread.join(SOON_S)
     assert not thread.is_alive()
     assert received == list(range(50))
 
@@ -355,7 +360,7 @@ def test_closing_wakes_all_who_wait(numbers):
         thread.start()
     subscriber.close()
     for thread in threads:
-        thread.join(2.0)
+        thread.join(SOON_S)
     assert ended == ["the subscriber of /numbers is closed"] * 3
 
 
@@ -382,7 +387,7 @@ def test_use_after_close(numbers):
 
 
 def test_what_was_sent_before_a_publisher_left_still_comes(node):
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     for round_ in range(3):
         with node.publisher("/numbers", Number, coalesce=True) as publisher:
             assert publisher.wait_for_subscribers(timeout_s=SOON_S)
@@ -395,9 +400,9 @@ def test_what_was_sent_before_a_publisher_left_still_comes(node):
 
 def test_many_publishers_of_a_topic(node):
     publishers = [node.publisher("/numbers", Number) for _ in range(5)]
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 5.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(256, 60.0))
     assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
-    wait_for(lambda: subscriber.wait_for_publisher() and subscriber.publisher_count == 5)
+    wait_for(lambda: subscriber.wait_for_publisher(SOON_S) and subscriber.publisher_count == 5)
     for value in range(40):
         for number, publisher in enumerate(publishers):
             publisher.publish(Number(number, value))
@@ -410,7 +415,7 @@ def test_many_publishers_of_a_topic(node):
 
 
 @pytest.mark.parametrize("how", ["recv", "recv_batch", "callback"])
-@pytest.mark.parametrize("policy", [reliable(16, 10.0), keep_last(64)], ids=str)
+@pytest.mark.parametrize("policy", [reliable(16, 60.0), keep_last(64)], ids=str)
 def test_no_publisher_starves_another(node, policy, how):
     """Two that send more than is read: both come through."""
     streams = {0: [], 1: []}
@@ -425,7 +430,7 @@ def test_no_publisher_starves_another(node, policy, how):
     publishers = [node.publisher("/numbers", Number) for _ in range(2)]
     subscriber = node.subscriber("/numbers", Number, take if how == "callback" else None, policy=policy)
     assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
-    wait_for(lambda: subscriber.wait_for_publisher() and subscriber.publisher_count == 2)
+    wait_for(lambda: subscriber.wait_for_publisher(SOON_S) and subscriber.publisher_count == 2)
 
     def publish(number):
         value = 0
@@ -438,7 +443,7 @@ def test_no_publisher_starves_another(node, policy, how):
     threads = [threading.Thread(target=publish, args=(number,)) for number in range(2)]
     for thread in threads:
         thread.start()
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + SOON_S
     try:
         while not done.is_set() and time.monotonic() < deadline:
             if how == "callback":
@@ -477,7 +482,7 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
                 asyncio.run(subscriber.recv_async(0.01))
         return not subscriber.fds()
 
-    wait_for(closed, 3.0)
+    wait_for(closed)
 
 
 def test_iteration_goes_on_after_a_mismatch(node):

@@ -53,7 +53,7 @@ def keys_of(base, names):
     return {name: base / name for name in names}
 
 
-@pytest.mark.parametrize("policy", [keep_last(64), reliable(8, 5.0)], ids=str)
+@pytest.mark.parametrize("policy", [keep_last(64), reliable(8, 60.0)], ids=str)
 def test_inproc(make_node, policy):
     publisher = make_node("one").publisher("/blocks", Block)
     subscriber = make_node("two").subscriber("/blocks", Block, policy=policy)
@@ -87,7 +87,7 @@ def pair(make_node, start_child, runtime, tmp_path):
     return make_pair
 
 
-@pytest.mark.parametrize("policy", [["keep_last"], ["reliable", {"depth": 8, "timeout_s": 5.0}]], ids=str)
+@pytest.mark.parametrize("policy", [["keep_last"], ["reliable", {"depth": 8, "timeout_s": 60.0}]], ids=str)
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_between_processes(pair, transport, policy):
     """Both ways: we publish and they check, then they publish and we check."""
@@ -95,7 +95,7 @@ def test_between_processes(pair, transport, policy):
     child.ask(do="subscriber", topic="/ours", type="Block", policy=policy)
     child.ask(do="publisher", topic="/theirs", type="Block")
     publisher = node.publisher("/ours", Block)
-    subscriber = node.subscriber("/theirs", Block, policy=reliable(8, 5.0))
+    subscriber = node.subscriber("/theirs", Block, policy=reliable(8, 60.0))
     assert publisher.wait_for_subscribers(1, SOON_S)
     assert child.ask(do="await_subscribers", topic="/theirs")["ok"]
     number = 0
@@ -121,7 +121,7 @@ def test_a_stream_is_complete(pair, transport):
     """Ten thousand messages as fast as they go, with back-pressure: each comes once, in order."""
     node, child = pair(transport)
     child.ask(do="publisher", topic="/numbers", type="Number", coalesce=True)
-    subscriber = node.subscriber("/numbers", Number, policy=reliable(64, 20.0))
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(64, 60.0))
     assert subscriber.wait_for_publisher(SOON_S)
     child.say(do="publish", topic="/numbers", count=10_000)
     values = [subscriber.recv(SOON_S).value for _ in range(10_000)]
@@ -139,8 +139,8 @@ def test_near_and_far_subscribers_of_one_topic(make_node, start_child):
     node = make_node(listen="127.0.0.1")
     for child in (near, far):
         child.hear()
-        child.ask(do="subscriber", topic="/blocks", type="Block", policy=["reliable", {"timeout_s": 10.0}])
-    own = node.subscriber("/blocks", Block, policy=reliable(8, 10.0))
+        child.ask(do="subscriber", topic="/blocks", type="Block", policy=["reliable", {"timeout_s": 60.0}])
+    own = node.subscriber("/blocks", Block, policy=reliable(8, 60.0))
     publisher = node.publisher("/blocks", Block)
     assert publisher.wait_for_subscribers(3, SOON_S)
     for child in (near, far):
@@ -229,12 +229,12 @@ def test_who_is_not_let_in(make_node, start_child, tmp_path, who, runtime):
 # Limits of what comes in
 
 
-def disconnected(socket, action):
+def disconnected(socket, action, within_s):
     """Whether the other side cuts the connection after an action."""
     monitor = socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
     try:
         action()
-        return bool(monitor.poll(3000))
+        return bool(monitor.poll(1e3 * within_s))
     finally:
         socket.disable_monitor()
         monitor.close(0)
@@ -248,7 +248,8 @@ def test_a_subscription_has_a_limit(make_node, size):
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.linger = 0
         socket.connect(address)
-        cut = disconnected(socket, lambda: socket.subscribe(b"x" * size))
+        within_s = SOON_S if size > 33 else 1.0
+        cut = disconnected(socket, lambda: socket.subscribe(b"x" * size), within_s)
     assert cut == (size > 33)
     publisher, subscriber = node.publisher("/n", Number), node.subscriber("/n", Number)
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
@@ -301,7 +302,7 @@ def hosts(runtime):
     names = [f"ctx{side}{os.getpid()}" for side in "xy"]
 
     def ip(*words):
-        subprocess.run(["ip", *words], check=True, capture_output=True, timeout=10.0)
+        subprocess.run(["ip", *words], check=True, capture_output=True, timeout=300.0)
 
     with contextlib.ExitStack() as stack:
         try:
@@ -347,7 +348,7 @@ def test_two_hosts(hosts, start_child, tmp_path):
     two.hear()
     for sender, receiver, topic in ((one, two, "/a"), (two, one, "/b")):
         sender.ask(do="publisher", topic=topic, type="Block")
-        receiver.ask(do="subscriber", topic=topic, type="Block", policy=["reliable", {"timeout_s": 10.0}])
+        receiver.ask(do="subscriber", topic=topic, type="Block", policy=["reliable", {"timeout_s": 60.0}])
         assert sender.ask(do="await_subscribers", topic=topic)["ok"]
         for start, size in ((0, 100), (50, 300_000)):
             receiver.say(do="receive", topic=topic, until=start + 49)

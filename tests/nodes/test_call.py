@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from processes import SOON_S
 
 from cortex import Node
 from cortex.messages import (
@@ -108,7 +109,7 @@ def test_an_answer_that_does_not_come(shared_runtime):
     with Node("simulator") as node:
 
         def handle(_: Trigger) -> SimulatorReply:
-            done.wait(20.0)
+            done.wait(SOON_S)
             return SimulatorReply(True, "", 0, "paused")
 
         node.service("/pause", Trigger, SimulatorReply, handle)

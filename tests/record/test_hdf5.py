@@ -459,7 +459,7 @@ except OSError as error:
     print(k, error)
 """
     command = [sys.executable, "-c", code, str(tmp_path / "f.h5"), str(Path(__file__).parent)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=True)
     count, message = done.stdout.split(" ", 1)
     assert "cannot write" in message
     assert "File too large" in message
