@@ -152,6 +152,40 @@ static PyObject *coder_read(Coder *coder, PyObject *frame) {
     return Py_BuildValue("KLN", (unsigned long long)sequence, (long long)publish_ns, message);
 }
 
+/* Where frames come from, and what is noted of them. */
+typedef struct {
+    PyObject *receive, *again, *latency;
+    int64_t expected, clock_offset_ns;
+    Py_ssize_t limit;
+} Source;
+
+/* Take `receive`, `again`, and then `expected`, `limit`, `latency`, `clock_offset_ns`; 0 with an error set. */
+static int take_source(Source *source, PyObject *const *first, PyObject *const *rest) {
+    source->receive = first[0];
+    source->again = first[1];
+    source->expected = PyLong_AsLongLong(rest[0]);
+    source->limit = PyLong_AsSsize_t(rest[1]);
+    source->latency = rest[2];
+    source->clock_offset_ns = PyLong_AsLongLong(rest[3]);
+    if (PyErr_Occurred()) return 0;
+    if (PyList_Check(source->latency) && PyList_GET_SIZE(source->latency) > 0) return 1;
+    PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
+    return 0;
+}
+
+/* Count how long the message was on its way; 0 with an error set. */
+static int note_latency(const Source *source, int64_t publish_ns) {
+    const int64_t elapsed_ns = monotonic_ns() - publish_ns - source->clock_offset_ns;
+    Py_ssize_t bucket = 0;
+    for (uint64_t left = elapsed_ns > 0 ? (uint64_t)elapsed_ns : 0; left; left >>= 1) ++bucket;
+    const Py_ssize_t last = PyList_GET_SIZE(source->latency) - 1;
+    if (bucket > last) bucket = last;
+    const long long count = PyLong_AsLongLong(PyList_GET_ITEM(source->latency, bucket));
+    if (count == -1 && PyErr_Occurred()) return 0;
+    PyObject *more = PyLong_FromLongLong(count + 1);
+    return more != NULL && PyList_SetItem(source->latency, bucket, more) == 0;
+}
+
 PyDoc_STRVAR(drain_doc,
 "drain($self, receive, again, messages, expected, limit, latency, clock_offset_ns, may_wait, /)\n--\n\n"
 "Read plain frames that follow one another, and append their messages.\n\n"
@@ -168,64 +202,54 @@ PyDoc_STRVAR(drain_doc,
 "    The sequence expected next, how many were read, and what ended it: None where there were no more or the limit\n"
 "    was reached, or a frame that was taken from the socket and is something else, or out of sequence.\n");
 
-static int note_latency(PyObject *latency, int64_t elapsed_ns) {
-    Py_ssize_t bucket = 0;
-    for (uint64_t left = elapsed_ns > 0 ? (uint64_t)elapsed_ns : 0; left; left >>= 1) ++bucket;
-    const Py_ssize_t last = PyList_GET_SIZE(latency) - 1;
-    if (bucket > last) bucket = last;
-    const long long count = PyLong_AsLongLong(PyList_GET_ITEM(latency, bucket));
-    if (count == -1 && PyErr_Occurred()) return 0;
-    PyObject *more = PyLong_FromLongLong(count + 1);
-    return more != NULL && PyList_SetItem(latency, bucket, more) == 0;
+/* The message of a frame if it is the expected one; NULL without error if it is something else. */
+static PyObject *read_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
+    uint64_t sequence;
+    if (coder->has_head && PyBytes_CheckExact(frame) && PyBytes_GET_SIZE(frame) >= HEADER_SIZE) {
+        memcpy(&sequence, PyBytes_AS_STRING(frame) + HEAD_SIZE, 8);
+        if (sequence != expected) return NULL;
+    }
+    return read_frame(coder, frame, &sequence, publish_ns);
+}
+
+/* Append a message, which is let go; 0 with an error set. */
+static int append_message(PyObject *append, PyObject *message) {
+    PyObject *appended = PyObject_CallOneArg(append, message);
+    Py_DECREF(message);
+    Py_XDECREF(appended);
+    return appended != NULL;
+}
+
+/* Read until something ends it, and return how many were read; `ended_by` is a frame or NULL, perhaps with an error. */
+static Py_ssize_t drain_source(const Coder *coder, Source *source, PyObject *append, int may_wait, PyObject **ended_by) {
+    Py_ssize_t read = 0;
+    for (; read < source->limit; ++read) {
+        *ended_by = take_frame(source->receive, source->again, may_wait && read == 0);
+        if (*ended_by == NULL) break;
+        int64_t publish_ns;
+        PyObject *message = read_expected(coder, *ended_by, (uint64_t)source->expected, &publish_ns);
+        if (message == NULL) break;
+        Py_CLEAR(*ended_by);
+        source->expected += 1;
+        if (!append_message(append, message) || (read % 8 == 0 && !note_latency(source, publish_ns))) break;
+    }
+    return read;
 }
 
 static PyObject *coder_drain(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 8)) return NULL;
-    PyObject *receive = arguments[0], *again = arguments[1], *messages = arguments[2], *latency = arguments[5];
-    int64_t expected = PyLong_AsLongLong(arguments[3]);
-    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[4]);
-    const int64_t clock_offset_ns = PyLong_AsLongLong(arguments[6]);
+    Source source;
+    if (!arguments_are(count, 8) || !take_source(&source, arguments, arguments + 3)) return NULL;
     const int may_wait = PyObject_IsTrue(arguments[7]);
-    if (PyErr_Occurred()) return NULL;
-    if (!PyList_Check(latency) || PyList_GET_SIZE(latency) == 0) {
-        PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
-        return NULL;
-    }
-    PyObject *append = PyObject_GetAttrString(messages, "append");
+    PyObject *append = may_wait < 0 ? NULL : PyObject_GetAttrString(arguments[2], "append");
     if (append == NULL) return NULL;
     PyObject *frame = NULL;
-    Py_ssize_t read = 0;
-    for (; read < limit; ++read) {
-        frame = take_frame(receive, again, may_wait && read == 0);
-        if (frame == NULL) {
-            if (PyErr_Occurred()) goto failed;
-            break;
-        }
-        uint64_t sequence;
-        int64_t publish_ns;
-        if (coder->has_head && PyBytes_CheckExact(frame) && PyBytes_GET_SIZE(frame) >= HEADER_SIZE) {
-            memcpy(&sequence, PyBytes_AS_STRING(frame) + HEAD_SIZE, 8);
-            if (sequence != (uint64_t)expected) break;
-        }
-        PyObject *message = read_frame(coder, frame, &sequence, &publish_ns);
-        if (message == NULL) {
-            if (PyErr_Occurred()) goto failed;
-            break;
-        }
-        Py_CLEAR(frame);
-        expected += 1;
-        PyObject *appended = PyObject_CallOneArg(append, message);
-        Py_DECREF(message);
-        if (appended == NULL) goto failed;
-        Py_DECREF(appended);
-        if (read % 8 == 0 && !note_latency(latency, monotonic_ns() - publish_ns - clock_offset_ns)) goto failed;
+    const Py_ssize_t read = drain_source(coder, &source, append, may_wait, &frame);
+    Py_DECREF(append);
+    if (PyErr_Occurred()) {
+        Py_XDECREF(frame);
+        return NULL;
     }
-    Py_DECREF(append);
-    return Py_BuildValue("LnN", (long long)expected, read, frame != NULL ? frame : Py_NewRef(Py_None));
-failed:
-    Py_XDECREF(frame);
-    Py_DECREF(append);
-    return NULL;
+    return Py_BuildValue("LnN", (long long)source.expected, read, frame != NULL ? frame : Py_NewRef(Py_None));
 }
 
 PyDoc_STRVAR(gather_doc,
@@ -234,52 +258,57 @@ PyDoc_STRVAR(gather_doc,
 "Returns:\n"
 "    The sequence expected next, the bodies one after the other, how many they are, and what ended it, as `drain`.\n");
 
-static PyObject *coder_gather(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
-    if (!arguments_are(count, 6)) return NULL;
-    PyObject *latency = arguments[4];
-    int64_t expected = PyLong_AsLongLong(arguments[2]);
-    const Py_ssize_t limit = PyLong_AsSsize_t(arguments[3]);
-    const int64_t clock_offset_ns = PyLong_AsLongLong(arguments[5]);
-    if (PyErr_Occurred()) return NULL;
-    if (!PyList_Check(latency) || PyList_GET_SIZE(latency) == 0) {
-        PyErr_SetString(PyExc_TypeError, "latency must be a list of counts");
-        return NULL;
-    }
+/* Whether a frame is the expected one of a type of fixed size. */
+static int is_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
     const Py_ssize_t size = coder->record.size;
+    if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE + size) return 0;
+    uint64_t rest[5];
+    memcpy(rest, PyBytes_AS_STRING(frame) + HEAD_SIZE, sizeof rest);
+    *publish_ns = (int64_t)rest[2];
+    return !memcmp(PyBytes_AS_STRING(frame), coder->head, HEAD_SIZE) && rest[0] == expected && rest[3] == (uint64_t)size;
+}
+
+/* Take frames until something ends it, and return how many there are; `ended_by` as for `drain_source`. */
+static Py_ssize_t gather_source(const Coder *coder, Source *source, PyObject **frames, PyObject **ended_by) {
+    Py_ssize_t found = 0;
+    while (found < source->limit && found < GATHER_MAX) {
+        *ended_by = take_frame(source->receive, source->again, 0);
+        int64_t publish_ns;
+        if (*ended_by == NULL || !is_expected(coder, *ended_by, (uint64_t)source->expected, &publish_ns)) break;
+        frames[found] = *ended_by;
+        *ended_by = NULL;
+        source->expected += 1;
+        if (found++ % 8 == 0 && !note_latency(source, publish_ns)) break;
+    }
+    return found;
+}
+
+/* The bodies of frames of fixed size one after the other; lets the frames go. */
+static PyObject *join_bodies(PyObject **frames, Py_ssize_t count, Py_ssize_t size) {
+    PyObject *bodies = PyErr_Occurred() ? NULL : PyBytes_FromStringAndSize(NULL, count * size);
+    for (Py_ssize_t index = 0; index < count; ++index) {
+        const char *body = PyBytes_AS_STRING(frames[index]) + HEADER_SIZE;
+        if (bodies != NULL) memcpy(PyBytes_AS_STRING(bodies) + index * size, body, (size_t)size);
+        Py_DECREF(frames[index]);
+    }
+    return bodies;
+}
+
+static PyObject *coder_gather(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
+    Source source;
+    if (!arguments_are(count, 6) || !take_source(&source, arguments, arguments + 2)) return NULL;
     if (coder->record.has_tail || !coder->has_head) {
         PyErr_SetString(PyExc_ValueError, "only bodies of fixed size are gathered");
         return NULL;
     }
-    PyObject *frames[GATHER_MAX], *frame = NULL, *bodies = NULL;
-    Py_ssize_t found = 0;
-    while (found < limit && found < GATHER_MAX) {
-        frame = take_frame(arguments[0], arguments[1], 0);
-        if (frame == NULL) {
-            if (PyErr_Occurred()) goto done;
-            break;
-        }
-        if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE + size) break;
-        const char *bytes = PyBytes_AS_STRING(frame);
-        uint64_t rest[5];
-        memcpy(rest, bytes + HEAD_SIZE, sizeof rest);
-        if (memcmp(bytes, coder->head, HEAD_SIZE) || rest[0] != (uint64_t)expected || rest[3] != (uint64_t)size) break;
-        frames[found] = frame;
-        frame = NULL;
-        expected += 1;
-        const int64_t elapsed_ns = monotonic_ns() - (int64_t)rest[2] - clock_offset_ns;
-        if (found++ % 8 == 0 && !note_latency(latency, elapsed_ns)) goto done;
-    }
-    bodies = PyBytes_FromStringAndSize(NULL, found * size);
-    for (Py_ssize_t index = 0; bodies != NULL && index < found; ++index) {
-        memcpy(PyBytes_AS_STRING(bodies) + index * size, PyBytes_AS_STRING(frames[index]) + HEADER_SIZE, (size_t)size);
-    }
-done:
-    for (Py_ssize_t index = 0; index < found; ++index) Py_DECREF(frames[index]);
+    PyObject *frames[GATHER_MAX], *frame = NULL;
+    const Py_ssize_t found = gather_source(coder, &source, frames, &frame);
+    PyObject *bodies = join_bodies(frames, found, coder->record.size);
     if (bodies == NULL) {
         Py_XDECREF(frame);
         return NULL;
     }
-    return Py_BuildValue("LNnN", (long long)expected, bodies, found, frame != NULL ? frame : Py_NewRef(Py_None));
+    return Py_BuildValue("LNnN", (long long)source.expected, bodies, found, frame != NULL ? frame : Py_NewRef(Py_None));
 }
 
 PyDoc_STRVAR(records_doc,

@@ -17,8 +17,18 @@ static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t a
 
 /* Numbers: each returns 0 if the value is not of the usual class or out of range, with no error set. */
 
+/* Whether a value is a number of NumPy, of a class that has no Python code. */
+#define IS_SCALAR(VALUE, CLASS) (PyArray_IsScalar(VALUE, CLASS) && !PyType_HasFeature(Py_TYPE(VALUE), Py_TPFLAGS_HEAPTYPE))
+
 static int write_integer(char code, PyObject *value, char *out) {
-    if (!PyLong_Check(value)) return 0;
+    if (!PyLong_Check(value)) {
+        if (!IS_SCALAR(value, Integer)) return 0;
+        PyObject *number = PyNumber_Index(value);
+        const int written = number != NULL && write_integer(code, number, out);
+        Py_XDECREF(number);
+        PyErr_Clear();
+        return written;
+    }
     if (code == 'Q') {
         const uint64_t number = PyLong_AsUnsignedLongLong(value);
         if (number == (uint64_t)-1 && PyErr_Occurred()) {
@@ -52,16 +62,12 @@ static int write_integer(char code, PyObject *value, char *out) {
 }
 
 static int write_float(char code, PyObject *value, char *out) {
-    double number;
-    if (PyFloat_Check(value)) {
-        number = PyFloat_AS_DOUBLE(value);
-    } else if (PyLong_CheckExact(value)) {
-        number = PyLong_AsDouble(value);
-        if (number == -1.0 && PyErr_Occurred()) {
-            PyErr_Clear();
-            return 0;
-        }
-    } else {
+    const int is_usual = PyFloat_Check(value) || PyLong_CheckExact(value) || IS_SCALAR(value, Floating)
+        || IS_SCALAR(value, Integer);
+    if (!is_usual) return 0;
+    const double number = PyFloat_AsDouble(value);
+    if (number == -1.0 && PyErr_Occurred()) {
+        PyErr_Clear();
         return 0;
     }
     if (code == 'd') {
@@ -76,6 +82,12 @@ static int write_float(char code, PyObject *value, char *out) {
 
 static inline int write_number(char code, PyObject *value, char *out) {
     return code == 'd' || code == 'f' ? write_float(code, value, out) : write_integer(code, value, out);
+}
+
+static int write_bool(PyObject *value, char *out) {
+    if (value != Py_True && value != Py_False && !PyArray_IsScalar(value, Bool)) return 0;
+    *out = value == Py_True || (value != Py_False && PyObject_IsTrue(value));
+    return 1;
 }
 
 static int write_member(const Members *members, PyObject *value, char *out) {
@@ -222,8 +234,7 @@ static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t a
         case NUMBER:
             return write_number(item->code, value, pack->out + at);
         case BOOL:
-            pack->out[at] = value == Py_True;
-            return value == Py_True || value == Py_False;
+            return write_bool(value, pack->out + at);
         case ENUM:
             return write_member(&item->members, value, pack->out + at);
         case FIXED:

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections import deque
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -102,11 +103,13 @@ def test_what_is_not_as_usual_is_left_to_python(wrong):
 
 
 def test_values_that_python_takes_and_c_does_not():
-    """A number of NumPy, an array that is not contiguous."""
+    """Numbers of neither Python nor NumPy, a str of another class, arrays that are not contiguous."""
     values = [
-        Numbers(np.int8(3), 4, 5.0, True, "six"),
-        Sample(np.int64(5), np.arange(10, dtype=np.float32)),
+        Numbers(3, 4, Fraction(1, 2), True, "six"),
+        Numbers(3, 4, 5.0, 1, "six"),
+        Numbers(3, 4, 5.0, True, np.str_("six")),
         Sample(5, np.arange(20, dtype=np.float32)[::2]),
+        Sample(5, np.arange(20, dtype=np.float32).view(np.recarray)),
     ]
     for value in values:
         codec = codec_of(type(value))

@@ -206,6 +206,13 @@ def test_absent_is_none_and_empty_is_nothing():
         {"mode": Level.LOW},
         {"level": 1},
         {"maybe": 1e300},
+        {"maybe": np.float64(1e300)},
+        {"maybe": np.complex64(1)},
+        {"stamp_ns": np.float64(1)},
+        {"stamp_ns": np.uint64(2**63)},
+        {"stamp_ns": np.bool_(True)},
+        {"sizes": [np.int16(128)]},
+        {"flags": [np.int8(2)]},
         {"maybe": "x"},
         {"point": (1.0, True)},
         {"point": Point(None)},
@@ -256,11 +263,19 @@ class Count(int):
         {"points": (Point(1.0),)},
         {"sizes": [True, Count(5)]},
         {"deep": ([1], (2, 3))},
+        {
+            "stamp_ns": np.int64(-5),
+            "sizes": [np.uint8(7), np.int16(-8)],
+            "flags": [np.bool_(True), np.bool_(False)],
+        },
+        {"maybe": np.float32(0.1), "point": Point(np.float16(0.1), np.bool_(True))},
+        {"maybe": np.int8(3), "point": Point(np.uint64(2**64 - 1))},
+        {"point": Point(np.longdouble("0.1"))},
     ],
     ids=str,
 )
 def test_values_that_stand_for_the_usual_ones(changes):
-    """An int where a float is due, a subclass of int, a tuple: C writes what Python does."""
+    """An int for a float, a subclass of int, numbers of NumPy, a tuple: C writes what Python does."""
     value = everything(**changes)
     assert coder_of(Everything).encode(value, 1 << 20) == python_body(value)
 
