@@ -124,54 +124,82 @@ static int gate_copy(Gate *gate, const Pack *pack) {
     return locked;
 }
 
+/* Write a message into a slot, without the lock while much is copied; 0 if it is not as usual, or with an error set. */
+static int gate_write(
+    Gate *gate, Ledger *ledger, PyObject *message, Py_ssize_t slot, Py_ssize_t size, int unlocked, int64_t *stamp_ns) {
+    Pack pack;
+    if (!write_body(gate->coder, message, &pack, ledger_memory(ledger, slot), size, 1)) return 0;
+    *stamp_ns = pack.stamp_ns;
+    int written = 1;
+    ledger_use(ledger, 1);
+    if (unlocked) written = gate_copy(gate, &pack);
+    else copy_deferred(&pack);
+    ledger_use(ledger, -1);
+    return written;
+}
+
+/* Lease a written slot to all and send its descriptor; NULL as for `gate_send`, and the slot is given up. */
+static PyObject *gate_commit(
+    Gate *gate, Ledger *ledger, Py_ssize_t slot, Py_ssize_t size, int64_t stamp_ns, int64_t now_ns) {
+    PyObject *frame = ledger_commit(ledger, slot, gate->sequence, stamp_ns, now_ns, size);
+    if (frame == NULL) {
+        ledger_abandon(ledger, slot);
+        return NULL;
+    }
+    gate->sequence += 1;
+    gate->bytes += size;
+    PyObject *sent = gate_send_frame(gate, frame);
+    Py_DECREF(frame);
+    return sent;
+}
+
+/* Send a message through a slot, if there is a free one; what has changed while others had the lock is left to `finish`. */
+static PyObject *gate_use_slot(
+    Gate *gate, Ledger *ledger, PyObject *message, Py_ssize_t size, int unlocked, int64_t now_ns) {
+    const Py_ssize_t slot = ledger_acquire(ledger, size);
+    if (slot < 0) return NULL;
+    int64_t stamp_ns;
+    if (!gate_write(gate, ledger, message, slot, size, unlocked, &stamp_ns)) {
+        ledger_abandon(ledger, slot);
+        return NULL;
+    }
+    if ((PyObject *)ledger == gate->ledger && gate->refresh_ns != 0 && ledger_has_room(ledger))
+        return gate_commit(gate, ledger, slot, size, stamp_ns, now_ns);
+    return PyObject_CallFunction(gate->finish, "nnLL", slot, size, (long long)stamp_ns, (long long)now_ns);
+}
+
+/* Take the lock of large messages if it is free; 0 if not, perhaps with an error set. */
+static int gate_lock_large(Gate *gate) {
+    PyObject *acquired = PyObject_CallOneArg(gate->large_acquire, Py_False);
+    Py_XDECREF(acquired);
+    return acquired == Py_True;
+}
+
+/* Give the lock of large messages back; keeps the error that is set, if one is. */
+static void gate_unlock_large(Gate *gate) {
+    PyObject *type, *value, *traceback;
+    PyErr_Fetch(&type, &value, &traceback);
+    PyObject *released = PyObject_CallNoArgs(gate->large_release);
+    if (released == NULL) PyErr_Clear(); /* it was ours */
+    Py_XDECREF(released);
+    PyErr_Restore(type, value, traceback);
+}
+
 /* Write a large message into a slot and send its descriptor, with the lock held; NULL as below.
 
-   While much is copied others may have the lock: then `large_acquire` keeps other large messages away, and whatever
-   has changed meanwhile is left to `finish`. */
+   While much is copied others may have the lock: then that of large messages keeps other large ones away. */
 static PyObject *gate_send_slot(Gate *gate, PyObject *message, Py_ssize_t size, int64_t now_ns) {
     Ledger *ledger = gate->ledger == NULL ? NULL : ledger_of(gate->ledger);
     if (ledger == NULL || gate->records != NULL || !ledger_has_room(ledger)) return NULL;
     const int unlocked = size >= UNLOCKED_BYTES;
-    if (unlocked) {
-        PyObject *acquired = PyObject_CallOneArg(gate->large_acquire, Py_False);
-        Py_XDECREF(acquired);
-        if (acquired != Py_True) return NULL;
+    Py_INCREF(ledger);
+    PyObject *sent = NULL;
+    if (!unlocked || gate_lock_large(gate)) {
+        sent = gate_use_slot(gate, ledger, message, size, unlocked, now_ns);
+        if (unlocked) gate_unlock_large(gate);
     }
-    PyObject *kept = Py_NewRef(gate->ledger), *result = NULL;
-    const Py_ssize_t slot = ledger_acquire(ledger, size);
-    if (slot >= 0) {
-        Pack pack;
-        int written = write_body(gate->coder, message, &pack, ledger_memory(ledger, slot), size, 1);
-        ledger_use(ledger, 1);
-        if (written && unlocked) written = gate_copy(gate, &pack);
-        else if (written) copy_deferred(&pack);
-        ledger_use(ledger, -1);
-        if (!written) {
-            ledger_abandon(ledger, slot);
-        } else if (gate->ledger != kept || gate->refresh_ns == 0 || !ledger_has_room(ledger)) {
-            result = PyObject_CallFunction(gate->finish, "nnLL", slot, size, (long long)pack.stamp_ns, (long long)now_ns);
-        } else {
-            PyObject *frame = ledger_commit(ledger, slot, gate->sequence, pack.stamp_ns, now_ns, size);
-            if (frame == NULL) {
-                ledger_abandon(ledger, slot);
-            } else {
-                gate->sequence += 1;
-                gate->bytes += size;
-                result = gate_send_frame(gate, frame);
-                Py_DECREF(frame);
-            }
-        }
-    }
-    Py_DECREF(kept);
-    if (unlocked) {
-        PyObject *type, *value, *traceback;
-        PyErr_Fetch(&type, &value, &traceback);
-        PyObject *released = PyObject_CallNoArgs(gate->large_release);
-        if (released == NULL) PyErr_Clear(); /* it was ours */
-        Py_XDECREF(released);
-        PyErr_Restore(type, value, traceback);
-    }
-    return result;
+    Py_DECREF(ledger);
+    return sent;
 }
 
 /* Send with the lock held; NULL without error if the message has to go the long way. */
