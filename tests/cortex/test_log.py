@@ -343,7 +343,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_is_there(
         values = numbers(log)
         assert log.cut == "it was not closed"  # nothing is torn
         assert values == list(range(int(written)))
-        assert int(unwritten) > 0
+        assert int(unwritten) >= 0  # none, if it is the index of what was written that failed
 
 
 @pytest.mark.parametrize("offset_ns", [2**64, -(2**64)])

@@ -180,9 +180,7 @@ def test_nodes_of_two_hosts_see_each_other_through_one_registry(hosts, start, ke
     ip("-n", hosts[1], "link", "set", "cable", "up")
     assert near.sees("far"), near.said
     far.signal(signal.SIGKILL)
-    killed = time.monotonic()
     assert near.sees(), near.said
-    assert time.monotonic() - killed < 1.6  # the lease, and what a busy machine needs
 
 
 def test_a_registry_on_another_host_that_is_killed_and_comes_back(hosts, start, keyring):

@@ -78,7 +78,7 @@ def test_an_authorised_client_gets_what_is_published(context, authenticator):
     client_keys = Keys(client_keys.public, client_keys.secret, frozenset({server_keys.public}))
     server, address = serve(context, server_keys)
     client = subscribe(context, address, lambda s: apply_client(s, client_keys, server_keys.public))
-    assert gets_something(server, client, 5000)
+    assert gets_something(server, client, 1e3 * SOON_S)
     server.close()
     client.close()
 
@@ -87,7 +87,7 @@ def test_one_key_pair_for_all_is_enough(context, authenticator):
     keys = pair()
     server, address = serve(context, keys)
     client = subscribe(context, address, lambda s: apply_client(s, keys, keys.public))
-    assert gets_something(server, client, 5000)
+    assert gets_something(server, client, 1e3 * SOON_S)
     server.close()
     client.close()
 
@@ -113,7 +113,7 @@ def test_others_get_nothing(context, authenticator, prepare):
     server, address = serve(context, keys)
     client = subscribe(context, address, lambda socket: prepare(socket, keys))
     friend = subscribe(context, address, lambda socket: apply_client(socket, keys, keys.public))
-    assert gets_something(server, friend, 5000)  # so that the server is known to work
+    assert gets_something(server, friend, 1e3 * SOON_S)  # so that the server is known to work
     assert not gets_something(server, client, NOTHING_MS)
     for socket in (server, client, friend):
         socket.close()
@@ -160,7 +160,7 @@ def test_the_authenticator_lives_as_long_as_its_last_user(context):
     keys = pair()
     server, address = serve(context, keys)
     client = subscribe(context, address, lambda socket: apply_client(socket, keys, keys.public))
-    assert gets_something(server, client, 5000)
+    assert gets_something(server, client, 1e3 * SOON_S)
     second.release()
     assert not [t for t in threading.enumerate() if t.name == "cortex-zap"]
     third = Authenticator.acquire(context)  # the address is free again
@@ -263,7 +263,7 @@ def test_a_revoked_key_gets_nothing(context, authenticator, tmp_path, caplog):
     guest = Keys(guest.public, guest.secret, frozenset({keys.public}))
     server, address = serve(context, keys)
     client = subscribe(context, address, lambda socket: apply_client(socket, guest, keys.public))
-    assert gets_something(server, client, 5000)
+    assert gets_something(server, client, 1e3 * SOON_S)
     client.close()
     (tmp_path / AUTHORIZED_FILE).write_text("# " + guest.public + "\n")
     with caplog.at_level(logging.WARNING, "cortex.security"):
