@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
-from neurosim_core.overrides import add_set_option, read_settings
+from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
 if TYPE_CHECKING:
@@ -229,6 +229,16 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     return overrides
 
 
+def _options(arguments: argparse.Namespace) -> dict[str, str]:
+    """What the command line calls the keys of `_overrides`, for error messages."""
+    return set_options(read_settings(arguments.settings)) | {
+        "duration_s": "--duration",
+        "seed": "--seed",
+        "device": "--device",
+        "live.real_time_factor": "--factor",
+    }
+
+
 def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """As `_overrides`, with what `_add_live` added."""
     overrides = _overrides(arguments)
@@ -244,7 +254,7 @@ def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
 def _run(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config, to_yaml
 
-    config = load_config(arguments.config, overrides=_overrides(arguments))
+    config = load_config(arguments.config, overrides=_overrides(arguments), options=_options(arguments))
     if arguments.print_config:
         print(to_yaml(config, comments=True), end="")
         return 0
@@ -260,7 +270,7 @@ def _serve(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
     from neurosim_core.nodes.simulator import serve
 
-    config = load_config(arguments.config, overrides=_live_overrides(arguments))
+    config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
     return serve(config, record=arguments.record, overwrite=arguments.overwrite)
 
 
@@ -270,7 +280,8 @@ def _fly(arguments: argparse.Namespace) -> int:
 
     overrides = _overrides(arguments)
     given = arguments.config is not None or overrides
-    config = load_config(arguments.config, overrides=overrides) if given else None
+    options = _options(arguments)
+    config = load_config(arguments.config, overrides=overrides, options=options) if given else None
     with handle_signals(signal.default_int_handler):
         return fly(config, vehicle=arguments.vehicle, mode=arguments.mode, delay_s=arguments.delay)
 
@@ -279,7 +290,7 @@ def _up(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
     from neurosim_core.nodes.stack import up
 
-    config = load_config(arguments.config, overrides=_live_overrides(arguments))
+    config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
     return up(config, viewer=arguments.viewer, record=arguments.record, overwrite=arguments.overwrite)
 
 

@@ -235,7 +235,10 @@ class SimulationConfig(Settings):
 
 
 def load_config(
-    source: str | Path | Mapping[str, Any] | None = None, *, overrides: Mapping[str, Any] | None = None
+    source: str | Path | Mapping[str, Any] | None = None,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    options: Mapping[str, str] | None = None,
 ) -> SimulationConfig:
     """Read settings and check them.
 
@@ -245,6 +248,8 @@ def load_config(
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
             another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
             the default set are changed, and new ones added to it.
+        options: What the user calls a key that does not come from a file, such as {"duration_s":
+            "--duration"}: a mistake there is said of it.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
     A sensor or body that is null is left out: {"sensors.depth": None}.
@@ -268,8 +273,7 @@ def load_config(
     try:
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
-        lines = [f"  {line}" for line in _explain(error, raw)]
-        raise ConfigError("\n".join([f"{origin} is not a valid configuration:", *lines])) from None
+        raise ConfigError(_say(origin, list(_explain(error, raw)), options or {})) from None
 
 
 def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
@@ -366,8 +370,37 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
         elif name == "kind" and group.startswith("sensors.") and reason.startswith("required"):
             others = [str(key) for key in raw["sensors"] if f"sensors.{key}" != group]
             yield f"{line}; {suggestion(group.removeprefix('sensors.'), others)}".rstrip("; ")
+        elif path == "device" and "pattern" in reason:
+            yield f"{path}: must be auto, cpu, cuda, or cuda:0 and so on, got {raw['device']!r}"
         else:
             yield line
+
+
+def _say(origin: str, mistakes: list[str], options: Mapping[str, str]) -> str:
+    """Return the text of an error: each mistake by the name that the user gave its key.
+
+    Args:
+        origin: What the settings are from.
+        mistakes: Lines that begin with a dotted key.
+        options: Names of keys that were given otherwise.
+    """
+    lines = dict.fromkeys(_by_option(line, options) for line in mistakes)
+    elsewhere = any(line in mistakes for line in lines)
+    if not elsewhere and len(lines) == 1:
+        return next(iter(lines))
+    head = f"{origin} is not a valid configuration:" if elsewhere else "wrong options:"
+    return "\n".join([head, *(f"  {line}" for line in lines)])
+
+
+def _by_option(line: str, options: Mapping[str, str]) -> str:
+    """Name the option in place of its key; a key within it, or one that it lies in, is said as well."""
+    key, separator, reason = line.partition(": ")
+    for place in sorted(options, key=len, reverse=True):
+        if key == place:
+            return f"{options[place]}{separator}{reason}"
+        if key.startswith(f"{place}."):
+            return f"{options[place]}: {line}"
+    return line
 
 
 def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -14,6 +14,11 @@ def add_set_option(parser: argparse.ArgumentParser, help_text: str) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=help_text
     )
+
+
+def set_options(settings: Mapping[str, Any] | None) -> dict[str, str]:
+    """Return what the user wrote for each key of `read_settings`, for error messages."""
+    return {key: f"--set {key}" for key in settings or {}}
 
 
 def read_settings(texts: Sequence[str]) -> dict[str, Any]:

@@ -187,6 +187,36 @@ def test_all_mistakes_are_told_at_once():
     assert len(str(error.value).splitlines()) == 4
 
 
+def test_mistakes_in_options_are_said_of_the_options(tmp_path):
+    """Whoever gave a value on the command line never saw its key; one in a file keeps its key."""
+    options = {"duration_s": "--duration", "sensors.imu.rate_hz": "--rates", "control.rate_hz": "--rates"}
+
+    def said(source: Any, **overrides: Any) -> str:
+        with pytest.raises(ConfigError) as caught:
+            load_config(source, overrides=overrides, options=options)
+        return str(caught.value)
+
+    assert said(None, duration_s=-1.0) == "--duration: Input should be greater than 0, got -1.0"
+    rates = {"sensors.imu.rate_hz": 0, "control.rate_hz": 0}
+    assert said(None, **rates) == "--rates: Input should be greater than 0, got 0"
+    both = said(None, duration_s=-1.0, **rates).splitlines()
+    assert both[0] == "wrong options:"
+    assert sorted(line.split(":")[0] for line in both[1:]) == ["  --duration", "  --rates"]
+    file = tmp_path / "scene.yaml"
+    file.write_text("seed: -4\n")
+    lines = said(file, duration_s=0.0).splitlines()
+    assert lines[0] == f"{file} is not a valid configuration:"
+    assert any(line.startswith("  seed: ") for line in lines)
+    assert any(line.startswith("  --duration: ") for line in lines)
+    options["scene"] = "--set scene"
+    assert said(None, **{"scene.rooms": 0}).startswith("--set scene: scene.rooms: ")
+
+
+def test_a_device_is_named_by_what_may_be_given():
+    with pytest.raises(ConfigError, match="device: must be auto, cpu, cuda, or cuda:0 and so on, got 'gpu'"):
+        load_config({"device": "gpu"})
+
+
 def test_overrides_win_and_may_be_dotted(tmp_path):
     file = tmp_path / "scene.yaml"
     file.write_text("duration_s: 3\nscene: {kind: apartment, seed: 1}\n")

@@ -34,6 +34,7 @@ from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.nodes.floor import measure_floor
 from neurosim_core.nodes.probe import ProbeError, answer_images
+from neurosim_core.overrides import set_options
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +44,14 @@ LoopMode = Literal["lockstep", "streaming"]
 TRANSPORT_BAR_S = (0.2e-3, 0.5e-3)
 """What the median and the 99th percentile of the transport are to stay under [s]."""
 _CAMERA = "camera"
+_OPTIONS = {
+    f"sensors.{_CAMERA}.lens.width": "--width",
+    f"sensors.{_CAMERA}.lens.height": "--height",
+    "device": "--device",
+    f"sensors.{_CAMERA}.rate_hz": "--rates",
+    "control.rate_hz": "--rates",
+}
+"""What the command line calls the keys of its settings, for error messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +124,7 @@ def loop_config(
     }
     if scene is not None:
         base["scene"] = {"kind": "mesh", "file": str(scene.resolve())}
-    return load_config(base, overrides=settings)
+    return load_config(base, overrides=settings, options=_OPTIONS | set_options(settings))
 
 
 def measure_loop(

@@ -22,6 +22,7 @@ from neurosim_core.bench.machine import describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
+from neurosim_core.overrides import set_options
 from neurosim_core.record import Flight
 
 TRANSPORT_S = 5e-4
@@ -98,10 +99,14 @@ def bench_delay(
         ValueError: An argument is out of its range.
         RuntimeError: A process failed.
     """
-    if tours < 1 or not delays_s or not all(0.0 <= delay_s < 10.0 for delay_s in delays_s):
-        raise ValueError(f"takes tours >= 1 and delays from 0 to 10 s, got {tours} and {list(delays_s)}")
-    if not (seconds > 0.0 and real_time_factor > 0.0):
-        raise ValueError(f"takes seconds and a factor > 0, got {seconds} and {real_time_factor}")
+    if tours < 1:
+        raise ValueError(f"tours must be >= 1, got {tours}")
+    if not delays_s or not all(0.0 <= delay_s < 10.0 for delay_s in delays_s):
+        raise ValueError(f"delays must be from 0 to less than 10 s, got {list(delays_s)}")
+    if not seconds > 0.0:  # also refuses nan
+        raise ValueError(f"seconds must be > 0, got {seconds}")
+    if not real_time_factor > 0.0:
+        raise ValueError(f"factor must be > 0, got {real_time_factor}")
     results: list[DelayResult] = []
     with own_runtime() as scratch, console.status("") as line:
         for tour in range(tours):
@@ -164,7 +169,7 @@ def _config(tour: int, seconds: float, settings: Mapping[str, Any]) -> Simulatio
         "sensors": {"odometry": {"kind": "odometry", "rate_hz": 200.0}},
         "live": {"run_on": False},
     }
-    return load_config(base, overrides=settings)
+    return load_config(base, overrides=settings, options=set_options(settings))
 
 
 def _compare(

@@ -106,6 +106,15 @@ def flight_settings(
     return settings
 
 
+_OPTIONS = {
+    "sensors.events.lens.width": "--width",
+    "sensors.events.lens.height": "--height",
+    "sensors.events.max_displacement_px": "--max-displacement",
+    "device": "--device",
+}
+"""What the command line calls the keys of its settings, for error messages."""
+
+
 def measure_steps(
     *,
     scene: Path | None = None,
@@ -148,7 +157,7 @@ def measure_steps(
         max_displacement_px=max_displacement_px,
     )
     return time_steps(
-        make_model(load_config(settings)),
+        make_model(load_config(settings, options=_OPTIONS)),
         warm_up_count=warm_up,
         step_count=step_count,
         repetitions=repetitions,

@@ -23,6 +23,7 @@ from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.bench.step import measure_steps
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.nodes.probe import ProbeError, StreamProbe, StreamTrace
+from neurosim_core.overrides import set_options
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,6 +39,13 @@ _SAMPLING_RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 100.0, 50.0, 25.0, 20.0, 10.0
 """Those that are chosen from; each divides the IMU's."""
 _CALIBRATION_RATE_HZ = 100.0
 _IMU, _CAMERA = "imu", "events"
+_OPTIONS = {
+    f"sensors.{_CAMERA}.lens.width": "--width",
+    f"sensors.{_CAMERA}.lens.height": "--height",
+    "device": "--device",
+    f"sensors.{_CAMERA}.sampling_rate_hz": "--sampling-rate",
+}
+"""What the command line calls the keys of its settings, for error messages."""
 _IMU_RATE_HZ = 1000.0
 _SETTLED_S = 10.0
 """When memory is looked at first: everything has been used once."""
@@ -159,7 +167,7 @@ def stream_config(
     }
     if scene is not None:
         base["scene"] = {"kind": "mesh", "file": str(scene.resolve())}
-    return load_config(base, overrides=settings)
+    return load_config(base, overrides=settings, options=_OPTIONS | set_options(settings))
 
 
 def measure_stream(config: SimulationConfig, *, seconds: float) -> StreamTrace:
