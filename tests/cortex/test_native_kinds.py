@@ -179,14 +179,28 @@ def test_vectors(name):
 
 
 def test_everything_damaged_word_by_word():
-    body = python_body(everything())
-    assert coder_of(Everything).encode(everything(), 1 << 20) == body
+    """All of the body but the items of its large array, and the two words that are its end."""
+    value = everything(names=["", "hé"], ragged=[np.ones((2, 2), np.float16), np.zeros((0, 0))])
+    body = python_body(value)
+    assert coder_of(Everything).encode(value, 1 << 20) == body
+    places = [*range(0, 256, 4), *range(256 + 1600, len(body), 4)]
     taken = 0
-    for place in range(0, 1000, 4):
-        for word in (0, 1, 2, 64, len(body), 2**31, 2**32 - 1):
+    for place in places:
+        for word in (0, 1, 2, 64, len(body), len(body) + 1, 2**31, 2**32 - 1):
             damaged = body[:place] + word.to_bytes(4, "little") + body[place + 4 :]
             taken += check_decoding(Everything, damaged)
-    assert 0 < taken < 1750
+    assert 0 < taken < 8 * len(places)
+
+
+@pytest.mark.parametrize(
+    "value", [everything(), everything(names=[""] * 3), Point(1.0)], ids=["all", "", "point"]
+)
+def test_bodies_that_are_cut_off_or_longer(value):
+    body = python_body(value)
+    for size in (*range(0, len(body), 7), len(body) - 1):
+        check_decoding(type(value), body[:size])
+    for size in (1, 8, 64):
+        check_decoding(type(value), body + bytes(size))
 
 
 def test_absent_is_none_and_empty_is_nothing():
