@@ -21,6 +21,8 @@ from cortex.layout import (
 from cortex.schema import ArrayType, Schema
 from cortex.structure import new_message
 
+_PLACED_MAX = 64
+"""Sizes of drafts whose places are kept."""
 RESERVE_BYTES = 4096
 """Room that a draft has for strings, lists and arrays of unknown size."""
 
@@ -88,19 +90,21 @@ class Drafter:
         self._fixed = [(name, kind, offset) for name, kind, offset in arrays if kind.is_fixed]
         self._variable = [(name, kind) for name, kind, _ in arrays if not kind.is_fixed]
         self._defaults = {field.name: field for field in dataclasses.fields(cls)}
+        self._kinds = dict(self._variable)
+        self._placed: dict[tuple[Any, ...], tuple[dict[str, _Place], int]] = {}
 
     def size(self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None) -> int:
         """Return how much memory a draft needs [bytes]."""
-        _, tail = self._place(dims, dtypes)
-        return tail.end + RESERVE_BYTES
+        _, end = self._places_of(dims, dtypes)
+        return end + RESERVE_BYTES
 
     def draft(
         self, buffer: NDArray[np.uint8], dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
     ) -> Draft:
         """Return a draft in writable memory."""
-        places, tail = self._place(dims, dtypes)
-        if tail.end > len(buffer):
-            raise ValueError(f"{self._schema.name}: draft of {tail.end} bytes, the buffer has {len(buffer)}")
+        places, end = self._places_of(dims, dtypes)
+        if end > len(buffer):
+            raise ValueError(f"{self._schema.name}: draft of {end} bytes, the buffer has {len(buffer)}")
         draft = Draft(buffer, self._names, places)
         views = draft._Draft__views
         for name, kind, offset in self._fixed:
@@ -114,7 +118,10 @@ class Drafter:
         buffer, places = draft._Draft__buffer, draft._Draft__places
         views = draft._Draft__views
         self._set_defaults(draft)
-        message: Any = new_message(self._cls, [getattr(draft, name) for name in self._names])
+        values = draft._Draft__values
+        message: Any = new_message(
+            self._cls, [views[name] if name in views else values[name] for name in self._names]
+        )
         try:
             parts, end = self._layout(message, places)
         except ENCODE_ERRORS as error:
@@ -142,7 +149,7 @@ class Drafter:
                 put(getattr(message, name), values, tail, scope)
                 continue
             place = places[name]
-            kind = dict(self._variable)[name]
+            kind = self._kinds[name]
             for size, dimension in zip(place.shape, kind.shape, strict=True):
                 if dimension in self._shared and scope.setdefault(str(dimension), size) != size:
                     raise ValueError
@@ -150,8 +157,9 @@ class Drafter:
         return self._encoder.finish(values, tail), tail.end
 
     def _set_defaults(self, draft: Draft) -> None:
+        views, values = draft._Draft__views, draft._Draft__values
         for name, field in self._defaults.items():
-            if hasattr(draft, name):
+            if name in views or values[name] is not _UNSET:
                 continue
             if field.default is not dataclasses.MISSING:
                 setattr(draft, name, field.default)
@@ -163,6 +171,22 @@ class Drafter:
     def _unplaced(self, places: dict[str, _Place]) -> list[str]:
         fixed = {name for name, _, _ in self._fixed}
         return [name for name in self._names if name not in places and name not in fixed]
+
+    def _places_of(
+        self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None
+    ) -> tuple[dict[str, _Place], int]:
+        """As `_place`, with the end of what is placed; those used last are kept, as they come again."""
+        key = (*(dims or {}).items(), *(dtypes or {}).items())
+        try:
+            found = self._placed.get(key)
+        except TypeError:  # not to be hashed, so no dtype: `_place` says so
+            key, found = (), None
+        if found is None:
+            places, tail = self._place(dims, dtypes)
+            if len(self._placed) >= _PLACED_MAX:
+                self._placed.clear()
+            found = self._placed[key] = places, tail.end
+        return found
 
     def _place(
         self, dims: Mapping[str, int] | None, dtypes: Mapping[str, Any] | None

@@ -346,7 +346,7 @@ def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
     rooms: list[np.ndarray] = []
     asked: list[str] = []
 
-    def make_room(name: str, picture: np.ndarray) -> np.ndarray | None:
+    def make_room(name: str, stamp_ns: int, picture: np.ndarray) -> np.ndarray | None:
         asked.append(name)
         if len(asked) % 2:
             return None

@@ -217,17 +217,22 @@ class Outlet:
         """See who listens, and return how many subscribers each topic has."""
         return tuple(stream.look() for stream in self.streams.values())
 
-    def make_room(self, name: str, picture: NDArray[Any]) -> NDArray[Any] | None:
+    def make_room(self, name: str, stamp_ns: int, picture: NDArray[Any]) -> NDArray[Any] | None:
         """Return where a picture can be written so that it is not copied again; None if that makes no sense.
 
-        May be called from another thread than all else.
+        That is so where it is recorded or passes a link, where nobody listens, and where it is due already:
+        then it is published at once, and to copy it takes less time than to prepare that it is not. May be
+        called from another thread than all else.
 
         Args:
             name: Of the camera.
+            stamp_ns: Of the picture [ns].
             picture: Of the shape and dtype that is needed.
         """
         stream = self.streams[name]
         if self.record is not None or not stream.subscriber_count or not stream.channel.delivers_at_once:
+            return None
+        if self.lateness_ns is not None and self.lateness_ns(stamp_ns) >= 0:
             return None
         return stream.loan.lend(picture)
 

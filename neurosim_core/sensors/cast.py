@@ -387,8 +387,8 @@ def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     return packets
 
 
-MakeRoom = Callable[[str, NDArray[Any]], NDArray[Any] | None]
-"""Returns memory for a camera's picture, like the one that is given; None: there is none."""
+MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
+"""Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none."""
 
 
 def read_images(
@@ -404,9 +404,9 @@ def read_images(
     """
     copies: dict[tuple[str, int], NDArray[Any]] = {}
 
-    def copy_of(image: ImageChannel, slot: int, name: str) -> NDArray[Any]:
+    def copy_of(image: ImageChannel, slot: int, name: str, stamp_ns: int) -> NDArray[Any]:
         picture: NDArray[Any] = cast.picture_copies[instants.lane][image.output].view(slot, 1)[0]
-        room = None if make_room is None else make_room(name, picture)
+        room = None if make_room is None else make_room(name, stamp_ns, picture)
         if room is not None:
             np.copyto(room, picture)
             return room
@@ -425,7 +425,7 @@ def read_images(
                 stamp_ns=stamp_ns,
                 sequence=image.sequence,
                 sensor=name,
-                data=copy_of(image, slot, name),
+                data=copy_of(image, slot, name, stamp_ns),
                 encoding=_ENCODING[image.output],
             )
         )

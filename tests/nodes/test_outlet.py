@@ -331,7 +331,7 @@ def test_a_picture_has_room_where_its_reader_finds_it(make_stand: Callable[..., 
     stand = make_stand()
     pictures = stand.listen("/drone/rgb", Image)
     like = np.arange(160 * 150 * 3, dtype=np.uint64).astype(np.uint8).reshape(160, 150, 3)
-    room = stand.outlet.make_room("rgb", like)
+    room = stand.outlet.make_room("rgb", 0, like)
     assert room is not None
     room[:] = like
     for sequence, data in enumerate((room, like)):
@@ -352,13 +352,23 @@ def test_a_picture_has_room_where_its_reader_finds_it(make_stand: Callable[..., 
 def test_no_room_for_a_picture_that_is_kept_or_that_nobody_sees(make_stand: Callable[..., Stand]):
     like = np.zeros((160, 150, 3), np.uint8)
     stand = make_stand()
-    assert stand.outlet.make_room("rgb", like) is None
+    assert stand.outlet.make_room("rgb", 0, like) is None
     stand.listen("/drone/rgb", Image)
     stand.record()
-    assert stand.outlet.make_room("rgb", like) is None
-    late = make_stand(links={"rgb": {"latency_s": 0.01}})
-    late.listen("/drone/rgb", Image)
-    assert late.outlet.make_room("rgb", like) is None
+    assert stand.outlet.make_room("rgb", 0, like) is None
+    linked = make_stand(links={"rgb": {"latency_s": 0.01}})
+    linked.listen("/drone/rgb", Image)
+    assert linked.outlet.make_room("rgb", 0, like) is None
+
+
+def test_no_room_for_a_picture_that_is_due(make_stand: Callable[..., Stand]):
+    """It is published at once: there is no time left in which it could be copied."""
+    like = np.zeros((160, 150, 3), np.uint8)
+    stand = make_stand()
+    stand.listen("/drone/rgb", Image)
+    stand.outlet.lateness_ns = lambda stamp_ns: 5 * MS - stamp_ns
+    assert stand.outlet.make_room("rgb", 5 * MS, like) is None
+    assert stand.outlet.make_room("rgb", 6 * MS, like) is not None
 
 
 def test_collisions_are_published(make_stand: Callable[..., Stand]):
