@@ -474,14 +474,17 @@ def test_pictures_take_the_short_cut_into_a_slot(node, monkeypatch):
 
 
 def test_more_large_arrays_than_are_deferred(node, monkeypatch):
-    """A list of arrays, some of which are copied with the lock held."""
-    frames = [np.full((90, 100 + k), k, "<u4" if k % 2 else "<f8") for k in range(20)]
-    value = Frames(5, frames, [1.0, 2.0], np.ones((200, 200), np.uint8))
-    publisher, subscriber = opened(node, Frames, value)
+    """A list of arrays, some of which are copied with the lock held; slots that had other numbers before."""
+
+    def frames(first: int) -> Frames:
+        arrays = [np.full((90, 100 + k), first + k, "<u4" if k % 2 else "<f8") for k in range(20)]
+        return Frames(5, arrays, [1.0, 2.0], np.full((200, 200), first, np.uint8))
+
+    publisher, subscriber = opened(node, Frames, frames(100))
     monkeypatch.setattr(publisher, "_publish_slowly", None)
-    assert publisher.publish(value)
+    assert publisher.publish(frames(1))
     _, body, _ = subscriber.recv_raw(SOON_S)
-    assert bytes(body) == python_body(value)
+    assert bytes(body) == python_body(frames(1))
 
 
 @pytest.mark.parametrize("change", ["longer", "shorter", "wrong"])
