@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from processes import wait_for
+from processes import SOON_S, wait_for
 from recording_backend import RecordingBackend
 
 from cortex import Node
@@ -30,7 +30,7 @@ class Rig:
             self.simulator.close()
             raise
 
-    def update_until(self, condition: Callable[[], object], timeout_s: float = 10.0) -> Any:
+    def update_until(self, condition: Callable[[], object], timeout_s: float = SOON_S) -> Any:
         def look() -> object:
             self.bridge.update()
             return condition()

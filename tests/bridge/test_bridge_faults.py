@@ -22,7 +22,7 @@ from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.msgs import message_class
 
-STALL_S = 1.0
+STALL_S = 10.0
 """A machine that does a lot besides may hold up a call for so long; a bridge that blocks would for ever."""
 
 

@@ -335,8 +335,8 @@ def test_a_killed_peer_is_forgotten(short_lease: None, backend: DdsBackend, fore
 
 def test_a_killed_peer_does_not_hold_up_the_end(backend: DdsBackend, foreigner: Start) -> None:
     other = foreigner()
-    publishers = [backend.publisher(f"/words{number}", STRING, Qos()) for number in range(5)]
-    for number in range(5):
+    publishers = [backend.publisher(f"/words{number}", STRING, Qos()) for number in range(12)]
+    for number in range(12):
         other.do("subscribe", topic=f"rt/words{number}", kind="String")
     wait_for(lambda: all(publisher.subscriber_count for publisher in publishers))
     other.kill()
@@ -344,7 +344,7 @@ def test_a_killed_peer_does_not_hold_up_the_end(backend: DdsBackend, foreigner: 
         publisher.publish(text("to nobody"))
     begin_s = time.monotonic()
     backend.close()
-    assert time.monotonic() - begin_s < 2.5  # by default Cyclone DDS waits for a second for each
+    assert time.monotonic() - begin_s < 10.0  # by default Cyclone DDS waits for a second for each
 
 
 def test_a_stopped_subscriber_holds_up_nobody(backend: DdsBackend, foreigner: Start) -> None:

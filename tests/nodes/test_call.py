@@ -48,7 +48,7 @@ STATUS_NOW = SimulatorStatus(
 
 
 def ask(*words: str) -> int:
-    return call(_parser().parse_args(["call", *words, "--timeout", "20"]))
+    return call(_parser().parse_args(["call", *words, "--timeout", "60"]))
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_requests_arrive_as_they_are_meant(asked, capsys):
     assert capsys.readouterr().out == f"{changed}; paused at 1.5 s\n"
     first, *others = requests
     assert (first.seed, first.vehicle, first.position.tolist()) == (7, "red", [1.0, -2.0, 0.5])
-    steps = [Step(12, timeout_s=20.0), Step(1, timeout_s=20.0)]  # no longer than we wait
+    steps = [Step(12, timeout_s=60.0), Step(1, timeout_s=60.0)]  # no longer than we wait
     assert others[:5] == [Reset(), *steps, Trigger(), Trigger()]
     assert isinstance(others[5], Parameters)
     assert others[5].to_dict() == {
@@ -114,8 +114,8 @@ def test_an_answer_that_does_not_come(shared_runtime):
 
         node.service("/pause", Trigger, SimulatorReply, handle)
         try:
-            with pytest.raises(RuntimeError, match="has not answered within 1 s, and may still do it"):
-                call(_parser().parse_args(["call", "pause", "--timeout", "1"]))
+            with pytest.raises(RuntimeError, match="has not answered within 3 s, and may still do it"):
+                call(_parser().parse_args(["call", "pause", "--timeout", "3"]))
         finally:
             done.set()
 

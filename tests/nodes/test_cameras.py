@@ -43,7 +43,7 @@ class Gate:
         self.open = threading.Event()
         self.reached = threading.Event()
         self.at_ns = 0
-        see = module.see
+        see = module.see_each
 
         def held(model: Model, state: State, batch: Batch) -> Any:
             if batch.until_ns >= self.at_ns:
@@ -51,7 +51,7 @@ class Gate:
                 assert self.open.wait(4 * SOON_S)
             return see(model, state, batch)
 
-        monkeypatch.setattr(module, "see", held)
+        monkeypatch.setattr(module, "see_each", held)
 
 
 def fly(model: Model, eyes: Cameras, **options: Any) -> State:
@@ -122,8 +122,8 @@ def test_what_comes_late_is_left_out_where_there_is_no_thread(model: Model, inli
 
 def test_a_core_is_left_to_others_as_long_as_no_picture_waits(model: Model, gate: Gate):
     spared = []
-    held = module.see
-    module.see = lambda *job: spared.append(spared_count()) or held(*job)  # the gate puts it back
+    held = module.see_each
+    module.see_each = lambda *job: spared.append(spared_count()) or held(*job)  # the gate puts it back
     eyes = Cameras(inline=False, on_packets=lambda: None)
     fly(model, eyes)
     assert gate.reached.wait(SOON_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import signal
 import subprocess
 import sys
@@ -187,14 +188,14 @@ def test_missing_rotor_speeds_are_said_and_replaced(stage, start_pilot, caplog, 
     stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
     stage.send(2)
     assert stage.hear() == expected(2)
-    for tick in range(3, 30):
+    for tick in range(3, 100):
         stage.send(tick, rotors=False)
         assert stage.hear() == expected(tick, rotor_speed=a_state(2)["rotor_speed"])
-    wait_for(lambda: pilot.missing_count == 28)
-    assert time.monotonic() - begin_s < 28 * 0.3  # it waits 5 + 1 times, then no more
+    wait_for(lambda: pilot.missing_count == 98)
+    assert time.monotonic() - begin_s < 98 * 0.3  # it waits 5 + 1 times, then no more
     said = [record.getMessage() for record in caplog.records]
     assert said[0].startswith("drone: no rotor speeds came with the odometry of 5000000 ns")
-    assert len(said) < 28  # once a second at most
+    assert len(said) < 50  # once a second at most
 
     def found_again() -> bool:
         stage.send(30)
@@ -209,12 +210,19 @@ def test_in_streaming_the_newest_counts(stage, start_pilot, monkeypatch):
     start_pilot(lockstep=False, delay_s=0.3)
     stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
     stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)
-    for tick in range(5):
-        stage.send(tick)
-    answered = [stage.hear()]
-    while answered[-1] != expected(4):
-        answered.append(stage.hear())
-    assert len(answered) <= 2
+    ticks = itertools.count()
+
+    def answers() -> int:
+        """How many answers there are to five states that come while it sleeps, unless this thread does."""
+        sent = list(itertools.islice(ticks, 5))
+        for tick in sent:
+            stage.send(tick)
+        count = 1
+        while stage.hear() != expected(sent[-1]):
+            count += 1
+        return count
+
+    wait_for(lambda: answers() <= 2)
     assert stage.silence()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from live_rig import make_config, models_of
-from processes import SOON_S
+from processes import SOON_S, wait_for
 
 from neurosim_core.config import load_config
 from neurosim_core.nodes import recorder as recorder_module
@@ -104,6 +104,7 @@ def test_a_run_that_is_stopped_does_not_wait_for_the_disk(tmp_path: Path, monkey
     """Packets are taken without waiting; what is not written at the deadline is counted and said."""
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
     monkeypatch.setattr(recorder_module, "HURRY_S", 0.1)
+    monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", SOON_S)
     gate, begun = threading.Event(), threading.Event()
     write = FlightWriter.write
 
@@ -127,7 +128,14 @@ def test_a_run_that_is_stopped_does_not_wait_for_the_disk(tmp_path: Path, monkey
     stop.set()
     filler.join(SOON_S)
     assert not filler.is_alive()
-    threading.Timer(0.2, gate.set).start()  # later than the deadline, in time for the files to be closed
+
+    def go_on() -> None:
+        """Write on, later than the deadline and in time for the files to be closed."""
+        deadline_s = wait_for(lambda: recorder._deadline_s)
+        wait_for(lambda: time.monotonic() > deadline_s)
+        gate.set()
+
+    threading.Thread(target=go_on).start()
     with pytest.raises(
         TimeoutError,
         match=r"the disk is too slow: 17 packets at the end of the run were not written in 0.1 s$",

@@ -123,10 +123,12 @@ def test_lockstep_takes_only_the_command_that_answers():
 
 
 def test_lockstep_ends_with_an_error_when_no_command_comes():
-    with LiveRig(make_config(**LOCKSTEP, **{"live.command_deadline_s": 0.2})) as rig:
+    with LiveRig(make_config(**LOCKSTEP)) as rig:
         odometry = rig.listen("/drone/odometry", Odometry)
         rig.fly(odometry, 2)
         rig.send(rig.hover(), stamp_ns=77)
+        rig.wait_for_status(lambda status: status.vehicles[0].superseded_count == 1)
+        rig.set({"live.command_deadline_s": 0.2})
         assert rig.join() == 1
         reason = rig.wait_for_status(lambda status: status.phase == "ended").reason
     assert "no command for drone within live.command_deadline_s = 0.2 s at control period 2" in reason
@@ -284,7 +286,7 @@ def test_only_what_is_listened_to_is_rendered():
 
 
 def test_who_subscribes_and_then_commands_gets_stamp_0(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("neurosim_core.nodes.audience.SETTLE_S", 1.0)  # time to subscribe on a busy machine
+    monkeypatch.setattr("neurosim_core.nodes.audience.SETTLE_S", 3.0)  # time to subscribe on a busy machine
     monkeypatch.setattr("neurosim_core.nodes.audience.SETTLE_MAX_S", SOON_S)
     with LiveRig(make_config(**LOCKSTEP)) as rig:
         rig.send(rig.hover(), stamp_ns=0)
@@ -372,7 +374,7 @@ def test_the_fail_safe_ends_with_the_next_command():
 
 
 def _with_slow_cameras(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    see = cameras.see
+    see = cameras.see_each
 
     def slow(model: Any, state: Any, batch: Any) -> Any:
         job = cameras.Job(vehicle="drone", model=model, state=state, batch=batch)
@@ -380,7 +382,7 @@ def _with_slow_cameras(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
             time.sleep(seconds)
         return see(model, state, batch)
 
-    monkeypatch.setattr(cameras, "see", slow)
+    monkeypatch.setattr(cameras, "see_each", slow)
 
 
 def test_slow_cameras_slow_time_down(monkeypatch: pytest.MonkeyPatch):
