@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from neurosim_core.model import Model
 from neurosim_core.packets import Packet
@@ -22,9 +22,16 @@ from neurosim_core.sensors.cast import (
 from neurosim_core.streams import on
 
 
-def look_at(model: Model, state: State, batch: Batch) -> None:
-    """Let the cameras that are wanted see a batch, and launch the copies to the host."""
-    due = choose(model, state, batch)
+def look_at(model: Model, state: State, batch: Batch, casts: Collection[int] | None = None) -> None:
+    """Let the cameras that are wanted see a batch, and launch the copies to the host.
+
+    Args:
+        model: What does not change.
+        state: What does.
+        batch: What was flown.
+        casts: Which look; None: all.
+    """
+    due = choose(model, state, batch, casts)
     with timed(state.wall_s, "render"), on(state.render_stream):
         state.flown[batch.number % state.flight_lane_count].hold()
         looks = plan_looks(state, batch, due)
@@ -39,10 +46,17 @@ def look_at(model: Model, state: State, batch: Batch) -> None:
         scan(state, batch, looks)
 
 
-def choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
-    """Return which boundaries of a batch each cast has to render; adaptive casts wait for the flight."""
-    chosen, choices = [], []
+def choose(model: Model, state: State, batch: Batch, casts: Collection[int] | None = None) -> list[list[int]]:
+    """Return which boundaries of a batch each cast has to render; adaptive casts wait for the flight.
+
+    Those that are not among `casts` have none.
+    """
+    chosen: list[list[int]] = []
+    choices = []
     for index, cast in enumerate(state.casts):
+        if casts is not None and index not in casts:
+            chosen.append([])
+            continue
         close_eyes(cast, batch.wanted)
         due = [
             place

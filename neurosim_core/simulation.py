@@ -2,9 +2,9 @@
 """The data flow, readable top to bottom: config -> Model -> State -> packets.
 
 What does not change is in `model.py`, what does in `run_state.py`. A run is cut into batches (`schedule.py`):
-`batch_flight.py` flies one, `batch_cameras.py` looks at it. Within a batch the vehicle is integrated from boundary to boundary,
-and its states stay on the device. Then every cast renders all its instants in one launch, every event camera
-scans them in one launch, and everything is read back once.
+`batch_flight.py` flies one, `batch_cameras.py` looks at it. Within a batch the vehicle is integrated from
+boundary to boundary, and its states stay on the device. Then every cast renders all its instants in one
+launch, every event camera scans them in one launch, and everything is read back once.
 
 On a CUDA device `run_model` launches the next batch before it reads one back, so the device always has work.
 Each batch under way has a lane: slots of the trace and buffers of the casts that no other batch writes to.
@@ -68,6 +68,7 @@ __all__ = [
     "run",
     "run_model",
     "see",
+    "see_each",
     "skip",
     "start",
     "step",
@@ -199,6 +200,20 @@ def see(model: Model, state: State, batch: Batch) -> list[Packet]:
     packets = read_cameras(state, batch)
     state.looked_count += 1
     return in_order(model, packets, batch.until_ns)
+
+
+def see_each(model: Model, state: State, batch: Batch) -> Iterator[list[Packet]]:
+    """Do what `see` does, and yield the packets of each cast when it is done, those of the fastest first.
+
+    A picture does not wait for one that takes longer. For a CPU: a CUDA device would have less at a time.
+    All has to be taken; arguments as for `see`.
+    """
+    for index in sorted(range(len(state.casts)), key=lambda index: -state.casts[index].rate.rate_hz):
+        look_at(model, state, batch, {index})
+        packets = in_order(model, read_cameras(state, batch), batch.until_ns)
+        if packets:
+            yield packets
+    state.looked_count += 1
 
 
 def skip(model: Model, state: State, batch: Batch) -> int:

@@ -368,6 +368,33 @@ def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
     assert sum(any(picture.data is room for room in rooms) for picture in pictures) == len(asked) // 2
 
 
+def test_the_fastest_camera_is_seen_first(settings):
+    """Cast by cast the packets are those of all at once; the first are there before others are rendered."""
+    lens = {"width": 20, "height": 16, "horizontal_fov_rad": 1.0}
+    slow = {"kind": "depth", "rate_hz": 50.0, "lens": lens}
+    sensors = {"slow": slow, **settings["sensors"]}  # the order of the rig is not that of their rates
+    model = simulation.make_model(ns.load_config({**settings, "sensors": sensors}))
+    together, apart = (simulation.make_state(model, flight_lane_count=64) for _ in range(2))
+    early_count = 0
+    for _ in range(10):
+        _, batches = simulation.fly_period(model, together, None)
+        expected = [simulation.see(model, together, batch) for batch in batches]
+        _, batches = simulation.fly_period(model, apart, None)
+        for batch, packets in zip(batches, expected, strict=True):
+            found, renders = [], []
+            for part in simulation.see_each(model, apart, batch):
+                renders.append(apart.counts["renders"])
+                found.append(part)
+            assert sorted(content([p for part in found for p in part])) == sorted(content(packets))
+            if of(packets, "slow") and len(found) > 1:
+                assert {packet.sensor for packet in found[-1]} == {"slow"}
+                assert renders[-1] == renders[-2] + 1
+                early_count += 1
+    assert early_count >= 2
+    assert apart.looked_count == together.looked_count
+    assert apart.counts == together.counts
+
+
 def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
     state = simulation.make_state(outside_model, flight_lane_count=3)
     simulation.fly_period(outside_model, state, None)  # the start and one period

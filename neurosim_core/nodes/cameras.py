@@ -13,7 +13,7 @@ from neurosim_core.packets import Packet
 from neurosim_core.priority import give_way, sparing
 from neurosim_core.schedule import batch_end_ns
 from neurosim_core.sensors.cast import is_due
-from neurosim_core.simulation import Batch, Model, State, free_lanes, see, skip
+from neurosim_core.simulation import Batch, Model, State, free_lanes, see, see_each, skip
 
 _LAG_PERIODS = (2, 100)
 """Bounds of how far cameras may be behind, in control periods."""
@@ -229,7 +229,14 @@ class Cameras:
                 if not job.forgotten:
                     self._count(job)
             return
-        packets = see(job.model, job.state, job.batch)
+        if self._thread is None:
+            self._give(job, see(job.model, job.state, job.batch))
+            return
+        for packets in see_each(job.model, job.state, job.batch):
+            self._give(job, packets)
+
+    def _give(self, job: Job, packets: list[Packet]) -> None:
+        """Let packets be taken."""
         with self._changed:
             if not packets or job.forgotten:
                 return
