@@ -180,7 +180,9 @@ def _run(role: Callable[[Channel, Any], None], channel: Channel, job: Any, log: 
     """Be the child: run the role, report what it raises, and leave without the parent's exit handlers."""
     status = 1
     try:
-        os.setsid()
+        # To be killed with all that it starts. A session would be a scheduling group of its own on Linux,
+        # with as large a share as all else that runs, whatever the run's own `nice` says.
+        os.setpgrp()
         _die_with_parent(parent)
         fd = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
         os.dup2(fd, 2)
