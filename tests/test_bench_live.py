@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from neurosim_core import cli
 from neurosim_core.bench.closed_loop import loop_config, measure_loop
@@ -44,9 +44,12 @@ def test_closed_loop(tmp_path, capsys):
         assert figures["requested_hz"] == 200.0
         assert figures["image_bytes"] == 64 * 48 * 3
         assert figures["image_count"] >= 10
-        assert 0.0 < figures["transport_median_s"] <= figures["transport_p99_s"] < 1.0
-        assert figures["transport_median_s"] < figures["latency_median_s"] <= figures["latency_p99_s"] < 5.0
-        assert figures["received_hz"] > 1.0
+        assert 0.0 < figures["transport_median_s"] <= figures["transport_p99_s"] < SOON_S
+        assert (
+            figures["transport_median_s"] < figures["latency_median_s"] <= figures["latency_p99_s"] < SOON_S
+        )
+        assert figures["transport_median_s"] < 1.0
+        assert figures["received_hz"] > 0.1
         assert figures["unfelt_count"] < figures["image_count"]
     assert float(lockstep["unfelt_count"]) <= 2  # the last ones: nobody waited for their images
     assert float(streaming["received_hz"]) < 220.0  # no faster than real time
@@ -65,8 +68,8 @@ def test_streaming(tmp_path, capsys):
     figures = {row["name"]: row["value"] for row in rows_of(out / "streaming.csv")}
     assert float(figures["sampling_rate_hz"]) == 20.0
     assert int(figures["imu_lost_count"]) == 0
-    assert 0.1 < float(figures["real_time_factor"]) < 1.2
-    assert 0.0 <= float(figures["jitter_median_s"]) <= float(figures["jitter_max_s"]) < 5.0
+    assert 0.01 < float(figures["real_time_factor"]) < 1.2
+    assert 0.0 <= float(figures["jitter_median_s"]) <= float(figures["jitter_max_s"]) < SOON_S
     arrivals = np.loadtxt(out / "arrivals.csv", delimiter=",", skiprows=1)
     assert len(arrivals) == int(figures["imu_count"])
     assert (np.diff(arrivals[:, 0]) == 1e6).all()
@@ -134,4 +137,4 @@ signal.pause()
     with pytest.raises(ProcessEnded, match=r"`neurosim serve` ended with status -9; it said:\n  deaf"):
         process.check()
     assert process.resident_bytes() == -1
-    assert process.wait(1.0) == -9
+    assert process.wait(SOON_S) == -9

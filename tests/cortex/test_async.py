@@ -159,6 +159,7 @@ def test_one_loop_after_another(numbers):
     assert subscriber.recv(SOON_S).value == 4
 
 
+@pytest.mark.alone
 def test_a_loop_is_woken_at_once(numbers):
     """Waking by the descriptor, not by looking ten times a second."""
     publisher, subscriber = numbers
@@ -175,6 +176,7 @@ def test_a_loop_is_woken_at_once(numbers):
     wait_for(lambda: max(asyncio.run(run())) < 0.02e9)  # the machine may be busy for a while
 
 
+@pytest.mark.alone
 def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
     """Also if its descriptor has the number of one that was closed."""
     subscriber = node.subscriber("/numbers", Number, policy=latest())

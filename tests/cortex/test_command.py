@@ -33,7 +33,7 @@ from cortex.message import message
 from cortex.schema import schema_of
 
 MakeNode = Callable[..., Node]
-PROMPTLY_S = 3.0
+PROMPTLY_S = 30.0
 """How soon a command must end after Ctrl-C, on a machine that does a lot besides."""
 
 

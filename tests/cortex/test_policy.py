@@ -114,6 +114,7 @@ def test_the_newest_after_a_long_absence(make_node, start_child, policy):
     assert counters.received == depth
 
 
+@pytest.mark.alone
 def test_a_reader_that_works_gets_the_newest_each_time(make_node, start_child):
     """Age of the datum: with 5 ms of work for each message at 2 kHz, what is read was published just now."""
     child = start_child("peer")

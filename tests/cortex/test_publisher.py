@@ -304,6 +304,7 @@ def test_a_burst_travels_together(node):
     assert [info.sequence for _, info in messages] == list(range(first, first + 1000))
 
 
+@pytest.mark.alone
 def test_the_tail_of_a_burst_does_not_wait(node):
     """It is sent when nothing more comes: within 0.15 ms, when the machine lets it."""
     publisher = node.publisher("/numbers", Number, coalesce=True)

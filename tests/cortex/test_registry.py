@@ -137,6 +137,7 @@ def test_the_registry_ends_after_the_last_node_even_if_all_were_killed(base):
     assert (runtime_dir(0) / REGISTRY_LOG).read_text() == ""
 
 
+@pytest.mark.alone
 def test_the_registry_costs_little(base):
     """CPU time to start below 0.25 s on any machine of today; idle with a node, below 1 %."""
     with node_process("one") as one:

@@ -59,6 +59,7 @@ def test_nothing_comes_in_time(numbers):
         subscriber.recv(0.0)
 
 
+@pytest.mark.alone
 def test_a_message_wakes_who_waits(numbers):
     """It does not wait for the next look: a tenth of a second would be that."""
     publisher, subscriber = numbers
