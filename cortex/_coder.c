@@ -260,7 +260,7 @@ PyDoc_STRVAR(gather_doc,
 
 /* Whether a frame is the expected one of a type of fixed size. */
 static int is_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
-    const Py_ssize_t size = coder->record.size;
+    const Py_ssize_t size = coder->block.size;
     if (!PyBytes_CheckExact(frame) || PyBytes_GET_SIZE(frame) != HEADER_SIZE + size) return 0;
     uint64_t rest[5];
     memcpy(rest, PyBytes_AS_STRING(frame) + HEAD_SIZE, sizeof rest);
@@ -297,13 +297,13 @@ static PyObject *join_bodies(PyObject **frames, Py_ssize_t count, Py_ssize_t siz
 static PyObject *coder_gather(Coder *coder, PyObject *const *arguments, Py_ssize_t count) {
     Source source;
     if (!arguments_are(count, 6) || !take_source(&source, arguments, arguments + 2)) return NULL;
-    if (coder->record.has_tail || !coder->has_head) {
+    if (coder->block.has_tail || !coder->has_head) {
         PyErr_SetString(PyExc_ValueError, "only bodies of fixed size are gathered");
         return NULL;
     }
     PyObject *frames[GATHER_MAX], *frame = NULL;
     const Py_ssize_t found = gather_source(coder, &source, frames, &frame);
-    PyObject *bodies = join_bodies(frames, found, coder->record.size);
+    PyObject *bodies = join_bodies(frames, found, coder->block.size);
     if (bodies == NULL) {
         Py_XDECREF(frame);
         return NULL;
@@ -380,10 +380,10 @@ static PyObject *coder_decode(Coder *coder, PyObject *const *arguments, Py_ssize
 /* The type */
 
 static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
-    static char *names[] = {"record", "stamp", "head", NULL};
-    PyObject *record, *head;
+    static char *names[] = {"block", "stamp", "head", NULL};
+    PyObject *block, *head;
     Py_ssize_t stamp;
-    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!nS:Coder", names, &PyTuple_Type, &record, &stamp, &head))
+    if (!PyArg_ParseTupleAndKeywords(arguments, keywords, "O!nS:Coder", names, &PyTuple_Type, &block, &stamp, &head))
         return NULL;
     const Py_ssize_t head_size = PyBytes_GET_SIZE(head);
     if (head_size != 0 && head_size != HEAD_SIZE) {
@@ -395,11 +395,11 @@ static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
     memcpy(coder->head, PyBytes_AS_STRING(head), (size_t)head_size);
     coder->has_head = head_size != 0;
     coder->stamp = stamp;
-    if (!take_record(&coder->record, record)) {
+    if (!take_block(&coder->block, block)) {
         Py_DECREF(coder);
         return NULL;
     }
-    if (stamp >= coder->record.count || (stamp >= 0 && coder->record.fields[stamp].kind != NUMBER)) {
+    if (stamp >= coder->block.count || (stamp >= 0 && coder->block.fields[stamp].kind != NUMBER)) {
         PyErr_Format(PyExc_ValueError, "field %zd is no stamp", stamp);
         Py_DECREF(coder);
         return NULL;
@@ -409,10 +409,10 @@ static PyObject *coder_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
 
 static int coder_traverse(Coder *coder, visitproc visit, void *arg) {
     Py_VISIT(coder->slots);
-    return visit_record(&coder->record, visit, arg);
+    return visit_block(&coder->block, visit, arg);
 }
 
-/* What keeps the record in a cycle is its class, which breaks it. */
+/* What keeps the block in a cycle is its class, which breaks it. */
 static int coder_clear(Coder *coder) {
     Py_CLEAR(coder->slots);
     return 0;
@@ -421,7 +421,7 @@ static int coder_clear(Coder *coder) {
 static void coder_dealloc(Coder *coder) {
     PyObject_GC_UnTrack(coder);
     coder_clear(coder);
-    free_record(&coder->record);
+    free_block(&coder->block);
     Py_TYPE(coder)->tp_free((PyObject *)coder);
 }
 
@@ -443,10 +443,10 @@ static PyMemberDef coder_members[] = {
 };
 
 PyDoc_STRVAR(coder_doc,
-"Coder(record, stamp, head)\n--\n\n"
+"Coder(block, stamp, head)\n--\n\n"
 "Writes and reads the messages of one type.\n\n"
 "Args:\n"
-"    record: What `native.describe_message` says of the type.\n"
+"    block: What `native.py` says of the type.\n"
 "    stamp: Index of the field that is the stamp, -1: none.\n"
 "    head: What frames begin with, 24 bytes; empty: this one makes and reads no frames.\n");
 

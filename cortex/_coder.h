@@ -9,7 +9,7 @@ enum { DEFERRED_MAX = 16 };
 
 typedef struct {
     PyObject_HEAD
-    Record record;
+    Block block;
     Py_ssize_t stamp; /* field that is the stamp, -1: none */
     int has_head;
     char head[HEAD_SIZE];

@@ -169,9 +169,9 @@ static int take_detail(Item *item, PyObject *detail, Py_ssize_t room, int dimens
             item->size = 8;
             return take_list(&item->list, detail);
         case MESSAGE:
-            if (!take_record(&item->record, detail)) return 0;
-            item->has_tail = (char)item->record.has_tail;
-            item->size = item->record.size;
+            if (!take_block(&item->block, detail)) return 0;
+            item->has_tail = (char)item->block.has_tail;
+            item->size = item->block.size;
             return 1;
     }
     return refuse("an unknown kind");
@@ -192,27 +192,27 @@ static int take_item(Item *item, PyObject *row, Py_ssize_t room, int dimension_c
 
 /* Messages */
 
-static int take_field(Record *record, PyObject *row) {
+static int take_field(Block *block, PyObject *row) {
     PyObject *name, *item;
     if (!PyArg_ParseTuple(row, "UO", &name, &item)) return 0;
-    Item *field = &record->fields[record->count++];
-    field->slot = slot_of(record->cls, name);
-    if (field->slot < 0 || !take_item(field, item, record->size, record->dimension_count)) return 0;
-    record->has_tail |= field->has_tail;
+    Item *field = &block->fields[block->count++];
+    field->slot = slot_of(block->cls, name);
+    if (field->slot < 0 || !take_item(field, item, block->size, block->dimension_count)) return 0;
+    block->has_tail |= field->has_tail;
     return 1;
 }
 
-int take_record(Record *record, PyObject *row) {
+int take_block(Block *block, PyObject *row) {
     PyObject *cls, *fields;
-    if (!PyArg_ParseTuple(row, "O!niO!", &PyType_Type, &cls, &record->size, &record->dimension_count, &PyTuple_Type, &fields))
+    if (!PyArg_ParseTuple(row, "O!niO!", &PyType_Type, &cls, &block->size, &block->dimension_count, &PyTuple_Type, &fields))
         return 0;
-    record->cls = (PyTypeObject *)Py_NewRef(cls);
-    if (record->size < 0 || record->size >= BODY_LIMIT) return refuse("a block of that size");
-    if (record->dimension_count < 0 || record->dimension_count > DIMENSIONS_MAX) return refuse("too many names");
-    record->fields = allocate(PyTuple_GET_SIZE(fields), sizeof(Item));
-    if (record->fields == NULL) return 0;
+    block->cls = (PyTypeObject *)Py_NewRef(cls);
+    if (block->size < 0 || block->size >= BODY_LIMIT) return refuse("a block of that size");
+    if (block->dimension_count < 0 || block->dimension_count > DIMENSIONS_MAX) return refuse("too many names");
+    block->fields = allocate(PyTuple_GET_SIZE(fields), sizeof(Item));
+    if (block->fields == NULL) return 0;
     for (Py_ssize_t index = 0; index < PyTuple_GET_SIZE(fields); ++index) {
-        if (!take_field(record, PyTuple_GET_ITEM(fields, index))) return 0;
+        if (!take_field(block, PyTuple_GET_ITEM(fields, index))) return 0;
     }
     return 1;
 }
@@ -241,13 +241,13 @@ static void free_item(Item *item) {
     if (item->kind == ENUM) free_members(&item->members);
     if (item->kind == OPTIONAL) free_inner(item->inner);
     if (item->kind == LIST) free_inner(item->list.item);
-    if (item->kind == MESSAGE) free_record(&item->record);
+    if (item->kind == MESSAGE) free_block(&item->block);
 }
 
-void free_record(Record *record) {
-    for (Py_ssize_t index = 0; index < record->count; ++index) free_item(&record->fields[index]);
-    PyMem_Free(record->fields);
-    Py_XDECREF(record->cls);
+void free_block(Block *block) {
+    for (Py_ssize_t index = 0; index < block->count; ++index) free_item(&block->fields[index]);
+    PyMem_Free(block->fields);
+    Py_XDECREF(block->cls);
 }
 
 static int visit_item(const Item *item, visitproc visit, void *arg) {
@@ -260,16 +260,16 @@ static int visit_item(const Item *item, visitproc visit, void *arg) {
         case LIST:
             return item->list.item == NULL ? 0 : visit_item(item->list.item, visit, arg);
         case MESSAGE:
-            return visit_record(&item->record, visit, arg);
+            return visit_block(&item->block, visit, arg);
         default:
             return 0;
     }
 }
 
-int visit_record(const Record *record, visitproc visit, void *arg) {
-    Py_VISIT(record->cls);
-    for (Py_ssize_t index = 0; index < record->count; ++index) {
-        const int stopped = visit_item(&record->fields[index], visit, arg);
+int visit_block(const Block *block, visitproc visit, void *arg) {
+    Py_VISIT(block->cls);
+    for (Py_ssize_t index = 0; index < block->count; ++index) {
+        const int stopped = visit_item(&block->fields[index], visit, arg);
         if (stopped) return stopped;
     }
     return 0;

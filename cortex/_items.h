@@ -51,14 +51,15 @@ typedef struct {
     int dimension_count; /* of the scope that each element is */
 } List;
 
+/* Of a message: where its fields lie. */
 typedef struct {
     PyTypeObject *cls;
-    Py_ssize_t size; /* of the block */
+    Py_ssize_t size;
     int dimension_count;
     int has_tail;
     Py_ssize_t count;
     Item *fields;
-} Record;
+} Block;
 
 /* A value of one type: a field, what is optional, or an element of a list. */
 struct Item {
@@ -73,14 +74,14 @@ struct Item {
         Members members; /* ENUM */
         Item *inner;     /* OPTIONAL */
         List list;
-        Record record; /* MESSAGE */
+        Block block; /* MESSAGE */
     };
 };
 
 /* Take what `native.py` says of a message, see there; 0 with an error set. Whatever was taken is to be freed. */
-int take_record(Record *record, PyObject *row);
-void free_record(Record *record);
-int visit_record(const Record *record, visitproc visit, void *arg);
+int take_block(Block *block, PyObject *row);
+void free_block(Block *block);
+int visit_block(const Block *block, visitproc visit, void *arg);
 
 static inline PyObject **place_of(const Item *field, PyObject *message) {
     return (PyObject **)((char *)message + field->slot);

@@ -215,12 +215,12 @@ static int pack_list(Pack *pack, const List *list, PyObject *value, Py_ssize_t a
     return 1;
 }
 
-static int pack_message(Pack *pack, const Record *record, PyObject *message, Py_ssize_t at) {
-    if (Py_TYPE(message) != record->cls) return 0;
+static int pack_message(Pack *pack, const Block *block, PyObject *message, Py_ssize_t at) {
+    if (Py_TYPE(message) != block->cls) return 0;
     npy_intp dimensions[DIMENSIONS_MAX];
-    begin_scope(dimensions, record->dimension_count);
-    const Item *end = record->fields + record->count;
-    for (const Item *field = record->fields; field < end; ++field) {
+    begin_scope(dimensions, block->dimension_count);
+    const Item *end = block->fields + block->count;
+    for (const Item *field = block->fields; field < end; ++field) {
         if (pack->out == NULL && !field->has_tail) continue;
         PyObject *value = *place_of(field, message);
         if (value == NULL || !pack_item(pack, field, value, at + field->offset, dimensions)) return 0;
@@ -252,7 +252,7 @@ static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t a
         case LIST:
             return pack_list(pack, &item->list, value, at);
         case MESSAGE:
-            return pack_message(pack, &item->record, value, at);
+            return pack_message(pack, &item->block, value, at);
     }
     Py_UNREACHABLE();
 }
@@ -260,27 +260,27 @@ static int pack_item(Pack *pack, const Item *item, PyObject *value, Py_ssize_t a
 /* Bodies */
 
 Py_ssize_t measure_body(const Coder *coder, PyObject *message) {
-    const Record *record = &coder->record;
-    if (!record->has_tail) return Py_TYPE(message) == record->cls ? record->size : -1;
+    const Block *block = &coder->block;
+    if (!block->has_tail) return Py_TYPE(message) == block->cls ? block->size : -1;
     Pack pack;
     pack.out = NULL;
-    pack.end = record->size;
+    pack.end = block->size;
     pack.limit = BODY_LIMIT - 1;
-    return pack_message(&pack, record, message, 0) ? pack.end : -1;
+    return pack_message(&pack, block, message, 0) ? pack.end : -1;
 }
 
 int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_ssize_t size, int defers) {
-    const Record *record = &coder->record;
+    const Block *block = &coder->block;
     pack->out = out;
-    pack->end = record->size;
+    pack->end = block->size;
     pack->limit = size;
     pack->stamp_ns = 0;
     pack->defers = defers;
     pack->deferred_count = 0;
-    memset(out, 0, (size_t)record->size);
-    if (!pack_message(pack, record, message, 0) || pack->end != size) return 0;
+    memset(out, 0, (size_t)block->size);
+    if (!pack_message(pack, block, message, 0) || pack->end != size) return 0;
     if (coder->stamp < 0) return 1;
-    pack->stamp_ns = PyLong_AsLongLong(*place_of(&record->fields[coder->stamp], message)); /* it was written */
+    pack->stamp_ns = PyLong_AsLongLong(*place_of(&block->fields[coder->stamp], message)); /* it was written */
     if (pack->stamp_ns != -1 || !PyErr_Occurred()) return 1;
     PyErr_Clear();
     return 0;

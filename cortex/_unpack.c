@@ -134,13 +134,13 @@ static PyObject *unpack_list(Body *body, const List *list, Py_ssize_t at) {
     return elements;
 }
 
-static PyObject *unpack_message(Body *body, const Record *record, Py_ssize_t at) {
-    PyObject *message = record->cls->tp_alloc(record->cls, 0);
+static PyObject *unpack_message(Body *body, const Block *block, Py_ssize_t at) {
+    PyObject *message = block->cls->tp_alloc(block->cls, 0);
     if (message == NULL) return NULL;
     npy_intp dimensions[DIMENSIONS_MAX];
-    begin_scope(dimensions, record->dimension_count);
-    const Item *end = record->fields + record->count;
-    for (const Item *field = record->fields; field < end; ++field) {
+    begin_scope(dimensions, block->dimension_count);
+    const Item *end = block->fields + block->count;
+    for (const Item *field = block->fields; field < end; ++field) {
         PyObject *value = unpack_item(body, field, at + field->offset, dimensions);
         if (value == NULL) {
             Py_DECREF(message);
@@ -178,14 +178,14 @@ static PyObject *unpack_item(Body *body, const Item *item, Py_ssize_t at, npy_in
         case LIST:
             return unpack_list(body, &item->list, at);
         case MESSAGE:
-            return unpack_message(body, &item->record, at);
+            return unpack_message(body, &item->block, at);
     }
     Py_UNREACHABLE();
 }
 
 PyObject *read_body(const Coder *coder, PyObject *owner, const char *data, Py_ssize_t size) {
-    const Record *record = &coder->record;
-    if (size < record->size || size >= BODY_LIMIT || (size > record->size && !record->has_tail)) return NULL;
-    Body body = {owner, data, size, size - record->size};
-    return unpack_message(&body, record, 0);
+    const Block *block = &coder->block;
+    if (size < block->size || size >= BODY_LIMIT || (size > block->size && !block->has_tail)) return NULL;
+    Body body = {owner, data, size, size - block->size};
+    return unpack_message(&body, block, 0);
 }

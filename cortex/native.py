@@ -65,14 +65,14 @@ def make_coder(schema: Schema, cls: type, head: bytes = b"") -> Any:
     if _Coder is None:
         return None
     try:
-        record = _message(schema, cls, block_size(schema))
+        block = _message(schema, cls, block_size(schema))
     except _TooManyNames:
         return None
     stamps = [
         k for k, field in enumerate(schema.fields) if field.name == "stamp_ns" and "int" in str(field.type)
     ]
     stamp = stamps[0] if stamps and isinstance(schema.fields[stamps[0]].type, str) else -1
-    return _Coder(record, stamp, head)
+    return _Coder(block, stamp, head)
 
 
 def _scope(kinds: list[FieldType]) -> _Scope:
