@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from cpp_client import Impostor, Peer, bad_frames, make_frame, make_rich
 from cpp_messages import OtherScan, Picture, Rich, Scan
+from cpp_programs import CPP, needs_compiler, programs, short, start
 from processes import SOON_S, shared_mappings, wait_for
 
 import cortex.messages
@@ -32,71 +33,19 @@ from cortex.registry import ensure_registry
 from cortex.schema import Schema, TypeMismatch, schema_of
 from cortex.vectors import load_vectors
 
-CPP = Path(__file__).parents[2] / "cortex" / "cpp"
 MUTATIONS = 3000
 CLEAN = {"wrong": 0, "lost": 0, "rejected": 0, "overtaken": 0}
 
+__all__ = ["programs", "start"]
 
-def _missing() -> str:
-    for tool in ("cmake", "g++"):
-        if shutil.which(tool) is None:
-            return f"no {tool}"
-    for header in ("zmq.h", "zmq.hpp"):
-        if not any((Path(root) / header).exists() for root in ("/usr/include", "/usr/local/include")):
-            return f"no {header}: apt install libzmq3-dev cppzmq-dev"
-    return ""
-
-
-pytestmark = pytest.mark.skipif(bool(_missing()), reason=f"the C++ client cannot be built here: {_missing()}")
-
-
-def _vector_types() -> list[Schema]:
-    return [Schema.from_json(vector["schema"]) for vector in load_vectors().values()]
-
-
-def _short(schema: Schema) -> str:
-    return schema.name.rpartition("/")[2]
-
-
-@pytest.fixture(scope="session")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The directory of the test programs and examples, built once, with all warnings as errors."""
-    build = tmp_path_factory.mktemp("cpp")
-    headers = build / "headers"
-    headers.mkdir()
-    schemas = _vector_types()
-    table = " ".join(f"X({_short(schema)})" for schema in schemas)
-    (headers / "vectors.hpp").write_text(f"{generate(schemas)}\n#define CORTEX_TYPES(X) {table}\n")
-    (headers / "peer_messages.hpp").write_text(generate([Rich, Picture, Scan]))
-    for command in (
-        ["cmake", "-S", CPP, "-B", build, f"-DCORTEX_TEST_HEADERS={headers}", "-DCORTEX_EXAMPLES=ON"],
-        ["cmake", "--build", build, "-j2"],
-        ["cmake", "--install", build, "--prefix", build / "installed"],
-    ):
-        done = subprocess.run(command, capture_output=True, text=True, timeout=900.0, check=False)
-        assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
-    return build
-
-
-@pytest.fixture
-def start(programs: Path, runtime: Path) -> Iterator[Callable[..., Peer]]:
-    """Starts `peer` in a role, with a registry for it to find, and ends it."""
-    ensure_registry(0)
-    with contextlib.ExitStack() as stack:
-
-        def run(*arguments: object) -> Peer:
-            peer = Peer([programs / "peer", *arguments])
-            stack.callback(peer.end)
-            return peer
-
-        yield run
+pytestmark = needs_compiler
 
 
 def test_vectors_and_damaged_bodies(programs: Path) -> None:
     """Good bodies return as the same bytes, bad ones are rejected, damaged ones do no harm (ASan, UBSan)."""
     lines = []
     for vector in load_vectors().values():
-        name = _short(Schema.from_json(vector["schema"]))
+        name = short(Schema.from_json(vector["schema"]))
         lines += [f"{name} good {case['body']}" for case in vector["cases"]]
         lines += [f"{name} bad {case['body']}" for case in vector["malformed"]]
     done = subprocess.run(
@@ -111,9 +60,19 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
     assert done.stdout.startswith(f"{len(lines)} bodies, ")
 
 
+def test_pipe_ends(programs: Path) -> None:
+    """Whole frames in order however they are cut; what is damaged does no harm (ASan, UBSan)."""
+    done = subprocess.run(
+        [programs / "pipe_test"], capture_output=True, text=True, timeout=300.0, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-4000:]
+
+
 def test_ring_between_threads(programs: Path) -> None:
     """Under the thread sanitizer: nothing is torn, lost or written while somebody looks at it."""
-    done = subprocess.run([programs / "ring_test"], capture_output=True, text=True, timeout=60.0, check=False)
+    done = subprocess.run(
+        [programs / "ring_test"], capture_output=True, text=True, timeout=300.0, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
 
@@ -161,7 +120,7 @@ def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callab
     out = node.publisher("/to_cpp", Rich)
     back = node.subscriber("/from_cpp", Rich, policy=reliable(8))
     assert out.wait_for_subscribers(1, SOON_S)
-    assert back.wait_for_publisher(10.0)
+    assert back.wait_for_publisher(SOON_S)
     for number, (height, width) in enumerate([(0, 5), (2, 3), (4, 4), (120, 160), (7, 1), (480, 640)]):
         message = make_rich(number, height, width)
         assert out.publish(message)
@@ -204,7 +163,13 @@ def test_reliable_flood_arrives_whole(
         assert scans.publish(Scan(number, np.full(size, number, np.float32)))
     assert scans.publish(Scan(-1, np.zeros(0, np.float32)))
     scans.flush()
-    assert json.loads(peer.line()) == {**CLEAN, "received": 3000, "sequence": 3000}
+    assert json.loads(peer.line()) == {
+        **CLEAN,
+        "received": 3000,
+        "sequence": 3000,
+        "sources": 1,
+        "last": 2999,
+    }
 
 
 @pytest.mark.parametrize(("policy", "size"), [("4", 10), ("4", 20_000), ("latest", 10), ("latest", 20_000)])
@@ -314,7 +279,7 @@ def test_latched_message_to_cpp(start: Callable[..., Peer], make_node: Callable[
     peer = start("count", "/scan", "4", 0, 0)
     assert scans.wait_for_subscribers(1, SOON_S)
     scans.publish(Scan(-1, np.zeros(0, np.float32)))
-    assert json.loads(peer.line()) == {**CLEAN, "received": 1, "sequence": 1}
+    assert json.loads(peer.line()) == {**CLEAN, "received": 1, "sequence": 1, "sources": 1, "last": 5}
 
 
 def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
@@ -365,7 +330,7 @@ def test_killed_cpp_reader_frees_its_slots(
     began_s = time.monotonic()
     for number in range(100):
         assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
-    assert time.monotonic() - began_s < 5.0  # its patience of 10 s is not used up
+    assert time.monotonic() - began_s < 9.0  # its patience of 10 s is not used up
 
 
 def test_cpp_publisher_takes_slots_of_the_dead_back(
@@ -387,7 +352,7 @@ def test_cpp_publisher_takes_slots_of_the_dead_back(
     began_s = time.monotonic()
     for number in range(first + 1, first + 200):
         assert scans.recv(SOON_S).stamp_ns == number
-    assert time.monotonic() - began_s < 5.0
+    assert time.monotonic() - began_s < 9.0
     assert scans.counters.lost == 0
 
 
@@ -475,8 +440,8 @@ def test_example_reads_the_other(programs: Path, runtime: Path) -> None:
     listener = subprocess.Popen([programs / "listener", "5"], stdout=subprocess.PIPE, text=True)
     lidar = subprocess.Popen([programs / "lidar", "100000"])  # goes on for longer than it takes to meet
     try:
-        assert listener.communicate(timeout=60.0)[0] == "steered by 5 scans\n"
-        few = subprocess.run([programs / "lidar", "3"], stdout=subprocess.PIPE, text=True, timeout=60.0)
+        assert listener.communicate(timeout=300.0)[0] == "steered by 5 scans\n"
+        few = subprocess.run([programs / "lidar", "3"], stdout=subprocess.PIPE, text=True, timeout=300.0)
         assert few.stdout == "published 3 scans\n"
     finally:
         for process in (listener, lidar):

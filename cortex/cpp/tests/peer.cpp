@@ -1,12 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 // A process with a node, for the tests with Python: `peer ROLE ...`. It ends when its standard input does.
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdlib>
 #include <deque>
 #include <iostream>
+#include <sstream>
 #include <string>
 #include <thread>
+#include <vector>
+
+#include <fcntl.h>
 
 #include <cortex/node.hpp>
 
@@ -54,16 +59,28 @@ void loan(cortex::Node& node, int count, std::uint32_t height) {
   while (!ended) std::this_thread::sleep_for(5ms);
 }
 
-void publish(cortex::Node& node, const std::string& topic, int count, std::uint32_t size, bool latch) {
+std::vector<std::uint32_t> numbers_of(const std::string& text) {
+  std::vector<std::uint32_t> numbers;
+  std::istringstream parts(text);
+  for (std::string part; std::getline(parts, part, ',');) numbers.push_back(static_cast<std::uint32_t>(std::stoul(part)));
+  return numbers;
+}
+
+// Publishes scans of these sizes by turns, as soon as there are so many readers; "latch": at once; "full": without a
+// free file descriptor.
+void publish(cortex::Node& node, const std::string& topic, int count, const std::vector<std::uint32_t>& sizes,
+             const std::string& how, std::size_t readers) {
   cortex::PublisherOptions options;
-  options.latch = latch;
+  options.latch = how == "latch";
   auto scans = node.advertise<Scan>(topic, options);
   std::cout << "ready" << std::endl;
-  if (!latch && !scans.wait_for_subscribers(1, 10s)) std::exit(2);
+  if (!options.latch && !scans.wait_for_subscribers(readers, 60s)) std::exit(2);
+  while (how == "full" && ::open("/dev/null", O_RDONLY) >= 0) {
+  }
   const auto send = [&](int number) {
     Scan scan;
     scan.stamp_ns = number;
-    scan.ranges = cortex::Array<float>::zeros({size});
+    scan.ranges = cortex::Array<float>::zeros({sizes[static_cast<std::size_t>(number) % sizes.size()]});
     for (auto& range : scan.ranges.writable()) range = static_cast<float>(number);
     return scans.publish(scan);
   };
@@ -73,8 +90,10 @@ void publish(cortex::Node& node, const std::string& topic, int count, std::uint3
   while (!ended) std::this_thread::sleep_for(5ms);
 }
 
-// Receives until a scan with stamp -1, holding the last `hold` messages, and says what came.
-void count(cortex::Node& node, const std::string& topic, const std::string& policy, int pause_us, std::size_t hold) {
+// Receives until a scan with stamp -1, or `until` if that is not 0, holding the last `hold` messages, and says what
+// came; each publisher's scans count up.
+void count(cortex::Node& node, const std::string& topic, const std::string& policy, int pause_us, std::size_t hold,
+           int until) {
   auto scans = node.subscribe<Scan>(topic, policy_of(policy));
   std::cout << "ready" << std::endl;
   std::deque<cortex::Received<Scan>> held;
@@ -82,6 +101,8 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
   std::uint64_t sequence = 0;
   int received = 0;
   int wrong = 0;
+  std::uint64_t source = 0;
+  int sources = 0;
   while (!ended) {
     std::optional<cortex::Received<Scan>> scan;
     try {
@@ -94,11 +115,17 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
     sequence = scan->info().sequence;
     if ((*scan)->stamp_ns == -1) break;
     ++received;
+    if (scan->info().source != source) {
+      source = scan->info().source;
+      last = -1;
+      ++sources;
+    }
     if ((*scan)->stamp_ns <= last) ++wrong;
     last = (*scan)->stamp_ns;
     for (const float range : (*scan)->ranges) {
       if (range != static_cast<float>(last)) ++wrong;
     }
+    if (until > 0 && last + 1 == until) break;
     if (hold > 0) {
       held.push_back(std::move(*scan));
       if (held.size() > hold) held.pop_front();
@@ -111,7 +138,8 @@ void count(cortex::Node& node, const std::string& topic, const std::string& poli
   const auto counters = scans.counters();
   std::cout << "{\"received\": " << received << ", \"wrong\": " << wrong << ", \"lost\": " << counters.lost
             << ", \"rejected\": " << counters.rejected << ", \"overtaken\": " << counters.overtaken
-            << ", \"sequence\": " << sequence << "}" << std::endl;
+            << ", \"sequence\": " << sequence << ", \"sources\": " << sources << ", \"last\": " << last << "}"
+            << std::endl;
   scans.close();
   for (const auto& old : held) {  // still there, though the publisher may write to the slots again
     if (!old->ranges.empty() && old->ranges[0] != static_cast<float>(old->stamp_ns)) std::exit(4);
@@ -140,11 +168,12 @@ int main(int argc, char** argv) {
   if (role == "echo") echo(node);
   if (role == "loan") loan(node, std::stoi(argument(2)), static_cast<std::uint32_t>(std::stoi(argument(3))));
   if (role == "publish") {
-    publish(node, argument(2), std::stoi(argument(3)), static_cast<std::uint32_t>(std::stoi(argument(4))),
-            argument(5) == "latch");
+    publish(node, argument(2), std::stoi(argument(3)), numbers_of(argument(4)), argument(5),
+            std::max<std::size_t>(1, static_cast<std::size_t>(std::stoi(argument(6)))));
   }
   if (role == "count") {
-    count(node, argument(2), argument(3), std::stoi(argument(4)), static_cast<std::size_t>(std::stoi(argument(5))));
+    count(node, argument(2), argument(3), std::stoi(argument(4)), static_cast<std::size_t>(std::stoi(argument(5))),
+          std::stoi(argument(6)));
   }
   input.join();
   return 0;

@@ -162,7 +162,7 @@ class Node {
 
   void open_sockets() {
     const bool tcp = !options_.listen.empty();
-    outlets_ = std::make_shared<detail::Outlets>(context_, tcp);
+    outlets_ = std::make_shared<detail::Outlets>(context_, tcp, net::folder_of(files_->endpoint("lossy")));
     lossy_fd_ = outlets_->lossy.socket.get(zmq::sockopt::fd);
     strict_fd_ = outlets_->strict.socket.get(zmq::sockopt::fd);
     router_ = net::make_socket(context_, zmq::socket_type::router, tcp, 4096, 200);

@@ -51,8 +51,9 @@ inline zmq::message_t message_of(const std::string& bytes) { return zmq::message
 // Both outlets of a node under one lock, and the publishers whose readers come and go through them.
 class Outlets {
  public:
-  Outlets(zmq::context_t& context, bool tcp)
-      : lossy{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), false},
+  Outlets(zmq::context_t& context, bool tcp, std::string directory)
+      : folder(std::move(directory)),
+        lossy{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), false},
         strict{net::make_socket(context, zmq::socket_type::xpub, tcp, net::queue_max, 1000), true} {
     strict.socket.set(zmq::sockopt::xpub_nodrop, true);
   }
@@ -61,6 +62,7 @@ class Outlets {
   inline void refresh();
 
   std::mutex mutex;
+  const std::string folder;  // where the unix sockets lie, and readers offer pipes
   Outlet lossy;
   Outlet strict;
   std::map<std::uint64_t, PublisherCore*> publishers;

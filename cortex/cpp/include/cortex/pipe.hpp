@@ -11,6 +11,7 @@
 #include <string>
 #include <system_error>
 #include <utility>
+#include <vector>
 
 #include <fcntl.h>
 #include <poll.h>
@@ -23,6 +24,7 @@
 
 namespace cortex::pipe {
 
+constexpr int pipe_bytes = 1 << 18;  // what a pipe holds; where the system grants less, the usual 64 KiB
 constexpr std::size_t read_bytes = 1 << 16;
 constexpr std::size_t kept_bytes = 1 << 20;  // a buffer that grew beyond this for one frame is let go after it
 
@@ -159,6 +161,71 @@ class Reader {
   std::size_t begin_ = 0;
   std::size_t end_ = 0;
   bool broken_ = false;
+};
+
+// Puts frames into a pipe. Not for several threads at once.
+class Writer {
+ public:
+  // The pipe that a reader offers; null if it offers none.
+  static std::unique_ptr<Writer> open(const std::string& directory, std::uint64_t reader) {
+    const std::string path = path_of(directory, reader);
+    runtime::Descriptor write(::open(path.c_str(), O_WRONLY | O_NONBLOCK | O_CLOEXEC | O_NOFOLLOW));
+    if (write.get() < 0) return nullptr;  // no such pipe, or nobody reads it
+    struct stat status {};
+    if (::fstat(write.get(), &status) != 0 || !S_ISFIFO(status.st_mode)) return nullptr;
+    // With an end of our own to read from, the death of the reader is no SIGPIPE: its subscription tells.
+    runtime::Descriptor read(::open(path.c_str(), O_RDONLY | O_NONBLOCK | O_CLOEXEC | O_NOFOLLOW));
+    struct stat other {};
+    if (read.get() < 0 || ::fstat(read.get(), &other) != 0 || other.st_dev != status.st_dev ||
+        other.st_ino != status.st_ino) {
+      return nullptr;
+    }
+#if defined(F_SETPIPE_SZ)
+    [[maybe_unused]] const int granted = ::fcntl(write.get(), F_SETPIPE_SZ, pipe_bytes);
+#endif
+    return std::unique_ptr<Writer>(new Writer(std::move(write), std::move(read)));
+  }
+
+  // Writes a frame, or as much of it as there is room for, and keeps the rest; false if there is no room at all.
+  bool write(Span<const std::uint8_t> frame) {
+    if (!flush()) return false;
+    const std::size_t written = write_some(frame);
+    if (written == 0) return false;
+    rest_.assign(frame.begin() + written, frame.end());
+    return true;
+  }
+
+  // Writes what is left of a frame; whether all is written.
+  bool flush() {
+    if (rest_.empty()) return true;
+    written_ += write_some({rest_.data() + written_, rest_.size() - written_});
+    if (written_ < rest_.size()) return false;
+    rest_ = {};
+    written_ = 0;
+    return true;
+  }
+
+ private:
+  Writer(runtime::Descriptor write, runtime::Descriptor read) noexcept
+      : write_(std::move(write)), read_(std::move(read)) {}
+
+  std::size_t write_some(Span<const std::uint8_t> bytes) noexcept {
+    std::size_t written = 0;
+    while (written < bytes.size()) {
+      const ssize_t count = ::write(write_.get(), bytes.data() + written, bytes.size() - written);
+      if (count >= 0) {
+        written += static_cast<std::size_t>(count);
+      } else if (errno != EINTR) {
+        break;
+      }
+    }
+    return written;
+  }
+
+  runtime::Descriptor write_;
+  runtime::Descriptor read_;
+  std::vector<std::uint8_t> rest_;  // of a frame that was written in part
+  std::size_t written_ = 0;         // of the rest
 };
 
 }  // namespace cortex::pipe

@@ -17,6 +17,7 @@
 
 #include "cortex/outlet.hpp"
 #include "cortex/policy.hpp"
+#include "cortex/readers.hpp"
 #include "cortex/ring.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/slot.hpp"
@@ -24,14 +25,6 @@
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
-
-// One subscriber's link to this publisher.
-struct Reader {
-  std::string key;
-  wire::AttachKey request;
-  Outlet* outlet = nullptr;
-  std::uint32_t column = wire::no_column;
-};
 
 // What does not depend on the type of the messages. Bodies are written without the lock, by one thread at a time.
 class PublisherCore {
@@ -84,10 +77,10 @@ class PublisherCore {
     ++counters_.published;
     counters_.bytes += size;
     if (latch_) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
-    if (lossy_readers_ > 0) outlets_->lossy.try_send(strict_readers_ > 0 ? share(frame) : std::move(frame));
-    if (strict_readers_ == 0) return true;
-    const bool late = is_late_;
-    const bool on_time = send_strict(lock, frame, zmq::send_flags::none) && !late;
+    if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
+    bool on_time = !is_late_;
+    if (has_sockets(outlets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
+    on_time &= send_piped(lock, net::bytes(frame));
     if (!on_time) ++counters_.timeouts;
     return on_time;
   }
@@ -133,27 +126,18 @@ class PublisherCore {
     }
     on_time = on_time && !is_late_;
     bool passed_over = false;
-    if (slot.ring != nullptr) {
-      std::uint64_t mask = 0;
-      bool columns = false;
-      for (const auto& reader : readers_) {
-        if (reader.column == wire::no_column) continue;
-        columns = true;
-        if (has_room(reader, *slot.ring)) {
-          mask |= std::uint64_t{1} << reader.column;
-        } else {
-          passed_over = true;
-        }
-      }
+    if (slot.ring == nullptr) {
+      on_time &= send_body_piped(lock, slot, sequence, stamp_ns, size);
+    } else {
+      const std::uint64_t mask = grant(*slot.ring, passed_over);
       slot.ring->pin(slot.index);  // until it has been handed to ZeroMQ below
       slot.ring->commit(slot.index, sequence, size, mask);
-      if (columns) on_time &= send_descriptor(lock, slot, sequence, stamp_ns, size, mask);
+      on_time &= send_descriptor(lock, slot, sequence, stamp_ns, size, mask);
     }
     for (Outlet* outlet : {&outlets_->lossy, &outlets_->strict}) {
-      const bool inline_readers = std::any_of(readers_.begin(), readers_.end(), [&](const Reader& reader) {
-        return reader.outlet == outlet && (slot.ring == nullptr || reader.column == wire::no_column);
-      });
-      if (inline_readers) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
+      if (outlets_->closed) break;  // while we waited for a reader
+      const bool wanted = slot.ring == nullptr ? has_sockets(*outlet) : readers_.any_inline(*outlet);
+      if (wanted) on_time &= send_large(lock, *outlet, slot, head, size, passed_over);
     }
     if (slot.ring != nullptr) slot.ring->unpin(slot.index);
     if (passed_over) ++counters_.skipped;
@@ -164,44 +148,38 @@ class PublisherCore {
   // After a burst: tells readers which number comes next, so that they know of a loss at its end.
   void tend(std::int64_t now_ns) {
     const Lock lock(outlets_->mutex, std::try_to_lock);
-    if (!lock.owns_lock() || closed_ || outlets_->closed || blocked_ || told_ == sequence_ ||
-        now_ns - refresh_at_ns_ < silence_ns) {
-      return;
-    }
+    if (!lock.owns_lock() || closed_ || outlets_->closed) return;
+    for (const auto& reader : readers_.piped()) reader->pipe->flush();
+    if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
     zmq::message_t frame(wire::header_size);
     write_header(static_cast<std::uint8_t*>(frame.data()), 'B', sequence_, 0, 0, 0);
-    if (lossy_readers_ > 0) outlets_->lossy.try_send(share(frame));
-    const bool sent = strict_readers_ == 0 || outlets_->strict.try_send(std::move(frame));
-    if (sent && !is_late_) told_ = sequence_;
+    bool sent = !is_late_;
+    for (const auto& reader : readers_.piped()) sent &= reader->pipe->write(net::bytes(frame));
+    if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
+    if (has_sockets(outlets_->strict)) sent &= outlets_->strict.try_send(std::move(frame));
+    if (sent) told_ = sequence_;
   }
 
   // A reader has come; called under the lock.
   void attach(Outlet& outlet, const std::string& key, const wire::AttachKey& request) {
     if (closed_ || readers_.size() >= 1024) return;
-    Reader reader{key, request, &outlet, wire::no_column};
-    if (request.shared_memory && !unavailable_) {
-      for (std::uint32_t column = 0; column < wire::column_count && reader.column == wire::no_column; ++column) {
-        const bool taken = std::any_of(readers_.begin(), readers_.end(),
-                                       [&](const Reader& other) { return other.column == column; });
-        if (!taken) reader.column = column;
-      }
+    const auto& reader = readers_.add(outlet, key, request, !unavailable_, outlets_->folder);
+    if (reader->pipe != nullptr) {  // this tells the reader that all else comes there
+      std::uint8_t nothing[wire::header_size];
+      write_header(nothing, 'B', sequence_, 0, 0, 0);
+      reader->pipe->write({nothing, sizeof nothing});
     }
-    readers_.push_back(reader);
-    ++(outlet.strict ? strict_readers_ : lossy_readers_);
-    answer(reader, latched_);
+    answer(*reader, latched_);
   }
 
   // A reader has left or died; called under the lock.
   void detach(const std::string& key) {
-    const auto found =
-        std::find_if(readers_.begin(), readers_.end(), [&](const Reader& reader) { return reader.key == key; });
-    if (found == readers_.end()) return;
-    if (found->column != wire::no_column) {
-      for (const auto& ring : rings_) ring->free_column(found->column);
+    const auto reader = readers_.remove(key);
+    if (reader == nullptr) return;
+    if (reader->column != wire::no_column) {
+      for (const auto& ring : rings_) ring->free_column(reader->column);
     }
-    if (found->outlet->strict) is_late_ = false;
-    --(found->outlet->strict ? strict_readers_ : lossy_readers_);
-    readers_.erase(found);
+    if (reader->outlet->strict && reader->pipe == nullptr) is_late_ = false;
   }
 
   // A reliable reader that was too late has seen what it lost, and reads again; called under the lock.
@@ -231,7 +209,6 @@ class PublisherCore {
     closed_ = true;
     outlets_->publishers.erase(source);
     readers_.clear();
-    lossy_readers_ = strict_readers_ = 0;
     rings_.clear();
   }
 
@@ -274,14 +251,12 @@ class PublisherCore {
     if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
   }
 
-  // Sends over the strict outlet, waiting for the slowest reader; the lock is let go while sleeping.
-  bool send_strict(Lock& lock, zmq::message_t& frame, zmq::send_flags flags) {
-    Outlet& outlet = outlets_->strict;
-    if (outlet.try_send(share(frame), flags)) return true;
-    std::uint32_t timeout_ms = 0;
-    for (const auto& reader : readers_) {
-      if (reader.outlet == &outlet) timeout_ms = std::max(timeout_ms, reader.request.timeout_ms);
-    }
+  // Whether the outlet itself serves some reader.
+  bool has_sockets(const Outlet& outlet) const noexcept { return readers_.socket_count(outlet) > 0; }
+
+  // Tries to send until it works or the time is over; the lock is let go while sleeping.
+  template <class Attempt>
+  bool await_room(Lock& lock, std::uint32_t timeout_ms, Attempt attempt) {
     Backoff backoff(std::int64_t{timeout_ms} * 1'000'000);
     bool sent = false;
     bool in_time = true;
@@ -292,17 +267,69 @@ class PublisherCore {
       lock.lock();
       if (closed_ || outlets_->closed) break;
       outlets_->refresh();
-      sent = outlet.try_send(share(frame), flags);
+      sent = attempt();
     }
     blocked_ = false;
-    if (closed_ || outlets_->closed) return false;
-    if (!sent) {
-      complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
-      late_until_ = sequence_;
-      is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
-      outlet.send_anyway(share(frame), flags);
-    }
+    if (!in_time && !sent) say_late();
     return sent;
+  }
+
+  void say_late() {
+    complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
+  }
+
+  // Sends over the strict outlet, waiting for the slowest reader.
+  bool send_strict(Lock& lock, zmq::message_t& frame, zmq::send_flags flags) {
+    Outlet& outlet = outlets_->strict;
+    const auto attempt = [&] { return outlet.try_send(share(frame), flags); };
+    if (attempt() || await_room(lock, readers_.timeout_ms(outlet), attempt)) return true;
+    if (closed_ || outlets_->closed) return false;
+    late_until_ = sequence_;
+    is_late_ = true;  // ZeroMQ sends that reader nothing until it has caught up
+    outlet.send_anyway(share(frame), flags);
+    return false;
+  }
+
+  // Writes into all pipes, waiting for reliable readers; false if one of those lost the frame.
+  bool send_piped(Lock& lock, Span<const std::uint8_t> frame) {
+    Readers::List full;
+    for (const auto& reader : readers_.piped()) {
+      if (reader->pipe->write(frame)) {
+        reader->late = false;
+      } else if (reader->request.strict) {
+        full.push_back(reader);
+      }
+    }
+    bool on_time = true;
+    for (const auto& reader : full) {
+      const auto attempt = [&] { return reader->left || reader->pipe->write(frame); };
+      if (!reader->late) reader->late = !await_room(lock, reader->request.timeout_ms, attempt);
+      on_time &= !reader->late;
+    }
+    return on_time;
+  }
+
+  // A body that found no slot travels through pipes as a message.
+  bool send_body_piped(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size) {
+    if (readers_.piped().empty()) return true;
+    std::vector<std::uint8_t> frame(wire::header_size + size);
+    write_header(frame.data(), 'M', sequence, stamp_ns, size, 0);
+    std::memcpy(frame.data() + wire::header_size, slot.buffer.data(), size);
+    return send_piped(lock, {frame.data(), frame.size()});
+  }
+
+  // The columns that get a lease of this message.
+  std::uint64_t grant(Ring& ring, bool& passed_over) {
+    std::uint64_t mask = 0;
+    for (const auto& reader : readers_.all()) {
+      if (reader->column == wire::no_column) continue;
+      if (has_room(*reader, ring)) {
+        mask |= std::uint64_t{1} << reader->column;
+      } else {
+        passed_over = true;
+      }
+    }
+    return mask;
   }
 
   bool send_descriptor(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size,
@@ -314,14 +341,14 @@ class PublisherCore {
     write_header(out, 'S', sequence, stamp_ns, size, aux);
     wire::store(out + wire::header_size, mask);
     wire::store_place(out + wire::header_size + 8, slot.ring->place());
-    bool on_time = true;
     bool lossy = false;
     bool strict = false;
-    for (const auto& reader : readers_) {
-      if (reader.column != wire::no_column) (reader.outlet->strict ? strict : lossy) = true;
+    for (const auto& reader : readers_.all()) {
+      if (reader->column != wire::no_column && reader->pipe == nullptr) (reader->outlet->strict ? strict : lossy) = true;
     }
     if (lossy) outlets_->lossy.try_send(share(frame));
-    if (strict) on_time = send_strict(lock, frame, zmq::send_flags::none);
+    bool on_time = !strict || send_strict(lock, frame, zmq::send_flags::none);
+    on_time &= send_piped(lock, net::bytes(frame));
     return on_time;
   }
 
@@ -355,9 +382,9 @@ class PublisherCore {
   bool await_strict(Lock& lock, const Slot& slot) {
     const auto timeout_ms = [&] {
       std::int64_t longest = -1;
-      for (const auto& reader : readers_) {
-        if (reader.request.strict && is_full(reader, slot)) {
-          longest = std::max<std::int64_t>(longest, reader.request.timeout_ms);
+      for (const auto& reader : readers_.all()) {
+        if (reader->request.strict && is_full(*reader, slot)) {
+          longest = std::max<std::int64_t>(longest, reader->request.timeout_ms);
         }
       }
       return longest;
@@ -375,14 +402,12 @@ class PublisherCore {
     }
     blocked_ = false;
     if (outlets_->closed) closed_ = true;
-    if (!in_time) {
-      complaints_->once("slow " + topic_, topic_ + ": a reliable subscriber did not keep up and lost a message");
-    }
+    if (!in_time) say_late();
     return in_time;
   }
 
   bool is_full(const Reader& reader, const Slot& slot) {
-    if (slot.ring == nullptr) return *private_bytes_ > private_bytes_max / 2;
+    if (slot.ring == nullptr) return reader.pipe == nullptr && *private_bytes_ > private_bytes_max / 2;
     if (reader.column != wire::no_column) return !has_room(reader, *slot.ring);
     return slot.ring->pinned() >= pin_quota(*slot.ring);
   }
@@ -393,26 +418,13 @@ class PublisherCore {
     return ring.outstanding(reader.column, quota) < quota;
   }
 
-  // Readers share the slots, so that one slow reader cannot take the ring from the others.
-  std::uint32_t shares() const {
-    std::uint32_t columns = 0;
-    bool inline_readers = false;
-    for (const auto& reader : readers_) {
-      if (reader.column == wire::no_column) {
-        inline_readers = true;
-      } else {
-        ++columns;
-      }
-    }
-    return std::max<std::uint32_t>(1, columns + (inline_readers ? 1 : 0));
-  }
-  std::uint32_t pin_quota(const Ring& ring) const { return std::max<std::uint32_t>(1, (ring.slots() - 1) / shares()); }
+  std::uint32_t pin_quota(const Ring& ring) const { return std::max<std::uint32_t>(1, (ring.slots() - 1) / readers_.shares()); }
 
   // The newest ring, made anew for larger messages or more readers; null where there is no shared memory.
   std::shared_ptr<Ring> ring_for(std::size_t size) {
     if (unavailable_) return nullptr;
     const std::shared_ptr<Ring> current = rings_.empty() ? nullptr : rings_.back();
-    const std::uint64_t wanted = 2 * std::uint64_t{shares()} + 2;
+    const std::uint64_t wanted = 2 * std::uint64_t{readers_.shares()} + 2;
     const bool fits = current != nullptr && current->slot_bytes() >= size;
     if (fits && current->slots() >= wanted) return current;
     std::uint64_t slot_bytes = exact_ ? size : size + size / 4;
@@ -432,20 +444,20 @@ class PublisherCore {
       return nullptr;
     }
     if (rings_.size() > wire::rings_alive) rings_.erase(rings_.begin());
-    for (const auto& reader : readers_) {
-      if (reader.column != wire::no_column) answer(reader, "");
+    for (const auto& reader : readers_.all()) {
+      if (reader->column != wire::no_column) answer(*reader, "");
     }
     return rings_.back();
   }
 
-  // Large messages go through sockets from now on, also to those that had a column.
+  // Large messages go through pipes and sockets from now on, also to those that had a column.
   void do_without_memory() {
     unavailable_ = true;
-    for (auto& reader : readers_) {
-      if (reader.column == wire::no_column) continue;
-      for (const auto& ring : rings_) ring->free_column(reader.column);
-      reader.column = wire::no_column;
-      answer(reader, "");
+    for (const auto& reader : readers_.all()) {
+      if (reader->column == wire::no_column || reader->pipe != nullptr) continue;
+      for (const auto& ring : rings_) ring->free_column(reader->column);
+      reader->column = wire::no_column;
+      answer(*reader, "");
     }
   }
 
@@ -457,9 +469,7 @@ class PublisherCore {
   const bool exact_;
   const std::size_t inline_max_;
   std::shared_ptr<net::Complaints> complaints_;
-  std::vector<Reader> readers_;
-  std::size_t lossy_readers_ = 0;
-  std::size_t strict_readers_ = 0;
+  Readers readers_;
   std::vector<std::shared_ptr<Ring>> rings_;
   std::uint32_t ring_count_ = 0;
   std::shared_ptr<std::atomic<std::size_t>> private_bytes_ = std::make_shared<std::atomic<std::size_t>>(0);

@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: Apache-2.0
+// Who reads one publisher, and which way each reader gets its frames.
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "cortex/outlet.hpp"
+#include "cortex/pipe.hpp"
+#include "cortex/wire.hpp"
+
+namespace cortex::detail {
+
+// One subscriber's link to this publisher.
+struct Reader {
+  std::string key;
+  wire::AttachKey request;
+  Outlet* outlet = nullptr;
+  std::uint32_t column = wire::no_column;
+  std::unique_ptr<pipe::Writer> pipe;  // where its frames go; null: through the outlet
+  bool late = false;  // its pipe was full for too long: it holds up nothing until it has room again
+  bool left = false;
+};
+
+// Calls are made under the publisher's lock. Readers are shared so that one may leave while the publisher, having let
+// go of the lock, waits for it.
+class Readers {
+ public:
+  using List = std::vector<std::shared_ptr<Reader>>;
+
+  const List& all() const noexcept { return all_; }
+  const List& piped() const noexcept { return piped_; }
+  bool empty() const noexcept { return all_.empty(); }
+  std::size_t size() const noexcept { return all_.size(); }
+  // Those that the outlet itself serves.
+  std::size_t socket_count(const Outlet& outlet) const noexcept { return outlet.strict ? strict_ : lossy_; }
+
+  // Takes a reader in; with a column of the lease table, and through its pipe, if it offers that and there is room.
+  const std::shared_ptr<Reader>& add(Outlet& outlet, const std::string& key, const wire::AttachKey& request,
+                                     bool shared_memory, const std::string& folder) {
+    auto reader = std::make_shared<Reader>();
+    reader->key = key;
+    reader->request = request;
+    reader->outlet = &outlet;
+    if (request.shared_memory && shared_memory) reader->column = free_column();
+    if (reader->column != wire::no_column && piped_.size() < pipes_max) {
+      reader->pipe = pipe::Writer::open(folder, request.reader);
+    }
+    if (reader->pipe == nullptr) {
+      ++(outlet.strict ? strict_ : lossy_);
+    } else {
+      piped_.push_back(reader);
+    }
+    return all_.emplace_back(std::move(reader));
+  }
+
+  // Null if there is no such reader.
+  std::shared_ptr<Reader> remove(const std::string& key) {
+    const auto found =
+        std::find_if(all_.begin(), all_.end(), [&](const auto& reader) { return reader->key == key; });
+    if (found == all_.end()) return nullptr;
+    const std::shared_ptr<Reader> reader = std::move(*found);
+    all_.erase(found);
+    if (reader->pipe == nullptr) --(reader->outlet->strict ? strict_ : lossy_);
+    piped_.erase(std::remove(piped_.begin(), piped_.end(), reader), piped_.end());
+    reader->left = true;
+    return reader;
+  }
+
+  void clear() noexcept {
+    for (const auto& reader : all_) reader->left = true;
+    all_.clear();
+    piped_.clear();
+    lossy_ = strict_ = 0;
+  }
+
+  // Readers that share the slots, so that one slow reader cannot take the ring from the others.
+  std::uint32_t shares() const noexcept {
+    std::uint32_t columns = 0;
+    for (const auto& reader : all_) columns += reader->column == wire::no_column ? 0 : 1;
+    return std::max<std::uint32_t>(1, columns + (columns < all_.size() ? 1 : 0));
+  }
+
+  // Whether some reader of this outlet has no part in shared memory.
+  bool any_inline(const Outlet& outlet) const noexcept {
+    return std::any_of(all_.begin(), all_.end(), [&](const auto& reader) {
+      return reader->outlet == &outlet && reader->column == wire::no_column;
+    });
+  }
+
+  // The longest that a reader which this outlet itself serves may hold up the publisher.
+  std::uint32_t timeout_ms(const Outlet& outlet) const noexcept {
+    std::uint32_t longest = 0;
+    for (const auto& reader : all_) {
+      if (reader->outlet == &outlet && reader->pipe == nullptr) longest = std::max(longest, reader->request.timeout_ms);
+    }
+    return longest;
+  }
+
+ private:
+  // A publisher writes each pipe itself; of further readers ZeroMQ takes care, in a thread of its own.
+  static constexpr std::size_t pipes_max = 2;
+
+  std::uint32_t free_column() const noexcept {
+    for (std::uint32_t column = 0; column < wire::column_count; ++column) {
+      if (std::none_of(all_.begin(), all_.end(), [&](const auto& other) { return other->column == column; })) {
+        return column;
+      }
+    }
+    return wire::no_column;
+  }
+
+  List all_;
+  List piped_;
+  std::size_t lossy_ = 0;
+  std::size_t strict_ = 0;
+};
+
+}  // namespace cortex::detail

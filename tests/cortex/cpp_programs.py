@@ -1,0 +1,89 @@
+"""The test programs and examples of the C++ client, built once per session, and what starts them."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from cpp_client import Peer
+from cpp_messages import Picture, Rich, Scan
+
+from cortex.cppgen import generate
+from cortex.registry import ensure_registry
+from cortex.schema import Schema
+from cortex.vectors import load_vectors
+
+CPP = Path(__file__).parents[2] / "cortex" / "cpp"
+
+
+def _missing() -> str:
+    for tool in ("cmake", "g++"):
+        if shutil.which(tool) is None:
+            return f"no {tool}"
+    for header in ("zmq.h", "zmq.hpp"):
+        if not any((Path(root) / header).exists() for root in ("/usr/include", "/usr/local/include")):
+            return f"no {header}: apt install libzmq3-dev cppzmq-dev"
+    return ""
+
+
+needs_compiler = pytest.mark.skipif(
+    bool(_missing()), reason=f"the C++ client cannot be built here: {_missing()}"
+)
+
+
+def short(schema: Schema) -> str:
+    """The name of a type without its namespaces."""
+    return schema.name.rpartition("/")[2]
+
+
+def _build(build: Path) -> None:
+    """Build everything with all warnings as errors."""
+    shutil.rmtree(build, ignore_errors=True)
+    headers = build / "headers"
+    headers.mkdir(parents=True)
+    schemas = [Schema.from_json(vector["schema"]) for vector in load_vectors().values()]
+    table = " ".join(f"X({short(schema)})" for schema in schemas)
+    (headers / "vectors.hpp").write_text(f"{generate(schemas)}\n#define CORTEX_TYPES(X) {table}\n")
+    (headers / "peer_messages.hpp").write_text(generate([Rich, Picture, Scan]))
+    for command in (
+        ["cmake", "-S", CPP, "-B", build, f"-DCORTEX_TEST_HEADERS={headers}", "-DCORTEX_EXAMPLES=ON"],
+        ["cmake", "--build", build, "-j2"],
+        ["cmake", "--install", build, "--prefix", build / "installed"],
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=1800.0, check=False)
+        assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    (build / "built").touch()
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of the programs; workers of one session share it."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    build = folder / "cpp"
+    with open(folder / "cpp.lock", "w", encoding="ascii") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (build / "built").exists():
+            _build(build)
+    return build
+
+
+@pytest.fixture
+def start(programs: Path, runtime: Path) -> Iterator[Callable[..., Peer]]:
+    """Starts `peer` in a role, with a registry for it to find, and ends it."""
+    ensure_registry(0)
+    with contextlib.ExitStack() as stack:
+
+        def run(*arguments: object) -> Peer:
+            peer = Peer([programs / "peer", *arguments])
+            stack.callback(peer.end)
+            return peer
+
+        yield run

@@ -1,0 +1,318 @@
+"""Pipes between the C++ client and Python, and between two C++ processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cpp_client import Impostor, Peer, make_frame
+from cpp_messages import Scan
+from cpp_programs import needs_compiler, programs, start
+from processes import SOON_S, wait_for
+
+import cortex.link
+from cortex import wire
+from cortex.codec import codec_of
+from cortex.host import pipe_path
+from cortex.node import Node
+from cortex.policy import Policy, keep_last, latest, reliable
+
+__all__ = ["programs", "start"]
+
+pytestmark = needs_compiler
+
+SIZES = "10,20000,4000,0,50000"
+"""Items of scans: in frames, in slots, in frames larger than a page, none, in slots of a second ring."""
+
+
+@pytest.fixture(autouse=True)
+def no_name_is_left(runtime: Path) -> Iterator[None]:
+    """Whoever meets, the name of a pipe goes as soon as they have."""
+    yield
+    assert not list(runtime.rglob("pipe.*"))
+
+
+def pipes_of(pid: int | str) -> set[tuple[int, int]]:
+    """The named pipes that a process has open."""
+    found = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            if "/pipe." in os.readlink(descriptor):
+                status = descriptor.stat()
+                found.add((status.st_dev, status.st_ino))
+        except OSError:  # closed meanwhile
+            continue
+    return found
+
+
+def is_piped(peer: Peer, other: int | str = "self") -> bool:
+    """Whether a C++ program and another process have a pipe in common."""
+    return bool(pipes_of(peer.process.pid) & pipes_of(other))
+
+
+def result_of(peer: Peer) -> dict[str, int]:
+    result: dict[str, int] = json.loads(peer.line())
+    return result
+
+
+def scan(number: int, size: int) -> Scan:
+    return Scan(number, np.full(size, number, np.float32))
+
+
+def sizes() -> list[int]:
+    return [int(size) for size in SIZES.split(",")]
+
+
+def test_all_sizes_to_cpp_in_one_order(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    scans = make_node().publisher("/scan", Scan)
+    peer = start("count", "/scan", "reliable", 0, 3, 3000)
+    assert scans.wait_for_subscribers(1, SOON_S)
+    assert is_piped(peer)
+    for number in range(3000):
+        assert scans.publish(scan(number, sizes()[number % 5]))
+    result = result_of(peer)
+    assert result["received"] == 3000
+    assert result["wrong"] == result["lost"] == result["rejected"] == result["overtaken"] == 0
+
+
+def test_all_sizes_from_cpp_in_one_order(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
+    peer = start("publish", "/scan", 3000, SIZES)
+    for number in range(3000):
+        received = scans.recv(SOON_S)
+        assert (received.stamp_ns, received.ranges.size) == (number, sizes()[number % 5])
+        assert (received.ranges == number).all()
+    assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
+    assert is_piped(peer)
+
+
+def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
+    reader = start("count", "/scan", "reliable", 0, 3, 3000)
+    writer = start("publish", "/scan", 3000, SIZES)
+    result = result_of(reader)
+    assert result["received"] == 3000
+    assert result["wrong"] == result["lost"] == result["rejected"] == 0
+    assert result_of(writer) == {"published": 3000, "refused": 0, "timeouts": 0}
+
+
+def test_messages_without_a_slot_go_through_the_pipe(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """A C++ publisher that has no descriptor left for a ring sends whole bodies, larger than the pipe."""
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
+    start("publish", "/scan", 100, "100000,10", "full")
+    for number in range(100):
+        received = scans.recv(SOON_S)
+        assert received.stamp_ns == number
+        assert received.ranges.size == (10 if number % 2 else 100_000)
+        assert (received.ranges == number).all()
+    assert (scans.counters.lost, scans.counters.rejected) == (0, 0)
+
+
+@pytest.mark.parametrize("policy", [keep_last(4), keep_last(100), latest()], ids=str)
+@pytest.mark.parametrize("size", ["10", "20000"])
+def test_slow_reader_of_cpp_knows_what_it_missed(
+    start: Callable[..., Peer], make_node: Callable[..., Node], policy: Policy, size: str
+) -> None:
+    """Far more than the pipe holds, without a pause: received, overtaken and lost are all that was sent."""
+    scans = make_node().subscriber("/scan", Scan, policy=policy)
+    start("publish", "/scan", 6000, size)
+    counters = scans.counters
+    last = -1
+    deadline_s = time.monotonic() + SOON_S
+    while counters.received + counters.lost + counters.overtaken < 6000:
+        assert time.monotonic() < deadline_s
+        try:
+            number = scans.recv(0.05).stamp_ns
+        except TimeoutError:
+            continue
+        assert number > last
+        last = number
+        time.sleep(0.001)  # work
+    assert counters.received + counters.lost + counters.overtaken == 6000
+    assert counters.rejected == 0
+
+
+def test_third_reader_is_served_by_zeromq(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """A publisher in C++ writes two pipes; all readers get everything."""
+    node = make_node()
+    readers = [node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) for _ in range(4)]
+    peer = start("publish", "/scan", 400, "10,20000", "", 4)
+    for number in range(400):  # each in turn, as a reliable one holds up the publisher
+        assert [reader.recv(SOON_S).stamp_ns for reader in readers] == [number] * 4
+    assert all(reader.counters.lost == 0 for reader in readers)
+    assert len(pipes_of(peer.process.pid)) == 2
+
+
+def test_reader_without_pipe(
+    start: Callable[..., Peer], make_node: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An older reader offers none: the C++ publisher serves it through ZeroMQ."""
+
+    def refuse(*_: object) -> None:
+        raise OSError("no pipes here")
+
+    monkeypatch.setattr(cortex.link, "Offer", refuse)
+    scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
+    peer = start("publish", "/scan", 500, SIZES)
+    for number in range(500):
+        assert scans.recv(SOON_S).stamp_ns == number
+    assert scans.counters.lost == 0
+    assert not pipes_of(peer.process.pid)
+
+
+def test_killed_cpp_reader_with_a_full_pipe(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """The publisher waits for a reliable reader; when that dies it goes on, and no signal kills it."""
+    node = make_node()
+    slow = start("count", "/scan", "reliable", 50_000, 3)
+    writer = start("publish", "/scan", -1, "10")
+
+    def published() -> int:
+        replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
+        return max((publisher.published for reply in replies for publisher in reply.publishers), default=0)
+
+    wait_for(lambda: published() > 500)  # more than one message each 50 ms
+    before = [0, published()]
+    while before[-1] > before[-2]:
+        time.sleep(0.02)
+        before.append(published())
+    slow.process.kill()
+    scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
+    first = scans.recv(SOON_S).stamp_ns
+    for number in range(first + 1, first + 5000):
+        assert scans.recv(SOON_S).stamp_ns == number
+    assert writer.process.poll() is None
+
+
+def test_killed_cpp_publisher_is_followed_by_another(start: Callable[..., Peer]) -> None:
+    """What a dead publisher wrote is read to its end, and the next one is another source."""
+    reader = start("count", "/scan", "reliable", 200, 3, 100_000_000)
+    first = start("publish", "/scan", -1, SIZES)
+    wait_for(lambda: is_piped(reader, first.process.pid))
+    time.sleep(random.random() * 0.2)  # it dies at any moment
+    first.process.kill()
+    reader.process.kill()
+
+    reader = start("count", "/scan", "reliable", 0, 3, 500)
+    second = start("publish", "/scan", -1, "10")
+    wait_for(lambda: is_piped(reader, second.process.pid))
+    result = result_of(reader)
+    assert (result["wrong"], result["lost"], result["rejected"]) == (0, 0, 0)
+
+
+class PipingImpostor(Impostor):
+    """A publisher that takes the pipe of its subscriber, and writes there what it likes."""
+
+    def take_pipe(self, runtime: Path, key: bytes) -> int:
+        number = int.from_bytes(key[16:24], "little")
+        path = pipe_path(runtime, number)
+        assert path.is_fifo()
+        assert path.stat().st_mode & 0o777 == 0o600
+        fd = os.open(path, os.O_WRONLY)
+        os.write(fd, make_frame(b"B", 0, b""))
+        self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
+        return fd
+
+
+@pytest.fixture
+def impostor(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PipingImpostor]:
+    liar = PipingImpostor(runtime)
+    monkeypatch.setenv("CORTEX_TEST_PEER", liar.control)
+    yield liar
+    liar.close()
+    assert not list(runtime.rglob("pipe.*"))
+    shutil.rmtree(runtime, ignore_errors=True)
+    runtime.mkdir(mode=0o700)
+
+
+def body_of(number: int, size: int = 4) -> bytes:
+    body = codec_of(Scan).encode(scan(number, size), 100_000)
+    assert body is not None
+    return body
+
+
+def bad_frames() -> list[bytes]:
+    """Frames that are whole as the pipe sees them, and that the subscriber must reject."""
+    body = body_of(1)
+    record = wire.RECORD.pack(0, 0, len(body), 0) + body
+    record += bytes(-len(record) % 8)
+    return [
+        make_frame(b"M", 1, body, fingerprint=1),
+        make_frame(b"M", 1, body, source=78),
+        make_frame(b"M", 2**63, body),
+        make_frame(b"B", 1, record, aux=0),
+        make_frame(b"B", 1, record, aux=2),
+        make_frame(b"B", 1, record, aux=2**64 - 1),
+        make_frame(b"B", 1, record[:-8], aux=1),
+        make_frame(b"S", 0, bytes(40), size=40, aux=1 << 32),  # its place is of another ring
+    ]
+
+
+def test_lies_in_a_pipe_are_rejected(programs: Path, runtime: Path, impostor: PipingImpostor) -> None:
+    """Frames in pieces, bad frames between good ones, at last no frame: then the socket is used again."""
+    peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
+    key = impostor.await_key()
+    assert key[24] & 1
+    fd = impostor.take_pipe(runtime, key)
+    bad = bad_frames()
+    stream = make_frame(b"M", 0, body_of(0)) + b"".join(bad) + make_frame(b"M", 1, body_of(1))
+    stream += make_frame(b"M", 2, b"\xff" * 40)  # the codec rejects it
+    stream += make_frame(b"M", 3, body_of(3, 20_000))  # larger than a read
+    for at in range(0, len(stream), 333):
+        os.write(fd, stream[at : at + 333])
+    os.write(fd, b"this is no frame" * 10)
+    second = impostor.await_key()  # it attaches anew, without shared memory
+    assert second[16:24] != key[16:24]
+    assert not second[24] & 1
+    impostor.xpub.send(wire.answer_frame(second, wire.AttachAnswer(6, None, (), b"")))
+    impostor.xpub.send(make_frame(b"M", 6, body_of(6)))
+    impostor.xpub.send_multipart([make_frame(b"L", 7, b"", size=len(body_of(7))), body_of(7)])
+    impostor.xpub.send(make_frame(b"M", 8, codec_of(Scan).encode(scan(-1, 0), 1000)))
+    result = result_of(peer)
+    os.close(fd)
+    assert result["received"] == 5  # 0, 1, 3, 6, 7
+    assert result["wrong"] == 0
+    assert result["rejected"] == len(bad) + 1 + 1  # with the body, and what is no frame
+    assert result["lost"] == 2  # 4 and 5
+    assert "cannot be read" in peer.end()
+
+
+def test_publisher_that_takes_no_pipe(programs: Path, runtime: Path, impostor: PipingImpostor) -> None:
+    """An older publisher answers without opening it: the name goes, and the socket is read."""
+    peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
+    key = impostor.await_key()
+    assert pipe_path(runtime, int.from_bytes(key[16:24], "little")).is_fifo()
+    impostor.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
+    impostor.xpub.send(make_frame(b"M", 0, body_of(0)))
+    impostor.xpub.send(make_frame(b"M", 1, codec_of(Scan).encode(scan(-1, 0), 1000)))
+    assert result_of(peer)["received"] == 1
+    peer.end()
+
+
+def test_random_bytes_in_a_pipe_do_no_harm(programs: Path, runtime: Path, impostor: PipingImpostor) -> None:
+    """Damaged streams, one reader each: it lives, and goes on with the socket or the pipe."""
+    rng = random.Random(11)
+    for _ in range(5):
+        peer = Peer([programs / "peer", "count", "/scan", "100", 0, 0])
+        key = impostor.await_key()
+        while not key[24] & 1:  # the one before, which has given up its pipe
+            key = impostor.await_key()
+        fd = impostor.take_pipe(runtime, key)
+        frames = [make_frame(b"M", number, body_of(number)) for number in range(50)] + bad_frames()
+        rng.shuffle(frames)
+        stream = bytearray(b"".join(frames))
+        for _ in range(20):
+            stream[rng.randrange(len(stream))] ^= 1 << rng.randrange(8)
+        os.write(fd, stream)
+        assert peer.process.poll() is None
+        peer.end()  # exits with status 0
+        os.close(fd)
