@@ -202,17 +202,15 @@ def see(model: Model, state: State, batch: Batch) -> list[Packet]:
     return in_order(model, packets, batch.until_ns)
 
 
-def see_each(model: Model, state: State, batch: Batch) -> Iterator[list[Packet]]:
-    """Do what `see` does, and yield the packets of each cast when it is done, those of the fastest first.
+def see_each(model: Model, state: State, batch: Batch) -> Iterator[tuple[int, list[Packet]]]:
+    """Do what `see` does, and yield each cast and its packets when it is done, the fastest first.
 
     A picture does not wait for one that takes longer. For a CPU: a CUDA device would have less at a time.
     All has to be taken; arguments as for `see`.
     """
     for index in sorted(range(len(state.casts)), key=lambda index: -state.casts[index].rate.rate_hz):
         look_at(model, state, batch, {index})
-        packets = in_order(model, read_cameras(state, batch), batch.until_ns)
-        if packets:
-            yield packets
+        yield index, in_order(model, read_cameras(state, batch), batch.until_ns)
     state.looked_count += 1
 
 

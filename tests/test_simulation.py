@@ -382,9 +382,11 @@ def test_the_fastest_camera_is_seen_first(settings):
         _, batches = simulation.fly_period(model, apart, None)
         for batch, packets in zip(batches, expected, strict=True):
             found, renders = [], []
-            for part in simulation.see_each(model, apart, batch):
-                renders.append(apart.counts["renders"])
-                found.append(part)
+            for cast, part in simulation.see_each(model, apart, batch):
+                assert {packet.sensor for packet in part} <= set(model.casts[cast].names)
+                if part:
+                    renders.append(apart.counts["renders"])
+                    found.append(part)
             assert sorted(content([p for part in found for p in part])) == sorted(content(packets))
             if of(packets, "slow") and len(found) > 1:
                 assert {packet.sensor for packet in found[-1]} == {"slow"}

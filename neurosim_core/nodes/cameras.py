@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import warp as wp
 
@@ -35,6 +35,8 @@ class Job:
     batch: Batch
     left_out: bool = False
     """The machine is too slow for it."""
+    done: set[int] = field(default_factory=set)
+    """Casts whose packets can be taken."""
     forgotten: bool = False
     """Nobody wants what it shows any more."""
 
@@ -232,13 +234,17 @@ class Cameras:
         if self._thread is None:
             self._give(job, see(job.model, job.state, job.batch))
             return
-        for packets in see_each(job.model, job.state, job.batch):
-            self._give(job, packets)
+        for cast, packets in see_each(job.model, job.state, job.batch):
+            self._give(job, packets, cast)
 
-    def _give(self, job: Job, packets: list[Packet]) -> None:
-        """Let packets be taken."""
+    def _give(self, job: Job, packets: list[Packet], cast: int | None = None) -> None:
+        """Let packets of a cast be taken, or of all."""
         with self._changed:
-            if not packets or job.forgotten:
+            if job.forgotten:
+                return
+            if cast is not None:
+                job.done.add(cast)
+            if not packets:
                 return
             self._seen.append((job.vehicle, packets))
         self._on_packets()
@@ -246,10 +252,14 @@ class Cameras:
     def _count(self, job: Job) -> None:
         """Count what a batch that is left out would have shown."""
         for index, cast in enumerate(job.model.casts):
+            if index in job.done:
+                continue
             stamps = [b.stamp_ns for b in job.batch.boundaries if index in b.casts]
             for name in job.batch.wanted.intersection(cast.event_cameras):
                 self.dropped[job.vehicle, name] += len(stamps)
-        for cast_state in job.state.casts:
+        for index, cast_state in enumerate(job.state.casts):
+            if index in job.done:
+                continue
             for name in job.batch.wanted.intersection(cast_state.images):
                 rate = cast_state.images[name].rate
                 due = sum(rate.has_tick(boundary.stamp_ns) for boundary in job.batch.boundaries)

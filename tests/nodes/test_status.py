@@ -64,14 +64,14 @@ def test_the_line_names_who_holds_it_up():
 
 def test_pictures_that_come_late_are_said_to(monkeypatch: pytest.MonkeyPatch):
     """A camera that takes 30 ms for each look is late by about that; the IMU beside it is not."""
-    see = cameras.see
+    see = cameras.see_each
 
     def slow(*arguments: Any) -> Any:
         packets = see(*arguments)
         threading.Event().wait(0.03)
         return packets
 
-    monkeypatch.setattr(cameras, "see", slow)
+    monkeypatch.setattr(cameras, "see_each", slow)
     with LiveRig(make_config()) as rig:
         pictures = rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())
