@@ -87,7 +87,7 @@ def test_a_simulator_that_cannot_start_says_why():
     ("arguments", "status", "said"),
     [
         (["closed-loop", "--rates", "fast"], 2, "takes numbers with commas between them, got 'fast'"),
-        (["closed-loop", "--rates", "100,0"], 1, "control.rate_hz"),
+        (["closed-loop", "--rates", "100,0"], 1, "--rates: Input should be greater than 0, got 0.0"),
         (["closed-loop", "--seconds", "-1"], 1, "seconds must be > 0 and <= 3600, got -1.0"),
         (["closed-loop", "--set", "scene.rooms"], 1, "--set takes KEY=VALUE"),
         (["streaming", "--seconds", "nan", "--sampling-rate", "20"], 1, "nan"),

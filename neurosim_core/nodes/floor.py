@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from cortex import Node, reliable
 from cortex.messages import Clock
 
+_MODULE = "neurosim_core.nodes.floor"
+"""This one, which the other process runs."""
 _TOPIC = "/floor/clock"
 _START_S = 60.0
 """Longest wait for the first message."""
@@ -91,7 +93,7 @@ def _sender(rate_hz: float, count: int) -> Iterator[int]:
     try:
         arguments = [str(value) for value in (rate_hz, count, writing)]
         process = subprocess.Popen(
-            [sys.executable, "-m", "neurosim_core.nodes.floor", *arguments],
+            [sys.executable, "-m", _MODULE, *arguments],
             pass_fds=[writing],
             stdin=subprocess.DEVNULL,
         )

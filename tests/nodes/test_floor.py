@@ -1,0 +1,51 @@
+"""What the machine takes to wake another process."""
+
+import time
+
+import pytest
+
+from neurosim_core.bench.closed_loop import LoopResult, with_floor
+from neurosim_core.nodes import floor
+from neurosim_core.nodes.floor import FloorError, measure_floor
+
+
+@pytest.mark.usefixtures("shared_runtime")
+def test_every_message_is_timed():
+    """Times lie between nothing and what the whole measurement took; the messages are spread over theirs."""
+    begin_ns = time.monotonic_ns()
+    trace = measure_floor(400.0, seconds=0.2)
+    elapsed_ns = time.monotonic_ns() - begin_ns
+    assert len(trace.wake_ns) == len(trace.message_ns) == 40
+    for times_ns in (trace.wake_ns, trace.message_ns):
+        assert times_ns.min() > 0
+        assert times_ns.max() < elapsed_ns
+    assert elapsed_ns > 0.19e9  # 80 messages, 2.5 ms apart
+
+
+@pytest.mark.usefixtures("shared_runtime")
+def test_a_sender_that_ends_is_said(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(floor, "_MODULE", "this")
+    with pytest.raises(FloorError, match="ended"):
+        measure_floor(400.0, seconds=0.1)
+
+
+def test_a_result_is_put_beside_its_floor():
+    nan = float("nan")
+    result = LoopResult(
+        mode="streaming",
+        requested_hz=500.0,
+        received_hz=500.0,
+        image_count=10,
+        image_bytes=921_600,
+        latency_median_s=nan,
+        latency_p99_s=nan,
+        transport_median_s=1e-4,
+        transport_p99_s=2e-4,
+        lost_count=0,
+        overtaken_count=0,
+        unfelt_count=0,
+    )
+    beside = with_floor(result, seconds=0.05)
+    assert 0.0 < beside.wake_median_s <= beside.wake_p99_s
+    assert 0.0 < beside.message_median_s <= beside.message_p99_s
+    assert (beside.transport_median_s, beside.requested_hz) == (1e-4, 500.0)
