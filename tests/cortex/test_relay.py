@@ -311,6 +311,7 @@ def test_only_frames_are_sent(relay, wrong):
 
 
 SIZES = [100, 150_000, 6000, 20_000]
+RELIABLE = ["reliable", {"timeout_s": 60.0}]
 
 
 def subscribers(start_child, count: int, *, policy: list) -> list:
@@ -328,7 +329,7 @@ def is_relaying(publisher) -> bool:
 def test_readers_come_and_go_and_lose_nothing(make_node, start_child, runtime):
     """Two are written directly, more by a relay, and two again: nobody misses a message."""
     publisher = make_node().publisher("/blocks", Block)
-    children = subscribers(start_child, 2, policy=["reliable"])
+    children = subscribers(start_child, 2, policy=RELIABLE)
     assert publisher.wait_for_subscribers(2, timeout_s=SOON_S)
     assert not is_relaying(publisher)
     blocks = [make_block(0, size) for size in SIZES]
@@ -342,7 +343,7 @@ def test_readers_come_and_go_and_lose_nothing(make_node, start_child, runtime):
             sent += 1
 
     publish(200)
-    more = subscribers(start_child, 3, policy=["reliable"])
+    more = subscribers(start_child, 3, policy=RELIABLE)
     assert publisher.wait_for_subscribers(5, timeout_s=SOON_S)
     assert is_relaying(publisher)
     publish(400)
@@ -368,7 +369,7 @@ def test_one_that_is_stopped_keeps_nothing_from_the_others(make_node, start_chil
     """It loses what it is too late for, and counts that; it gets the rest once it goes on."""
     publisher = make_node().publisher("/blocks", Block)
     (stopped,) = subscribers(start_child, 1, policy=policy)
-    others = subscribers(start_child, 3, policy=["reliable", {"timeout_s": 60.0}])
+    others = subscribers(start_child, 3, policy=RELIABLE)
     assert publisher.wait_for_subscribers(4, timeout_s=SOON_S)
     assert is_relaying(publisher)
     block, sent, refused = make_block(0, 1000), 0, 0
@@ -403,7 +404,7 @@ def test_one_that_is_stopped_keeps_nothing_from_the_others(make_node, start_chil
         assert refused == 0
 
 
-@pytest.mark.parametrize("policy", [["keep_last"], ["reliable"]], ids=str)
+@pytest.mark.parametrize("policy", [["keep_last"], RELIABLE], ids=str)
 def test_the_relay_alone_serves_like_pipes(make_node, start_child, runtime, monkeypatch, policy):
     """One reader, written by a relay: small and large messages in one order."""
     monkeypatch.setattr(cortex.pipes, "PIPES_MAX", 0)
@@ -425,7 +426,7 @@ def test_the_relay_alone_serves_like_pipes(make_node, start_child, runtime, monk
 def test_what_waits_in_the_relay_arrives_after_close(make_node, start_child, runtime, monkeypatch):
     monkeypatch.setattr(cortex.pipes, "PIPES_MAX", 0)
     publisher = make_node().publisher("/blocks", Block)
-    (child,) = subscribers(start_child, 1, policy=["reliable"])
+    (child,) = subscribers(start_child, 1, policy=RELIABLE)
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
     for number in range(300):
         assert publisher.publish(make_block(number, 100))
