@@ -40,7 +40,7 @@ def neurosim(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedPr
         capture_output=True,
         text=True,
         cwd=cwd,
-        timeout=300,
+        timeout=900,
     )
 
 

@@ -200,7 +200,7 @@ def test_child_may_end_before_the_one_that_is_waited_for(tmp_path: Path):
 
 
 def test_child_beside_that_dies_is_noticed(tmp_path: Path):
-    slow = Child(_is_slow, None, log=tmp_path / "log", deadline_s=SOON_S)
+    slow = Child(_hangs, None, log=tmp_path / "log", deadline_s=SOON_S)
     server = Child(_dies, None, log=tmp_path / "log", deadline_s=SOON_S)
     with slow, server, pytest.raises(ChildFailed, match="died before 'result'"):
         slow.expect("result", beside=[server])

@@ -220,7 +220,8 @@ def test_late_reliable_reader_of_python_is_told(
         time.sleep(0.01)
     result = json.loads(peer.line())
     assert (result["wrong"], result["rejected"]) == (0, 0)
-    assert result["received"] + result["lost"] == result["sequence"]
+    # It may have been told of messages after the last that it received.
+    assert result["sequence"] <= result["received"] + result["lost"] <= scans.counters.published
     assert result["lost"] > 0
     assert refused > 0
 
@@ -238,7 +239,7 @@ def test_late_reliable_reader_of_cpp_is_told(
         time.sleep(0.001)  # work
         if not result and peer.has_line():
             result = json.loads(peer.line())
-            deadline_s = time.monotonic() + 20.0
+            deadline_s = time.monotonic() + SOON_S
         assert not result or time.monotonic() < deadline_s
     assert scans.counters.received + scans.counters.lost == result["published"]
     assert scans.counters.lost > 0
