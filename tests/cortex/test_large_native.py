@@ -80,20 +80,17 @@ def test_a_reader_that_is_behind_holds_up_or_loses(node):
         assert publisher.publish(scan(number, 30_000))
     counters = subscriber.counters
     received = 0
-    while True:
-        try:
-            message = subscriber.recv(0.2)
-        except TimeoutError:
-            break
+    message = None
+    while message is None or message.stamp_ns < 199:
+        message = subscriber.recv(SOON_S)
         assert (message.ranges == message.stamp_ns).all()
         received += 1
-    assert message.stamp_ns == 199
     wait_for(lambda: received + counters.lost + counters.overtaken == 200)
 
 
 def test_publishers_in_several_threads(node):
     """Messages copied with and without the lock, small ones between them: each arrives once, and whole."""
-    publisher, subscriber = connected(node, Block, reliable(64, 20.0))
+    publisher, subscriber = connected(node, Block, reliable(64, 60.0))
     sizes, count, threads = (10, 40_000, 200_000, 600_000), 40, 4
     made = {(k, size): make_block(1000 * k + size % 997, size) for k in range(threads) for size in sizes}
     refused = []
@@ -113,7 +110,7 @@ def test_publishers_in_several_threads(node):
         key = (block.number, len(block.data))
         seen[key] = seen.get(key, 0) + 1
     for worker in workers:
-        worker.join(10.0)
+        worker.join(SOON_S)
     assert not refused
     assert seen == {(block.number, size): count // 4 for (_, size), block in made.items()}
     assert subscriber.counters.lost == 0
@@ -138,7 +135,7 @@ def test_closing_while_others_publish(node):
         subscriber.recv(SOON_S)
         time.sleep(0.003)
         publisher.close(linger_s=0.0)
-        thread.join(10.0)
+        thread.join(SOON_S)
         assert ended
         subscriber.close()
 
