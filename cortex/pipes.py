@@ -1,9 +1,10 @@
 """The pipes of one publisher's local readers: a few it writes itself, more are written by a relay.
 
 To write one pipe and wake its reader is the quickest way to one reader. Done for each of many readers it
-makes a storm on a machine that is busy: each of them takes the processor from the publisher, reads one
-message and sleeps again, 8 readers 12,000 times a second. A relay, a thread in C (`_relay.c`), takes the
-frames instead and writes to each reader in turn what has come meanwhile: 8 readers 190,000 times a second.
+makes a storm where there are fewer processors than readers: each of them takes the processor from the
+publisher, reads one message and sleeps again. A relay, a thread in C (`_relay.c`), takes the frames instead
+and writes to each reader in turn what has come meanwhile. 8 readers of 40 B on two cores, each: 83-139 k/s
+written directly (12-20 on a busy machine), 450-560 by a relay; 160-230 through two pipes and ZeroMQ.
 """
 
 from __future__ import annotations
