@@ -15,8 +15,8 @@ from processes import SOON_S, wait_for
 import cortex.large
 import cortex.pipes
 from cortex import native
-from cortex.pipe import PIPE_BYTES
-from cortex.wire import BATCH, HEADER_SIZE, MESSAGE, Header, pack_header
+from cortex.pipe import PIPE_BYTES, make_writer
+from cortex.wire import BATCH, HEADER_SIZE, MESSAGE, AttachKey, Header, pack_header
 
 pytestmark = pytest.mark.skipif(native.NativeRelay is None, reason="no C module")
 
@@ -308,6 +308,41 @@ def test_only_frames_are_sent(relay, wrong):
 
 
 # Publishers
+
+
+def test_news_for_all_reaches_all_that_have_room():
+    """A reliable reader that is late keeps it from nobody."""
+    pipes = cortex.pipes.Pipes(lambda send, timeout_s: False)
+    fds, readers = [], []
+    for strict in (True, True, False):
+        fd, write = os.pipe()
+        os.set_blocking(fd, False)
+        os.set_blocking(write, False)
+        fds.append(fd)
+        request = AttachKey(1, 2, True, strict, 4, 100)
+        readers.append(cortex.large.Reader(os.urandom(4), request, None, 0, make_writer(write)))
+        pipes.admit(readers[-1])
+    assert pipes.settle()
+    streams = [bytearray() for _ in fds]
+
+    def read(place: int) -> bool:
+        try:
+            streams[place] += os.read(fds[place], 1 << 20)
+        except BlockingIOError:
+            return False
+        return True
+
+    count = 0
+    while pipes.send(frame(count, 1000)):
+        count += 1
+        size = count * 1064
+        wait_for(lambda size=size: not read(1) and not read(2) and len(streams[1]) == len(streams[2]) == size)
+    pipes.offer(frame(count + 1, 0))
+    wait_for(lambda: [read(1), read(2)] and numbers_of(bytes(streams[1]))[-1] == count + 1)
+    wait_for(lambda: [read(1), read(2)] and numbers_of(bytes(streams[2]))[-1] == count + 1)
+    pipes.close()
+    for fd in fds:
+        os.close(fd)
 
 
 SIZES = [100, 150_000, 6000, 20_000]
