@@ -36,7 +36,13 @@ EQUAL_BAR = 1e-12
 
 _TIMEOUT_S = 600.0
 _ROOM_M = (8.0, 6.0, 3.0)
-_SAMPLER = ("sample_texture", "sample_finest", "sample_nearest", "shade_textured_packet")
+_SAMPLER = (
+    "sample_texture",
+    "sample_finest",
+    "sample_nearest",
+    "shade_textured_packet",
+    "see_textured_packet",
+)
 _RGB = "_to_srgb"
 _IMU, _IMU_FILE = "imu", "imu-file"
 _EVENTS, _EVENTS_PLAIN = "events", "events-plain"

@@ -4,7 +4,8 @@
 The same arithmetic in the same order as `raycast.shade` for baked light and mip-mapped textures, so the same
 bytes. Ray by ray, shading took three times as long as Embree takes to find what the rays hit. Here lanes are
 gathered into arrays, one for each quantity, and each loop does one thing for all lanes without a branch, but
-for those that load from tables, and for the logarithm of the footprint, which is the library's.
+for those that load from tables, and for the logarithm of the footprint, which is the library's. Where all
+lanes see one triangle, its tables are read once.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -14,31 +15,86 @@ from typing import Any
 
 import warp as wp
 
-_HITS = """
-    constexpr int N = LANES;
-    constexpr float COSINE_MIN = 0.05f;
-    alignas(64) float facing[N], red[N], green[N], blue[N], u[N], v[N], w[N];
-    alignas(64) float light[3][3][N];
-    alignas(64) int face[N];
+from neurosim_core.render.embree import INTERSECT
+from neurosim_core.render.scene_data import SceneData
+
+_GATHER = """
+    alignas(64) float ray[3][N], normal[3][N], spread[N], ts[N], us[N], vs[N];
+    alignas(64) int faces[N];
     for (int lane = 0; lane < N; ++lane) {
-        const wp::vec3 front = FRONT;
-        facing[lane] = wp::dot(rays.data[lane], front);
-        face[lane] = faces.data[lane] < 0 ? 0 : faces.data[lane];  // of a miss, any: the sky takes its place
-        u[lane] = us.data[lane];
-        v[lane] = vs.data[lane];
-        w[lane] = 1.0f - u[lane] - v[lane];
+        faces[lane] = hit_face.data[lane];
+        ts[lane] = hit_t.data[lane];
+        us[lane] = hit_u.data[lane];
+        vs[lane] = hit_v.data[lane];
+        spread[lane] = spreads.data[lane];
+        for (int axis = 0; axis < 3; ++axis) {
+            ray[axis][lane] = rays.data[lane][axis];
+            normal[axis][lane] = normals.data[lane][axis];
+        }
     }
-    alignas(64) int material[N];
+"""
+
+_AIM = """
+    alignas(64) float ray[3][N], spread[N];
+    const wp::vec4* aimed = wp::address(rays, layer, first_pixel);
+    if (columns == SIDE && rows == SIDE)
+        for (int lane = 0; lane < N; ++lane) {
+            const wp::vec4& pixel = aimed[(lane / SIDE) * width + lane % SIDE];
+            for (int axis = 0; axis < 3; ++axis) ray[axis][lane] = pixel[axis];
+            spread[lane] = pixel[3];
+        }
+    else
+        for (int lane = 0; lane < N; ++lane) {
+            const bool inside = lane % SIDE < columns && lane / SIDE < rows;
+            const wp::vec4& pixel = aimed[inside ? (lane / SIDE) * width + lane % SIDE : 0];
+            for (int axis = 0; axis < 3; ++axis) ray[axis][lane] = inside ? pixel[axis] : 0.0f;
+            spread[lane] = inside ? pixel[3] : 0.0f;
+        }
     for (int lane = 0; lane < N; ++lane) {
-        material[lane] = face_material.data[face[lane]];
-        const wp::vec3& base = base_color.data[material[lane]];
+        const wp::vec3 turned = wp::quat_rotate(q_WC, wp::vec3(ray[0][lane], ray[1][lane], ray[2][lane]));
+        for (int axis = 0; axis < 3; ++axis) ray[axis][lane] = turned[axis];
+    }
+"""
+
+_HITS = """
+    constexpr float COSINE_MIN = 0.05f;
+    alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
+    alignas(64) float light[3][3][N];
+    alignas(64) int face[N], material[N];
+    for (int lane = 0; lane < N; ++lane) {
+        const float x = normal[0][lane], y = normal[1][lane], z = normal[2][lane];
+        const float length = UNIT ? 1.0f : __builtin_elementwise_sqrt(x * x + y * y + z * z);
+        const float cosine
+            = ray[0][lane] * (x / length) + ray[1][lane] * (y / length) + ray[2][lane] * (z / length);
+        facing[lane] = length > 0.0f ? cosine : 0.0f;
+        face[lane] = faces[lane] < 0 ? 0 : faces[lane];  // of a miss, any: the sky takes its place
+        w[lane] = 1.0f - us[lane] - vs[lane];
+    }
+    int others = 0;
+    for (int lane = 0; lane < N; ++lane)
+        others |= (face[lane] ^ face[0]) | ((facing[lane] > 0.0f) ^ (facing[0] > 0.0f));
+    const int different = others ? N : 1;  // lanes that are loaded for
+    auto repeat = [](auto& values) {
+        for (int lane = 1; lane < N; ++lane) values[lane] = values[0];
+    };
+    for (int lane = 0; lane < different; ++lane) {
+        material[lane] = scene.face_material.data[face[lane]];
+        const wp::vec3& base = scene.base_color.data[material[lane]];
         red[lane] = base[0];
         green[lane] = base[1];
         blue[lane] = base[2];
-        const wp::vec3* corner = corner_light.data + (size_t)(facing[lane] > 0.0f ? corner_light.shape[1] : 0)
-            + 3 * (size_t)face[lane];
+        const wp::vec3* corner = scene.corner_light.data
+            + (size_t)(facing[lane] > 0.0f ? scene.corner_light.shape[1] : 0) + 3 * (size_t)face[lane];
         for (int tip = 0; tip < 3; ++tip)
             for (int channel = 0; channel < 3; ++channel) light[channel][tip][lane] = corner[tip][channel];
+    }
+    if (different == 1) {
+        repeat(material);
+        repeat(red);
+        repeat(green);
+        repeat(blue);
+        for (int tip = 0; tip < 3; ++tip)
+            for (int channel = 0; channel < 3; ++channel) repeat(light[channel][tip]);
     }
 """
 
@@ -48,22 +104,29 @@ _TEXTURE = """
     alignas(64) float uv[2][3][N];
     alignas(64) float face_lods[N];
     alignas(64) int level_count[N];
-    for (int lane = 0; lane < N; ++lane) {
-        const wp::vec2i& texture = material_texture.data[material[lane]];
+    for (int lane = 0; lane < different; ++lane) {
+        const wp::vec2i& texture = scene.material_texture.data[material[lane]];
         first[lane] = texture[0];
         level_count[lane] = texture[1];
-        face_lods[lane] = face_lod.data[face[lane]];
-        const wp::vec2* corner = corner_uv.data + 3 * (size_t)face[lane];
+        face_lods[lane] = scene.face_lod.data[face[lane]];
+        const wp::vec2* corner = scene.corner_uv.data + 3 * (size_t)face[lane];
         for (int tip = 0; tip < 3; ++tip)
             for (int axis = 0; axis < 2; ++axis) uv[axis][tip][lane] = corner[tip][axis];
     }
+    if (different == 1) {
+        repeat(first);
+        repeat(level_count);
+        repeat(face_lods);
+        for (int tip = 0; tip < 3; ++tip)
+            for (int axis = 0; axis < 2; ++axis) repeat(uv[axis][tip]);
+    }
     for (int lane = 0; lane < N; ++lane)
-        lod[lane] = spreads.data[lane] * ts.data[lane] / wp::max(wp::abs(facing[lane]), COSINE_MIN);
+        lod[lane] = spread[lane] * ts[lane] / wp::max(wp::abs(facing[lane]), COSINE_MIN);
     for (int lane = 0; lane < N; ++lane) lod[lane] = wp::log2(lod[lane]);
     for (int lane = 0; lane < N; ++lane) {
-        const float wanted = lod[lane] + face_lods[lane] + mip_bias;
-        x[lane] = u[lane] * uv[0][0][lane] + v[lane] * uv[0][1][lane] + w[lane] * uv[0][2][lane];
-        y[lane] = u[lane] * uv[1][0][lane] + v[lane] * uv[1][1][lane] + w[lane] * uv[1][2][lane];
+        const float wanted = lod[lane] + face_lods[lane] + scene.mip_bias;
+        x[lane] = us[lane] * uv[0][0][lane] + vs[lane] * uv[0][1][lane] + w[lane] * uv[0][2][lane];
+        y[lane] = us[lane] * uv[1][0][lane] + vs[lane] * uv[1][1][lane] + w[lane] * uv[1][2][lane];
         x[lane] = x[lane] - wp::floor(x[lane]);
         y[lane] = 1.0f - (y[lane] - wp::floor(y[lane]));
         const float clamped = wp::clamp(wanted, 0.0f, (float)(level_count[lane] - 1));
@@ -72,7 +135,7 @@ _TEXTURE = """
     }
     int mixed = 0;
     for (int lane = 0; lane < N; ++lane) {
-        const bool textured = level_count[lane] > 0 && faces.data[lane] >= 0;
+        const bool textured = level_count[lane] > 0 && faces[lane] >= 0;
         if (!textured) first[lane] = finer[lane] = 0;  // read something, and use nothing of it
         if (!textured) blend[lane] = x[lane] = y[lane] = 0.0f;
         level_count[lane] = textured;
@@ -85,7 +148,7 @@ _TEXTURE = """
         alignas(64) uint32_t code[4][N];
         for (int lane = 0; lane < N; ++lane) {
             const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
-            const wp::vec3i& level = levels.data[index];
+            const wp::vec3i& level = scene.levels.data[index];
             origin[lane] = level[0];
             width[lane] = level[1];
             height[lane] = level[2];
@@ -111,7 +174,7 @@ _TEXTURE = """
             place[3][lane] = lower + right;
         }
         for (int corner = 0; corner < 4; ++corner)
-            for (int lane = 0; lane < N; ++lane) code[corner][lane] = texels.data[place[corner][lane]];
+            for (int lane = 0; lane < N; ++lane) code[corner][lane] = scene.texels.data[place[corner][lane]];
         for (int lane = 0; lane < N; ++lane) {
             for (int channel = 0; channel < 3; ++channel) {
                 float texel[4];
@@ -144,28 +207,67 @@ _LIGHT = """
     alignas(64) float radiance[3][N], emitted[3][N];
     for (int channel = 0; channel < 3; ++channel)
         for (int lane = 0; lane < N; ++lane)
-            emitted[channel][lane] = EMISSIVE ? emission.data[EMISSIVE ? material[lane] : 0][channel] : 0.0f;
+            emitted[channel][lane]
+                = EMISSIVE ? scene.emission.data[EMISSIVE ? material[lane] : 0][channel] : 0.0f;
     for (int channel = 0; channel < 3; ++channel) {
         const float* albedo = channel == 0 ? red : channel == 1 ? green : blue;
         for (int lane = 0; lane < N; ++lane) {
-            const float lit = u[lane] * light[channel][0][lane] + v[lane] * light[channel][1][lane]
+            const float lit = us[lane] * light[channel][0][lane] + vs[lane] * light[channel][1][lane]
                 + w[lane] * light[channel][2][lane];
-            radiance[channel][lane] = albedo[lane] * lit + emitted[channel][lane];
+            const float lit_and_own = albedo[lane] * lit + emitted[channel][lane];
+            radiance[channel][lane] = faces[lane] < 0 ? scene.sky[channel] : lit_and_own;
         }
     }
-    for (int lane = 0; lane < N; ++lane)
-        for (int channel = 0; channel < 3; ++channel)
-            total.data[lane][channel] += faces.data[lane] < 0 ? sky[channel] : radiance[channel][lane];
 """
+
+_ADD = """
+    for (int lane = 0; lane < N; ++lane)
+        for (int channel = 0; channel < 3; ++channel) total.data[lane][channel] += radiance[channel][lane];
+"""
+
+_SEE = """
+    alignas(64) float total[3][N] = {};
+    const int layers = rays.shape[0];
+    for (int layer = layers > 1; layer < layers; ++layer) {
+        BODY
+        for (int channel = 0; channel < 3; ++channel)
+            for (int lane = 0; lane < N; ++lane) total[channel][lane] += radiance[channel][lane];
+    }
+    alignas(64) float luma[N];
+    const float share = layers > 1 ? 1.0f / (float)(layers - 1) : 1.0f;
+    for (int lane = 0; lane < N; ++lane) {
+        luma[lane] = 0.2126f * (share * total[0][lane]) + 0.7152f * (share * total[1][lane])
+            + 0.0722f * (share * total[2][lane]);
+        luma[lane] = luma[lane] + scene.dark_floor;
+    }
+    for (int y = 0; y < rows; ++y) {
+        float* out = wp::address(log_radiance_out, instant, top + y, left);
+        for (int x = 0; x < columns; ++x) out[x] = wp::log(luma[SIDE * y + x]);
+    }
+"""
+
+
+def _shading(*, textured: bool, emissive: bool, unit_normals: bool) -> str:
+    """Return C++ that shades what `_GATHER`, or `_AIM` and a cast, have left of each lane."""
+    snippet = "".join([_HITS, _TEXTURE if textured else "", _LIGHT])
+    names = {
+        "UNIT": "true" if unit_normals else "false",
+        "EMISSIVE": "true" if emissive else "false",
+        "SCALE_RG": "(float)(1.0 / 2047)",
+        "SCALE_B": "(float)(1.0 / 1023)",
+    }
+    for name, value in names.items():
+        snippet = snippet.replace(name, value)
+    return snippet
 
 
 @cache
 def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: bool) -> Any:
     """Return the Warp function, for CPU kernels only, that adds the radiance of a packet's hits to a total.
 
-    Its parameters are the arrays of `raycast.SceneData` and its sky and mip bias; then of each lane: ray, of
-    unit length; spread [rad]; face, -1: nothing was hit; distance [m]; u and v, the weights of the first and
-    the second corner; the normal of the front. The last is the radiance of each lane so far, to add to.
+    Its parameters are the scene; then of each lane: ray, of unit length; spread [rad]; face, -1: nothing was
+    hit; distance [m]; u and v, the weights of the first and the second corner; the normal of the front. The
+    last is the radiance of each lane so far, to add to.
 
     Args:
         lanes: Rays of a packet.
@@ -173,39 +275,67 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
         emissive: Some material emits light.
         unit_normals: Normals are of unit length already.
     """
-    snippet = "\n".join([_HITS, _TEXTURE if textured else "", _LIGHT])
-    names = {
-        "LANES": str(lanes),
-        "FRONT": "normals.data[lane]" if unit_normals else "wp::normalize(normals.data[lane])",
-        "EMISSIVE": "true" if emissive else "false",
-        "SCALE_RG": "(float)(1.0 / 2047)",
-        "SCALE_B": "(float)(1.0 / 1023)",
-    }
-    for name, value in names.items():
-        snippet = snippet.replace(name, value)
+    shading = _shading(textured=textured, emissive=emissive, unit_normals=unit_normals)
 
     def shade_packet(
-        face_material: wp.array[int],
-        face_lod: wp.array[float],
-        corner_uv: wp.array[wp.vec2],
-        corner_light: wp.array2d[wp.vec3],
-        base_color: wp.array[wp.vec3],
-        emission: wp.array[wp.vec3],
-        material_texture: wp.array[wp.vec2i],
-        levels: wp.array[wp.vec3i],
-        texels: wp.array[wp.uint32],
-        sky: wp.vec3,
-        mip_bias: float,
+        scene: SceneData,
         rays: wp.array[wp.vec3],
         spreads: wp.array[float],
-        faces: wp.array[int],
-        ts: wp.array[float],
-        us: wp.array[float],
-        vs: wp.array[float],
+        hit_face: wp.array[int],
+        hit_t: wp.array[float],
+        hit_u: wp.array[float],
+        hit_v: wp.array[float],
         normals: wp.array[wp.vec3],
         total: wp.array[wp.vec3],
     ): ...
 
     if textured:  # by its name the code of a kernel tells whether it samples textures
         shade_packet.__name__ = shade_packet.__qualname__ = "shade_textured_packet"
-    return wp.func_native(snippet)(shade_packet)
+    return wp.func_native(f"constexpr int N = {lanes};" + _GATHER + shading + _ADD)(shade_packet)
+
+
+@cache
+def packet_eye(width: int, *, textured: bool, emissive: bool) -> Any:
+    """Return the Warp function, for CPU kernels only, that casts and shades 4 x 4 pixels, and takes the log.
+
+    The same bits as casting by `packet_caster`, shading by `packet_shader` and writing each pixel; but what
+    the rays hit is passed on in arrays by quantity, which are neither cleared nor transposed on the way. Of
+    several layers of rays the first is left out, and the mean of the others taken.
+
+    Its parameters: the scene; rays of pixels, as `raycast_kernel` has them, contiguous; the first of the
+    packet, and the columns of the picture; position and orientation of the camera; the distance beyond which
+    hits do not count [m]; instant, top row and left column of the packet; its rows and columns, at most 4.
+    The last is the log radiance, of which these pixels are written.
+
+    Args:
+        width: `embree.packet_width()`.
+        textured: Some material has a texture; it is filtered trilinearly.
+        emissive: Some material emits light.
+    """
+    intersect = (
+        INTERSECT.replace("WIDTH", str(width))
+        .replace("EMBREE_INTERSECT", "scene.embree_intersect")
+        .replace("EMBREE_SCENE", "scene.embree_scene")
+    )
+    shading = _shading(textured=textured, emissive=emissive, unit_normals=False)
+
+    def see_packet(
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        first_pixel: int,
+        width: int,
+        origin: wp.vec3,
+        q_WC: wp.quat,
+        far_m: float,
+        instant: int,
+        top: int,
+        left: int,
+        rows: int,
+        columns: int,
+        log_radiance_out: wp.array3d[float],
+    ): ...
+
+    if textured:
+        see_packet.__name__ = see_packet.__qualname__ = "see_textured_packet"
+    code = "constexpr int N = 16, SIDE = 4;" + _SEE.replace("BODY", _AIM + intersect + shading)
+    return wp.func_native(code)(see_packet)

@@ -21,7 +21,8 @@ import warp as wp
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
-from neurosim_core.render.packet_shading import packet_shader
+from neurosim_core.render.packet_shading import packet_eye, packet_shader
+from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.tile_walk import ASK, TILE, WalkData, find_face, find_faces, meet_face
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
@@ -62,43 +63,6 @@ class Terms(NamedTuple):
     """Rays of a tile share a walk through the tree (`tile_walk`), a block of 64 threads at a time."""
     by_tile: bool = False
     """With `walked`: on a CPU, a thread for each tile."""
-
-
-@wp.struct
-class SceneData:
-    """The arrays of a scene that the kernel reads. Corner k of face f is at 3 f + k.
-
-    Of moving bodies, material, instance, texture coordinates and density follow those of the scene.
-    """
-
-    mesh: wp.uint64
-    embree_scene: wp.uint64
-    """`EmbreeTree.scene`; 0 if Warp finds what rays hit."""
-    embree_intersect: wp.uint64
-    """`EmbreeTree.intersect`, likewise."""
-    face_material: wp.array[int]
-    face_instance: wp.array[int]
-    face_lod: wp.array[float]
-    """log2 of texels per metre on each face."""
-    corner_uv: wp.array[wp.vec2]
-    corner_normal: wp.array[wp.vec3]
-    """Shading normals, on the front of the face; not filled if light is baked."""
-    corner_light: wp.array2d[wp.vec3]
-    """Baked light, shape [2, 3F]: front, back; not filled otherwise."""
-    base_color: wp.array[wp.vec3]
-    emission: wp.array[wp.vec3]
-    material_texture: wp.array[wp.vec2i]
-    levels: wp.array[wp.vec3i]
-    texels: wp.array[wp.uint32]
-    light_position: wp.array[wp.vec3]
-    light_intensity: wp.array[wp.vec3]
-    light_radius_m: float
-    ambient_up: wp.vec3
-    ambient_down: wp.vec3
-    sky: wp.vec3
-    mip_bias: float
-    dark_floor: float
-    exposure: float
 
 
 @wp.struct
@@ -512,6 +476,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     together = with_radiance and baked and not with_bodies and not finest_level
     each_lane = with_geometry or walked or not together
     shade_packet = packet_shader(lanes, textured=textured, emissive=emissive, unit_normals=walked)
+    at_once = with_log and together and not walked  # where no picture is asked for
+    see_packet = packet_eye(terms.embree, textured=textured, emissive=emissive) if at_once else None
 
     @wp.kernel(module="unique", enable_backward=False)
     def raycast_packets(
@@ -568,6 +534,26 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     return
         origin = p_WC[instant]
         q = q_WC[instant]
+        columns = wp.min(width - left, side)
+        rows = wp.min(height - top, side)
+        if wp.static(at_once):
+            if slot < 0:
+                see_packet(
+                    scene,
+                    rays,
+                    first_ray + top * width + left,
+                    width,
+                    origin,
+                    q,
+                    _FAR_M,
+                    instant,
+                    top,
+                    left,
+                    rows,
+                    columns,
+                    log_radiance_out,
+                )
+                return
         ray = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         face = wp.zeros(shape=(lanes,), dtype=int)
         t = wp.zeros(shape=(lanes,), dtype=float)
@@ -576,8 +562,6 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         normal = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         spread_rad = wp.zeros(shape=(lanes if together else 1,), dtype=float)
-        columns = wp.min(width - left, side)
-        rows = wp.min(height - top, side)
         for layer in range(rays.shape[0]):
             if wp.static(supersampled):
                 if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
@@ -656,17 +640,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             if wp.static(together):
                 if wp.static(not supersampled) or layer > 0:
                     shade_packet(
-                        scene.face_material,
-                        scene.face_lod,
-                        scene.corner_uv,
-                        scene.corner_light,
-                        scene.base_color,
-                        scene.emission,
-                        scene.material_texture,
-                        scene.levels,
-                        scene.texels,
-                        scene.sky,
-                        scene.mip_bias,
+                        scene,
                         ray,
                         spread_rad,
                         face,

@@ -31,7 +31,8 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.raycast import SceneData, Terms, WorldData, raycast_kernel
+from neurosim_core.render.raycast import Terms, WorldData, raycast_kernel
+from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures

@@ -47,22 +47,23 @@ def scene_of(kind):
     )
 
 
-def pictures(scene, **settings):
-    """Return log radiance of views all around, of which one is far outside."""
+def pictures(scene, *, with_depth=False, **settings):
+    """Return log radiance of views all around, of which one is far outside; with depth: of half of them."""
     rng = np.random.default_rng(2)
     q_WC = rng.normal(size=(VIEWS, 4)).astype(np.float32)
     q_WC /= np.linalg.norm(q_WC, axis=1, keepdims=True)
     p_WC = np.tile(np.float32([0.3, 2.1, 1.7]), (VIEWS, 1))
     p_WC[-1] += 400.0
     arrays = upload_scene(scene, RenderConfig(**settings), "cpu")
-    renderer = WarpRenderer(arrays, LENS, outputs=("log_radiance",), instant_count=VIEWS)
-    nowhere = wp.full(VIEWS, -1, dtype=int, device="cpu")
+    outputs = ("log_radiance", "depth") if with_depth else ("log_radiance",)
+    renderer = WarpRenderer(arrays, LENS, outputs=outputs, instant_count=VIEWS, image_count=VIEWS)
+    slots = wp.array([k if with_depth and k % 2 else -1 for k in range(VIEWS)], dtype=int, device="cpu")
     poses = wp.array(p_WC, dtype=wp.vec3, device="cpu"), wp.array(q_WC, dtype=wp.quat, device="cpu")
-    renderer.render(*poses, nowhere, instant_count=VIEWS)
+    renderer.render(*poses, slots, instant_count=VIEWS)
     return renderer.log_radiance.numpy()
 
 
-@pytest.mark.parametrize(
+KINDS = pytest.mark.parametrize(
     ("kind", "settings"),
     [
         ("plain", {}),
@@ -70,6 +71,9 @@ def pictures(scene, **settings):
         ("emissive", {"mip_bias": 1.0, "samples_per_pixel": 2}),
     ],
 )
+
+
+@KINDS
 def test_packets_are_shaded_like_single_rays(kind, settings):
     scene = scene_of(kind)
     alone = pictures(scene, cpu_traversal="warp", **settings)
@@ -79,3 +83,14 @@ def test_packets_are_shaded_like_single_rays(kind, settings):
     seen = np.abs(alone - sky) > 1e-3
     assert 1.0 - seen.mean() > 0.02  # the sky is seen, and other things
     assert len(np.unique(alone[seen])) > 1000
+
+
+@KINDS
+def test_packets_are_seen_at_once_as_step_by_step(kind, settings):
+    """Where a picture of depth is taken, casting, shading and writing are steps of their own; else one."""
+    pytest.importorskip("embreex", exc_type=ImportError)
+    scene = scene_of(kind)
+    at_once = pictures(scene, cpu_traversal="embree", **settings)
+    by_step = pictures(scene, with_depth=True, cpu_traversal="embree", **settings)
+    assert by_step.tobytes() == at_once.tobytes()
+    assert len(np.unique(at_once)) > 1000
