@@ -188,7 +188,7 @@ def test_slow_reader_knows_what_it_missed(
         time.sleep(0.01)
     result = json.loads(peer.line())
     assert (result["wrong"], result["rejected"]) == (0, 0)
-    assert 0 < result["received"] < 2000
+    assert result["received"] < 2000  # 0 if it was asleep until the end overtook them all
     assert result["received"] + result["lost"] + result["overtaken"] == result["sequence"]
 
 
