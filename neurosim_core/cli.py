@@ -230,13 +230,15 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _options(arguments: argparse.Namespace) -> dict[str, str]:
-    """What the command line calls the keys of `_overrides`, for error messages."""
-    return set_options(read_settings(arguments.settings)) | {
-        "duration_s": "--duration",
-        "seed": "--seed",
-        "device": "--device",
-        "live.real_time_factor": "--factor",
+    """What the command line calls the keys that it gives a value, for error messages."""
+    names = {
+        "duration_s": "duration",
+        "seed": "seed",
+        "device": "device",
+        "live.real_time_factor": "factor",
     }
+    given = {key: f"--{name}" for key, name in names.items() if getattr(arguments, name, None) is not None}
+    return set_options(read_settings(arguments.settings)) | given
 
 
 def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:

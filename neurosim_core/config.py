@@ -248,8 +248,8 @@ def load_config(
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
             another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
             the default set are changed, and new ones added to it.
-        options: What the user calls a key that does not come from a file, such as {"duration_s":
-            "--duration"}: a mistake there is said of it.
+        options: What the user calls a key of `overrides`, such as {"duration_s": "--duration"}: a mistake
+            there is said of it, and so is what lacks or is unknown in a group that only it has made.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
     A sensor or body that is null is left out: {"sensors.depth": None}.
@@ -265,6 +265,7 @@ def load_config(
         # pixels are ideal where nothing is said of them, which leaves a preset free to say it
         sensors = _default_sensors()
         raw["sensors"] = {name: sensor.model_dump(exclude={"pixel"}) for name, sensor in sensors.items()}
+    given = raw
     for patch in patches:
         raw = _merge(raw, patch)
     if isinstance(source, str | Path):
@@ -273,7 +274,7 @@ def load_config(
     try:
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(_say(origin, list(_explain(error, raw)), options or {})) from None
+        raise ConfigError(_say(origin, list(_explain(error, raw)), options or {}, given)) from None
 
 
 def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
@@ -376,15 +377,16 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
             yield line
 
 
-def _say(origin: str, mistakes: list[str], options: Mapping[str, str]) -> str:
+def _say(origin: str, mistakes: list[str], options: Mapping[str, str], given: Mapping[str, Any]) -> str:
     """Return the text of an error: each mistake by the name that the user gave its key.
 
     Args:
         origin: What the settings are from.
         mistakes: Lines that begin with a dotted key.
         options: Names of keys that were given otherwise.
+        given: What is in the settings without these.
     """
-    lines = dict.fromkeys(_by_option(line, options) for line in mistakes)
+    lines = dict.fromkeys(_by_option(line, options, given) for line in mistakes)
     elsewhere = any(line in mistakes for line in lines)
     if not elsewhere and len(lines) == 1:
         return next(iter(lines))
@@ -392,15 +394,29 @@ def _say(origin: str, mistakes: list[str], options: Mapping[str, str]) -> str:
     return "\n".join([head, *(f"  {line}" for line in lines)])
 
 
-def _by_option(line: str, options: Mapping[str, str]) -> str:
-    """Name the option in place of its key; a key within it, or one that it lies in, is said as well."""
+def _by_option(line: str, options: Mapping[str, str], given: Mapping[str, Any]) -> str:
+    """Name the option in place of its key; a key within it, or in a group that it made, is said as well."""
     key, separator, reason = line.partition(": ")
     for place in sorted(options, key=len, reverse=True):
         if key == place:
             return f"{options[place]}{separator}{reason}"
         if key.startswith(f"{place}."):
             return f"{options[place]}: {line}"
+    for group in (key, key.rpartition(".")[0]):
+        makers = [place for place in options if group and place.startswith(f"{group}.")]
+        if makers and not _holds(given, key) and (f"{group}.kind" in makers or not _holds(given, group)):
+            return f"{options[makers[0]]}: {line}"
     return line
+
+
+def _holds(raw: Mapping[str, Any], key: str) -> bool:
+    """Return whether settings have a value at a dotted key."""
+    value: Any = raw
+    for part in key.split("."):
+        if not isinstance(value, Mapping) or part not in value:
+            return False
+        value = value[part]
+    return True
 
 
 def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:

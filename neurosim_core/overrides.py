@@ -25,12 +25,16 @@ def read_settings(texts: Sequence[str]) -> dict[str, Any]:
     """Return values by dotted key; a value is read as YAML.
 
     Raises:
-        ValueError: A text is not KEY=VALUE.
+        ValueError: A text is not KEY=VALUE, or its value is no YAML.
     """
     settings: dict[str, Any] = {}
     for text in texts:
         key, separator, value = text.partition("=")
         if not separator or not key:
             raise ValueError(f"--set takes KEY=VALUE, got {text!r}")
-        settings[key] = yaml.safe_load(value)
+        try:
+            settings[key] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(f"--set {key}: the value {value!r} is not YAML: {reason}") from None
     return settings

@@ -208,3 +208,38 @@ def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path):
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["run", "serve", "fly", "up"])
+def test_mistakes_in_a_file_are_said_of_the_file(command, tmp_path, capsys):
+    """Nobody has typed an option: the file and its keys are named, and what is typed beside it as it is."""
+    file = tmp_path / "scene.yaml"
+    file.write_text("{duration_s: -5, seed: -1, device: gpu, live: {real_time_factor: -1}}")
+    assert cli.main([command, str(file)]) == 1
+    head, *lines = capsys.readouterr().err.splitlines()
+    assert head == f"neurosim: {file} is not a valid configuration:"
+    keys = {"  duration_s", "  seed", "  device", "  live.real_time_factor"}
+    assert {line.split(":")[0] for line in lines} == keys
+    assert cli.main([command, str(file), "--set", "device=amd", "--seed", "-2"]) == 1
+    head, *lines = capsys.readouterr().err.splitlines()
+    assert head == f"neurosim: {file} is not a valid configuration:"
+    keys = {"  duration_s", "  --seed", "  --set device", "  live.real_time_factor"}
+    assert {line.split(":")[0] for line in lines} == keys
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["device=gpu"], "--set device: must be auto, cpu, cuda"),
+        (["duration_s=-5"], "--set duration_s: Input should be greater than 0, got -5"),
+        (["sensors.evnts.rate_hz=3"], "--set sensors.evnts.rate_hz: sensors.evnts.kind: required"),
+        (["seed=3", "cat.dog=3"], "--set cat.dog: cat: unknown key"),
+        (["scene.kind=mesh"], "--set scene.kind: scene.file: required"),
+        (["scene.seed=[3"], "--set scene.seed: the value '[3' is not YAML"),
+    ],
+)
+def test_mistakes_of_set_are_said_of_it(settings, said, capsys):
+    options = [part for text in settings for part in ("--set", text)]
+    assert cli.main(["run", *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"neurosim: {said}")

@@ -210,6 +210,10 @@ def test_mistakes_in_options_are_said_of_the_options(tmp_path):
     assert any(line.startswith("  --duration: ") for line in lines)
     options["scene"] = "--set scene"
     assert said(None, **{"scene.rooms": 0}).startswith("--set scene: scene.rooms: ")
+    options["sensors.rgb.rate_hz"] = "--set sensors.rgb.rate_hz"
+    file.write_text("sensors: {rgb: {lens: {}}}")  # lacks its kind, whatever the option says
+    head, line = said(file, **{"sensors.rgb.rate_hz": 3.0}).splitlines()
+    assert (head, line[:19]) == (f"{file} is not a valid configuration:", "  sensors.rgb.kind:")
 
 
 def test_a_device_is_named_by_what_may_be_given():
