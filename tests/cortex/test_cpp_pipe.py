@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import random
+import select
 import shutil
+import termios
 import time
+from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from cpp_client import Impostor, Peer, make_frame
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs, start
@@ -22,7 +27,9 @@ from cortex import wire
 from cortex.codec import codec_of
 from cortex.host import pipe_path
 from cortex.node import Node
+from cortex.pipe import Offer
 from cortex.policy import Policy, keep_last, latest, reliable
+from cortex.shm import RingView
 
 __all__ = ["programs", "start"]
 
@@ -207,6 +214,118 @@ def test_killed_cpp_publisher_is_followed_by_another(start: Callable[..., Peer])
     wait_for(lambda: is_piped(reader, second.process.pid))
     result = result_of(reader)
     assert (result["wrong"], result["lost"], result["rejected"]) == (0, 0, 0)
+
+
+class SlowReader:
+    """A reliable reader of a C++ publisher that attaches by hand, and reads when it is told to.
+
+    Args:
+        node: Who knows the publisher.
+        topic: Its topic.
+    """
+
+    def __init__(self, node: Node, topic: str) -> None:
+        def found() -> list[tuple[int, str]]:
+            return [
+                (publisher.source, record.endpoints[0].strict)
+                for record in node.nodes()
+                for publisher in record.publishers
+                if publisher.topic == topic
+            ]
+
+        wait_for(lambda: bool(found()))
+        ((self.source, address),) = found()
+        self.key = wire.attach_key(wire.AttachKey(self.source, 1, True, True, 10, 1), stamped=True)
+        self._offer = Offer(Path(address.removeprefix("ipc://")).parent, 1)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.connect(address)
+        self._socket.subscribe(self.key)
+        assert self._socket.poll(1e3 * SOON_S), "the publisher does not answer"
+        column = wire.parse_answer(self._socket.recv()).column
+        assert column is not None
+        assert self._offer.taken()
+        self.column: int = column
+
+    @property
+    def waiting(self) -> int:
+        """What lies in the pipe [bytes]."""
+        count = array("i", [0])
+        fcntl.ioctl(self._offer.fd, termios.FIONREAD, count)
+        return count[0]
+
+    def frame(self) -> bytes:
+        """The next frame, taken apart by its header's own size."""
+        head = self._read(wire.HEADER_SIZE)
+        slot = wire.MASK.size + wire.PLACE_SIZE
+        return head + self._read(slot if head[3:4] == b"S" else int.from_bytes(head[48:56], "little"))
+
+    def _read(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            assert select.select([self._offer.fd], [], [], SOON_S)[0], "the rest of a frame does not come"
+            data += os.read(self._offer.fd, size - len(data))
+        return data
+
+    def leave(self) -> None:
+        self._offer.close()
+        self._context.destroy(linger=0)
+
+
+@pytest.fixture
+def attach(
+    make_node: Callable[..., Node], start: Callable[..., Peer]
+) -> Iterator[Callable[..., tuple[SlowReader, dict[str, int]]]]:
+    """Makes a C++ program fill the pipe of a reader and leave; both, and what the program says."""
+    readers = []
+
+    def run(most: int, size: int) -> tuple[SlowReader, dict[str, int]]:
+        node = make_node()
+        peer = start("fill", "/scan", most, size)
+        readers.append(SlowReader(node, "/scan"))
+        return readers[-1], result_of(peer)
+
+    yield run
+    for reader in readers:
+        reader.leave()
+
+
+def sequence_of(frame: bytes) -> int:
+    return int.from_bytes(frame[24:32], "little")
+
+
+def test_closed_publisher_finishes_a_frame(
+    attach: Callable[..., tuple[SlowReader, dict[str, int]]],
+) -> None:
+    """A frame that is in the pipe in part comes whole, behind it the number that tells of the loss."""
+    reader, result = attach(10**9, 2700)
+    frame = wire.HEADER_SIZE + len(body_of(0, 2700))
+    assert reader.waiting < wire.HEADER_SIZE + result["taken"] * frame  # three pages each: one was cut
+    assert reader.frame()[3:4] == b"B"
+    for number in range(result["taken"]):
+        assert reader.frame()[wire.HEADER_SIZE :] == body_of(number, 2700)
+    last = reader.frame()
+    assert (last[3:4], len(last), sequence_of(last)) == (b"B", wire.HEADER_SIZE, result["published"])
+    assert result["published"] == result["taken"] + 1
+
+
+def test_slots_of_a_closed_publisher_stay(
+    attach: Callable[..., tuple[SlowReader, dict[str, int]]],
+) -> None:
+    """What was sent through shared memory is there until its reader has given it back."""
+    reader, result = attach(5, 20_000)
+    assert result == {"taken": 5, "published": 5}
+    frames = [reader.frame() for _ in range(6)][1:]
+    assert reader.frame()[3:4] == b"B"
+    offset = wire.HEADER_SIZE + wire.MASK.size
+    place = wire.parse_place(frames[0], offset)
+    ring = RingView(reader.source, *place, reader.column)
+    for number, frame in enumerate(frames):
+        assert frame[3:4] == b"S"
+        size, aux = (int.from_bytes(frame[at : at + 8], "little") for at in (48, 56))
+        assert ring.lease(aux & 0xFFFFFFFF, number, size).tobytes() == body_of(number, 20_000)
+    path = Path(f"/proc/{place.pid}/fd/{place.fd}")
+    wait_for(lambda: not path.is_symlink() or "cortex-" not in os.readlink(path))  # all was given back
 
 
 class PipingImpostor(Impostor):

@@ -3,7 +3,9 @@
 // built without). No registry: the nodes are static peers.
 #include <atomic>
 #include <chrono>
+#include <cstdlib>
 #include <iostream>
+#include <map>
 #include <string>
 #include <thread>
 #include <vector>
@@ -49,7 +51,8 @@ void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic,
   auto publisher = talker.advertise<Scan>(topic);
   auto every = hearer.subscribe<Scan>(topic, cortex::reliable(16, 20s));
   auto newest = hearer.subscribe<Scan>(topic, cortex::latest());
-  expect(publisher.wait_for_subscribers(2, 10s), "two subscribers attach");
+  expect(publisher.wait_for_subscribers(2, 60s), "two subscribers attach");
+  expect(every.wait_for_publisher(60s), "and learn of it");  // its answer may still be on its way
   std::vector<std::thread> threads;
   for (int writer = 0; writer < 2; ++writer) {
     threads.emplace_back([&publisher, size, count, writer] {
@@ -94,6 +97,50 @@ void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic,
   expect(every.counters().lost == 0 && every.counters().rejected == 0, "nothing is lost");
 }
 
+// Publishes until the pipe of a reliable subscriber is full; how many messages were taken.
+int fill(cortex::Publisher<Scan>& publisher) {
+  int taken = 0;
+  while (publisher.publish(scan_of(taken, 10))) ++taken;
+  return taken;
+}
+
+// Two publishers whose pipes are full: a reliable subscription, in whose queue there is room for few, reads both.
+void share_the_room(cortex::Node& talker, cortex::Node& hearer) {
+  auto subscription = hearer.subscribe<Scan>("/room", cortex::reliable(8, 1ms));
+  std::vector<cortex::Publisher<Scan>> publishers;
+  for (int number = 0; number < 2; ++number) {
+    publishers.push_back(talker.advertise<Scan>("/room"));
+    expect(publishers.back().wait_for_subscribers(1, 60s), "a publisher is found");
+    expect(fill(publishers.back()) > 200, "a pipe holds hundreds of messages");
+  }
+  std::map<std::uint64_t, int> received;
+  for (int left = 200; left > 0; --left) {
+    const auto scan = subscription.receive(60s);
+    expect(scan.has_value(), "what is in the pipes arrives");
+    if (scan) ++received[scan->info().source];
+  }
+  expect(received.size() == 2, "both publishers are heard");
+  for (const auto& entry : received) expect(std::abs(entry.second - 100) <= 16, "each as often as the other");
+}
+
+// A reliable subscription that is read long after its publisher has left gets all that this was told to be taken.
+void read_late(cortex::Node& talker, cortex::Node& hearer) {
+  auto subscription = hearer.subscribe<Scan>("/late", cortex::reliable(8, 1ms));
+  int taken = 0;
+  {
+    auto publisher = talker.advertise<Scan>("/late");
+    expect(publisher.wait_for_subscribers(1, 60s), "the subscriber attaches");
+    taken = fill(publisher);
+  }
+  while (subscription.publisher_count() > 0) std::this_thread::sleep_for(1ms);
+  std::this_thread::sleep_for(2500ms);  // more than what is on its way would need
+  for (int number = 0; number < taken; ++number) {
+    const auto scan = subscription.receive(10s);
+    expect(scan && (*scan)->stamp_ns == number, "every scan arrives, in order");
+    if (!scan) return;
+  }
+}
+
 // A node that ends under its users: receivers return, publishers throw, received messages stay.
 void end_early() {
   auto talker = std::make_unique<cortex::Node>("talker", alone());
@@ -133,6 +180,8 @@ int main() {
     std::thread large([&] { share(talker, hearer, "/large", 8000, 150); });
     share(talker, hearer, "/small", 10, 500);
     large.join();
+    share_the_room(talker, hearer);
+    read_late(talker, hearer);
     auto wrong = talker.advertise<Scan>("/wrong");
     bool refused = false;
     try {

@@ -90,6 +90,29 @@ void publish(cortex::Node& node, const std::string& topic, int count, const std:
   while (!ended) std::this_thread::sleep_for(5ms);
 }
 
+// Publishes scans of this size, at most so many, until a reliable reader has no room; says how many were taken once the
+// publisher is gone.
+void fill(cortex::Node& node, const std::string& topic, int most, std::uint32_t size) {
+  std::cout << "ready" << std::endl;
+  int taken = 0;
+  std::uint64_t published = 0;
+  {
+    auto scans = node.advertise<Scan>(topic);
+    if (!scans.wait_for_subscribers(1, 60s)) std::exit(2);
+    Scan scan;
+    scan.ranges = cortex::Array<float>::zeros({size});
+    while (taken < most) {
+      scan.stamp_ns = taken;
+      for (auto& range : scan.ranges.writable()) range = static_cast<float>(taken);
+      if (!scans.publish(scan)) break;
+      ++taken;
+    }
+    published = scans.counters().published;
+  }
+  std::cout << "{\"taken\": " << taken << ", \"published\": " << published << "}" << std::endl;
+  while (!ended) std::this_thread::sleep_for(5ms);
+}
+
 // Receives until a scan with stamp -1, or `until` if that is not 0, holding the last `hold` messages, and says what
 // came; each publisher's scans count up.
 void count(cortex::Node& node, const std::string& topic, const std::string& policy, int pause_us, std::size_t hold,
@@ -171,6 +194,7 @@ int main(int argc, char** argv) {
     publish(node, argument(2), std::stoi(argument(3)), numbers_of(argument(4)), argument(5),
             std::max<std::size_t>(1, static_cast<std::size_t>(std::stoi(argument(6)))));
   }
+  if (role == "fill") fill(node, argument(2), std::stoi(argument(3)), static_cast<std::uint32_t>(std::stoi(argument(4))));
   if (role == "count") {
     count(node, argument(2), argument(3), std::stoi(argument(4)), static_cast<std::size_t>(std::stoi(argument(5))),
           std::stoi(argument(6)));

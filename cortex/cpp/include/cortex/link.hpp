@@ -76,7 +76,12 @@ class Link {
   std::uint64_t source() const noexcept { return source_; }
   const std::string& address() const noexcept { return address_; }
   bool attached() const noexcept { return attached_; }
-  std::int64_t leaving_ns = 0;  // when the publisher was seen to have left; 0: it is there
+  std::int64_t leaving_ns = 0;  // when the publisher had left and there was still something to read; 0: it is there
+
+  // There may be more to read, if the publisher has left or not.
+  void stay(std::int64_t now_ns) noexcept {
+    if (leaving_ns != 0) leaving_ns = now_ns;
+  }
 
   // Reads at most `budget` frames into the queue, those of the pipe first; false if there may be more.
   bool drain(std::deque<Item>& queue, std::size_t budget) {

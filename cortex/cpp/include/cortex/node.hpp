@@ -116,9 +116,12 @@ class Node {
     thread_.join();
     directory_->leave();
     for (const auto& subscription : subscriptions()) subscription->close();
+    for (const auto& publisher : publishers()) publisher->close();
+    linger();
     {
       const std::lock_guard<std::mutex> lock(outlets_->mutex);
       outlets_->closed = true;
+      outlets_->leftovers.clear();
       outlets_->lossy.socket.close();
       outlets_->strict.socket.close();
     }
@@ -138,6 +141,7 @@ class Node {
   static constexpr std::int64_t tick_ns = 20'000'000;
   static constexpr std::int64_t short_tick_ns = 2'000'000;  // for a while after a change, so that peers meet soon
   static constexpr std::int64_t busy_ns = 300'000'000;
+  static constexpr std::int64_t linger_ns = 500'000'000;
 
   static bool is_loopback(const std::string& host) {
     return host.rfind("127.", 0) == 0 || host == "::1" || host == "[::1]" || host == "localhost";
@@ -259,6 +263,21 @@ class Node {
     return record;
   }
 
+  // Waits until readers have got what publishers have left behind, if that is soon.
+  void linger() {
+    detail::Backoff backoff(linger_ns);
+    bool in_time = true;
+    while (in_time) {
+      {
+        const detail::Lock lock(outlets_->mutex);
+        outlets_->refresh();
+        outlets_->leftovers.deliver();
+        if (outlets_->leftovers.empty()) return;
+      }
+      in_time = backoff.wait();
+    }
+  }
+
   // The node's thread
 
   void run() {
@@ -286,6 +305,7 @@ class Node {
     if ((fds[0].revents & POLLIN) != 0) waker_.clear();
   }
 
+  // Whether the next turn should come soon.
   bool turn() {
     bool changed = changed_.exchange(false);
     if (prune() || changed) {
@@ -295,9 +315,13 @@ class Node {
     serve();
     directory_->tick();
     connected_ = directory_->connected();
+    bool delivering = false;
     {
       const detail::Lock lock(outlets_->mutex, std::try_to_lock);
-      if (lock.owns_lock()) outlets_->refresh();
+      if (lock.owns_lock()) {
+        outlets_->refresh();
+        delivering = outlets_->leftovers.deliver();
+      }
     }
     changed = directory_->take_changed() || changed;
     const auto subscriptions = this->subscriptions();
@@ -305,7 +329,7 @@ class Node {
     const std::int64_t now_ns = monotonic_ns();
     for (const auto& subscription : subscriptions) subscription->tend(now_ns);
     for (const auto& publisher : publishers()) publisher->tend(now_ns);
-    return changed;
+    return changed || delivering;
   }
 
   void match(const std::vector<std::shared_ptr<detail::SubscriptionCore>>& subscriptions) {

@@ -15,6 +15,7 @@
 #include <utility>
 #include <vector>
 
+#include "cortex/leftovers.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/socket.hpp"
 #include "cortex/wire.hpp"
@@ -67,6 +68,7 @@ class Outlets {
   Outlet strict;
   std::map<std::uint64_t, PublisherCore*> publishers;
   std::map<std::string, Outlet*> attached;
+  Leftovers leftovers;  // of publishers that have closed
   bool closed = false;
 };
 

@@ -195,6 +195,9 @@ class Writer {
     return true;
   }
 
+  // Bytes that are left of a frame.
+  std::size_t left() const noexcept { return rest_.size() - written_; }
+
   // Writes what is left of a frame; whether all is written.
   bool flush() {
     if (rest_.empty()) return true;

@@ -15,10 +15,12 @@
 #include <utility>
 #include <vector>
 
+#include "cortex/leftovers.hpp"
 #include "cortex/outlet.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/readers.hpp"
 #include "cortex/ring.hpp"
+#include "cortex/rings.hpp"
 #include "cortex/runtime.hpp"
 #include "cortex/slot.hpp"
 #include "cortex/socket.hpp"
@@ -37,9 +39,9 @@ class PublisherCore {
         fingerprint_(fingerprint),
         flags_(stamped ? wire::flag_stamp : 0),
         latch_(latch),
-        exact_(exact),
         inline_max_(inline_max),
-        complaints_(std::move(complaints)) {
+        complaints_(std::move(complaints)),
+        rings_(source, exact) {
     const Lock lock(outlets_->mutex);
     outlets_->publishers[source] = this;
   }
@@ -129,7 +131,7 @@ class PublisherCore {
     if (slot.ring == nullptr) {
       on_time &= send_body_piped(lock, slot, sequence, stamp_ns, size);
     } else {
-      const std::uint64_t mask = grant(*slot.ring, passed_over);
+      const std::uint64_t mask = readers_.grant(*slot.ring, passed_over);
       slot.ring->pin(slot.index);  // until it has been handed to ZeroMQ below
       slot.ring->commit(slot.index, sequence, size, mask);
       on_time &= send_descriptor(lock, slot, sequence, stamp_ns, size, mask);
@@ -176,9 +178,7 @@ class PublisherCore {
   void detach(const std::string& key) {
     const auto reader = readers_.remove(key);
     if (reader == nullptr) return;
-    if (reader->column != wire::no_column) {
-      for (const auto& ring : rings_) ring->free_column(reader->column);
-    }
+    if (reader->column != wire::no_column) rings_.free_column(reader->column);
     if (reader->outlet->strict && reader->pipe == nullptr) is_late_ = false;
   }
 
@@ -203,20 +203,23 @@ class PublisherCore {
     return closed_ || outlets_->closed;
   }
 
+  // Leaves the topic. What readers have not got yet is delivered by the node.
   void close() noexcept {
     const Lock lock(outlets_->mutex);
     if (closed_) return;
     closed_ = true;
     outlets_->publishers.erase(source);
-    readers_.clear();
-    rings_.clear();
+    try {
+      leave_behind();
+    } catch (...) {  // no memory to keep it: it is lost, as with the end of the process
+      readers_.release();
+      rings_.release();
+    }
   }
 
  private:
   static constexpr std::int64_t refresh_ns = 1'000'000;
   static constexpr std::int64_t silence_ns = 100'000'000;
-  static constexpr std::uint64_t ring_bytes = 4u << 20;  // rings of small slots stay in cache
-  static constexpr std::uint64_t ring_bytes_max = std::uint64_t{2} << 30;
   static constexpr std::size_t private_bytes_max = 64u << 20;  // outside of rings, waiting to be sent
 
   void write_header(std::uint8_t* out, char kind, std::uint64_t sequence, std::int64_t stamp_ns, std::uint64_t size,
@@ -236,7 +239,23 @@ class PublisherCore {
     if (!now && time_ns < refresh_at_ns_) return;
     refresh_at_ns_ = time_ns + refresh_ns;
     outlets_->refresh();
-    while (rings_.size() > 1 && rings_.front()->idle()) rings_.erase(rings_.begin());
+    rings_.tidy();
+  }
+
+  // Tells readers that this was all, and gives the node what they have no room for.
+  void leave_behind() {
+    Leftover leftover;
+    write_header(leftover.end.data(), 'B', sequence_, 0, 0, 0);
+    leftover.rings = rings_.release();
+    if (!outlets_->closed && told_ != sequence_) {
+      zmq::message_t frame(leftover.end.data(), leftover.end.size());
+      if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
+      if (has_sockets(outlets_->strict)) outlets_->strict.send_anyway(std::move(frame));
+    }
+    for (const auto& reader : readers_.release()) {
+      leftover.readers.push_back({reader->key, reader->column, std::move(reader->pipe), told_ == sequence_});
+    }
+    if (!outlets_->closed) outlets_->leftovers.add(std::move(leftover));
   }
 
   void answer(const Reader& reader, const std::string& latched) {
@@ -244,9 +263,7 @@ class PublisherCore {
     answer.sequence = sequence_;
     answer.column = reader.column;
     answer.latched = {reinterpret_cast<const std::uint8_t*>(latched.data()), latched.size()};
-    if (reader.column != wire::no_column) {
-      for (const auto& ring : rings_) answer.rings.push_back(ring->place());
-    }
+    if (reader.column != wire::no_column) answer.rings = rings_.places();
     zmq::message_t frame = message_of(wire::pack_answer(reader.key, answer));
     if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
   }
@@ -318,20 +335,6 @@ class PublisherCore {
     return send_piped(lock, {frame.data(), frame.size()});
   }
 
-  // The columns that get a lease of this message.
-  std::uint64_t grant(Ring& ring, bool& passed_over) {
-    std::uint64_t mask = 0;
-    for (const auto& reader : readers_.all()) {
-      if (reader->column == wire::no_column) continue;
-      if (has_room(*reader, ring)) {
-        mask |= std::uint64_t{1} << reader->column;
-      } else {
-        passed_over = true;
-      }
-    }
-    return mask;
-  }
-
   bool send_descriptor(Lock& lock, const Slot& slot, std::uint64_t sequence, std::int64_t stamp_ns, std::size_t size,
                        std::uint64_t mask) {
     zmq::message_t frame(wire::header_size + 8 + wire::place_size);
@@ -355,7 +358,7 @@ class PublisherCore {
   // Header and body, the body from where it lies.
   bool send_large(Lock& lock, Outlet& outlet, const Slot& slot, const std::string& head, std::size_t size,
                   bool& passed_over) {
-    if (slot.ring == nullptr || slot.ring->pinned() > pin_quota(*slot.ring)) {
+    if (slot.ring == nullptr || slot.ring->pinned() > readers_.quota(*slot.ring)) {
       if (*private_bytes_ + size > std::max<std::size_t>(private_bytes_max, 4 * size)) {
         passed_over = true;
         return !outlet.strict;
@@ -374,7 +377,7 @@ class PublisherCore {
   }
 
   zmq::message_t body_message(const Slot& slot, std::size_t size) {
-    if (slot.ring != nullptr && slot.ring->pinned() <= pin_quota(*slot.ring)) return pinned_message(slot, size);
+    if (slot.ring != nullptr && slot.ring->pinned() <= readers_.quota(*slot.ring)) return pinned_message(slot, size);
     return private_message(slot, size, private_bytes_);
   }
 
@@ -408,46 +411,26 @@ class PublisherCore {
 
   bool is_full(const Reader& reader, const Slot& slot) {
     if (slot.ring == nullptr) return reader.pipe == nullptr && *private_bytes_ > private_bytes_max / 2;
-    if (reader.column != wire::no_column) return !has_room(reader, *slot.ring);
-    return slot.ring->pinned() >= pin_quota(*slot.ring);
+    if (reader.column != wire::no_column) return !readers_.has_room(reader, *slot.ring);
+    return slot.ring->pinned() >= readers_.quota(*slot.ring);
   }
 
-  bool has_room(const Reader& reader, Ring& ring) {
-    std::uint32_t quota = pin_quota(ring);
-    if (reader.request.quota != 0) quota = std::min<std::uint32_t>(quota, reader.request.quota);
-    return ring.outstanding(reader.column, quota) < quota;
-  }
-
-  std::uint32_t pin_quota(const Ring& ring) const { return std::max<std::uint32_t>(1, (ring.slots() - 1) / readers_.shares()); }
-
-  // The newest ring, made anew for larger messages or more readers; null where there is no shared memory.
+  // Where a message of this size is written; null where there is no shared memory.
   std::shared_ptr<Ring> ring_for(std::size_t size) {
     if (unavailable_) return nullptr;
-    const std::shared_ptr<Ring> current = rings_.empty() ? nullptr : rings_.back();
-    const std::uint64_t wanted = 2 * std::uint64_t{readers_.shares()} + 2;
-    const bool fits = current != nullptr && current->slot_bytes() >= size;
-    if (fits && current->slots() >= wanted) return current;
-    std::uint64_t slot_bytes = exact_ ? size : size + size / 4;
-    if (current != nullptr) slot_bytes = std::max(slot_bytes, current->slot_bytes());
-    slot_bytes = wire::round_up(slot_bytes, ring::page);
-    std::uint64_t slots = std::max(std::clamp<std::uint64_t>(ring_bytes / slot_bytes, 4, 64), wanted);
-    slots = std::max<std::uint64_t>(4, std::min(slots, ring_bytes_max / slot_bytes));
-    if (fits && current->slots() >= slots) return current;
     try {
-      rings_.push_back(
-          std::make_shared<Ring>(source, ++ring_count_, static_cast<std::uint32_t>(slots), slot_bytes));
+      const std::shared_ptr<Ring> before = rings_.newest();
+      std::shared_ptr<Ring> ring = rings_.with_room_for(size, readers_.shares());
+      for (const auto& reader : readers_.all()) {
+        if (ring != before && reader->column != wire::no_column) answer(*reader, "");
+      }
+      return ring;
     } catch (const ShmUnavailable& error) {
-      if (fits) return current;
       complaints_->once("memory " + topic_, topic_ + ": no shared memory, large messages go through sockets: " +
                                                 error.what());
       do_without_memory();
       return nullptr;
     }
-    if (rings_.size() > wire::rings_alive) rings_.erase(rings_.begin());
-    for (const auto& reader : readers_.all()) {
-      if (reader->column != wire::no_column) answer(*reader, "");
-    }
-    return rings_.back();
   }
 
   // Large messages go through pipes and sockets from now on, also to those that had a column.
@@ -455,7 +438,7 @@ class PublisherCore {
     unavailable_ = true;
     for (const auto& reader : readers_.all()) {
       if (reader->column == wire::no_column || reader->pipe != nullptr) continue;
-      for (const auto& ring : rings_) ring->free_column(reader->column);
+      rings_.free_column(reader->column);
       reader->column = wire::no_column;
       answer(*reader, "");
     }
@@ -466,12 +449,10 @@ class PublisherCore {
   const std::uint64_t fingerprint_;
   const std::uint8_t flags_;
   const bool latch_;
-  const bool exact_;
   const std::size_t inline_max_;
   std::shared_ptr<net::Complaints> complaints_;
   Readers readers_;
-  std::vector<std::shared_ptr<Ring>> rings_;
-  std::uint32_t ring_count_ = 0;
+  Rings rings_;
   std::shared_ptr<std::atomic<std::size_t>> private_bytes_ = std::make_shared<std::atomic<std::size_t>>(0);
   bool unavailable_ = false;
   std::uint64_t sequence_ = 0;
@@ -503,6 +484,7 @@ inline void Outlets::refresh() {
       const auto publisher = publishers.find(request.source);
       if (publisher == publishers.end()) {
         attached.erase(key);
+        if (bytes[0] == 0) leftovers.detach(key);
       } else if (bytes[0] == 1) {
         attached[key] = outlet;
         publisher->second->attach(*outlet, key, request);

@@ -12,6 +12,7 @@
 
 #include "cortex/outlet.hpp"
 #include "cortex/pipe.hpp"
+#include "cortex/ring.hpp"
 #include "cortex/wire.hpp"
 
 namespace cortex::detail {
@@ -72,11 +73,12 @@ class Readers {
     return reader;
   }
 
-  void clear() noexcept {
+  // Gives all readers away.
+  List release() noexcept {
     for (const auto& reader : all_) reader->left = true;
-    all_.clear();
     piped_.clear();
     lossy_ = strict_ = 0;
+    return std::exchange(all_, {});
   }
 
   // Readers that share the slots, so that one slow reader cannot take the ring from the others.
@@ -84,6 +86,31 @@ class Readers {
     std::uint32_t columns = 0;
     for (const auto& reader : all_) columns += reader->column == wire::no_column ? 0 : 1;
     return std::max<std::uint32_t>(1, columns + (columns < all_.size() ? 1 : 0));
+  }
+
+  // The slots of a ring that may be pinned, or leased to one reader.
+  std::uint32_t quota(const Ring& ring) const noexcept {
+    return std::max<std::uint32_t>(1, (ring.slots() - 1) / shares());
+  }
+
+  bool has_room(const Reader& reader, Ring& ring) const noexcept {
+    std::uint32_t slots = quota(ring);
+    if (reader.request.quota != 0) slots = std::min<std::uint32_t>(slots, reader.request.quota);
+    return ring.outstanding(reader.column, slots) < slots;
+  }
+
+  // The columns that get a lease of the next message of a ring, and whether some reader is passed over.
+  std::uint64_t grant(Ring& ring, bool& passed_over) const noexcept {
+    std::uint64_t mask = 0;
+    for (const auto& reader : all_) {
+      if (reader->column == wire::no_column) continue;
+      if (has_room(*reader, ring)) {
+        mask |= std::uint64_t{1} << reader->column;
+      } else {
+        passed_over = true;
+      }
+    }
+    return mask;
   }
 
   // Whether some reader of this outlet has no part in shared memory.

@@ -138,6 +138,14 @@ class Ring {
     }
   }
 
+  // Whether some reader has a message of it, or will have one.
+  bool is_leased() noexcept {
+    for (std::uint32_t slot = 0; slot < slots_; ++slot) {
+      if (!is_free(slot)) return true;
+    }
+    return false;
+  }
+
   bool idle() noexcept {
     for (std::uint32_t slot = 0; slot < slots_; ++slot) {
       if (busy_[slot] != 0 || pins_[slot].load(std::memory_order_acquire) != 0 || !is_free(slot)) return false;
@@ -204,6 +212,7 @@ class Ring {
   std::uint32_t pinned() const noexcept { return 0; }
   std::uint32_t outstanding(std::uint32_t, std::uint32_t) noexcept { return 0; }
   void free_column(std::uint32_t) noexcept {}
+  bool is_leased() noexcept { return false; }
   bool idle() noexcept { return true; }
 };
 

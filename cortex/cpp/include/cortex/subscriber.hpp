@@ -230,7 +230,7 @@ class SubscriptionCore {
   static constexpr std::int64_t fresh_ns = 1'000'000;    // and longer ones if they were filled so long ago
   static constexpr std::int64_t spin_ns = 20'000;
   static constexpr std::int64_t tend_ns = 20'000'000;
-  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way
+  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way, after all that is there
 
   // Waits until something may have come. To sleep costs the publisher a wake-up, more than the message itself: where
   // the last one was there within `spin_ns`, this looks for the next one for so long.
@@ -254,16 +254,25 @@ class SubscriptionCore {
            monotonic_ns() - drained_ns_.load(std::memory_order_relaxed) > fresh_ns;
   }
 
+  // Reads what has arrived, of a different publisher first each time. Those of a reliable subscription share the room
+  // in the queue, so that none starves another.
   void drain() {
-    drained_ns_.store(monotonic_ns(), std::memory_order_relaxed);
+    const std::int64_t now_ns = monotonic_ns();
+    drained_ns_.store(now_ns, std::memory_order_relaxed);
+    if (policy_.is_reliable && queue_.size() >= policy_.depth) {
+      for (auto& link : links_) link->stay(now_ns);
+      return;
+    }
     exhausted_ = true;
-    for (auto& link : links_) {
-      if (policy_.is_reliable) {
-        if (queue_.size() >= policy_.depth) break;
-        exhausted_ &= link->drain(queue_, policy_.depth - queue_.size());
-      } else {
-        exhausted_ &= drain_lossy(*link);
-      }
+    const std::size_t count = links_.size();
+    if (count > 1) first_ = (first_ + 1) % count;
+    for (std::size_t index = 0; index < count; ++index) {
+      Link& link = *links_[(first_ + index) % count];
+      const std::size_t room = policy_.depth - std::min(policy_.depth, queue_.size());
+      const std::size_t share = (room + count - index - 1) / (count - index);
+      if (policy_.is_reliable ? link.drain(queue_, share) : drain_lossy(link)) continue;
+      link.stay(now_ns);
+      exhausted_ = false;
     }
   }
 
@@ -303,6 +312,7 @@ class SubscriptionCore {
   std::vector<std::unique_ptr<Link>> links_;
   std::deque<TypeMismatch> problems_;
   std::deque<std::uint64_t> mismatched_;
+  std::size_t first_ = 0;  // the link that was read first the last time
   std::atomic<std::int64_t> drained_ns_{0};
   std::atomic<bool> in_rush_{false};  // messages follow one another within `spin_ns`
   bool exhausted_ = true;
