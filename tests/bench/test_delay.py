@@ -120,9 +120,15 @@ def test_a_slow_controller_flies_as_predicted(tmp_path, console):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"tours": 0}, {"delays_s": ()}, {"delays_s": (-0.01,)}, {"seconds": 0.0}, {"real_time_factor": 0.0}],
+    ("options", "mistake"),
+    [
+        ({"tours": 0}, "tours must be >= 1, got 0"),
+        ({"delays_s": ()}, r"delays must be from 0 to less than 10 s, got \[\]"),
+        ({"delays_s": (-0.01,)}, r"delays must be from 0 to less than 10 s, got \[-0.01\]"),
+        ({"seconds": 0.0}, "seconds must be > 0, got 0.0"),
+        ({"real_time_factor": 0.0}, "factor must be > 0, got 0.0"),
+    ],
 )
-def test_wrong_options_are_refused(tmp_path, console, options):
-    with pytest.raises(ValueError, match="takes "):
+def test_wrong_options_are_refused(tmp_path, console, options, mistake):
+    with pytest.raises(ValueError, match=mistake):
         bench_delay(tmp_path, console, **options)

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import SOON_S
 
 from cortex.ledger import PyLedger
 from cortex.shm import Ring, RingView
@@ -380,7 +379,7 @@ def test_leases_die_in_other_threads():
     for _ in threads:
         work.put(None)
     for thread in threads:
-        thread.join(SOON_S)
+        thread.join(DEADLINE_S)
     assert not wrong
     assert ring.idle
     reader.close()
@@ -427,7 +426,7 @@ def test_writers_in_several_threads_never_share_a_slot(monkeypatch: pytest.Monke
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(SOON_S)
+        thread.join(DEADLINE_S)
     assert not failures
     assert len(written) > 100
     for column in (0, 1):
