@@ -303,6 +303,16 @@ static void reader_dealloc(PipeReader *reader) {
     Py_TYPE(reader)->tp_free((PyObject *)reader);
 }
 
+static PyObject *reader_broken(PipeReader *reader, void *unused) {
+    (void)unused;
+    return PyBool_FromLong(reader->broken);
+}
+
+static PyGetSetDef reader_properties[] = {
+    {"broken", (getter)reader_broken, NULL, "Whether it brought something that is no frame.", NULL},
+    {NULL, NULL, NULL, NULL, NULL},
+};
+
 static PyMethodDef reader_methods[] = {
     {"receive", (PyCFunction)reader_receive, METH_O, "Take the next frame; `again` if there is none."},
     {NULL, NULL, 0, NULL},
@@ -319,6 +329,7 @@ static PyTypeObject PipeReaderType = {
     .tp_clear = (inquiry)reader_clear,
     .tp_dealloc = (destructor)reader_dealloc,
     .tp_methods = reader_methods,
+    .tp_getset = reader_properties,
 };
 
 int add_pipe(PyObject *module) {

@@ -67,6 +67,8 @@ class Reader:
     """Its number in the relay that writes the pipe, if one does."""
     late: bool = False
     """Its pipe was full for too long: it holds up nothing until it has room again."""
+    has_last: bool = False
+    """The last frame of all was given to its pipe."""
 
     @property
     def timeout_s(self) -> float:

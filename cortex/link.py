@@ -16,7 +16,7 @@ import zmq
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Frames, new_socket
 from cortex.packer import make_reader
-from cortex.pipe import Offer
+from cortex.pipe import Offer, Reader
 from cortex.policy import Policy
 from cortex.records import PublisherRecord
 from cortex.schema import Schema
@@ -137,7 +137,7 @@ class Link:
         self._frames = Frames(self.socket)
         self._receive_socket = self._frames.receive
         self.receive: Callable[[int], bytes] = self._receive_socket
-        self._piped = False
+        self._pipe: Reader | None = None
         try:
             if secure is not None:
                 secure(self.socket)
@@ -180,6 +180,8 @@ class Link:
         if text not in self._complained and len(self._complained) < 16:
             self._complained.add(text)
             logger.warning("%s: rejected a frame of %s: %s", self.record.topic, self.address, reason)
+        if self._pipe is not None and self._pipe.broken:
+            self._do_without_shared_memory("its pipe carries something that is no frame")
 
     def handle(self, frame: bytes) -> list[Item]:
         """Take in a frame that is not a plain small message."""
@@ -387,15 +389,17 @@ class Link:
 
     def _use_pipe(self, offer: Offer) -> None:
         """The publisher sends all that follows through our pipe."""
-        self.receive = offer.reader(self._socket_fd, self._receive_socket, BLOCK_MS).receive
-        self._piped = True
+        self._pipe = offer.reader(self._socket_fd, self._receive_socket, BLOCK_MS)
+        self.receive = self._pipe.receive
         for head in (self._message_prefix, self.batch_head, self._slot_head):
             self.socket.unsubscribe(head)
 
     def _use_socket(self) -> None:
         """What follows comes through the socket again, as we shall be another reader to the publisher."""
         self.receive = self._receive_socket
-        self._piped = False
+        self._pipe = None
+        if self._offer is not None:
+            self._offer.silence()
         for head in (self._message_prefix, self.batch_head, self._slot_head):
             self.socket.subscribe(head)
 
@@ -471,11 +475,11 @@ class Link:
             raise MalformedMessage(f"a latched message of {len(frame)} bytes that says its body has {size}")
         return [Item(self, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)]
 
-    def _do_without_shared_memory(self, error: ShmUnavailable) -> None:
-        logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, error)
+    def _do_without_shared_memory(self, reason: ShmUnavailable | str) -> None:
+        logger.info("%s: cannot share memory with %s: %s", self.record.topic, self.address, reason)
         self._close_rings()  # before the publisher can learn that our column is free
         self._newest_ring = -1
-        if self._piped:
+        if self._pipe is not None:
             self._use_socket()
         if not self._large_subscribed:
             self.socket.subscribe(self._large_head)

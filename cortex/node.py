@@ -21,7 +21,7 @@ import zmq
 
 from cortex.callbacks import CallbackThread
 from cortex.codec import MalformedMessage, codec_of
-from cortex.context import Closed, context
+from cortex.context import LINGER_MS, Closed, context
 from cortex.control import control_types
 from cortex.discovery import Directory
 from cortex.flusher import Flusher
@@ -30,7 +30,7 @@ from cortex.link import Link
 from cortex.outlet import Outlets
 from cortex.places import Places, clock_offset_ns, reach
 from cortex.policy import Policy, keep_last
-from cortex.publisher import INLINE_MAX, LINGER_S, Publisher
+from cortex.publisher import INLINE_MAX, Publisher, close_publishers
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import (
     NodeRecord,
@@ -325,7 +325,11 @@ class Node:
         return True
 
     def close(self) -> None:
-        """Leave: send what is queued, close publishers, subscribers and services, stop the threads."""
+        """Leave: send what is queued, close publishers, subscribers and services, stop the threads.
+
+        Nobody holds this up for longer than a second, reliable subscribers neither: to give each of them its
+        time, close the publishers first.
+        """
         if self._pid != os.getpid():
             return  # a forked child has copies of us, but not our threads
         with self._lock:
@@ -334,9 +338,7 @@ class Node:
             self._closed = True
             publishers, subscribers = list(self._publishers), list(self._subscribers)
         self._flusher.close()
-        deadline_s = time.monotonic() + LINGER_S
-        for publisher in publishers:
-            publisher.close(max(0.0, deadline_s - time.monotonic()))
+        close_publishers(publishers, longest_s=LINGER_MS * 1e-3)  # as long as the sockets
         for subscriber in subscribers:
             subscriber.close()
         for client in list(self._clients):

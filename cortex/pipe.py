@@ -111,6 +111,11 @@ class Reader(Protocol):
         """
         ...
 
+    @property
+    def broken(self) -> bool:
+        """Whether the pipe brought something that is no frame: nothing after it can be read."""
+        ...
+
 
 class PyWriter:
     """As `Writer`.
@@ -188,7 +193,7 @@ class PyReader:
         self._wait_ms = wait_ms
         self._buffer = b""
         self._at = 0
-        self._broken = False
+        self.broken = False
         self._poll = select.poll()
         self._poll.register(fd, select.POLLIN)
         self._poll.register(socket_fd, select.POLLIN)
@@ -204,10 +209,10 @@ class PyReader:
         return self._receive(zmq.DONTWAIT) if frame is None else frame
 
     def _next(self) -> bytes | None:
-        while not self._broken:
+        while not self.broken:
             size = frame_size(self._buffer, self._at)
             if size < 0:
-                self._broken = True
+                self.broken = True
                 return self._buffer[self._at :]
             if 0 < size <= len(self._buffer) - self._at:
                 frame = self._buffer[self._at : self._at + size]
@@ -245,8 +250,11 @@ def open_writer(directory: Path | None, number: int) -> Writer | None:
     """
     if directory is None:
         return None
+    path, flags = pipe_path(directory, number), os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        fd = os.open(pipe_path(directory, number), os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        os.close(os.open(path, os.O_WRONLY | flags))  # refused where nobody reads
+        # With a reading end of our own there is no SIGPIPE, which ends programs that do not ignore it.
+        fd = os.open(path, os.O_RDWR | flags)
     except OSError:
         return None
     if not stat.S_ISFIFO(os.fstat(fd).st_mode):
@@ -323,6 +331,13 @@ class Offer:
         kind: Any = NativePipeReader or PyReader
         reader: Reader = kind(self.fd, socket_fd, receive, zmq.Again, wait_ms)
         return reader
+
+    def silence(self) -> None:
+        """Read no more: the descriptor stays valid, as others may wait for it, but nothing comes there."""
+        self._unlink()
+        for fd, quiet in zip(self._fds, os.pipe(), strict=True):
+            os.dup2(quiet, fd, inheritable=False)
+            os.close(quiet)
 
     def _unlink(self) -> None:
         path, self._path = self._path, None

@@ -9,6 +9,7 @@ written directly (12-20 on a busy machine), 450-560 by a relay; 160-230 through 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -32,6 +33,8 @@ class Pipes:
         self._direct: list[Reader] = []
         self._relayed: list[Reader] = []
         self._relay: Relay | None = None
+        self.close_by_s = math.inf
+        """Nobody is waited for after this, on the monotonic clock [s]."""
         self.lossy: tuple[Callable[..., Any], ...] = ()
         """Take a frame and flags; never refuse one."""
         self.strict: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
@@ -72,16 +75,20 @@ class Pipes:
                 self._direct = []
                 self._route()
                 return True
-        if not many and self._relay is not None:
-            for reader in self._relayed:
-                reader.pipe = make_writer(*self._relay.take(reader.member))
-            self._direct += self._relayed
-            self._relayed = []
-            self._relay.close()
-            self._relay = None
-            self._route()
-            return True
-        return False
+        return not many and self._take_back()
+
+    def _take_back(self) -> bool:
+        """Write all pipes ourselves; whether that is new."""
+        if self._relay is None:
+            return False
+        for reader in self._relayed:
+            reader.pipe = make_writer(*self._relay.take(reader.member))
+        self._direct += self._relayed
+        self._relayed = []
+        self._relay.close()
+        self._relay = None
+        self._route()
+        return True
 
     def _route(self) -> None:
         pipes = [(reader, reader.pipe) for reader in self._direct if reader.pipe is not None]
@@ -151,8 +158,11 @@ class Pipes:
             timeout_s = min((r.timeout_s for r in self._relayed if r.member in slow), default=0.0)
             if self._await_room(send, timeout_s - (time.monotonic() - begin_s)):
                 break
+            now_s = time.monotonic()
             for reader in self._relayed:
-                if reader.member in slow and reader.timeout_s <= time.monotonic() - begin_s:
+                if reader.member in slow and (
+                    reader.timeout_s <= now_s - begin_s or self.close_by_s <= now_s
+                ):
                     relay.give_up(frame, reader.member)
         return on_time
 
@@ -162,10 +172,30 @@ class Pipes:
             if reader.pipe is not None:
                 reader.pipe.flush()
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether the relay has written all that it was given."""
-        return self._relay is None or self._relay.is_idle()
+    def finish(self, last: bytes, waited_s: float, linger_s: float) -> bool:
+        """Write what is left and a last frame to each, as far as there is room; to be called again and again.
+
+        Args:
+            last: Nothing is sent after it.
+            waited_s: For how long this has gone on [s].
+            linger_s: How long to wait for a reader that may not hold us up for longer [s].
+
+        Returns:
+            Whether each has all of it, or has had its time.
+        """
+        self._take_back()
+        done = True
+        for reader in self._direct:
+            assert reader.pipe is not None
+            if not reader.has_last:
+                try:
+                    reader.pipe.send(last)
+                    reader.has_last = True
+                except zmq.Again:
+                    pass
+            written = reader.has_last and reader.pipe.flush()
+            done &= written or waited_s >= max(linger_s, reader.timeout_s)
+        return done
 
     def close(self) -> None:
         """Write no more."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -45,6 +46,7 @@ SILENCE_MAX_NS = 30_000_000_000
 SILENCE_NS = 100_000_000
 """After so long without a message readers are told how many there have been."""
 LINGER_S = 0.5
+"""How long `close` waits for whom it owes nothing: lossy readers, and slots that nobody has given back."""
 
 BURST_NS = 15_000
 """Two messages closer than this are a burst."""
@@ -126,6 +128,7 @@ class Publisher(Generic[T]):
         self._batch_sequence = 0
         self._on_batch = on_batch
         self._on_close = on_close
+        self._closing = False
         self._closed = False
         outlets.register(self.source, self)
 
@@ -343,7 +346,7 @@ class Publisher(Generic[T]):
                     self._lock.acquire()
                 self._check_open()
                 self._outlets.refresh()
-                if not more:
+                if not more or time.monotonic() >= self._pipes.close_by_s:
                     if not self._timeouts:
                         self._outlets.note(
                             f"{self.topic}: a reliable subscriber was too late and lost a message"
@@ -471,14 +474,17 @@ class Publisher(Generic[T]):
     def _prepare(self, now_ns: int) -> None:
         """Wait for our turn if another thread is held up; see who has come and gone. The lock is held."""
         while self._blocked:
-            self._lock.release()
-            try:
-                time.sleep(100e-6)
-            finally:
-                self._lock.acquire()
+            self._sleep_unlocked()
         self._check_open()
         self._gate.refresh_ns = now_ns + REFRESH_NS
         self._outlets.refresh_if_older(now_ns - REFRESH_NS)
+
+    def _sleep_unlocked(self) -> None:
+        self._lock.release()
+        try:
+            time.sleep(100e-6)
+        finally:
+            self._lock.acquire()
 
     def _check_open(self) -> None:
         if self._closed:
@@ -611,29 +617,53 @@ class Publisher(Generic[T]):
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
         self._lock = threading.Lock()  # the old one may have been held at the fork
         self._gate = LongGate(self._publish_slowly)
-        self._closed = True
+        self._blocked = False  # who was held up at the fork is not here
+        self._closing = self._closed = True
 
     def close(self, linger_s: float = LINGER_S) -> None:
-        """Send what is held back, and leave the topic.
+        """Send what is held back, tell readers how many messages there were, and leave the topic.
+
+        What `publish` has taken reaches every local reliable subscriber that makes room for it within its
+        `timeout_s`, counted from here. The others, and what goes through sockets, have `linger_s`.
 
         Args:
-            linger_s: How long to wait for large messages that are on their way to be taken in [s].
+            linger_s: How long to wait for lossy subscribers, and for large messages that are on their way to
+                be taken in [s].
         """
+        close_publishers([self], linger_s=linger_s)
+
+    def _claim_close(self) -> bool:
+        """Whether the caller is the one to close it."""
         with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            self._gate.refresh_ns = 0  # so that `publish` looks
-            if not self._outlets.closed:
-                self._flush()
-        backoff = Backoff(linger_s)
-        while True:
-            with self._lock:
-                if not self._outlets.closed:
-                    self._outlets.refresh()
-                taken_in = self._outlets.closed or (self._large.taken_in and self._pipes.is_idle)
-            if taken_in or not backoff.wait():
-                break
+            claimed, self._closing = not self._closing, True
+        return claimed
+
+    def _stop(self, by_s: float) -> None:
+        """Send what is held back, until a time of the monotonic clock [s]; publish no more."""
+        with self._lock:
+            self._pipes.close_by_s = by_s
+            try:
+                while self._batch and self._blocked and time.monotonic() < by_s:
+                    self._sleep_unlocked()
+                if not self._outlets.closed and not self._blocked:
+                    self._flush()
+                    self._tell_sequence(monotonic_ns())
+            finally:
+                self._closed = True
+                self._gate.refresh_ns = 0  # so that `publish` looks
+
+    def _is_finished(self, waited_s: float, linger_s: float) -> bool:
+        """Whether nobody is worth waiting for any more; writes what there is room for."""
+        with self._lock:
+            if self._outlets.closed:
+                return True
+            self._outlets.refresh()
+            last = self._batch_head + REST.pack(self._gate.sequence, 0, monotonic_ns(), 0, 0)
+            written = self._pipes.finish(last, waited_s, linger_s)
+            return written and (waited_s >= linger_s or self._large.taken_in)
+
+    def _end(self) -> None:
+        """Let go of everything."""
         with self._lock:
             self._pipes.close()
             self._readers.clear()
@@ -648,3 +678,29 @@ class Publisher(Generic[T]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def close_publishers(
+    publishers: Iterable[Publisher[Any]], *, linger_s: float = LINGER_S, longest_s: float = math.inf
+) -> None:
+    """Close publishers as `Publisher.close` does, all at the same time.
+
+    Args:
+        publishers: Those that are closed already are left alone.
+        linger_s: How long to wait for lossy subscribers and for large messages [s].
+        longest_s: How long to wait in all, for reliable subscribers, too [s].
+    """
+    begin_s = time.monotonic()
+    backoff = Backoff(longest_s)
+    with ExitStack() as ends:  # whatever happens: a publisher is gone after this
+        closing = [publisher for publisher in publishers if publisher._claim_close()]
+        for publisher in closing:
+            ends.callback(publisher._end)
+        for publisher in closing:
+            publisher._stop(begin_s + longest_s)
+        stopped_s = time.monotonic()
+        while closing:
+            waited_s = time.monotonic() - stopped_s
+            closing = [each for each in closing if not each._is_finished(waited_s, linger_s)]
+            if closing and not backoff.wait():
+                break

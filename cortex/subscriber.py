@@ -722,7 +722,10 @@ class Subscriber(Generic[T]):
         return False
 
     def forget(self, source: int) -> None:
-        """A publisher has left: read what is still on its way, then disconnect; for the node."""
+        """A publisher has left: read what is still on its way, then disconnect; for the node.
+
+        A reliable subscriber disconnects once it has read all of it, however long its user takes.
+        """
         with self._turn:
             for link in self._links:
                 if link.source == source and link not in self._leaving:
@@ -753,6 +756,12 @@ class Subscriber(Generic[T]):
         """Close connections whose time is over; the lock is held."""
         for link, deadline_ns in list(self._leaving.items()):
             if now_ns >= deadline_ns:
+                if self.policy.reliable:  # what is on its way stays there until there is room for it
+                    self._drain()
+                    if self._queue:
+                        self.wakeup.set()
+                    if not self._exhausted:
+                        return
                 link.close()
                 self._links.remove(link)
                 del self._leaving[link]

@@ -1,0 +1,199 @@
+"""Closing a publisher: what it has taken arrives, what it has not is counted, and nothing is left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+
+import pytest
+from peer import Block, make_block
+from processes import SOON_S, wait_for
+
+import cortex.gate
+import cortex.large
+import cortex.pipes
+import cortex.publisher
+from cortex import native
+from cortex.context import Closed
+
+PATIENT = ["reliable", {"timeout_s": SOON_S}]  # as long as a machine may stand still
+
+
+def subscribe(publisher, start_child, policy: list, count: int = 1) -> list:
+    children = [start_child("endless_subscriber", topic="/blocks", policy=policy) for _ in range(count)]
+    for child in children:
+        child.hear()
+    assert publisher.wait_for_subscribers(count, timeout_s=SOON_S)
+    return children
+
+
+def fill(publisher, publish) -> None:
+    """Publish until the last frame fits into the only reader's pipe in part.
+
+    Frames of four pages and a little: the little goes into pages that were begun, four do not go up.
+    """
+    (reader,) = publisher._pipes._direct
+    while reader.pipe.flush():
+        publish()
+
+
+def begin_close(publisher, **options) -> threading.Thread:
+    """Close in a thread, which has time for it; returns once nothing can be published any more."""
+    thread = threading.Thread(target=publisher.close, kwargs=options)
+    thread.start()
+    wait_for(lambda: publisher._closed)
+    thread.join(0.2)  # one that does not wait for the reader is done by then
+    return thread
+
+
+def arrives(child, sent: int, lost: int = 0) -> bool:
+    """Whether a child has seen so many; what is lost is counted, and nothing is torn or rejected."""
+    found = child.ask()
+    assert (found["torn"], found["rejected"]) == (0, 0)
+    return found["count"] == sent - lost and found["lost"] == lost
+
+
+class Sent:
+    """Publishes blocks, and counts."""
+
+    def __init__(self, publisher, size: int) -> None:
+        self.publisher = publisher
+        self.block = make_block(0, size)
+        self.count = self.refused = 0
+
+    def __call__(self) -> None:
+        self.refused += not self.publisher.publish(Block(self.count, self.block.check, self.block.data))
+        self.count += 1
+
+
+def test_the_rest_of_a_frame_is_written(make_node, start_child):
+    """The reader stands still when the publisher is closed, without a linger."""
+    publisher = make_node().publisher("/blocks", Block)
+    (child,) = subscribe(publisher, start_child, PATIENT)
+    sent = Sent(publisher, 16_300)
+    with child.stopped():
+        fill(publisher, sent)
+        thread = begin_close(publisher, linger_s=0.0)
+    wait_for(lambda: arrives(child, sent.count))
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+    assert not sent.refused
+
+
+@pytest.mark.skipif(native.NativeRelay is None, reason="no C module")
+def test_what_a_relay_has_taken_is_written(make_node, start_child):
+    """More than the pipes hold waits for readers that stand still when the publisher is closed."""
+    publisher = make_node().publisher("/blocks", Block)
+    children = subscribe(publisher, start_child, PATIENT, count=3)
+    sent = Sent(publisher, 3000)
+    with children[0].stopped(), children[1].stopped():
+        for _ in range(95):  # more than a pipe holds, less than the ring holds besides the smallest pipe
+            sent()
+        thread = begin_close(publisher, linger_s=0.0)
+    for child in children:
+        wait_for(lambda child=child: arrives(child, sent.count))
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+    assert not sent.refused
+
+
+def test_a_batch_that_finds_no_room_is_sent(make_node, start_child, monkeypatch):
+    """Held back by a publisher that coalesces, for a reader whose pipe is full."""
+    for module, name in [
+        (cortex.publisher, "BURST_NS"),
+        (cortex.publisher, "BATCH_NS"),
+        (cortex.gate, "BATCH_NS"),
+    ]:
+        monkeypatch.setattr(module, name, 10**15)
+    node = make_node()
+    publisher = node.publisher("/blocks", Block, coalesce=True)
+    (child,) = subscribe(publisher, start_child, PATIENT)
+    sent = Sent(publisher, 208)
+    with child.stopped():
+        fill(publisher, lambda: [sent() for _ in range(64)])
+        while len(publisher._batch) < 3:
+            sent()
+        thread = threading.Thread(target=publisher.close)
+        thread.start()
+        wait_for(lambda: publisher._closing)
+        thread.join(0.2)
+    wait_for(lambda: arrives(child, sent.count))
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+    assert not sent.refused
+    assert publisher.source not in node._outlets._publishers
+    assert publisher not in node._publishers
+
+
+def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
+    """The reader learns of it as it has room again, and the publisher is still there so long."""
+    publisher = make_node().publisher("/blocks", Block)
+    (child,) = subscribe(publisher, start_child, ["reliable", {"timeout_s": 0.01}])
+    sent = Sent(publisher, 1000)
+    with child.stopped():
+        while sent.refused < 5:
+            sent()
+        thread = begin_close(publisher, linger_s=SOON_S)
+    wait_for(lambda: arrives(child, sent.count, lost=sent.refused))
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("relayed", [False, True], ids=["direct", "relay"])
+@pytest.mark.parametrize("coalesce", [False, True], ids=["single", "coalesce"])
+def test_nobody_holds_up_a_node_for_long(make_node, start_child, monkeypatch, relayed, coalesce):
+    """A reader that stands still, and may hold up `publish` for a day."""
+    if relayed:
+        if native.NativeRelay is None:
+            pytest.skip("no C module")
+        monkeypatch.setattr(cortex.pipes, "PIPES_MAX", 0)
+        monkeypatch.setattr(cortex.large, "PIPES_MAX", 0)
+    node = make_node()
+    publisher = node.publisher("/blocks", Block, coalesce=coalesce)
+    (child,) = subscribe(publisher, start_child, ["reliable", {"timeout_s": 86_400.0}])
+    before = len(os.listdir("/proc/self/fd"))
+    with child.stopped():
+        waiting = threading.Thread(target=flood, args=(publisher,))
+        waiting.start()
+        wait_for(lambda: publisher._blocked)
+        thread = threading.Thread(target=node.close)
+        thread.start()
+        thread.join(SOON_S)
+        assert not thread.is_alive()
+        waiting.join(SOON_S)
+        assert not waiting.is_alive()
+        assert len(os.listdir("/proc/self/fd")) < before
+
+
+def flood(publisher) -> None:
+    """Publish until the publisher is closed."""
+    sent = Sent(publisher, 1000)
+    with contextlib.suppress(Closed):
+        while True:
+            sent()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node
+def test_a_forked_child_hears_that_it_may_not_publish(make_node, start_child):
+    """Also where the parent waits for a reader at the moment of the fork."""
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    (reader,) = subscribe(publisher, start_child, PATIENT)
+    with reader.stopped():
+        waiting = threading.Thread(target=flood, args=(publisher,))
+        waiting.start()
+        wait_for(lambda: publisher._blocked)
+        child = os.fork()
+        if child == 0:
+            signal.alarm(int(SOON_S))
+            try:
+                publisher.publish(make_block(0, 10))
+            except Closed:
+                os._exit(0)
+            os._exit(1)
+        assert os.waitpid(child, 0)[1] == 0
+    publisher.close()
+    waiting.join(SOON_S)
+    assert not waiting.is_alive()
