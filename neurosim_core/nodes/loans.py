@@ -12,7 +12,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cortex import Loan, Publisher
+from cortex import Closed, Loan, Publisher
 
 _BYTES_MIN = 1 << 16
 """Smaller pictures are copied: that takes less time than to write in place."""
@@ -33,16 +33,18 @@ class PictureLoan:
     def lend(self, picture: NDArray[Any]) -> NDArray[Any] | None:
         """Return room for a picture, to be filled; None if there is none, or another is under way.
 
+        Does not wait, nor for one that is being published to a reader that makes no room.
+
         Args:
             picture: Of the shape and dtype that is needed, shape [H, W] or [H, W, C].
         """
         if picture.nbytes < _BYTES_MIN:
             return None
-        with self._lock:
-            if self._loan is not None:
-                if self._room is not None and self._room() is not None:
-                    return None
-                self._loan.drop()  # its picture was thrown away
+        if not self._lock.acquire(blocking=False):
+            return None
+        try:
+            if not self._give_back():
+                return None
             height, width, channels = picture.shape if picture.ndim == 3 else (*picture.shape, 1)
             self._loan = self._publisher.try_loan(
                 {"data": picture.dtype}, height=height, width=width, channels=channels
@@ -52,6 +54,13 @@ class PictureLoan:
             room: NDArray[Any] = self._loan.draft.data.reshape(picture.shape)
             self._room = weakref.ref(room)
             return room
+        finally:
+            self._lock.release()
+
+    def drop(self) -> None:
+        """Give back the room of a picture that was thrown away; not while somebody can still write there."""
+        with self._lock:
+            self._give_back()
 
     def holds(self, data: NDArray[Any]) -> bool:
         """Return whether that is the room that was lent last, and not published yet."""
@@ -64,11 +73,29 @@ class PictureLoan:
             message: Its image; of its data only the place is used.
 
         Returns:
-            As `Publisher.publish`.
+            As `Publisher.publish`; False, too, if the room was given up for larger pictures meanwhile, and
+            there is no other: readers lose the picture.
+
+        Raises:
+            Closed: The publisher was closed.
         """
         with self._lock:
             loan, self._loan, self._room = self._loan, None, None
             assert loan is not None
             for name in _FIELDS:
                 setattr(loan.draft, name, getattr(message, name))
-            return loan.publish()
+            try:
+                return loan.publish()
+            except Closed:
+                raise
+            except RuntimeError:
+                return False
+
+    def _give_back(self) -> bool:
+        """Return whether nothing is lent, having dropped what nobody can publish; the lock is held."""
+        if self._loan is not None:
+            if self._room is not None and self._room() is not None:
+                return False
+            self._loan.drop()
+            self._loan = self._room = None
+        return True

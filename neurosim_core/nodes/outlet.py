@@ -145,6 +145,7 @@ class Stream(Post):
     def begin(self, *, seed: int) -> None:
         """Forget what is under way and begin again."""
         self.reset()
+        self.loan.drop()
         self.late_times.take()
         self.channel.reset(seed=seed)
         self.published_count = 0
@@ -212,6 +213,11 @@ class Outlet:
             stream.begin(seed=seed)
         for post in self._delivery_posts.values():
             post.reset()
+
+    def drop_loans(self) -> None:
+        """Give back the room of pictures that are never published, on which closing topics would wait."""
+        for stream in self.streams.values():
+            stream.loan.drop()
 
     def look(self) -> tuple[int, ...]:
         """See who listens, and return how many subscribers each topic has."""

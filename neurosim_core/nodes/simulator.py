@@ -119,6 +119,7 @@ class Simulator:
             self.crafts = [
                 Craft(node, name, model, record=self._record(name)) for name, model in models.items()
             ]
+            stack.callback(self._drop_loans)
             device = next(iter(models.values())).device
             inline = config.live.mode == "lockstep" or sees_inline(device)
             self._cameras = Cameras(inline=inline, on_packets=self._bell.set)
@@ -373,6 +374,10 @@ class Simulator:
             if at_rest:
                 craft.finish()
             craft.outlet.publish_due(max(self.stamp_ns, craft.state.stamp_ns))
+
+    def _drop_loans(self) -> None:
+        for craft in self.crafts:
+            craft.outlet.drop_loans()
 
     def _culprit(self, error: DynamicsError) -> str:
         return next(craft.name for craft in self.crafts if craft.state.failure is error)

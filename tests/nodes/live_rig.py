@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from processes import SOON_S, wait_for
 
-from cortex import Node, Publisher, Subscriber, reliable
+from cortex import Loan, Node, Publisher, Subscriber, reliable
 from cortex.messages import Odometry, Parameters, SimulatorReply, SimulatorStatus
 from neurosim_core.config import SimulationConfig, VehicleConfig, load_config
 from neurosim_core.live import LiveConfig
@@ -165,6 +165,24 @@ class LiveRig:
 
         wait_for(look)
         return found[0]
+
+
+def loans_of(publisher: Publisher[Any], shape: tuple[int, ...]) -> list[Loan]:
+    """Every loan that a publisher has left for pictures of bytes; somebody must listen."""
+    loans: list[Loan] = []
+    dims = dict(zip(("height", "width", "channels"), shape, strict=True))
+    while (loan := publisher.try_loan({"data": "u1"}, **dims)) is not None:
+        loans.append(loan)
+        assert len(loans) < 1000
+    return loans
+
+
+def count_free(publisher: Publisher[Any], shape: tuple[int, ...]) -> int:
+    """How many pictures of a shape can be lent room for at once."""
+    loans = loans_of(publisher, shape)
+    for loan in loans:
+        loan.drop()
+    return len(loans)
 
 
 def drain(subscriber: Subscriber[Any], timeout_s: float = 0.2, *, least: int = 0) -> list[Any]:

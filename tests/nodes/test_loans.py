@@ -1,9 +1,12 @@
 """Pictures that are written where their readers find them."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from live_rig import count_free, loans_of
 
 from cortex import Node, reliable
 from cortex.messages import Image
@@ -80,6 +83,63 @@ def test_one_at_a_time(pair):
     assert received.sequence == 3
     assert subscriber.counters.lost == 0
     assert (received.data == picture).all()
+
+
+def test_what_is_thrown_away_is_given_back(pair):
+    """Unless somebody can still write there."""
+    publisher, _ = pair
+    shape, loan = SHAPES[0], PictureLoan(publisher)
+    loan.drop()
+    free = count_free(publisher, shape)
+    room = loan.lend(picture_of(shape))
+    loan.drop()
+    assert loan.holds(room)
+    del room
+    assert count_free(publisher, shape) == free - 1
+    loan.drop()
+    assert count_free(publisher, shape) == free
+
+
+def test_room_that_was_given_up_is_a_lost_picture(pair):
+    """No error, which would end the thread that flies: this one is lost, and the next ones arrive."""
+    publisher, subscriber = pair
+    rows, *rest = SHAPES[0]
+    picture, loan = picture_of(SHAPES[0]), PictureLoan(publisher)
+    room = loan.lend(picture)
+    for size in (2, 4, 8, 16, 32):  # for each, all memory is new
+        publisher.publish(message_of(picture_of((size * rows, *rest))))
+        subscriber.recv(60.0)
+    others = loans_of(publisher, (32 * rows, *rest))
+    assert loan.publish(message_of(room, sequence=1)) is False
+    assert not loan.holds(room)
+    for other in others:
+        other.drop()
+    room = loan.lend(picture)
+    assert loan.publish(message_of(room, sequence=2))
+    assert subscriber.recv(60.0).sequence == 2
+
+
+def test_no_room_while_a_picture_waits_for_its_reader():
+    """Who renders does not wait with it: the next picture is copied."""
+    begun, read = threading.Event(), threading.Event()
+
+    def publish():
+        begun.set()
+        return read.wait(600.0)
+
+    draft = SimpleNamespace(data=np.zeros(SHAPES[0], np.uint8))
+    publisher = SimpleNamespace(try_loan=lambda *_, **__: SimpleNamespace(draft=draft, publish=publish))
+    loan = PictureLoan(publisher)
+    room = loan.lend(draft.data)
+    with ThreadPoolExecutor() as pool:
+        published = pool.submit(loan.publish, message_of(room))
+        try:
+            assert begun.wait(60.0)
+            assert pool.submit(loan.lend, draft.data).result(60.0) is None
+            assert not published.done()
+        finally:
+            read.set()
+        assert published.result(60.0)
 
 
 def test_small_pictures_are_copied(pair):

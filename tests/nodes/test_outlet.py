@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_rig import make_config, models_of
+from live_rig import count_free, make_config, models_of
 from processes import SOON_S, wait_for
 
 from cortex import Node, Subscriber, reliable
@@ -369,6 +369,22 @@ def test_no_room_for_a_picture_that_is_due(make_stand: Callable[..., Stand]):
     stand.outlet.lateness_ns = lambda stamp_ns: 5 * MS - stamp_ns
     assert stand.outlet.make_room("rgb", 5 * MS, like) is None
     assert stand.outlet.make_room("rgb", 6 * MS, like) is not None
+
+
+def test_room_is_given_back_at_a_reset_and_before_topics_close(make_stand: Callable[..., Stand]):
+    """A flight may end between a picture and its stamp: nobody publishes it any more."""
+    stand = make_stand()
+    stand.listen("/drone/rgb", Image)
+    like = np.zeros((160, 150, 3), np.uint8)
+    publisher = stand.outlet.streams["rgb"].publisher
+    assert stand.outlet.make_room("rgb", MS, like) is not None
+    free = count_free(publisher, like.shape)
+    stand.outlet.reset(seed=0)
+    assert count_free(publisher, like.shape) == free + 1
+    assert stand.outlet.make_room("rgb", MS, like) is not None
+    assert count_free(publisher, like.shape) == free
+    stand.outlet.drop_loans()
+    assert count_free(publisher, like.shape) == free + 1
 
 
 def test_collisions_are_published(make_stand: Callable[..., Stand]):

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from live_rig import IMU, LiveRig, drain, make_config, models_of
+from live_rig import IMU, LiveRig, count_free, drain, make_config, models_of
 from processes import SOON_S, wait_for
 from rich.console import Console
 
+from cortex import Node
 from cortex.messages import (
     Clock,
     Collision,
@@ -37,6 +38,7 @@ from neurosim_core.config import load_config
 from neurosim_core.nodes import cameras
 from neurosim_core.nodes import simulator as simulator_module
 from neurosim_core.nodes.console import print_end
+from neurosim_core.nodes.simulator import Simulator
 from neurosim_core.packets import Delivery
 from neurosim_core.record import Flight
 from neurosim_core.simulation import make_state, observe, step
@@ -720,6 +722,24 @@ def test_gains_change_in_flight():
 
 
 # Ends
+
+
+def test_room_for_a_picture_is_given_back_before_the_topics_close():
+    """One that the flight did not come to, as it ended before: else closing would wait for it."""
+    config = make_config()
+    like = np.zeros((160, 150, 3), np.uint8)
+    with Node("simulator") as node, Node("viewer") as viewer:
+        simulator = Simulator(config, node, models=models_of(config))
+        try:
+            outlet = simulator.crafts[0].outlet
+            publisher = outlet.streams["rgb"].publisher
+            viewer.subscriber("/drone/rgb", Image)
+            assert publisher.wait_for_subscribers(1, SOON_S)
+            assert outlet.streams["rgb"].loan.lend(like) is not None
+            free = count_free(publisher, like.shape)
+        finally:
+            simulator.close()
+        assert count_free(publisher, like.shape) == free + 1
 
 
 def test_a_collision_ends_the_run_until_the_reset():
