@@ -460,6 +460,7 @@ class Subscriber(Generic[T]):
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
+                    exhausted &= link.receive is receive  # else what came has told it to read elsewhere
                     break
                 self._accept(link, frame, timed=count & 7 == 0)
                 if not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns:

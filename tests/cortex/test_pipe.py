@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import select
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
 import zmq
 from peer import Block, is_whole, make_block
-from processes import SOON_S
+from processes import ROOT, SOON_S, wait_for
 
+import cortex.subscriber
 from cortex import keep_last, native, pipe, reliable
 from cortex.host import pipe_path, sweep
 from cortex.wire import BATCH, HEADER_SIZE, LARGE, MESSAGE, SLOT, Header, pack_header
@@ -206,6 +211,46 @@ def test_an_offer_that_nobody_takes(tmp_path: Path):
     assert pipe.open_writer(tmp_path, 2) is None
 
 
+@pytest.mark.parametrize("writer", WRITERS, ids=lambda kind: kind.__name__)
+def test_a_reader_that_is_gone_ends_no_program_that_does_not_ignore_sigpipe(tmp_path: Path, writer):
+    program = f"""
+import pathlib, signal
+import zmq
+from cortex import native, pipe
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+pipe.NativePipeWriter = {"native.NativePipeWriter" if writer is not pipe.PyWriter else None}
+offer = pipe.Offer(pathlib.Path({str(tmp_path)!r}), 1)
+writer = pipe.open_writer(pathlib.Path({str(tmp_path)!r}), 1)
+assert type(writer).__name__ == {writer.__name__!r}
+offer.close()
+writer.offer(bytes(100))
+writer.offer(bytes(10_000_000))
+writer.close()
+print("alive")
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert (found.returncode, found.stdout) == (0, "alive\n"), found.stderr
+
+
+def test_an_offer_falls_silent(tmp_path: Path):
+    """Whoever waits for its descriptor is not woken any more, whatever was written or will be."""
+    offer = pipe.Offer(tmp_path, 1)
+    writer = pipe.open_writer(tmp_path, 1)
+    writer.send(frame(3))
+    poll = select.poll()
+    poll.register(offer.fd, select.POLLIN)
+    assert poll.poll(0)
+    before = offer.fd, len(os.listdir("/proc/self/fd"))
+    offer.silence()
+    assert (offer.fd, len(os.listdir("/proc/self/fd"))) == before
+    assert list(tmp_path.iterdir()) == []
+    writer.offer(frame(3))
+    assert not poll.poll(0)
+    writer.close()
+    assert not poll.poll(0)
+    offer.close()
+
+
 def test_names_of_dead_readers_are_swept(tmp_path: Path):
     living = pipe.Offer(tmp_path, 1)
     os.mkfifo(pipe_path(tmp_path, 2))
@@ -233,6 +278,57 @@ def test_processes_speak_through_pipes(make_node, start_child, runtime, policy):
     assert not list(runtime.glob("*/pipe.*"))
     assert subscriber.counters.lost == subscriber.counters.rejected == 0
     child.finish()
+
+
+def test_a_pipe_that_brings_nonsense_is_left_for_the_socket(make_node, start_child, runtime):
+    """What was published meanwhile is counted as lost, and nothing after it."""
+    publisher = make_node().publisher("/blocks", Block)
+    child = start_child("endless_subscriber", topic="/blocks", policy=["reliable", {"timeout_s": SOON_S}])
+    child.hear()
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    (reader,) = publisher._pipes._direct
+    sent = 0
+
+    def publish() -> None:
+        nonlocal sent
+        assert publisher.publish(make_block(sent, 100))
+        sent += 1
+
+    publish()
+    wait_for(lambda: child.ask()["count"] == 1)
+    reader.pipe.send(b"nonsense" * 20)
+    wait_for(lambda: (publish(), child.ask()["count"] > 10)[1])
+
+    def accounts() -> bool:
+        found = child.ask()
+        assert (found["torn"], found["rejected"]) == (0, 1)
+        return found["count"] + found["lost"] == sent
+
+    wait_for(accounts)
+    lost = child.ask()["lost"]
+    for _ in range(20):
+        publish()
+    wait_for(lambda: child.ask()["count"] == sent - lost)
+    assert not publisher._pipes._direct
+
+
+def test_a_pipe_is_read_to_its_end_however_long_that_takes(make_node, start_child, runtime, monkeypatch):
+    """Its publisher has left long ago when its reader comes to read."""
+    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 0)
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block")
+    node = make_node()
+    subscriber = node.subscriber("/blocks", Block, policy=reliable(2, SOON_S))
+    child.ask(do="await_subscribers", topic="/blocks")
+    assert child.ask(do="publish", topic="/blocks", count=40, size=100)["delivered"] == 40
+    child.finish()
+    wait_for(lambda: not subscriber.sources())
+    for _ in range(5):
+        subscriber.dismiss(time.monotonic_ns())
+    assert [subscriber.recv(SOON_S).number for _ in range(40)] == list(range(40))
+    wait_for(lambda: not subscriber._links)
+    assert subscriber.counters.lost == 0
 
 
 def test_a_reader_in_the_same_process_needs_no_pipe(make_node, runtime):
