@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import struct
 import time
@@ -125,6 +126,8 @@ class LargeSender:
         self._pins: deque[_Pin] = deque()
         self._private_bytes = {False: 0, True: 0}
         self._unavailable_until_s = 0.0
+        self.wait_until_s = math.inf
+        """Nobody is waited for after this, on the monotonic clock [s]."""
         # What follows from who reads and from the ring in use; see `_plan`.
         self._shares = 1
         self._ring: Ring | None = None
@@ -311,7 +314,7 @@ class LargeSender:
                 more = backoff.wait()
             finally:
                 self._outlets.lock.acquire()
-            if not more:
+            if not more or time.monotonic() >= self.wait_until_s:
                 if ring is not None:
                     self._give_up(ring)
                 return False

@@ -324,6 +324,11 @@ class Node:
             time.sleep(2e-3)
         return True
 
+    def stop_waiting(self) -> None:
+        """Hold up no publisher any more, as `Publisher.stop_waiting`; may be called by a signal handler."""
+        for publisher in list(self._publishers):
+            publisher.stop_waiting()
+
     def close(self) -> None:
         """Leave: send what is queued, close publishers, subscribers and services, stop the threads.
 

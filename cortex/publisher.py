@@ -620,6 +620,13 @@ class Publisher(Generic[T]):
         self._blocked = False  # who was held up at the fork is not here
         self._closing = self._closed = True
 
+    def stop_waiting(self) -> None:
+        """Hold up nobody any more: a reliable subscriber that has no room loses messages, which is counted.
+
+        Ends a wait of another thread, too; to be called when the end is asked for. It takes no lock.
+        """
+        self._pipes.close_by_s = self._large.wait_until_s = 0.0
+
     def close(self, linger_s: float = LINGER_S) -> None:
         """Send what is held back, tell readers how many messages there were, and leave the topic.
 
@@ -641,7 +648,7 @@ class Publisher(Generic[T]):
     def _stop(self, by_s: float) -> None:
         """Send what is held back, until a time of the monotonic clock [s]; publish no more."""
         with self._lock:
-            self._pipes.close_by_s = by_s
+            self._pipes.close_by_s = min(self._pipes.close_by_s, by_s)
             try:
                 while self._batch and self._blocked and time.monotonic() < by_s:
                     self._sleep_unlocked()

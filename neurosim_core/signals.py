@@ -28,13 +28,20 @@ def handle_signals(handler: Callable[[int, FrameType | None], object]) -> Iterat
 
 
 @contextlib.contextmanager
-def stop_at_signals(stop: threading.Event) -> Iterator[None]:
-    """Turn signals into an event: they must not break into the writing of a file. A second may."""
+def stop_at_signals(stop: threading.Event, *, on_stop: Callable[[], object] | None = None) -> Iterator[None]:
+    """Turn signals into an event: they must not break into the writing of a file. A second may.
+
+    Args:
+        stop: Is set.
+        on_stop: Called then, wherever the main thread is: it must take no lock.
+    """
 
     def on_signal(_signal: int, _frame: FrameType | None) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
+        if on_stop is not None:
+            on_stop()
 
     with handle_signals(on_signal):
         yield

@@ -159,7 +159,8 @@ class Simulator:
         """Fly until told to stop.
 
         Args:
-            stop: Ends it within a few hundredths of a second.
+            stop: Ends it within a few hundredths of a second, if no reliable reader is waited for then; see
+                `Node.stop_waiting`.
 
         Returns:
             0 if it was stopped or the flight is over, 1 if the flight ended with an error.
@@ -481,7 +482,7 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
         gc.collect()
         gc.freeze()  # what is here stays: to look at it again would hold up time by a tenth of a second
         sys.setswitchinterval(_SWITCH_S)
-        with stop_at_signals(stop), simulator:
+        with stop_at_signals(stop, on_stop=node.stop_waiting), simulator:
             print_plan(console, simulator.crafts, config)
             with StatusLine(console) as line:
                 simulator.board.on_status = line.show

@@ -127,6 +127,35 @@ def test_a_batch_that_finds_no_room_is_sent(make_node, start_child, monkeypatch)
     assert publisher not in node._publishers
 
 
+@pytest.mark.parametrize("size", [8_000, 100_000])
+def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, size):
+    """Not who publishes already, nor later; what the reader loses is counted. Through pipes and slots."""
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    policy = ["reliable", {"depth": 1, "timeout_s": 10.0 * SOON_S}]
+    (child,) = subscribe(publisher, start_child, policy)
+    sent = Sent(publisher, size)
+
+    def publish() -> None:
+        while not sent.refused:
+            sent()
+
+    with child.stopped():
+        thread = threading.Thread(target=publish)
+        thread.start()
+        wait_for(lambda: publisher._blocked)
+        node.stop_waiting()
+        thread.join(SOON_S)
+        assert not thread.is_alive()
+        sent()
+        assert (sent.refused, publisher.counters.timeouts) == (2, 2)
+        lost = sent.refused
+    thread = begin_close(publisher)
+    wait_for(lambda: arrives(child, sent.count, lost))
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+
+
 def test_what_was_lost_at_the_end_is_counted(make_node, start_child):
     """The reader learns of it as it has room again, and the publisher is still there so long."""
     publisher = make_node().publisher("/blocks", Block)

@@ -13,14 +13,16 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 from line_process import LineProcess
+from live_rig import drain
 from processes import ROOT, processes_with, wait_for
 
-from cortex import Node, latest
-from cortex.messages import SimulatorStatus
-from neurosim_core.nodes.topics import STATUS
+from cortex import Node, latest, reliable
+from cortex.messages import Clock, Image, MotorCommand, SimulatorStatus
+from neurosim_core.nodes.topics import STATUS, command_topic
 from neurosim_core.record import Flight
 
 START_S = 60.0
@@ -224,6 +226,39 @@ def test_ctrl_c_ends_all_that_one_command_started(runtime, tmp_path, monkeypatch
     assert picture.stat().st_size > 0
     assert not list(tmp_path.glob("neurosim-*"))
     assert not [pid for pid in processes_with(str(runtime)) if b"neurosim_core" in command_line(pid)]
+
+
+def test_ctrl_c_waits_for_no_reader_that_has_stopped_reading(runtime, tmp_path, monkeypatch):
+    """A reliable one may hold up the simulator for ten minutes, but not its end."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    record = tmp_path / "flight"
+    lens = "{width: 160, height: 120, horizontal_fov_rad: 1.5}"
+    options = ["renderer=synthetic", "vehicle.on_collision=report"]
+    options += [f"sensors.rgb={{kind: rgb, rate_hz: 50, lens: {lens}}}"]
+    settings = [part for text in options for part in ("--set", text)]
+    command = neurosim("serve", make_settings(tmp_path), *settings, "--record", record)
+    with LineProcess(command) as serve, Node("onlooker") as node:
+        pictures = node.subscriber("/drone/rgb", Image, policy=reliable(1, timeout_s=600.0))
+        clock = node.subscriber("/clock", Clock, policy=reliable(4096))
+        commands = node.publisher(command_topic("drone", "motor_speeds"), MotorCommand)
+        assert commands.wait_for_subscribers(1, START_S)
+        assert pictures.wait_for_publisher(START_S)
+
+        def time_passes() -> bool:
+            commands.publish(MotorCommand(stamp_ns=0, speed=np.zeros(4)))
+            return bool(drain(clock, 0.1))
+
+        wait_for(time_passes, START_S)
+        drain(clock, 1.0)  # until time stands still
+        begin_s = time.monotonic()
+        serve.interrupt()
+        lines = serve.rest()
+        print(f"ended {time.monotonic() - begin_s:.2f} s after Ctrl-C")
+    assert serve.process.returncode == 130
+    assert not [line for line in lines if "Traceback" in line]
+    with Flight(record / "flight.h5") as flight:
+        assert flight.clean
+        assert flight.packet_count("rgb") > 0
 
 
 def command_line(process: int) -> bytes:
