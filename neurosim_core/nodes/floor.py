@@ -42,7 +42,7 @@ class FloorTrace:
     """Times from sending to having [ns], each of shape [n]."""
 
     wake_ns: NDArray[np.int64]
-    """Eight bytes through a pipe to a thread that sleeps in `read`."""
+    """Eight bytes through a pipe to a thread that sleeps in `poll` until they are there."""
     message_ns: NDArray[np.int64]
     """A message of 40 bytes through Cortex."""
 

@@ -48,7 +48,7 @@ def scene_of(kind):
 
 
 def pictures(scene, *, with_depth=False, **settings):
-    """Return log radiance of views all around, of which one is far outside; with depth: of half of them."""
+    """Return log radiance of views all around, of which one is far outside; with depth: of each."""
     rng = np.random.default_rng(2)
     q_WC = rng.normal(size=(VIEWS, 4)).astype(np.float32)
     q_WC /= np.linalg.norm(q_WC, axis=1, keepdims=True)
@@ -57,7 +57,7 @@ def pictures(scene, *, with_depth=False, **settings):
     arrays = upload_scene(scene, RenderConfig(**settings), "cpu")
     outputs = ("log_radiance", "depth") if with_depth else ("log_radiance",)
     renderer = WarpRenderer(arrays, LENS, outputs=outputs, instant_count=VIEWS, image_count=VIEWS)
-    slots = wp.array([k if with_depth and k % 2 else -1 for k in range(VIEWS)], dtype=int, device="cpu")
+    slots = wp.array([k if with_depth else -1 for k in range(VIEWS)], dtype=int, device="cpu")
     poses = wp.array(p_WC, dtype=wp.vec3, device="cpu"), wp.array(q_WC, dtype=wp.quat, device="cpu")
     renderer.render(*poses, slots, instant_count=VIEWS)
     return renderer.log_radiance.numpy()
