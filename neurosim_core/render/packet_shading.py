@@ -63,7 +63,13 @@ _HITS = """
     alignas(64) int face[N], material[N];
     for (int lane = 0; lane < N; ++lane) {
         const float x = normal[0][lane], y = normal[1][lane], z = normal[2][lane];
-        const float length = UNIT ? 1.0f : __builtin_elementwise_sqrt(x * x + y * y + z * z);
+        const float square = x * x + y * y + z * z;
+#ifdef __CUDA_ARCH__
+        const float root = sqrtf(square);
+#else
+        const float root = __builtin_elementwise_sqrt(square);  // a vector instruction without a branch
+#endif
+        const float length = UNIT ? 1.0f : root;
         const float cosine
             = ray[0][lane] * (x / length) + ray[1][lane] * (y / length) + ray[2][lane] * (z / length);
         facing[lane] = length > 0.0f ? cosine : 0.0f;
