@@ -6,7 +6,19 @@ import sysconfig
 import numpy
 from setuptools import Extension, setup
 
-SUBJECTS = ("coder", "construct", "gate", "items", "native", "pack", "pipe", "relay", "ring", "socket", "unpack")
+SUBJECTS = [
+    "coder",
+    "construct",
+    "gate",
+    "items",
+    "native",
+    "pack",
+    "pipe",
+    "relay",
+    "ring",
+    "socket",
+    "unpack",
+]
 HEADERS = ("coder", "items", "native", "numpy", "ring")
 
 setup(
