@@ -229,17 +229,22 @@ class SubscriptionCore {
   static constexpr std::size_t fresh_depth = 64;         // shorter queues are topped up before every message
   static constexpr std::int64_t fresh_ns = 1'000'000;    // and longer ones if they were filled so long ago
   static constexpr std::int64_t spin_ns = 20'000;
+  static constexpr std::int64_t gather_ns = 10'000;
   static constexpr std::int64_t tend_ns = 20'000'000;
   static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way, after all that is there
 
   // Waits until something may have come. To sleep costs the publisher a wake-up, more than the message itself: where
-  // the last one was there within `spin_ns`, this looks for the next one for so long.
+  // the last one was there within `spin_ns`, this looks for the next one for so long. It looks every `gather_ns`, since
+  // each look and each read hold up whoever writes to the pipe.
   void wait(std::vector<pollfd>& fds, std::int64_t begin_ns, std::int64_t deadline_ns) {
     if (in_rush_.load(std::memory_order_relaxed)) {
       const std::int64_t end_ns = std::min(begin_ns + spin_ns, deadline_ns);
-      do {
+      for (std::int64_t look_ns = begin_ns; look_ns < end_ns;) {
+        look_ns = std::min(look_ns + gather_ns, end_ns);
+        while (monotonic_ns() < look_ns) {
+        }
         if (::poll(fds.data(), fds.size(), 0) > 0) return;
-      } while (monotonic_ns() < end_ns);
+      }
     }
     // Another thread's call on a socket may swallow its event, hence the bound.
     const std::int64_t left_ns = std::max<std::int64_t>(deadline_ns - monotonic_ns(), 0);
