@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import zmq
 from cpp_messages import Mode, Point, Rich, Scan
+from processes import SOON_S
 
 from cortex import records, wire
 from cortex.host import host_id
@@ -48,14 +49,14 @@ class Peer:
 
     def line(self) -> str:
         """The next line that it prints."""
-        assert self.has_line(20.0), "the C++ program is silent"
+        assert self.has_line(SOON_S), "the C++ program is silent"
         line, self._rest = self._rest.split(b"\n", 1)
         return line.decode()
 
     def end(self) -> str:
         """Close its input, wait, and return what it wrote to standard error."""
         try:
-            _, errors = self.process.communicate(timeout=20.0)
+            _, errors = self.process.communicate(timeout=SOON_S)
         finally:
             self.process.kill()
             self.process.wait()
