@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Both ends of a pipe, for the address sanitizer: frames come out whole and in order however they are cut, a full pipe
-// refuses, what is no frame ends it, damaged streams do no harm.
+// refuses, what is no frame ends it, damaged streams do no harm. And when a reader lets messages gather.
 #include <cstdint>
 #include <cstdlib>
 #include <deque>
@@ -12,6 +12,7 @@
 #include <dirent.h>
 #include <unistd.h>
 
+#include <cortex/pace.hpp>
 #include <cortex/pipe.hpp>
 
 namespace {
@@ -172,6 +173,38 @@ void ends_that_go(const std::string& directory) {
   ::unlink(cortex::pipe::path_of(directory, 3).c_str());
 }
 
+// How long is waited after frames of so many bytes have come for a millisecond, one every `gap_ns`.
+std::int64_t gather_after(const cortex::Policy& policy, std::int64_t gap_ns, std::size_t bytes) {
+  cortex::detail::Pace pace(policy);
+  const std::int64_t begin_ns = 5'000'000'000;
+  pace.looked(begin_ns);
+  for (std::int64_t passed_ns = gap_ns; passed_ns <= 1'000'000; passed_ns += gap_ns) {
+    pace.count(bytes);
+    pace.looked(begin_ns + passed_ns);
+  }
+  return pace.gather_ns();
+}
+
+void floods_gather() {
+  const auto reliable = cortex::reliable();
+  expect(gather_after(reliable, 1'000, 104) == 50'000, "a flood gathers");
+  expect(gather_after(reliable, 10'000, 104) == 0, "100 kHz are no flood");
+  expect(gather_after(reliable, 1'000, 4'164) == 0, "a pipe that is soon full is looked into at once");
+  const std::int64_t between = gather_after(reliable, 1'000, 364);
+  expect(between > 20'000 && between < 40'000, "half of a usual pipe may gather, less what timers are late");
+  expect(gather_after(cortex::latest(), 1'000, 104) == 0, "the latest message is wanted at once");
+  expect(gather_after(cortex::keep_last(64), 1'000, 104) == 0, "a short queue would drop what gathers");
+  expect(gather_after(cortex::keep_last(1000), 1'000, 104) == 50'000, "a long one does not");
+  cortex::detail::Pace pace(reliable);
+  for (std::int64_t now_ns = 1'000; now_ns <= 1'000'000; now_ns += 1'000) {
+    pace.count(104);
+    pace.looked(now_ns);
+  }
+  expect(pace.gather_ns() > 0, "a flood gathers from its first moments");
+  pace.looked(1'050'000);
+  expect(pace.gather_ns() == 0, "and is over with the first look that finds nothing");
+}
+
 }  // namespace
 
 int main() {
@@ -183,6 +216,7 @@ int main() {
   nonsense();
   damaged(random);
   ends_that_go(directory);
+  floods_gather();
   expect(names_in(directory) == 0, "no name is left");
   ::rmdir(directory);
   std::cout << failures << " failures\n";

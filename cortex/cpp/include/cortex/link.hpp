@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "cortex/pace.hpp"
 #include "cortex/pipe.hpp"
 #include "cortex/policy.hpp"
 #include "cortex/ring_view.hpp"
@@ -84,11 +85,12 @@ class Link {
   }
 
   // Reads at most `budget` frames into the queue, those of the pipe first; false if there may be more.
-  bool drain(std::deque<Item>& queue, std::size_t budget) {
+  bool drain(std::deque<Item>& queue, std::size_t budget, Pace& pace) {
     for (; budget > 0; --budget) {
       if (pipe_ != nullptr) {
         const auto bytes = pipe_->next();
         if (!bytes.empty()) {
+          pace.count(bytes.size());
           take_in({bytes, nullptr}, queue);
           continue;
         }
