@@ -30,6 +30,8 @@ wp.set_module_options({"enable_backward": False})
 
 SUB_BITS = 11
 """Bits of a key below the column: polarity and nanoseconds."""
+BLOCK_SIZE = 256
+"""Threads of a block on CUDA; with four blocks on a multiprocessor nothing of `scan` has to leave registers."""
 TILE_SIZE = wp.constant(256)
 """Pixels that a thread of `screen` takes."""
 LOG_RADIANCE_MAX = 1.0e3
@@ -241,6 +243,47 @@ def _count_lead(
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // the loads of 16 frames are under way together, and threads that ask from different frames of the 16 on
+    // read the same lines; beyond the end the last frame stands in, which is no louder than itself
+    constexpr int SIZE = 16;
+    const float* sample = log_radiance.data + pixel;
+    const size_t stride = log_radiance.shape[1];
+    for (int begin = first / SIZE * SIZE; begin < frame_count; begin += SIZE) {
+        float value[SIZE];
+#pragma unroll
+        for (int i = 0; i < SIZE; ++i) {
+            const int frame = begin + i < frame_count ? begin + i : frame_count - 1;
+            value[i] = sample[frame * stride];
+        }
+        unsigned loud = 0;
+#pragma unroll
+        for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
+        if (begin < first) loud &= ~0u << (first - begin);
+        if (loud != 0) return begin + __ffs(loud) - 1 < frame_count ? begin + __ffs(loud) - 1 : frame_count;
+    }
+    return frame_count;
+#else
+    const float* sample = log_radiance.data + pixel;
+    const size_t stride = log_radiance.shape[1];
+    int frame = first;
+    while (frame < frame_count && sample[frame * stride] > low && sample[frame * stride] < high) ++frame;
+    return frame;
+#endif
+""")
+def _next_loud(
+    log_radiance: wp.array2d[wp.float32],
+    pixel: wp.int32,
+    first: wp.int32,
+    frame_count: wp.int32,
+    low: wp.float32,
+    high: wp.float32,
+) -> wp.int32:
+    """Return the first frame from `first` on whose sample leaves (low, high); if there is none, their number."""
+    ...
+
+
 @wp.func
 def walk(
     tabulate: wp.bool,
@@ -270,16 +313,16 @@ def walk(
     down = state.down
     quiet = quiet_range(base, up, down, threshold_on, threshold_off)
     last = state.last
-    if lead > 0:
-        last = log_radiance[lead - 1, pixel]
     invalid_count = wp.int32(0)
     invalid_first = wp.int32(0)
+    after = wp.int32(0)  # the first frame that comes after those that `last` knows of
 
-    for frame in range(lead, frame_count):
+    frame = _next_loud(log_radiance, pixel, lead, frame_count, quiet[0], quiet[1])
+    while frame < frame_count:
+        if frame > after:
+            last = log_radiance[frame - 1, pixel]
         sample = log_radiance[frame, pixel]
-        if sample > quiet[0] and sample < quiet[1]:
-            last = sample
-        elif wp.abs(sample) <= LIMIT:
+        if wp.abs(sample) <= LIMIT:
             up_before = up
             down_before = down
             while sample >= quiet[1]:
@@ -318,6 +361,10 @@ def walk(
             if invalid_count == 0:
                 invalid_first = frame
             invalid_count += 1
+        after = frame + 1
+        frame = _next_loud(log_radiance, pixel, after, frame_count, quiet[0], quiet[1])
+    if after < frame_count:
+        last = log_radiance[frame_count - 1, pixel]
 
     state.last = last
     state.up = up
@@ -464,7 +511,7 @@ def screen(
     )
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))
 def scan(
     # Model:
     threshold_on: wp.float64,

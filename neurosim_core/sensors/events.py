@@ -29,14 +29,13 @@ from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_noise import PixelNoise, terms_of
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
+from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
 from neurosim_core.streams import HostCopy, Milestone, make_stream, on
 
 __all__ = ["EventCamera", "EventCameraConfig"]
 
 _log = logging.getLogger(__name__)
 
-_BLOCK_SIZE = 256
 _PIXELS_PER_THREAD_MIN = 16_384
 _ROOM_PER_PIXEL = 16
 """Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
@@ -466,7 +465,7 @@ class EventCamera:
                     outputs=[*self._quiet_range, self._lead],
                     device=self.device,
                 )
-            block = _BLOCK_SIZE if self.device.is_cuda else 1
+            block = BLOCK_SIZE if self.device.is_cuda else 1
             blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
             noise, origin_ns = self._noise, scan.origin_us * NS_PER_US
             own = [*thresholds] if noise is None else noise.inputs()
@@ -476,7 +475,7 @@ class EventCamera:
             wp.launch(
                 event_scan.scan if noise is None else noise.scan,
                 dim=blocks * block,  # whole blocks: their threads reserve slots together
-                block_dim=_BLOCK_SIZE,
+                block_dim=BLOCK_SIZE,
                 inputs=[
                     *own,
                     self.width,
