@@ -7,9 +7,11 @@ import numpy
 from setuptools import Extension, setup
 
 SUBJECTS = [
+    "arrival",
     "coder",
     "construct",
     "gate",
+    "inlet",
     "items",
     "native",
     "pack",
@@ -19,7 +21,7 @@ SUBJECTS = [
     "socket",
     "unpack",
 ]
-HEADERS = ("coder", "items", "native", "numpy", "ring")
+HEADERS = ("coder", "inlet", "items", "native", "numpy", "ring")
 
 setup(
     ext_modules=[

@@ -173,17 +173,20 @@ static int take_source(Source *source, PyObject *const *first, PyObject *const *
     return 0;
 }
 
-/* Count how long the message was on its way; 0 with an error set. */
-static int note_latency(const Source *source, int64_t publish_ns) {
-    const int64_t elapsed_ns = monotonic_ns() - publish_ns - source->clock_offset_ns;
+int note_latency(PyObject *latency, int64_t elapsed_ns) {
     Py_ssize_t bucket = 0;
     for (uint64_t left = elapsed_ns > 0 ? (uint64_t)elapsed_ns : 0; left; left >>= 1) ++bucket;
-    const Py_ssize_t last = PyList_GET_SIZE(source->latency) - 1;
+    const Py_ssize_t last = PyList_GET_SIZE(latency) - 1;
     if (bucket > last) bucket = last;
-    const long long count = PyLong_AsLongLong(PyList_GET_ITEM(source->latency, bucket));
+    const long long count = PyLong_AsLongLong(PyList_GET_ITEM(latency, bucket));
     if (count == -1 && PyErr_Occurred()) return 0;
     PyObject *more = PyLong_FromLongLong(count + 1);
-    return more != NULL && PyList_SetItem(source->latency, bucket, more) == 0;
+    return more != NULL && PyList_SetItem(latency, bucket, more) == 0;
+}
+
+/* Count how long the message of a source was on its way; 0 with an error set. */
+static int note_arrival(const Source *source, int64_t publish_ns) {
+    return note_latency(source->latency, monotonic_ns() - publish_ns - source->clock_offset_ns);
 }
 
 PyDoc_STRVAR(drain_doc,
@@ -202,8 +205,7 @@ PyDoc_STRVAR(drain_doc,
 "    The sequence expected next, how many were read, and what ended it: None where there were no more or the limit\n"
 "    was reached, or a frame that was taken from the socket and is something else, or out of sequence.\n");
 
-/* The message of a frame if it is the expected one; NULL without error if it is something else. */
-static PyObject *read_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
+PyObject *read_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns) {
     uint64_t sequence;
     if (coder->has_head && PyBytes_CheckExact(frame) && PyBytes_GET_SIZE(frame) >= HEADER_SIZE) {
         memcpy(&sequence, PyBytes_AS_STRING(frame) + HEAD_SIZE, 8);
@@ -231,7 +233,7 @@ static Py_ssize_t drain_source(const Coder *coder, Source *source, PyObject *app
         if (message == NULL) break;
         Py_CLEAR(*ended_by);
         source->expected += 1;
-        if (!append_message(append, message) || (read % 8 == 0 && !note_latency(source, publish_ns))) break;
+        if (!append_message(append, message) || (read % 8 == 0 && !note_arrival(source, publish_ns))) break;
     }
     return read;
 }
@@ -278,7 +280,7 @@ static Py_ssize_t gather_source(const Coder *coder, Source *source, PyObject **f
         frames[found] = *ended_by;
         *ended_by = NULL;
         source->expected += 1;
-        if (found++ % 8 == 0 && !note_latency(source, publish_ns)) break;
+        if (found++ % 8 == 0 && !note_arrival(source, publish_ns)) break;
     }
     return found;
 }

@@ -54,4 +54,10 @@ PyObject *make_record(const Coder *coder, PyObject *message, int64_t publish_ns,
 /* The message of a body within `owner`, which its arrays keep; NULL without error if it is malformed. */
 PyObject *read_body(const Coder *coder, PyObject *owner, const char *body, Py_ssize_t size);
 
+/* The message of a frame if it is the expected one; NULL without error if it is something else. */
+PyObject *read_expected(const Coder *coder, PyObject *frame, uint64_t expected, int64_t *publish_ns);
+
+/* Add to a histogram, a list of counts by powers of two of a nanosecond; 0 with an error set. */
+int note_latency(PyObject *latency, int64_t elapsed_ns);
+
 #endif

@@ -18,9 +18,11 @@ enum {
 };
 
 /* Each adds its names to the module; 0, or -1 with an error set. */
+int add_arrival(PyObject *module);
 int add_coder(PyObject *module);
 int add_construct(PyObject *module);
 int add_gate(PyObject *module);
+int add_inlet(PyObject *module);
 int add_pipe(PyObject *module);
 int add_relay(PyObject *module);
 int add_socket(PyObject *module);

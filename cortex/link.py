@@ -108,7 +108,7 @@ class Link:
         self._stamped = stamped
         self.message_head = message_head(MESSAGE, self.source, codec.fingerprint, stamped=stamped)
         """The first 24 bytes of every plain message."""
-        self.read, self.drain, self.gather, self.records, self._coder = make_reader(codec, self.message_head)
+        self.read, self.drain, self.gather, self.records, self.coder = make_reader(codec, self.message_head)
         self._message_prefix = self.message_head[:16]
         self._handlers = {
             prefix(LARGE, self.source, stamped=stamped): self._on_large,
@@ -438,9 +438,9 @@ class Link:
 
     def _shorten(self) -> None:
         """Let the short cut in C read the slots of the ring, if there is one ring only."""
-        if self._coder is not None:
+        if self.coder is not None:
             views = list(self._rings.values())
-            self._coder.slots = views[0].short_cut if len(views) == 1 and not self._large_subscribed else None
+            self.coder.slots = views[0].short_cut if len(views) == 1 and not self._large_subscribed else None
 
     def _open_ring(self, place: RingPlace) -> RingView | None:
         """Map the ring of a descriptor; where that cannot be done, go on without shared memory."""
@@ -504,8 +504,8 @@ class Link:
             self._offer.close()
 
     def _close_rings(self) -> None:
-        if self._coder is not None:
-            self._coder.slots = None
+        if self.coder is not None:
+            self.coder.slots = None
         for ring in self._rings.values():
             ring.close()
         self._rings.clear()

@@ -35,6 +35,9 @@ from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType
 _Coder: Any = native and native.Coder
 NativeGate: Any = native and native.Gate
 """Sends small messages; see `gate.py`. There is one wherever `make_coder` returns something."""
+NativeInlet: Any = native and native.Inlet
+NativeArrivals: Any = native and native.Arrivals
+"""Take messages one at a time; see `inlet.py`."""
 NativePipeWriter: Any = native and native.PipeWriter
 NativePipeReader: Any = native and native.PipeReader
 """The ends of a pipe; see `pipe.py`."""

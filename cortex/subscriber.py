@@ -20,6 +20,7 @@ import zmq
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
+from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, make_arrivals, make_inlet
 from cortex.link import BLOCK_MS, WHOLE_BATCH, Item, Link, make
 from cortex.loop_reader import LoopReader
 from cortex.policy import Policy
@@ -40,9 +41,6 @@ DRAIN_MAX = 64
 """Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
 DRAIN_LOSSY_MAX = 4096
 """Where only the last messages count, all that has arrived is read: more than a socket holds."""
-PAUSE_NS = 1_000_000
-PAUSE_COUNT = 256
-"""An asyncio loop that always finds a message runs other tasks after so long, or so many messages."""
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
 WAIT_MAX_S = 0.1
@@ -93,15 +91,13 @@ class Subscriber(Generic[T]):
         self._queue: deque[Item] = deque()
         self._problems: deque[Exception] = deque()
         self._drained_ns = 0
-        self._exhausted = True
+        self._inlet = make_inlet(self._turn, self._queue, self.counters, self._accept_timed)
         self._whole_batches = False
         self._on_close = on_close
         self._closed = False
         self._reader: LoopReader | None = None
         self._generation = 0
         self._first = 0
-        self._pause_ns = 0
-        self._in_a_row = 0
         self._raised = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
@@ -118,14 +114,9 @@ class Subscriber(Generic[T]):
             TypeMismatch: A publisher of this topic sends another type; raised once for each.
             Closed: The subscriber was closed.
         """
-        message: T
-        if self.policy.reliable and self.callback is None and (timeout_s is None or timeout_s >= BLOCK_S):
-            with self._lock:
-                message = self._receive_decoded() if not self._queue else _LOST
-                if message is not _LOST:
-                    self.counters.received += 1
-                    return message
-        message = self._receive(timeout_s, self._decode)
+        message: T = self._inlet(timeout_s is None or timeout_s >= BLOCK_S)
+        if message is NOTHING:
+            message = self._receive(timeout_s, self._decode)
         return message
 
     def recv_with_info(self, timeout_s: float | None = None) -> tuple[T, Info]:
@@ -174,7 +165,7 @@ class Subscriber(Generic[T]):
 
     def __aiter__(self) -> AsyncIterator[T]:
         """Messages as they come, on the running loop, until the subscriber is closed."""
-        return _AsyncMessages(self)
+        return make_arrivals(self._inlet, self._recv_until_closed)
 
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`.
@@ -183,7 +174,7 @@ class Subscriber(Generic[T]):
         messages; then other tasks get a turn. A task that is cancelled while it waits has taken no message.
         """
         message: T
-        if self._may_go_on() and (message := self._take_now()) is not _LOST:
+        if self._may_go_on() and (message := self._take_now()) is not NOTHING:
             return message
         reader = self._reader
         if reader is None or reader.loop is not asyncio.get_running_loop():
@@ -191,43 +182,38 @@ class Subscriber(Generic[T]):
                 reader.stop()
             reader = self._reader = LoopReader(self._watched, self._on_wake)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        if self._in_a_row >= PAUSE_COUNT or monotonic_ns() >= self._pause_ns:  # others want to run, too
+        if self._inlet.left <= 0 or monotonic_ns() >= self._inlet.until_ns:  # others want to run, too
             await asyncio.sleep(0)
         while True:
-            self._in_a_row, self._pause_ns = 0, monotonic_ns() + PAUSE_NS
+            self._inlet.left, self._inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
             message = self._take_now()
-            if message is not _LOST:
+            if message is not NOTHING:
                 return message
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(self._nothing_came(timeout_s))
-            if self._queue or not self._exhausted:  # what came could not be read
+            if self._queue or not self._inlet.exhausted:  # what came could not be read
                 await asyncio.sleep(0)
                 continue
             await reader.wait(min(left_s, WAIT_MAX_S))
 
     def _may_go_on(self) -> bool:
         """Whether an asyncio task may take one more message before other tasks get a turn."""
-        self._in_a_row += 1
-        return self._in_a_row < PAUSE_COUNT and monotonic_ns() < self._pause_ns
+        self._inlet.left -= 1
+        return self._inlet.left >= 0 and monotonic_ns() < self._inlet.until_ns
 
     def _take_now(self) -> Any:
-        """Take the next message if it is there; `_LOST` if not, or if it could not be read."""
-        if self.policy.reliable and not self._queue:
-            with self._lock:
-                message = self._receive_decoded(DONTWAIT) if not self._queue else _LOST
-                if message is not _LOST:
-                    self.counters.received += 1
-                    return message
-        item = self._take()
-        return _LOST if item is None else self._open(item, self._decode)
+        """Take the next message if it is there; `NOTHING` if not, or if it could not be read."""
+        message = self._inlet(False)
+        if message is NOTHING and (item := self._take()) is not None:
+            message = self._open(item, self._decode)
+        return message
 
-    async def _next_async(self) -> T:
-        """As `recv_async`, with one coroutine less for a message that is there."""
-        message: T
-        if self._may_go_on() and (message := self._take_now()) is not _LOST:
-            return message
-        return await self.recv_async()
+    async def _recv_until_closed(self) -> T:
+        try:
+            return await self.recv_async()
+        except Closed:
+            raise StopAsyncIteration from None
 
     def _nothing_came(self, timeout_s: float | None) -> str:
         others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
@@ -250,7 +236,7 @@ class Subscriber(Generic[T]):
             item = self._take(whole=whole, block=left_s >= BLOCK_S)
             if item is not None:
                 result = self._open(item, use)
-                if result is not _LOST:
+                if result is not NOTHING:
                     return result
             if deadline_s is not None:
                 left_s = deadline_s - time.monotonic()
@@ -271,7 +257,9 @@ class Subscriber(Generic[T]):
             if self._closed:
                 raise Closed(f"the subscriber of {self.topic} is closed")
             if self._problems:
-                raise self._problems.popleft()
+                problem = self._problems.popleft()
+                self._open_inlet()
+                raise problem
             if not self.policy.reliable and (
                 not queue or self.policy.depth < DRAIN_MAX or monotonic_ns() - self._drained_ns > FRESH_NS
             ):
@@ -290,7 +278,7 @@ class Subscriber(Generic[T]):
             return item
 
     def _open(self, item: Item, use: Callable[[Item], Any]) -> Any:
-        """Apply `use`; a message that cannot be read is counted and `_LOST` returned."""
+        """Apply `use`; a message that cannot be read is counted and `NOTHING` returned."""
         try:
             return use(item)
         except MalformedMessage as error:
@@ -301,7 +289,7 @@ class Subscriber(Generic[T]):
             with self._turn:
                 self.counters.received -= 1
                 self.counters.lost += 1
-        return _LOST
+        return NOTHING
 
     def _buffer(self, item: Item) -> bytes | np.ndarray:
         if item.buffer is not None:
@@ -375,7 +363,7 @@ class Subscriber(Generic[T]):
                     link.clock_offset_ns,
                 )
                 if frame is not None:
-                    self._exhausted = False
+                    self._inlet.exhausted = False
                     self._accept(link, frame, timed=True)
                 if count:
                     self.counters.received += count
@@ -391,14 +379,14 @@ class Subscriber(Generic[T]):
         Waiting in the socket itself costs half of what waiting for its descriptor does.
         """
         links = self._links
-        flags = 0 if block and len(links) == 1 and not self._turn.asked else DONTWAIT
-        self._exhausted = True
+        flags = 0 if block and len(links) == 1 and not self._turn.waiting else DONTWAIT
+        self._inlet.exhausted = True
         for link in links if len(links) == 1 else self._rotated():
             try:
                 frame = link.receive(flags)
             except zmq.Again:
                 continue
-            self._exhausted = False
+            self._inlet.exhausted = False
             self._accept(link, frame, timed=True)
             if self._queue:
                 return
@@ -410,37 +398,6 @@ class Subscriber(Generic[T]):
             self._first = (self._first + 1) % len(links)
             return links[self._first :] + links[: self._first]
         return links
-
-    def _receive_decoded(self, flags: int = 0) -> Any:
-        """Take one message from the only socket, and decode it; the lock is held, and the queue is empty.
-
-        Args:
-            flags: DONTWAIT, or 0 to wait up to `BLOCK_S`.
-
-        Returns:
-            The message, or `_LOST` if none came, or if it went to the queue because it needs more care.
-        """
-        links = self._links
-        if len(links) != 1 or (not flags and self._turn.asked) or self._closed or self._problems:
-            return _LOST
-        link = links[0]
-        read = link.read
-        self._exhausted = True
-        try:
-            frame = link.receive(flags)
-        except zmq.Again:
-            return _LOST
-        self._exhausted = False
-        if (found := read(frame)) is not None:
-            sequence, publish_ns, message = found
-            if sequence == link.expected:
-                link.expected = sequence + 1
-            elif not link.advance(sequence):
-                return _LOST
-            self._time(publish_ns, link)
-            return message
-        self._accept(link, frame, timed=True)
-        return _LOST
 
     def _drain(self) -> None:
         """Read what has arrived into the queue; the lock is held.
@@ -468,7 +425,7 @@ class Subscriber(Generic[T]):
                     break
             else:
                 exhausted = False
-        self._exhausted = exhausted
+        self._inlet.exhausted = exhausted
         self._drained_ns = monotonic_ns()
 
     def _accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
@@ -491,6 +448,9 @@ class Subscriber(Generic[T]):
             self._time(publish_ns, link)
         self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
 
+    def _accept_timed(self, link: Link, frame: bytes) -> None:
+        self._accept(link, frame, timed=True)
+
     def _drain_decoded(self, messages: deque[T], *, may_wait: bool) -> None:
         """As `_drain`, for an empty queue that cannot overflow: messages are decoded on the spot.
 
@@ -502,7 +462,7 @@ class Subscriber(Generic[T]):
             may_wait: Wait up to `BLOCK_S` for the first if there is one socket only.
         """
         links, latency = self._rotated(), self.counters.latency
-        may_wait = may_wait and len(links) == 1 and not self._turn.asked
+        may_wait = may_wait and len(links) == 1 and not self._turn.waiting
         exhausted = True
         self._drained_ns = monotonic_ns()
         for link in links:
@@ -530,7 +490,7 @@ class Subscriber(Generic[T]):
                 exhausted = False
             if self._queue:
                 break
-        self._exhausted = exhausted
+        self._inlet.exhausted = exhausted
 
     def _take_decoded(self, link: Link, frame: bytes, messages: deque[T]) -> None:
         """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
@@ -571,7 +531,7 @@ class Subscriber(Generic[T]):
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
         with self._turn:
-            if self._closed or not self._exhausted:
+            if self._closed or not self._inlet.exhausted:
                 return
             poll = self._poll or self._new_poll()
             self._poll = None  # one thread at a time may use it
@@ -619,7 +579,7 @@ class Subscriber(Generic[T]):
                 items, self._queue = self._queue, items
             received = len(messages) + len(items)
             self.counters.received += received
-            more = not self._exhausted or (block and received > 0)
+            more = not self._inlet.exhausted or (block and received > 0)
         for problem in problems:
             logger.error("%s", problem)
         while messages and not self._closed:  # each gives back its slot as soon as its callback is done
@@ -629,7 +589,7 @@ class Subscriber(Generic[T]):
                 self._log_raised()
         while items and not self._closed:
             message = self._open(items.popleft(), self._decode)
-            if message is not _LOST:
+            if message is not NOTHING:
                 try:
                     callback(message)
                 except Exception:
@@ -651,7 +611,9 @@ class Subscriber(Generic[T]):
     @property
     def must_read(self) -> bool:
         """Whether the last look left something in a socket, which its descriptor may not show."""
-        return not self._exhausted and (not self.policy.reliable or len(self._queue) < self.policy.depth)
+        return not self._inlet.exhausted and (
+            not self.policy.reliable or len(self._queue) < self.policy.depth
+        )
 
     def fds(self) -> list[int]:
         """File descriptors that become readable when a message may have come."""
@@ -705,7 +667,7 @@ class Subscriber(Generic[T]):
                 return
             link.whole_batches = self._whole_batches
             self._links.append(link)
-            self._exhausted = False  # a descriptor shows nothing until its socket was found empty once
+            self._inlet.exhausted = False  # a descriptor shows nothing until its socket was found empty once
             self._links_changed()
 
     def sources(self) -> set[int]:
@@ -737,9 +699,19 @@ class Subscriber(Generic[T]):
         with self._turn:
             self.counters.rejected += 1
             self._problems.append(problem)
+            self._open_inlet()
         self.wakeup.set()
 
+    def _open_inlet(self) -> None:
+        """Let the inlet read the only publisher, if there is nothing else to mind; the lock is held."""
+        links = self._links if self.policy.reliable and self.callback is None and not self._closed else ()
+        if len(links) == 1 and not self._problems:
+            self._inlet.open(links[0], links[0].coder)
+        else:
+            self._inlet.open(None, None)
+
     def _links_changed(self) -> None:
+        self._open_inlet()
         self._poll = None
         self._generation += 1
         self.wakeup.set()
@@ -761,7 +733,7 @@ class Subscriber(Generic[T]):
                     self._drain()
                     if self._queue:
                         self.wakeup.set()
-                    if not self._exhausted:
+                    if not self._inlet.exhausted:
                         return
                 link.close()
                 self._links.remove(link)
@@ -773,6 +745,7 @@ class Subscriber(Generic[T]):
         self._turn = Turn()  # the old one may have been held at the fork
         self._lock = self._turn.lock
         self._closed = True
+        self._inlet.open(None, None)
 
     def close(self) -> None:
         """Stop receiving. Messages that the user still holds stay valid."""
@@ -780,6 +753,7 @@ class Subscriber(Generic[T]):
             if self._closed:
                 return
             self._closed = True
+            self._inlet.open(None, None)
             self._queue.clear()
             links, self._links = self._links, []
             self._leaving.clear()
@@ -817,29 +791,6 @@ class _Messages(Generic[T]):
             return self._subscriber.recv()
         except Closed:
             raise StopIteration from None
-
-
-class _AsyncMessages(Generic[T]):
-    """Iterates on the running loop."""
-
-    def __init__(self, subscriber: Subscriber[T]) -> None:
-        self._subscriber = subscriber
-
-    def __aiter__(self) -> AsyncIterator[T]:
-        return self
-
-    async def __anext__(self) -> T:
-        try:
-            return await self._subscriber._next_async()
-        except Closed:
-            raise StopAsyncIteration from None
-
-
-class _Lost:
-    """Stands for a message that could not be read."""
-
-
-_LOST: Any = _Lost()
 
 
 class _Overwritten(Exception):

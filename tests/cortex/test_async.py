@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
+from itertools import pairwise
 
 import pytest
 from peer import Number
 from processes import SOON_S, wait_for
 
-from cortex import latest, reliable
+from cortex import keep_last, latest, reliable
 
 
 @pytest.fixture
@@ -231,30 +232,40 @@ def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers):
     assert len(turns) < 150  # one for each message, were there a switch
 
 
-def test_a_stream_that_never_ends_lets_others_run(numbers):
-    publisher, subscriber = numbers
+@pytest.mark.parametrize("policy", [reliable(256, 60.0), keep_last(256), latest()], ids=str)
+@pytest.mark.parametrize("publisher_count", [1, 2])
+@pytest.mark.parametrize("how", ["iteration", "recv_async"])
+def test_a_stream_that_never_ends_lets_others_run(node, policy, publisher_count, how):
+    """Other tasks get a turn after 256 messages at the latest, whichever way the messages take."""
+    publishers = [node.publisher("/numbers", Number) for _ in range(publisher_count)]
+    subscriber = node.subscriber("/numbers", Number, policy=policy)
+    assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
+
+    async def messages():
+        while True:
+            yield await subscriber.recv_async(SOON_S)
 
     async def run():
-        done = False
+        turns = [0]
+        count = 0
 
         async def other():
-            nonlocal done
             for _ in range(5):
+                turns.append(count)
                 await asyncio.sleep(0)
-            done = True
 
         task = asyncio.ensure_future(other())
-        publisher.publish(Number(0, 0))
-        count = 0
-        async for message in subscriber:
-            publisher.publish(Number(0, message.value + 1))  # there is always one
+        for publisher in publishers:
+            publisher.publish(Number(0, 0))
+        async for _ in subscriber if how == "iteration" else messages():
+            publishers[count % publisher_count].publish(Number(0, 0))  # there is always one
             count += 1
-            if done or count == 1_000_000:
+            if task.done() or count == 100_000:
                 break
         await task
-        return count
+        return [later - earlier for earlier, later in pairwise(turns)]
 
-    assert asyncio.run(run()) < 1_000_000
+    assert max(asyncio.run(run())) <= 256
 
 
 def test_cancelling_before_and_while_waiting_takes_no_message(numbers):
