@@ -23,7 +23,7 @@ from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
 from neurosim_core.render.packet_shading import packet_eye, packet_shader
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.tile_walk import ASK, TILE, WalkData, find_face, find_faces, meet_face
+from neurosim_core.render.tile_walk import ASK, TILE, WalkData, find_face, find_faces, leave, meet_face
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
@@ -60,9 +60,12 @@ class Terms(NamedTuple):
     world_lenses: bool = False
     """Worlds look through different lenses."""
     walked: bool = False
-    """Rays of a tile share a walk through the tree (`tile_walk`), a block of 64 threads at a time."""
+    """Rays of a tile share a walk through the tree (`tile_walk`), a block of 64 threads at a time. Pixels of
+    which the lists do not tell are left to the kernel of the same terms with `asking`."""
+    asking: bool = False
+    """Of the pixels that `walked` left, and no others: each ray walks by itself."""
     by_tile: bool = False
-    """With `walked`: on a CPU, a thread for each tile."""
+    """With `walked`: on a CPU, a thread for each tile, which leaves nothing."""
 
 
 @wp.struct
@@ -126,6 +129,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     world_scenes = terms.world_scenes
     world_lenses = terms.world_lenses
     walked = terms.walked
+    leaving = walked and not terms.by_tile
+    asking = terms.asking
 
     @wp.func
     def meet_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
@@ -142,17 +147,19 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     def meet_listed(scene: SceneData, origin: wp.vec3, ray: wp.vec3, face: int) -> Hit:
         # `face`: what a walk found that the ray hits, -1: nothing, ASK: it does not tell.
         hit = Hit()
-        hit.face = -1
+        hit.face = face
         if face >= 0:
             met = meet_face(scene.mesh, face, origin, ray)
             if met[0] >= 0.0:
-                hit.face = face
                 hit.t = met[0]
                 hit.u = met[1]
                 hit.v = met[2]
                 hit.normal = wp.mesh_eval_face_normal(scene.mesh, face)
-        if face == ASK or (face >= 0 and hit.face < 0):
-            hit = meet_scene(scene, origin, ray)
+            else:
+                hit.face = ASK
+        if wp.static(not leaving):
+            if hit.face == ASK:
+                hit = meet_scene(scene, origin, ray)
         return hit
 
     @wp.func
@@ -359,6 +366,114 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                 rgb_out[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
                 rgb_out[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
 
+    @wp.func
+    def see(
+        index: int,
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        bodies: BodyData,
+        world_data: WorldData,
+        walk_data: WalkData,
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ):
+        # A pixel of an instant, of which `index` tells.
+        in_tile = index % 64
+        block = index // 64
+        instant = block % instant_count  # a tile of all instants, then the next: they see the same triangles
+        tile = block // instant_count
+        tile_columns = (width + 7) // 8
+        world = int(0)
+        first_ray = int(0)
+        if wp.static(worlds):  # all tiles of a world, then the next world
+            tile_count = tile_columns * ((height + 7) // 8)
+            world = tile // tile_count
+            tile -= world * tile_count
+            instant += world * world_data.stride
+            if world_data.active[world] == 0:
+                return
+        if wp.static(world_scenes):
+            scene = world_data.scenes[world_data.scene[world]]
+        if wp.static(world_lenses):
+            first_ray = world_data.lens[world] * width * height
+        col = (tile % tile_columns) * 8 + in_tile % 8
+        row = (tile // tile_columns) * 8 + in_tile // 8
+        outside = col >= width or row >= height
+        if wp.static(not leaving):
+            if outside:
+                return
+        else:  # what the block does together, all threads do
+            col = wp.min(col, width - 1)
+            row = wp.min(row, height - 1)
+        slot = int(-1)
+        if wp.static(with_images):
+            slot = image_slot[instant]
+            if wp.static(not with_log):
+                if slot < 0:
+                    return
+        origin = p_WC[instant]
+        q = q_WC[instant]
+        pixel = first_ray + row * width + col
+        radiance = wp.vec3(0.0)
+        left = bool(False)
+        for layer in range(rays.shape[0]):
+            if wp.static(supersampled):
+                # Layer 0 goes through the centre and is for geometry, the others are for radiance.
+                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
+                    continue
+            ray_C = rays[layer, pixel]
+            ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            if wp.static(leaving):
+                walk = instant // walk_data.instants
+                face = find_face(
+                    scene.mesh,
+                    walk_data.faces,
+                    (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
+                    walk_data.count[walk, tile],
+                    walk_data.reach[walk, tile],
+                    _FAR_M,
+                    walk_data.bounds[tile],
+                    wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
+                    wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
+                    wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
+                    origin,
+                    ray,
+                )
+                if outside or left:
+                    continue
+                hit = meet_listed(scene, origin, ray, face)
+                if hit.face == ASK:
+                    left = True
+                    continue
+            else:
+                hit = meet_scene(scene, origin, ray)
+            body = int(-1)
+            if wp.static(with_bodies):
+                hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
+            if wp.static(with_radiance):
+                if wp.static(not supersampled) or layer > 0:
+                    radiance += radiance_of(scene, bodies, instant, body, q, ray, origin, ray_C[3], hit)
+            if wp.static(with_geometry):
+                if slot >= 0 and layer == 0:
+                    write_geometry(
+                        scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
+                    )
+        if wp.static(leaving):
+            leave(left, index, walk_data.left, walk_data.left_count)
+            if outside or left:
+                return
+        if wp.static(with_radiance):
+            write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
+
     @wp.kernel(module="unique", enable_backward=False)
     def raycast(
         first: int,
@@ -382,88 +497,35 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         normal_out: wp.array3d[wp.vec3],
         instance_out: wp.array3d[int],
     ) -> None:
-        index = first + wp.tid()
-        in_tile = index % 64
-        block = index // 64
-        instant = block % instant_count  # a tile of all instants, then the next: they see the same triangles
-        tile = block // instant_count
-        tile_columns = (width + 7) // 8
-        world = int(0)
-        first_ray = int(0)
-        if wp.static(worlds):  # all tiles of a world, then the next world
-            tile_count = tile_columns * ((height + 7) // 8)
-            world = tile // tile_count
-            tile -= world * tile_count
-            instant += world * world_data.stride
-            if world_data.active[world] == 0:
-                return
-        if wp.static(world_scenes):
-            scene = world_data.scenes[world_data.scene[world]]
-        if wp.static(world_lenses):
-            first_ray = world_data.lens[world] * width * height
-        col = (tile % tile_columns) * 8 + in_tile % 8
-        row = (tile // tile_columns) * 8 + in_tile // 8
-        outside = col >= width or row >= height
-        if wp.static(not walked):
-            if outside:
-                return
-        else:  # what the block does together, all threads do
-            col = wp.min(col, width - 1)
-            row = wp.min(row, height - 1)
-        slot = int(-1)
-        if wp.static(with_images):
-            slot = image_slot[instant]
-            if wp.static(not with_log):
-                if slot < 0:
-                    return
-        origin = p_WC[instant]
-        q = q_WC[instant]
-        pixel = first_ray + row * width + col
-        radiance = wp.vec3(0.0)
-        for layer in range(rays.shape[0]):
-            if wp.static(supersampled):
-                # Layer 0 goes through the centre and is for geometry, the others are for radiance.
-                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
-                    continue
-            ray_C = rays[layer, pixel]
-            ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-            if wp.static(walked):
-                walk = instant // walk_data.instants
-                face = find_face(
-                    scene.mesh,
-                    walk_data.faces,
-                    (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
-                    walk_data.count[walk, tile],
-                    walk_data.reach[walk, tile],
-                    _FAR_M,
-                    walk_data.bounds[tile],
-                    wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
-                    wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
-                    wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
-                    origin,
-                    ray,
-                )
-                if outside:
-                    continue
-                hit = meet_listed(scene, origin, ray, face)
-            else:
-                hit = meet_scene(scene, origin, ray)
-            body = int(-1)
-            if wp.static(with_bodies):
-                hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
-            if wp.static(with_radiance):
-                if wp.static(not supersampled) or layer > 0:
-                    radiance += radiance_of(scene, bodies, instant, body, q, ray, origin, ray_C[3], hit)
-            if wp.static(with_geometry):
-                if slot >= 0 and layer == 0:
-                    write_geometry(
-                        scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
-                    )
-        if wp.static(with_radiance):
-            if wp.static(not walked) or not outside:
-                write_radiance(
-                    scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out
-                )
+        begin = first + wp.tid()
+        end = begin + 1
+        step = int(1)
+        if wp.static(asking):
+            end = walk_data.left_count[0]
+            step = walk_data.left_threads
+        for place in range(begin, end, step):
+            index = place
+            if wp.static(asking):
+                index = walk_data.left[place]
+            see(
+                index,
+                scene,
+                rays,
+                width,
+                height,
+                instant_count,
+                p_WC,
+                q_WC,
+                image_slot,
+                bodies,
+                world_data,
+                walk_data,
+                log_radiance_out,
+                rgb_out,
+                depth_out,
+                normal_out,
+                instance_out,
+            )
 
     if not (terms.embree or terms.by_tile):
         return raycast
@@ -698,3 +760,13 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     if unknown or not outputs:
         raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")
     return _kernel(tuple(name for name in OUTPUTS if name in outputs), terms)
+
+
+def asking_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel | None:
+    """Return the kernel that renders the pixels that `raycast_kernel` leaves; None: it leaves none.
+
+    It is launched after the other, with the same arguments and `WalkData.left_threads` threads.
+    """
+    if not terms.walked or terms.by_tile:
+        return None
+    return raycast_kernel(outputs, terms._replace(walked=False, asking=True))

@@ -72,6 +72,8 @@ _REACH_M = wp.constant(0.01)
 """How much further than the furthest of the rays that are cast a list reaches: a share, and a length [m]."""
 _COSINE_MIN = wp.constant(0.2)
 """Between the axis of a frustum and its rays; turned by more within M instants, a tile has no list."""
+_THREADS_PER_MULTIPROCESSOR = 640
+"""Of those that render what is left: as many as run at a time."""
 _CONSTANTS = """
     using namespace wp;
     constexpr float EDGE = 4.0e-6f, TIE = 2.0e-4f, SIDE = 4.0e-3f, SURE = 1.0f - TIE;
@@ -94,6 +96,12 @@ class WalkData:
     """Distance up to which a list is complete [m], shape [walk, tile]."""
     bounds: wp.array[wp.vec4]
     """Least and largest x / z, least and largest y / z of the rays of a tile in C, shape [tile]."""
+    left: wp.array[int]
+    """Threads whose pixels are left for rays that walk by themselves, in any order; empty on a CPU."""
+    left_count: wp.array[int]
+    """How many there are, shape [1]."""
+    left_threads: int
+    """How many threads share them."""
 
 
 @wp.struct
@@ -447,6 +455,26 @@ def find_faces(
 
 @wp.func_native("""
     using namespace wp;
+#ifdef __CUDA_ARCH__
+    // one atomic for a warp, whose pixels stay side by side
+    const unsigned mask = __ballot_sync(0xffffffffu, is_left), lane = threadIdx.x & 31;
+    int place = 0;
+    if (mask && lane == 0)
+        place = atomicAdd(count.data, __popc(mask));
+    place = __shfl_sync(0xffffffffu, place, 0) + __popc(mask & ((1u << lane) - 1));
+#else
+    const int place = is_left ? __atomic_fetch_add(count.data, 1, __ATOMIC_RELAXED) : 0;
+#endif
+    if (is_left)
+        left.data[place] = index;
+""")
+def leave(is_left: wp.bool, index: int, left: wp.array[int], count: wp.array[int]):
+    """Note that the pixel of a thread is left; all threads of a block call it together."""
+    ...
+
+
+@wp.func_native("""
+    using namespace wp;
     const Mesh mesh = mesh_get(id);
     const vec3 a = mesh.points[mesh.indices[3 * face]], b = mesh.points[mesh.indices[3 * face + 1]],
                c = mesh.points[mesh.indices[3 * face + 2]];
@@ -626,6 +654,7 @@ class TileWalk:
         extent_m: float,
         config: WalkConfig,
         instant_count: int,
+        leaves: bool,
         thread_count: int | None = None,
     ) -> None:
         """Allocate the lists.
@@ -638,6 +667,7 @@ class TileWalk:
             extent_m: Largest coordinate of the mesh [m].
             config: How walks are shared.
             instant_count: K, the most instants per launch.
+            leaves: Pixels are left to another kernel (`raycast.asking_kernel`).
             thread_count: Threads on a CPU device; all cores if None.
 
         Raises:
@@ -659,6 +689,11 @@ class TileWalk:
         self.data.count = wp.zeros((walks, len(bounds)), dtype=int, device=self._device)
         self.data.reach = wp.zeros((walks, len(bounds)), dtype=float, device=self._device)
         self.data.bounds = wp.array(bounds, dtype=wp.vec4, device=self._device)
+        self.data.left_count = wp.zeros(1, dtype=int, device=self._device)
+        room = instant_count * len(bounds) * BLOCK if leaves else 0
+        self.data.left = wp.zeros(room, dtype=int, device=self._device)
+        processors = mesh.device.sm_count if mesh.device.is_cuda else 0
+        self.data.left_threads = max(1, processors * _THREADS_PER_MULTIPROCESSOR)
 
     def launch(
         self,
@@ -677,6 +712,7 @@ class TileWalk:
             instant_count: How many of the K instants are rendered.
         """
         walks = -(-instant_count // self.data.instants)
+        self.data.left_count.zero_()
         launch_split(
             walk_kernel(self._lanes),
             dim=walks * self.data.bounds.shape[0] * self._lanes,

@@ -31,7 +31,7 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.raycast import Terms, WorldData, raycast_kernel
+from neurosim_core.render.raycast import Terms, WorldData, asking_kernel, raycast_kernel
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
 from neurosim_core.scene.bodies import Body, BodyPoses
@@ -300,6 +300,7 @@ class WarpRenderer:
                 rays of a layer together, or rays that share a walk do not look forward or are too many.
         """
         self._kernel = raycast_kernel(outputs, arrays.terms)
+        self._asking = asking_kernel(outputs, arrays.terms)
         self._arrays = arrays
         self._width, self._height = lens.width, lens.height
         self._thread_count = thread_count
@@ -327,6 +328,7 @@ class WarpRenderer:
                 extent_m=float(np.abs(arrays.scene.bounds_m).max()),
                 config=arrays.config.shared_walk,
                 instant_count=instant_count,
+                leaves=self._asking is not None,
                 thread_count=thread_count,
             )
         images = (image_count, lens.height, lens.width)
@@ -370,23 +372,30 @@ class WarpRenderer:
             )
         if self.walk is not None:
             self.walk.launch(self.rays, p_WC, q_WC, instant_count=instant_count)
+        inputs = [
+            self._arrays.data,
+            self.rays,
+            self._width,
+            self._height,
+            instant_count,
+            p_WC,
+            q_WC,
+            image_slot,
+            self._body_data,
+            self._world_data,
+            WalkData() if self.walk is None else self.walk.data,
+        ]
+        outputs = [self.log_radiance, self.rgb, self.depth, self.normal, self.instance]
+        device = self._arrays.device
         launch_split(
             self._kernel,
             dim=instant_count * self._instant_threads,
-            inputs=[
-                self._arrays.data,
-                self.rays,
-                self._width,
-                self._height,
-                instant_count,
-                p_WC,
-                q_WC,
-                image_slot,
-                self._body_data,
-                self._world_data,
-                WalkData() if self.walk is None else self.walk.data,
-            ],
-            outputs=[self.log_radiance, self.rgb, self.depth, self.normal, self.instance],
-            device=self._arrays.device,
+            inputs=inputs,
+            outputs=outputs,
+            device=device,
             thread_count=self._thread_count,
         )
+        if self._asking is not None and self.walk is not None:
+            launch_split(
+                self._asking, dim=self.walk.data.left_threads, inputs=inputs, outputs=outputs, device=device
+            )

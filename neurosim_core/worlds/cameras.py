@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurosim_core.render.body_arrays import make_body_data, place_camera
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.raycast import WorldData, raycast_kernel
+from neurosim_core.render.raycast import WorldData, asking_kernel, raycast_kernel
 from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
 from neurosim_core.render.warp_renderer import SceneArrays, ray_layers
 from neurosim_core.scene.bodies import BodyConfig, make_body_poses, pose_bodies, upload_motions
@@ -93,6 +93,7 @@ class WorldCast:
                 "are more than 2^31 rays a step: take fewer worlds, or commands more often"
             )
         self._kernel = raycast_kernel(cast.outputs, terms)
+        self._asking = asking_kernel(cast.outputs, terms)
         rays = np.concatenate([ray_layers(lens, arrays.config.samples_per_pixel) for lens in lenses], axis=1)
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
         self._scene = arrays.data
@@ -189,24 +190,24 @@ class WorldCast:
         if self._walk is not None:
             self._walk.launch(self._rays, self._p_WC, self._q_WC, instant_count=self._count * self._stride)
         self._worlds.active = active
-        launch_split(
-            self._kernel,
-            dim=self._count * instant_count * self._instant_threads,
-            inputs=[
-                self._scene,
-                self._rays,
-                *self._size,
-                instant_count,
-                self._p_WC,
-                self._q_WC,
-                self._slots_of(instant_count, bool(names)),
-                self._body_data,
-                self._worlds,
-                WalkData() if self._walk is None else self._walk.data,
-            ],
-            outputs=[self._outputs["log_radiance"], self._outputs["rgb"], self._outputs["depth"], None, None],
-            device=self._device,
-        )
+        inputs = [
+            self._scene,
+            self._rays,
+            *self._size,
+            instant_count,
+            self._p_WC,
+            self._q_WC,
+            self._slots_of(instant_count, bool(names)),
+            self._body_data,
+            self._worlds,
+            WalkData() if self._walk is None else self._walk.data,
+        ]
+        outputs = [self._outputs["log_radiance"], self._outputs["rgb"], self._outputs["depth"], None, None]
+        dim = self._count * instant_count * self._instant_threads
+        launch_split(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
+        if self._asking is not None and self._walk is not None:
+            dim = self._walk.data.left_threads
+            launch_split(self._asking, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
         for name in names:
             if name in self._own:
                 wp.copy(self.pictures[name], self._own[name])
@@ -233,6 +234,7 @@ class WorldCast:
             extent_m=float(np.abs(arrays.scene.bounds_m).max()),
             config=shared.model_copy(update={"instants": self._stride}),
             instant_count=self._count * self._stride,
+            leaves=self._asking is not None,
         )
 
     def _make_bodies(self, bodies: Mapping[str, BodyConfig]) -> None:

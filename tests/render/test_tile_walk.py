@@ -358,6 +358,7 @@ def test_what_kernels_cannot_count_is_refused():
             extent_m=1.0,
             config=WalkConfig(instants=1, face_count_max=face_count_max),
             instant_count=count,
+            leaves=False,
         )
 
     with pytest.raises(
