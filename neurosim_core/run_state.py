@@ -30,7 +30,8 @@ from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_s
 from neurosim_core.trace import Trace
 from neurosim_core.vehicle import DynamicsError, Multirotor
 
-_LANES_ON_CUDA = 2
+_LANES_ON_CUDA = 3
+"""With three, one batch is flown and one rendered while the host reads a third."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +157,7 @@ def make_state(
 
     Args:
         model: What does not change.
-        lane_count: How many batches `run_model` keeps under way. By default 2 on a CUDA device, and 1 where a
+        lane_count: How many batches `run_model` keeps under way. By default 3 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
         flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
         borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`.

@@ -31,7 +31,7 @@ wp.set_module_options({"enable_backward": False})
 SUB_BITS = 11
 """Bits of a key below the column: polarity and nanoseconds."""
 BLOCK_SIZE = 256
-"""Threads of a block on CUDA; with four blocks on a multiprocessor nothing of `scan` has to leave registers."""
+"""Threads of a block on CUDA."""
 TILE_SIZE = wp.constant(256)
 """Pixels that a thread of `screen` takes."""
 LOG_RADIANCE_MAX = 1.0e3
@@ -280,7 +280,7 @@ def _next_loud(
     low: wp.float32,
     high: wp.float32,
 ) -> wp.int32:
-    """Return the first frame from `first` on whose sample leaves (low, high); if there is none, their number."""
+    """Return the first frame from `first` on whose sample leaves (low, high), or the number of frames."""
     ...
 
 
@@ -511,7 +511,7 @@ def screen(
     )
 
 
-@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))  # as many blocks as need no register spilled
 def scan(
     # Model:
     threshold_on: wp.float64,
