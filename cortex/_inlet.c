@@ -123,6 +123,10 @@ int inlet_take_soon(PyObject *self, PyObject **message) {
     const int may_go_on = inlet->left > 0 && monotonic_ns() < inlet->until_ns;
     inlet->left -= may_go_on;
     *message = may_go_on ? inlet_take(inlet, 0) : Py_NewRef(inlet->nothing);
+    if (may_go_on && *message == inlet->nothing && inlet->exhausted && inlet->link != NULL) {
+        Py_DECREF(*message); /* a stream that keeps up with us brings the next one before a coroutine is made */
+        *message = inlet_take(inlet, 0);
+    }
     return *message != inlet->nothing;
 }
 
@@ -214,6 +218,16 @@ static PyMethodDef inlet_methods[] = {
     {NULL, NULL, 0, NULL},
 };
 
+static PyObject *inlet_get_open(Inlet *inlet, void *unused) {
+    (void)unused;
+    return PyBool_FromLong(inlet->link != NULL);
+}
+
+static PyGetSetDef inlet_properties[] = {
+    {"is_open", (getter)inlet_get_open, NULL, "Whether there is a link to read.", NULL},
+    {NULL, NULL, NULL, NULL, NULL},
+};
+
 static PyMemberDef inlet_members[] = {
     {"exhausted", T_BOOL, offsetof(Inlet, exhausted), 0, "Whether the last look found nothing."},
     {"left", T_LONGLONG, offsetof(Inlet, left), 0, "Messages that `soon` may still take."},
@@ -235,6 +249,7 @@ PyTypeObject InletType = {
     .tp_dealloc = (destructor)inlet_dealloc,
     .tp_methods = inlet_methods,
     .tp_members = inlet_members,
+    .tp_getset = inlet_properties,
 };
 
 int add_inlet(PyObject *module) {

@@ -23,7 +23,7 @@ T = TypeVar("T")
 monotonic_ns = time.monotonic_ns
 
 PAUSE_NS = 1_000_000
-PAUSE_COUNT = 256
+PAUSE_COUNT = 1024
 """An asyncio loop that always finds a message runs other tasks after so long, or so many messages."""
 
 
@@ -43,6 +43,11 @@ class Inlet(Protocol):
     """Messages that `soon` may still take."""
     until_ns: int
     """How long it may do so, on the monotonic clock."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a link to read."""
+        ...
 
     def open(self, link: Link | None, coder: Any, /) -> None:
         """Read a link from now on; None: every message goes the long way. The lock is held."""
@@ -82,6 +87,11 @@ class PyInlet:
     def open(self, link: Link | None, coder: Any, /) -> None:
         """Read a link from now on; None: every message goes the long way. The lock is held."""
         self._link = link
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a link to read."""
+        return self._link is not None
 
     def __call__(self, may_wait: bool, /) -> Any:
         """Take the next message; `NOTHING` if none came, or if it went to the queue."""

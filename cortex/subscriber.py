@@ -170,31 +170,34 @@ class Subscriber(Generic[T]):
     async def recv_async(self, timeout_s: float | None = None) -> T:
         """Take the next message without blocking the running loop; see `recv`.
 
-        A message that is there is returned without a switch of tasks, for up to a millisecond or 256
+        A message that is there is returned without a switch of tasks, for up to a millisecond or 1024
         messages; then other tasks get a turn. A task that is cancelled while it waits has taken no message.
         """
         message: T
         if self._may_go_on() and (message := self._take_now()) is not NOTHING:
             return message
-        reader = self._reader
-        if reader is None or reader.loop is not asyncio.get_running_loop():
-            if reader is not None:
-                reader.stop()
-            reader = self._reader = LoopReader(self._watched, self._on_wake)
+        return await self._wait_async(timeout_s)
+
+    async def _wait_async(self, timeout_s: float | None) -> T:
+        inlet, reader = self._inlet, self._reader
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        if self._inlet.left <= 0 or monotonic_ns() >= self._inlet.until_ns:  # others want to run, too
+        if inlet.left <= 0 or monotonic_ns() >= inlet.until_ns:  # others want to run, too
             await asyncio.sleep(0)
         while True:
-            self._inlet.left, self._inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
-            message = self._take_now()
+            inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+            message: T = self._take_now()
             if message is not NOTHING:
                 return message
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(self._nothing_came(timeout_s))
-            if self._queue or not self._inlet.exhausted:  # what came could not be read
+            if self._queue or not inlet.exhausted:  # what came could not be read
                 await asyncio.sleep(0)
                 continue
+            if reader is None or reader.loop is not asyncio.get_running_loop():
+                if reader is not None:
+                    reader.stop()
+                reader = self._reader = LoopReader(self._watched, self._on_wake)
             await reader.wait(min(left_s, WAIT_MAX_S))
 
     def _may_go_on(self) -> bool:
@@ -205,13 +208,15 @@ class Subscriber(Generic[T]):
     def _take_now(self) -> Any:
         """Take the next message if it is there; `NOTHING` if not, or if it could not be read."""
         message = self._inlet(False)
-        if message is NOTHING and (item := self._take()) is not None:
-            message = self._open(item, self._decode)
+        if message is NOTHING and (self._queue or not self._inlet.is_open):
+            item = self._take()
+            if item is not None:
+                message = self._open(item, self._decode)
         return message
 
     async def _recv_until_closed(self) -> T:
         try:
-            return await self.recv_async()
+            return await self._wait_async(None)
         except Closed:
             raise StopAsyncIteration from None
 

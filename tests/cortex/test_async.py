@@ -12,6 +12,9 @@ from peer import Number
 from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
+from cortex.inlet import PAUSE_COUNT
+
+STREAM = 12 * PAUSE_COUNT
 
 
 @pytest.fixture
@@ -69,12 +72,12 @@ def test_two_subscribers_on_one_loop(node):
     assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
 
     def publish(publisher):
-        for value in range(2000):
+        for value in range(STREAM):
             assert publisher.publish(Number(0, value))
 
     async def collect(subscriber):
         values = []
-        while len(values) < 2000:
+        while len(values) < STREAM:
             values.append((await subscriber.recv_async(SOON_S)).value)
         return values
 
@@ -90,13 +93,13 @@ def test_two_subscribers_on_one_loop(node):
         ticking = asyncio.ensure_future(tick())
         results = await asyncio.gather(*map(collect, subscribers))
         ticking.cancel()
-        assert ticks > 10
+        assert ticks > 10  # a turn after `PAUSE_COUNT` messages at the latest
         return results
 
     threads = [threading.Thread(target=publish, args=(publisher,)) for publisher in publishers]
     for thread in threads:
         thread.start()
-    assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [list(range(2000))] * 2
+    assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [list(range(STREAM))] * 2
     for thread in threads:
         thread.join()
 
@@ -236,7 +239,7 @@ def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers):
 @pytest.mark.parametrize("publisher_count", [1, 2])
 @pytest.mark.parametrize("how", ["iteration", "recv_async"])
 def test_a_stream_that_never_ends_lets_others_run(node, policy, publisher_count, how):
-    """Other tasks get a turn after 256 messages at the latest, whichever way the messages take."""
+    """Other tasks get a turn after so many messages at the latest, whichever way the messages take."""
     publishers = [node.publisher("/numbers", Number) for _ in range(publisher_count)]
     subscriber = node.subscriber("/numbers", Number, policy=policy)
     assert all(publisher.wait_for_subscribers(timeout_s=SOON_S) for publisher in publishers)
@@ -265,7 +268,7 @@ def test_a_stream_that_never_ends_lets_others_run(node, policy, publisher_count,
         await task
         return [later - earlier for earlier, later in pairwise(turns)]
 
-    assert max(asyncio.run(run())) <= 256
+    assert max(asyncio.run(run())) <= PAUSE_COUNT
 
 
 def test_cancelling_before_and_while_waiting_takes_no_message(numbers):
