@@ -124,6 +124,7 @@ class LargeSender:
         """Columns of reliable readers that did not make room in time: they hold up nothing until they do."""
         self._inline: list[Reader] = []
         self._pins: deque[_Pin] = deque()
+        self._returned: deque[Slot] = deque()
         self._private_bytes = {False: 0, True: 0}
         self._unavailable_until_s = 0.0
         self.wait_until_s = math.inf
@@ -221,7 +222,7 @@ class LargeSender:
         Returns:
             None if every slot is taken.
         """
-        if self._pins:
+        if self._pins or self._returned:
             self._prune()
         ring = self._ring
         if ring is None or ring.slot_bytes < size or ring.slots < self._slots_wanted:
@@ -238,11 +239,12 @@ class LargeSender:
         """Move a message out of a ring that readers were told to forget; the caller holds the lock.
 
         Returns:
-            The slot itself if its ring is in use, another with the same bytes, or None if there is none.
+            The slot itself if its ring is in use, another with the same bytes, or None if there is none; then
+            the slot is given back.
         """
         if slot.ring is None or slot.ring in self._rings[-RINGS_ALIVE:]:
             return slot
-        other = self.acquire(size, sequence, exact=False)
+        other = self.acquire(size, sequence, exact=False, spare=True)
         if other is not None:
             other.buffer[:size] = slot.buffer[:size]
         slot.ring.abandon(slot.number)
@@ -252,6 +254,13 @@ class LargeSender:
         """Give a slot back unpublished; the caller holds the lock."""
         if slot.ring is not None:
             slot.ring.abandon(slot.number)
+
+    def give_back(self, slot: Slot) -> None:
+        """Give a slot back unpublished, as soon as somebody asks for one.
+
+        The caller holds no lock, or any: it may be the garbage collector, in the middle of anything.
+        """
+        self._returned.append(slot)
 
     def grant(self, ring: Ring | None) -> tuple[int, bool, bool]:
         """Decide who gets the next message; the caller holds the lock.
@@ -458,6 +467,8 @@ class LargeSender:
             self._rings.pop(0).close()
 
     def _prune(self) -> None:
+        while self._returned:
+            self.abandon(self._returned.popleft())
         for _ in range(len(self._pins)):
             pin = self._pins.popleft()
             if not pin.tracker.done:
@@ -517,6 +528,7 @@ class LargeSender:
     @property
     def taken_in(self) -> bool:
         """Whether all that was sent through slots has been given back; the caller holds the lock."""
+        self._prune()
         return all(ring.idle for ring in self._rings)
 
     def close(self) -> None:

@@ -6,8 +6,10 @@ import math
 import secrets
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -249,25 +251,30 @@ class Publisher(Generic[T]):
                 slot = self._large.acquire(size, self._gate.sequence, exact=exact)
             if slot is None:
                 return None
+        room = None if slot.ring is None else slot.ring.room(slot.number)
         try:
-            draft = self.codec.draft(slot.buffer, dims, dtypes)
+            draft = self.codec.draft(slot.buffer if room is None else room.view(np.ndarray), dims, dtypes)
         except BaseException:
-            self._abandon(slot)
+            self._large.give_back(slot)
             raise
-        return Loan(draft, slot, inline=inline, publish=self._publish_loan, drop=self._abandon)
+        if room is not None:
+            room.on_forgotten = partial(self._recall, slot)
+        return Loan(draft, slot, room, inline=inline, publish=self._publish_loan, drop=self._large.give_back)
 
-    def _abandon(self, slot: Slot) -> None:
-        with self._lock:
-            self._large.abandon(slot)
+    def _recall(self, slot: Slot) -> None:
+        """Take back the slot of a loan that nobody can publish any more; takes no lock, see `Room`."""
+        self._large.give_back(slot)
+        if not self._closed:
+            text = f"{self.topic}: a loan was forgotten, neither published nor dropped"
+            warnings.warn(text, ResourceWarning, stacklevel=2)
 
-    def _publish_loan(self, draft: Any, slot: Slot | None, inline: bool) -> bool:
-        """Send what was written on loan; as `publish`, but for RuntimeError where its slot was given up."""
-        assert slot is not None
+    def _publish_loan(self, draft: Any, slot: Slot, inline: bool) -> bool:
+        """Send what was written on loan; returns and raises as `Loan.publish`."""
         try:
             size = self.codec.finish(draft)
             stamp_ns = 0 if self._stamp_of is None else int(draft.stamp_ns)
         except BaseException:
-            self._abandon(slot)
+            self._large.give_back(slot)
             raise
         if inline:
             with self._lock:
@@ -276,11 +283,16 @@ class Publisher(Generic[T]):
                 return self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
         with self._large_lock, self._lock:
             now_ns = monotonic_ns()
-            self._prepare(now_ns)
-            slot = self._large.renew(slot, size, self._gate.sequence)
-            if slot is None:
-                raise RuntimeError(f"{self.topic}: every slot is out on loan; the message is lost")
-            return self._publish_slot(slot, size, stamp_ns, now_ns)
+            try:
+                self._prepare(now_ns)
+            except BaseException:
+                self._large.abandon(slot)
+                raise
+            renewed = self._large.renew(slot, size, self._gate.sequence)
+            if renewed is None:
+                self._skip()
+                return False
+            return self._publish_slot(renewed, size, stamp_ns, now_ns)
 
     def _publish_inline(self, body: bytes, stamp_ns: int, now_ns: int) -> bool:
         """Send or collect a small message; the lock is held."""

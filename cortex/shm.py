@@ -20,6 +20,7 @@ import mmap
 import os
 import threading
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,25 @@ _U8 = np.dtype(np.uint8)
 Bytes = npt.NDArray[np.uint8]
 
 
+class Room(np.ndarray[Any, np.dtype[np.uint8]]):
+    """A slot that is lent: the root of all arrays through which it can be written.
+
+    Those keep it alive, because NumPy's `base` does not reach past a subclass.
+
+    Attributes:
+        on_forgotten: Called when the last of them is gone, by any thread in the middle of anything, as the
+            garbage collector pleases: it must take no lock. None: the slot is not lent any more.
+    """
+
+    __slots__ = ("on_forgotten",)
+    on_forgotten: Callable[[], object] | None
+
+    def __del__(self) -> None:
+        on_forgotten = getattr(self, "on_forgotten", None)  # a slice has none
+        if on_forgotten is not None:
+            on_forgotten()
+
+
 class Ring:
     """The publisher's side of a ring of message slots.
 
@@ -92,6 +112,8 @@ class Ring:
         layout = layout_of(slots, self.slot_bytes)
         self.fd, memory = create_ring_memory(source, ring_id, slots, self.slot_bytes)
         self._close_fd = weakref.finalize(self, os.close, self.fd)
+        self._memory: Any = memory
+        self._first = layout.slots
         self._buffers: list[Bytes] = [
             np.ndarray((self.slot_bytes,), _U8, memory, layout.slots + k * self.slot_bytes)
             for k in range(slots)
@@ -127,6 +149,11 @@ class Ring:
     def buffer(self, slot: int) -> Bytes:
         """Return a slot's memory, writable, shape [slot_bytes]; write only between acquire and commit."""
         return self._buffers[slot]
+
+    def room(self, slot: int) -> Room:
+        """Return a slot's memory as `buffer` does, to be lent to someone who may forget it."""
+        room: Room = Room((self.slot_bytes,), _U8, self._memory, self._first + slot * self.slot_bytes)
+        return room
 
     def commit(self, slot: int, sequence: int, body_size: int, mask: int) -> None:
         """Finish a slot and lease it to readers.
@@ -207,7 +234,7 @@ class Ring:
             self._closed = True
             self.fd = -1
             self.ledger.close()
-            self._buffers = []
+            self._buffers, self._memory = [], None
             self._close_fd()
 
     def _check_writing(self, slot: int) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cortex import Closed, Loan, Publisher
+from cortex import Loan, Publisher
 
 _BYTES_MIN = 1 << 16
 """Smaller pictures are copied: that takes less time than to write in place."""
@@ -73,8 +73,7 @@ class PictureLoan:
             message: Its image; of its data only the place is used.
 
         Returns:
-            As `Publisher.publish`; False, too, if the room was given up for larger pictures meanwhile, and
-            there is no other: readers lose the picture.
+            As `Loan.publish`.
 
         Raises:
             Closed: The publisher was closed.
@@ -84,12 +83,7 @@ class PictureLoan:
             assert loan is not None
             for name in _FIELDS:
                 setattr(loan.draft, name, getattr(message, name))
-            try:
-                return loan.publish()
-            except Closed:
-                raise
-            except RuntimeError:
-                return False
+            return loan.publish()
 
     def _give_back(self) -> bool:
         """Return whether nothing is lent, having dropped what nobody can publish; the lock is held."""

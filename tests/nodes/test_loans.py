@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from live_rig import count_free, loans_of
 
-from cortex import Node, reliable
+from cortex import Node, keep_last, reliable
 from cortex.messages import Image
 from neurosim_core.nodes.loans import PictureLoan
 
@@ -17,11 +17,12 @@ DTYPES = {3: np.uint8, 2: np.float32}
 
 
 @pytest.fixture
-def pair():
-    """A publisher of images, and a subscriber that gets all of them."""
+def pair(request):
+    """A publisher of images, and a subscriber that gets all of them, unless a test asks for another policy."""
+    policy = getattr(request, "param", reliable())
     with Node("camera") as node, Node("viewer") as viewer:
         publisher = node.publisher("/picture", Image)
-        subscriber = viewer.subscriber("/picture", Image, policy=reliable())
+        subscriber = viewer.subscriber("/picture", Image, policy=policy)
         assert publisher.wait_for_subscribers(1, timeout_s=60.0)
         yield publisher, subscriber
 
@@ -100,8 +101,9 @@ def test_what_is_thrown_away_is_given_back(pair):
     assert count_free(publisher, shape) == free
 
 
+@pytest.mark.parametrize("pair", [keep_last(8)], indirect=True, ids=str)
 def test_room_that_was_given_up_is_a_lost_picture(pair):
-    """No error, which would end the thread that flies: this one is lost, and the next ones arrive."""
+    """No error, which would end the thread that flies: this one is lost and counted, the next ones arrive."""
     publisher, subscriber = pair
     rows, *rest = SHAPES[0]
     picture, loan = picture_of(SHAPES[0]), PictureLoan(publisher)
@@ -117,6 +119,7 @@ def test_room_that_was_given_up_is_a_lost_picture(pair):
     room = loan.lend(picture)
     assert loan.publish(message_of(room, sequence=2))
     assert subscriber.recv(60.0).sequence == 2
+    assert subscriber.counters.lost == 1
 
 
 def test_no_room_while_a_picture_waits_for_its_reader():
