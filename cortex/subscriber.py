@@ -181,10 +181,10 @@ class Subscriber(Generic[T]):
     async def _wait_async(self, timeout_s: float | None) -> T:
         inlet, reader = self._inlet, self._reader
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        if inlet.left <= 0 or monotonic_ns() >= inlet.until_ns:  # others want to run, too
-            await asyncio.sleep(0)
         while True:
-            inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+            if inlet.left <= 0 or monotonic_ns() >= inlet.until_ns:  # others want to run, too
+                await asyncio.sleep(0)
+                inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
             message: T = self._take_now()
             if message is not NOTHING:
                 return message
@@ -199,6 +199,7 @@ class Subscriber(Generic[T]):
                     reader.stop()
                 reader = self._reader = LoopReader(self._watched, self._on_wake)
             await reader.wait(min(left_s, WAIT_MAX_S))
+            inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
 
     def _may_go_on(self) -> bool:
         """Whether an asyncio task may take one more message before other tasks get a turn."""
@@ -740,6 +741,7 @@ class Subscriber(Generic[T]):
                         self.wakeup.set()
                     if not self._inlet.exhausted:
                         return
+                link.end()
                 link.close()
                 self._links.remove(link)
                 del self._leaving[link]
