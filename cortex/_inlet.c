@@ -48,21 +48,22 @@ static int set_number(PyObject *object, PyObject *name, long long number) {
 }
 
 /* Account for a message that was read; 0 with an error set. */
-static int inlet_count(const Inlet *inlet, PyObject *link, int64_t expected, int64_t publish_ns) {
+static int inlet_count(const Inlet *inlet, PyObject *link, int64_t expected, int64_t publish_ns, int64_t now_ns) {
+    const int64_t sent_ns = publish_ns + inlet->clock_offset_ns;
+    if (now_ns < sent_ns) now_ns = monotonic_ns(); /* it was sent after we had looked at the clock */
     const long long received = number_of(inlet->counters, received_name);
     return !PyErr_Occurred() && set_number(link, expected_name, expected + 1)
-        && set_number(inlet->counters, received_name, received + 1)
-        && note_latency(inlet->latency, monotonic_ns() - publish_ns - inlet->clock_offset_ns);
+        && set_number(inlet->counters, received_name, received + 1) && note_latency(inlet->latency, now_ns - sent_ns);
 }
 
 /* The message of a frame; NULL without error if it was handed on. */
-static PyObject *inlet_read(Inlet *inlet, PyObject *link, PyObject *frame) {
+static PyObject *inlet_read(Inlet *inlet, PyObject *link, PyObject *frame, int64_t now_ns) {
     const int64_t expected = number_of(link, expected_name);
     if (expected == -1 && PyErr_Occurred()) return NULL;
     int64_t publish_ns;
     PyObject *message = read_expected(inlet->coder, frame, (uint64_t)expected, &publish_ns);
     if (message != NULL) {
-        if (inlet_count(inlet, link, expected, publish_ns)) return message;
+        if (inlet_count(inlet, link, expected, publish_ns, now_ns)) return message;
         Py_DECREF(message);
     } else if (!PyErr_Occurred()) {
         PyObject *arguments[3] = {NULL, link, frame};
@@ -81,26 +82,26 @@ static int inlet_is_open(const Inlet *inlet, int may_wait) {
 }
 
 /* The next message, with the lock held; NULL as for `inlet_read`. */
-static PyObject *inlet_take_locked(Inlet *inlet, int may_wait) {
+static PyObject *inlet_take_locked(Inlet *inlet, int may_wait, int64_t now_ns) {
     if (inlet_is_open(inlet, may_wait) <= 0) return NULL;
     PyObject *link = Py_NewRef(inlet->link), *message = NULL;
     PyObject *receive = PyObject_GetAttr(link, receive_name);
     PyObject *frame = receive == NULL ? NULL : take_frame(receive, inlet->again, may_wait);
     inlet->exhausted = frame == NULL;
-    if (frame != NULL) message = inlet_read(inlet, link, frame);
+    if (frame != NULL) message = inlet_read(inlet, link, frame, now_ns);
     Py_XDECREF(frame);
     Py_XDECREF(receive);
     Py_DECREF(link);
     return message;
 }
 
-/* The next message, or `nothing`; NULL with an error set. */
-static PyObject *inlet_take(Inlet *inlet, int may_wait) {
+/* The next message, or `nothing`; NULL with an error set. The time may have passed a little. */
+static PyObject *inlet_take(Inlet *inlet, int may_wait, int64_t now_ns) {
     if (inlet->link == NULL) return Py_NewRef(inlet->nothing);
     PyObject *acquired = PyObject_CallNoArgs(inlet->acquire);
     if (acquired == NULL) return NULL;
     Py_DECREF(acquired);
-    PyObject *message = inlet_take_locked(inlet, may_wait), *type, *value, *traceback;
+    PyObject *message = inlet_take_locked(inlet, may_wait, now_ns), *type, *value, *traceback;
     PyErr_Fetch(&type, &value, &traceback);
     PyObject *released = PyObject_CallNoArgs(inlet->release);
     if (released == NULL) PyErr_Clear(); /* it was ours */
@@ -115,17 +116,18 @@ static PyObject *inlet_call(PyObject *self, PyObject *const *arguments, size_t f
         return NULL;
     }
     const int may_wait = PyObject_IsTrue(arguments[0]);
-    return may_wait < 0 ? NULL : inlet_take((Inlet *)self, may_wait);
+    return may_wait < 0 ? NULL : inlet_take((Inlet *)self, may_wait, INT64_MIN);
 }
 
 int inlet_take_soon(PyObject *self, PyObject **message) {
     Inlet *inlet = (Inlet *)self;
-    const int may_go_on = inlet->left > 0 && monotonic_ns() < inlet->until_ns;
+    const int64_t now_ns = monotonic_ns();
+    const int may_go_on = inlet->left > 0 && now_ns < inlet->until_ns;
     inlet->left -= may_go_on;
-    *message = may_go_on ? inlet_take(inlet, 0) : Py_NewRef(inlet->nothing);
+    *message = may_go_on ? inlet_take(inlet, 0, now_ns) : Py_NewRef(inlet->nothing);
     if (may_go_on && *message == inlet->nothing && inlet->exhausted && inlet->link != NULL) {
         Py_DECREF(*message); /* a stream that keeps up with us brings the next one before a coroutine is made */
-        *message = inlet_take(inlet, 0);
+        *message = inlet_take(inlet, 0, now_ns);
     }
     return *message != inlet->nothing;
 }
