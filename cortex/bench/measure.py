@@ -1,4 +1,9 @@
-"""Runs a case: its contestants in turn, again and again, each repetition in processes of its own."""
+"""Runs a case: its contestants in turn, again and again, each repetition in processes of its own.
+
+What a machine does besides changes by the second, and from process to process: so repetitions are short,
+their order is turned round each time, ratios are taken within each, and a bar that lies within the interval
+of what was measured is measured again, up to a limit, whichever side of it the median is on.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,7 @@ from cortex.bench.cases import METRICS, Bar, Case, Contestant
 from cortex.bench.children import Child, ChildFailed
 from cortex.bench.copies import copy_alone, copy_in, copy_out, make_ring, slots_of
 from cortex.bench.job import Job
+from cortex.bench.spread import Spread
 from cortex.bench.transports import missing
 
 _SHM = Path("/dev/shm")
@@ -33,6 +39,8 @@ class Settings:
     folder: Path
     """Private directory of the run."""
     repeats: int = 5
+    repeats_max: int = 0
+    """Up to which a bar is measured again that lies within the noise; 0: it is not."""
     seconds: float = 0.5
     count_max: int = 0
     """Bounds the messages of cases that count them; 0: no bound."""
@@ -82,22 +90,6 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Median and half of the range."""
-
-    median: float
-    half_range: float
-    count: int
-
-    @classmethod
-    def of(cls, values: list[float]) -> Spread | None:
-        """Return the spread of some figures; None if there are none."""
-        if not values:
-            return None
-        return cls(statistics.median(values), (max(values) - min(values)) / 2.0, len(values))
-
-
-@dataclass(frozen=True)
 class Verdict:
     """A bar and what was measured."""
 
@@ -119,6 +111,11 @@ class Verdict:
             return f"missed ({self.note})"
         return "met" if met else "missed"
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the bar lies within the noise: more repetitions might give another verdict."""
+        return self.measured is not None and not self.note and self.measured.leaves_open(self.bar.bound)
+
 
 @dataclass
 class CaseResult:
@@ -135,19 +132,22 @@ class CaseResult:
 def run_case(
     case: Case, settings: Settings, *, progress: Callable[[str], None] = lambda _: None
 ) -> CaseResult:
-    """Measure all contestants of a case, interleaved: A B C, A B C, and so on.
+    """Measure all contestants of a case, interleaved: A B C, C B A, and so on.
 
     A repetition that fails is recorded, and the next one begins afresh.
     """
     outcomes = {c.name: Outcome(c, absent=_absent(c)) for c in case.contestants}
+    result = CaseResult(case, outcomes)
     repeats = min(settings.repeats, case.repeats or settings.repeats)
-    for repetition in range(repeats):
-        for outcome in outcomes.values():
-            if outcome.absent:
-                continue
+    repeats_max = max(repeats, 0 if case.repeats else settings.repeats_max)
+    for repetition in range(repeats_max):
+        if repetition >= repeats and not any(verdict.is_open for verdict in result.verdicts()):
+            break
+        present = [outcome for outcome in outcomes.values() if not outcome.absent]
+        for outcome in reversed(present) if repetition & 1 else present:
             progress(f"{case.name} {repetition + 1}/{repeats} {outcome.contestant.name}")
             outcome.repetitions.append(_repeat(case, outcome.contestant, settings))
-    return CaseResult(case, outcomes)
+    return result
 
 
 def judge(bar: Bar, outcomes: dict[str, Outcome]) -> Verdict:

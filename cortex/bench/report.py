@@ -15,7 +15,8 @@ from typing import TextIO
 import zmq
 
 from cortex.bench.cases import METRICS, Case
-from cortex.bench.measure import CaseResult, Outcome, Spread, Verdict
+from cortex.bench.measure import CaseResult, Outcome, Verdict
+from cortex.bench.spread import Spread
 
 WIDTH = 110
 _LABELS = ("case", "contestant", "payload_bytes")
@@ -71,7 +72,7 @@ def summary_lines(results: list[CaseResult], *, quick: bool = False) -> Iterator
         unmeasured = len(words) - words.count("quick")
         yield f"a quick run judges nothing: {words.count('quick')} quick, {unmeasured} not measured"
         return
-    met, missed = words.count("met"), sum(word.startswith("missed") for word in words)
+    met, missed = (sum(word.startswith(start) for word in words) for start in ("met", "missed"))
     yield f"{met} met, {missed} missed, {len(words) - met - missed} not measured"
 
 
@@ -123,7 +124,7 @@ def write_csv(path: Path, results: list[CaseResult]) -> None:
 def _write_rows(file: TextIO, results: list[CaseResult]) -> None:
     writer = csv.writer(file)
     writer.writerow(
-        [*_LABELS, "metric", "unit", "median", "half_range", "repetitions", *_COUNTS, "error", "values"]
+        [*_LABELS, "metric", "unit", "median", "low", "high", "repetitions", *_COUNTS, "error", "values"]
     )
     for result in results:
         for outcome in result.outcomes.values():
@@ -140,7 +141,8 @@ def _write_rows(file: TextIO, results: list[CaseResult]) -> None:
                         metric,
                         METRICS[metric].unit,
                         "" if spread is None else f"{spread.median:.6g}",
-                        "" if spread is None else f"{spread.half_range:.6g}",
+                        "" if spread is None else f"{spread.low:.6g}",
+                        "" if spread is None else f"{spread.high:.6g}",
                         len(values),
                         *(
                             outcome.total(count)
@@ -169,7 +171,7 @@ def _outcome_lines(case: Case, outcome: Outcome) -> Iterator[str]:
 
 
 def _figure(spread: Spread, unit: str) -> str:
-    percent = 100.0 * spread.half_range / spread.median if spread.median else 0.0
+    percent = 100.0 * spread.half_width / spread.median if spread.median else 0.0
     return f"{_number(spread.median):>9} {unit:<3}± {percent:2.0f} %"
 
 
@@ -178,7 +180,9 @@ def _number(value: float) -> str:
 
 
 def _word(verdict: Verdict, quick: bool) -> str:
-    return "quick" if quick and verdict.measured is not None else verdict.word
+    if quick and verdict.measured is not None:
+        return "quick"
+    return f"{verdict.word}, within noise" if verdict.is_open else verdict.word
 
 
 def _what(verdict: Verdict) -> str:
@@ -195,7 +199,7 @@ def _measured(verdict: Verdict) -> str:
     if spread is None:
         return "-"
     if verdict.bar.against:
-        return f"{spread.median:.2f} ± {spread.half_range:.2f}"
+        return f"{spread.median:.2f} ± {spread.half_width:.2f}"
     return f"{_number(spread.median)} {METRICS[verdict.bar.metric].unit}".strip()
 
 
