@@ -9,6 +9,9 @@ an array that is freed between two launches holds up both: what runs ahead of th
 
 from __future__ import annotations
 
+import ctypes
+import weakref
+from collections import deque
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -21,6 +24,9 @@ _GRAPH_COUNT_MAX = 512
 """Most graphs that are kept. Steps whose sensors do not divide the control clock come in many patterns, each
 in two states of the pixels; batches that are streamed take turns among slots: each combination is a graph.
 With fewer places than a cycle has, each would be given up before it comes again."""
+
+_LENT_BYTES_MAX = 64 << 20
+"""Most memory of one kind that is lent out: pages that are pinned are nobody else's."""
 
 
 def make_stream(device: Any, *, urgent: bool = False) -> wp.Stream | None:
@@ -152,3 +158,55 @@ class HostCopy:
     def view(self, first: int, count: int) -> NDArray[Any]:
         """Return rows that were fetched, where they are: valid until they are fetched again."""
         return self._rows[first : first + count]
+
+
+class LentBlock:
+    """Memory of the host that the device copies to, pinned on CUDA, and that is lent to who reads it."""
+
+    def __init__(self, size: int, device: Any) -> None:
+        self.array = wp.empty(size, dtype=wp.uint8, device="cpu", pinned=wp.get_device(device).is_cuda)
+
+    def rows(self) -> NDArray[np.uint8]:
+        """Return all of it; as a new array, which lives as long as it or a view of it is held."""
+        size = self.array.shape[0]
+        return np.frombuffer((ctypes.c_uint8 * size).from_address(self.array.ptr), dtype=np.uint8)
+
+
+class LentBlocks:
+    """Blocks that go round: who gets one may keep it, and it comes back when its last view is gone.
+
+    So nothing is copied for those who read and forget. Who keeps more than 64 MB gets copies.
+
+    Args:
+        device: What copies to them.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self._device = device
+        self._free: deque[LentBlock] = deque()
+        self._made_count = 0
+
+    def take(self, size: int) -> LentBlock:
+        """Return a block of at least so many bytes that nobody reads."""
+        while self._free:
+            block = self._free.popleft()  # the one that came back first
+            if block.array.shape[0] >= size:
+                return block
+            self._made_count -= 1
+        self._made_count += 1
+        return LentBlock(1 << max(0, size - 1).bit_length(), self._device)
+
+    def give_back(self, block: LentBlock) -> None:
+        """Let a block be taken again: its content is not wanted."""
+        self._free.append(block)
+
+    def lend(self, block: LentBlock, size: int) -> NDArray[np.uint8]:
+        """Return the first bytes of a block for the caller to keep, or a copy; the block is not theirs."""
+        away_count = self._made_count - len(self._free)
+        if away_count * block.array.shape[0] > _LENT_BYTES_MAX:
+            rows = np.array(block.rows()[:size])
+            self._free.append(block)
+            return rows
+        rows = block.rows()
+        weakref.finalize(rows, self._free.append, block).atexit = False
+        return rows

@@ -539,7 +539,7 @@ def make_scan(terms: frozenset[str]) -> Any:
         end_pixel: wp.int32,
         log_radiance: wp.array2d[wp.float32],
         stamps: wp.array[wp.int64],
-        since_reset_ns: wp.int64,
+        since_reset_ns: wp.array[wp.int64],
         frame_count: wp.int32,
         row_limit: wp.array[wp.int32],
         base: wp.array[wp.float32],
@@ -555,7 +555,10 @@ def make_scan(terms: frozenset[str]) -> Any:
         counters_out: wp.array[wp.int64],
         table_out: wp.array2d[wp.int32],
     ):
-        """Take the pixels [first_pixel, end_pixel) over `frame_count` frames, like `event_scan.scan`."""
+        """Take the pixels [first_pixel, end_pixel) over `frame_count` frames, like `event_scan.scan`.
+
+        The origin of the stamps is `since_reset_ns[0]` after the reset: an array that a graph can hold.
+        """
         pixel = first_pixel + wp.tid()
         write_key(OPEN, wp.int64(0), keys_out, counters_out)
         if pixel < end_pixel:
@@ -567,7 +570,7 @@ def make_scan(terms: frozenset[str]) -> Any:
                 pixel,
                 log_radiance,
                 stamps,
-                since_reset_ns,
+                since_reset_ns[0],
                 frame_count,
                 row_limit,
                 base,

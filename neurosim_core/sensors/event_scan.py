@@ -592,6 +592,26 @@ def scan(
     write_key(CLOSE, wp.int64(0), keys_out, counters_out)
 
 
+@wp.func
+def mark(key: wp.int64, stamps: wp.array[wp.int64], stamp_count: wp.int32, time_shift: wp.int32) -> wp.int64:
+    """Return a key with `late` set if it comes after a stamp within its microsecond; see `mark_late`."""
+    time_us = key >> wp.int64(time_shift)
+    low = wp.int32(0)
+    high = stamp_count
+    while low < high:
+        middle = (low + high) // 2
+        if stamps[middle] // _US < time_us:
+            low = middle + 1
+        else:
+            high = middle
+    if low < stamp_count:
+        end_ns = stamps[low]
+        sub_ns = key & wp.int64(1023)
+        if end_ns // _US == time_us and sub_ns > end_ns - time_us * _US:
+            return key | (wp.int64(1) << wp.int64(time_shift - 1))
+    return key
+
+
 @wp.kernel
 def mark_late(
     # In:
@@ -610,21 +630,13 @@ def mark_late(
         keys: Keys, in any order; overwritten.
     """
     event = wp.tid()
-    key = keys[event]
-    time_us = key >> wp.int64(time_shift)
-    low = wp.int32(0)
-    high = stamp_count
-    while low < high:
-        middle = (low + high) // 2
-        if stamps[middle] // _US < time_us:
-            low = middle + 1
-        else:
-            high = middle
-    if low < stamp_count:
-        end_ns = stamps[low]
-        sub_ns = key & wp.int64(1023)
-        if end_ns // _US == time_us and sub_ns > end_ns - time_us * _US:
-            keys[event] = key | (wp.int64(1) << wp.int64(time_shift - 1))
+    keys[event] = mark(keys[event], stamps, stamp_count, time_shift)
+
+
+@wp.func
+def move_origin(key: wp.int64, step_us: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return a key with a time origin that is later, and without `late`."""
+    return (key & ~(wp.int64(1) << wp.int64(time_shift - 1))) - (step_us << wp.int64(time_shift))
 
 
 @wp.kernel
@@ -640,8 +652,24 @@ def carry_over(
 ) -> None:
     """Copy keys, from and to a position, with a time origin that is later, and clear `late`."""
     event = wp.tid()
-    key = keys[first + event] & ~(wp.int64(1) << wp.int64(time_shift - 1))
-    keys_out[first_out + event] = key - (origin_step_us << wp.int64(time_shift))
+    keys_out[first_out + event] = move_origin(keys[first + event], origin_step_us, time_shift)
+
+
+@wp.func
+def count_until(
+    end_ns: wp.int64, keys: wp.array[wp.int64], key_count: wp.int32, time_shift: wp.int32
+) -> wp.int32:
+    """Return how many of the sorted keys are in a window that ends then, or before it; see `find_ends`."""
+    bound = ((end_ns // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
+    low = wp.int32(0)
+    high = key_count
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < bound:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @wp.kernel
@@ -664,16 +692,29 @@ def find_ends(
         end_out: Index of the first key after each window, shape [window].
     """
     window = wp.tid()
-    bound = ((stamps[window] // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
-    low = wp.int32(0)
-    high = key_count
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < bound:
-            low = middle + 1
-        else:
-            high = middle
-    end_out[window] = low
+    end_out[window] = count_until(stamps[window], keys, key_count, time_shift)
+
+
+@wp.func
+def take_apart(
+    key: wp.int64,
+    event: wp.int32,
+    time_origin_us: wp.int64,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    t_out: wp.array[wp.int64],
+    x_out: wp.array[wp.uint16],
+    y_out: wp.array[wp.uint16],
+    polarity_out: wp.array[wp.uint8],
+) -> None:
+    """Write what a key says into the columns of an event; parameters as for `decode`."""
+    one = wp.int64(1)
+    row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
+    column_mask = (one << (wp.int64(row_shift) - COLUMN_SHIFT)) - one
+    t_out[event] = time_origin_us + (key >> wp.int64(time_shift))
+    x_out[event] = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
+    y_out[event] = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
+    polarity_out[event] = wp.uint8((key >> wp.int64(10)) & one)
 
 
 @wp.kernel
@@ -702,11 +743,4 @@ def decode(
         polarity_out: 1: brighter, 0: darker.
     """
     event = wp.tid()
-    key = keys[event]
-    one = wp.int64(1)
-    row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
-    column_mask = (one << (wp.int64(row_shift) - COLUMN_SHIFT)) - one
-    t_out[event] = time_origin_us + (key >> wp.int64(time_shift))
-    x_out[event] = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
-    y_out[event] = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
-    polarity_out[event] = wp.uint8((key >> wp.int64(10)) & one)
+    take_apart(keys[event], event, time_origin_us, row_shift, time_shift, t_out, x_out, y_out, polarity_out)

@@ -12,7 +12,7 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 import itertools
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,16 +26,20 @@ from neurosim_core.packets import Events
 from neurosim_core.priority import spared_count
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_scan
+from neurosim_core.sensors.event_ahead import WINDOW_COUNT_MAX, Draft, Drafts
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_noise import PixelNoise, terms_of
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
-from neurosim_core.streams import HostCopy, Milestone, make_stream, on
+from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_stream, on
 
 __all__ = ["EventCamera", "EventCameraConfig"]
 
 _log = logging.getLogger(__name__)
 
+_CUT_AHEAD_ON_CUDA = True
+_GRAPHS_ON_CUDA = True
+"""A scan is replayed as a graph where it comes again."""
 _PIXELS_PER_THREAD_MIN = 16_384
 _ROOM_PER_PIXEL = 16
 """Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
@@ -61,18 +65,27 @@ class _Chunk:
 class _Scan:
     """The scan of one stack, and the buffers that are its own until its events have been taken over."""
 
+    number: int
+    """Its own for ever: a graph may be made of its buffers."""
     chunks: list[_Chunk]
     done: Milestone
-    stamps_on_host: wp.array[wp.int64]
+    times: HostInput
+    """Time from the reset to the origin [ns]; then `stamps`."""
+    since_reset_ns: wp.array[wp.int64]
     stamps: wp.array[wp.int64]
+    """Of the state and of each frame, from the origin [ns]."""
     row_limit: wp.array[wp.int32]
     frames: Any = None
-    """Shape [frame, pixel]."""
+    """Shape [frame, row, column]."""
     stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     origin_us: int = 0
     """Origin of its keys' time."""
     state: int = 0
     """Where in the ring the state before it is; the state after it comes next."""
+    ends_ns: tuple[int, ...] | None = None
+    """Where windows will end in it [ns]; None: nobody has said."""
+    draft: Draft | None = None
+    """These windows, cut ahead."""
 
 
 class EventCamera:
@@ -113,9 +126,12 @@ class EventCamera:
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
         terms: What is compiled in beyond ideal pixels, some of `event_noise.TERMS`; by default what the
             configuration asks for.
+        cut_ahead: Cut windows before they are asked for, if `feed_device` was told where they end; they are
+            the same. By default on a CUDA device that hands events out on the host.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise.TERMS`, and "readout".
+        ahead_count: Stacks whose windows were cut before they were asked for.
 
     Raises:
         ValueError: If width, height or seed is out of range.
@@ -133,6 +149,7 @@ class EventCamera:
         scan_count_max: int = 1,
         on_host: bool = False,
         terms: Sequence[str] | None = None,
+        cut_ahead: bool | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -172,8 +189,13 @@ class EventCamera:
         scratch = pixel_count if self._screened else 0
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._table = self._empty((1, height), wp.int32)
-        self._idle = [self._make_scan(16) for _ in range(scan_count_max)]
+        # on CUDA one more than is needed: scans and states then take turns together, in few graphs
+        self._scan_count_max = scan_count_max
+        self._scan_number = itertools.count()
+        scan_count = len(ring) if self.device.is_cuda else scan_count_max
+        self._idle = deque(self._make_scan(16) for _ in range(scan_count))
         self._under_way: deque[_Scan] = deque()
+        self._graphs = Graphs(device)
         self._reader = make_stream(device, urgent=True)
         self._taken = Milestone(device)
         self._read = Milestone(device)
@@ -192,6 +214,17 @@ class EventCamera:
                 time_shift=self._time_shift,
                 device=self.device,
             )
+        self._drafts: Drafts | None = None
+        wanted = self.device.is_cuda and _CUT_AHEAD_ON_CUDA if cut_ahead is None else cut_ahead
+        if wanted and self._on_host and self._readout is None and len(self._chunk_bounds()) == 1:
+            self._drafts = Drafts(
+                row_shift=self._row_shift,
+                time_shift=self._time_shift,
+                under_way_max=scan_count_max,
+                device=self.device,
+            )
+        self._feeder: Any = None
+        self.ahead_count = 0
         wp.load_module(event_scan, device=self.device)
 
         self._now_ns: int | None = None
@@ -268,10 +301,12 @@ class EventCamera:
         stamps = _as_stamps(stamps_ns)
         frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
         if len(stamps) > 0:
-            self.feed_device(frames, stamps)
+            self._feed(frames, stamps, None, again=False)
         return self.collect()
 
-    def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
+    def feed_device(
+        self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any, *, ends_ns: Sequence[int] | None = None
+    ) -> None:
         """Launch the scan of a stack of frames, without waiting for it.
 
         Nothing is allocated unless the stack is longer than any before. After `scan_count_max` calls
@@ -282,16 +317,55 @@ class EventCamera:
             log_radiance: Frames on the camera's device, float32, contiguous, shape [K_max, H, W].
             stamps_ns: Times of the first K frames [ns], integers on the host, shape [K], 1 <= K <= K_max;
                 strictly increasing, later than what the camera has seen. The frames after K are not read.
+            ends_ns: Where `collect_windows` will be asked to end windows when this stack is the last that it
+                waits for [ns], so that they can be cut before; a guess that proves wrong changes no packet.
 
         Raises:
             RuntimeError: If the camera was not reset, or a stack before must be collected.
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
+        self._feed(log_radiance, _as_stamps(stamps_ns), ends_ns, again=True)
+
+    def _feed(
+        self,
+        log_radiance: wp.array3d[wp.float32],
+        stamps: NDArray[np.int64],
+        ends_ns: Sequence[int] | None,
+        *,
+        again: bool,
+    ) -> None:
+        """Launch a scan; with `again`, frames are expected to come in the same memory again."""
+        self._check_feed(log_radiance, stamps)
+        self._taken.hold()
+        scan = self._idle.popleft()
+        count = len(stamps)
+        if count > scan.row_limit.shape[0]:
+            scan = self._make_scan(count)
+        scan.frames = log_radiance
+        scan.stamps_ns = stamps
+        scan.ends_ns = None if ends_ns is None else tuple(int(end) for end in ends_ns)
+        ahead = self._can_cut_ahead(scan)
+        scan.origin_us = self._drafted_ns // NS_PER_US if ahead else self._origin_us
+        scan.state = self._state
+        origin_ns = scan.origin_us * NS_PER_US
+        times = scan.times.rows
+        times[0] = 0 if self._noise is None else self._noise.since_reset_ns(origin_ns)
+        times[1] = self._fed_ns - origin_ns
+        np.subtract(stamps, origin_ns, out=times[2 : count + 2])
+        self._state = (self._state + 1) % len(self._last)
+        self._fed_ns = int(stamps[-1])
+        self._launch(scan, tabulate=False, again=again)
+        if ahead:
+            self._cut_ahead(scan)
+        self._under_way.append(scan)
+        if self.device.is_cuda:
+            self._feeder = self.device.stream
+
+    def _check_feed(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> None:
         self._require_reset()
-        if not self._idle:
+        if len(self._under_way) >= self._scan_count_max:
             raise RuntimeError(f"collect() must be called after {len(self._under_way)} feed_device()")
-        stamps = _as_stamps(stamps_ns)
         count = len(stamps)
         fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == (self.height, self.width)
         if not (fits and 1 <= count <= log_radiance.shape[0] and log_radiance.is_contiguous):
@@ -314,25 +388,6 @@ class EventCamera:
                 f"stamps_ns must be within {limit_s:g} s of the last window, got {span_us / 1e6:g} s"
             )
 
-        self._taken.hold()
-        scan = self._idle.pop()
-        if count > scan.row_limit.shape[0]:
-            scan = self._make_scan(count)
-        relative = scan.stamps_on_host.numpy()
-        relative[0] = self._fed_ns
-        relative[1 : count + 1] = stamps
-        relative[: count + 1] -= self._origin_us * NS_PER_US
-        if self.device.is_cuda:
-            wp.copy(scan.stamps, scan.stamps_on_host, count=count + 1)
-        scan.frames = log_radiance.reshape((log_radiance.shape[0], self.width * self.height))
-        scan.stamps_ns = stamps
-        scan.origin_us = self._origin_us
-        scan.state = self._state
-        self._state = (self._state + 1) % len(self._last)
-        self._fed_ns = int(stamps[-1])
-        self._under_way.append(scan)
-        self._launch(scan, tabulate=False)
-
     def collect(self) -> Events:
         """Return all events up to the last frame fed, and wait for them.
 
@@ -341,9 +396,12 @@ class EventCamera:
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
         with on(self._reader):
+            self._leave_drafts()
             while self._under_way:
                 self._take_over()
-            return self._cut([self._require_reset()])[0]
+            packets = self._cut([self._require_reset()])
+            self._taken.set()
+            return packets[0]
 
     def collect_windows(self, ends_ns: Sequence[int], *, scan_count: int | None = None) -> list[Events]:
         """Return the events fed so far as one packet per window, and wait for them.
@@ -363,29 +421,126 @@ class EventCamera:
             ValueError: If `ends_ns` is wrong; also if a value of the frames was not finite or beyond +-1000,
                 in which case the camera must be reset.
         """
+        ends = [int(end) for end in ends_ns]
+        if scan_count is None:
+            scan_count = len(self._under_way)
+        if scan_count == 1 and self._is_foreseen(self._under_way[0], ends):
+            return self._hand_out_draft()
         with on(self._reader):
-            for _ in range(len(self._under_way) if scan_count is None else scan_count):
+            self._leave_drafts()
+            for _ in range(scan_count):
                 self._take_over()
             now_ns = self._require_reset()
-            ends = [int(end) for end in ends_ns]
-            bounds = [self._window_start_ns, *ends]
-            if any(b - a < NS_PER_US for a, b in zip(bounds, ends, strict=False)) or bounds[-1] > now_ns:
+            if not _are_ends(ends, self._window_start_ns, now_ns):
                 raise ValueError(
-                    f"ends_ns must increase by at least 1000 from {bounds[0]} and not pass {now_ns},"
-                    f" got {ends}"
+                    f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
+                    f" and not pass {now_ns}, got {ends}"
                 )
-            return self._cut(ends)
+            packets = self._cut(ends)
+            self._taken.set()
+            self._take_up_drafts()
+            return packets
+
+    def _can_cut_ahead(self, scan: _Scan) -> bool:
+        """Return whether the windows of the next scan can be cut: those of all under way before it were."""
+        ends = scan.ends_ns
+        return (
+            self._drafts is not None
+            and self._drafts.ready
+            and ends is not None
+            and len(ends) <= WINDOW_COUNT_MAX
+            and all(before.draft is not None for before in self._under_way)
+            and _are_ends(ends, self._drafted_ns, int(scan.stamps_ns[-1]))
+        )
+
+    def _cut_ahead(self, scan: _Scan) -> None:
+        """Cut the windows of a scan that was launched on this stream after the one cut before."""
+        assert self._drafts is not None
+        assert scan.ends_ns is not None
+        if self._draft is None:
+            self._drafts.seed(self._keys, self._key_count, self._origin_us)
+        (chunk,) = scan.chunks
+        scan.draft = self._draft = self._drafts.launch(
+            chunk.keys,
+            chunk.counters,
+            ends_ns=scan.ends_ns,
+            origin_us=scan.origin_us,
+            now_ns=int(scan.stamps_ns[-1]),
+        )
+        if scan.ends_ns:
+            self._drafted_ns = scan.ends_ns[-1]
+
+    def _is_foreseen(self, scan: _Scan, ends: list[int]) -> bool:
+        """Wait for the draft of a scan; return whether it holds what is wanted now."""
+        draft = scan.draft
+        if draft is None or draft.ends_ns != tuple(ends):
+            return False
+        draft.done.wait()
+        (chunk,) = scan.chunks
+        found, invalid, _ = chunk.counters_on_host.view(0, 3).tolist()
+        room = min(chunk.keys.shape[0], self.config.event_count_max)
+        return invalid == 0 and found <= room and draft.total() <= draft.room
+
+    def _hand_out_draft(self) -> list[Events]:
+        """Return the windows of the oldest scan, which were cut ahead."""
+        scan = self._under_way.popleft()
+        draft, scan.draft = scan.draft, None
+        assert self._drafts is not None
+        assert draft is not None
+        self.ahead_count += 1
+        self._drafts.note(draft.total())
+        cuts = draft.cuts()
+        columns = self._drafts.take(draft)
+        self._carried = draft
+        self._finish(scan)
+        packets = self._packets(list(draft.ends_ns), columns, cuts)
+        self._origin_us = self._window_start_ns // NS_PER_US
+        return packets
+
+    def _leave_drafts(self) -> None:
+        """Let the keys be those that the host has counted, and forget what was cut ahead."""
+        if self._drafts is None or self._draft is None:
+            return
+        for scan in self._under_way:
+            if scan.draft is not None:
+                self._drafts.drop(scan.draft)
+                scan.draft = None
+        carried, self._carried, self._draft = self._carried, None, None
+        if carried is not None:
+            self._drafts.grown.hold()
+            first, self._key_count = carried.carried()
+            self._reserve_keys(kept=0)
+            if self._key_count > 0:
+                step_us = self._origin_us - carried.origin_us
+                self._copy_keys(carried.keys, first, self._key_count, self._keys, 0, step_us)
+
+    def _take_up_drafts(self) -> None:
+        """Cut the windows of the scans under way ahead again, from the keys that there are now."""
+        self._drafted_ns = self._window_start_ns
+        scans = list(self._under_way)
+        self._under_way.clear()
+        with on(self._feeder if scans else None):
+            for scan in scans:
+                if self._can_cut_ahead(scan) and scan.origin_us <= self._drafted_ns // NS_PER_US:
+                    self._cut_ahead(scan)
+                self._under_way.append(scan)
 
     def _forget(self) -> None:
         self._idle += self._under_way
         self._under_way.clear()
+        for scan in self._idle:
+            if self._drafts is not None and scan.draft is not None:
+                self._drafts.drop(scan.draft)
+                scan.draft = None
+        self._draft: Draft | None = None
+        self._carried: Draft | None = None
         self._state = 0
         self._key_count = 0
         self._read_count = 0
         self._dropped: list[tuple[int, int]] = []
         self._drop_reported = False
         self._sequence = 0
-        self._window_start_ns = self._now_ns or 0
+        self._window_start_ns = self._drafted_ns = self._now_ns or 0
         self._origin_us = self._window_start_ns // NS_PER_US
 
     def _require_reset(self) -> int:
@@ -415,12 +570,14 @@ class EventCamera:
             else:
                 keys = self._empty(2 * (end - first), wp.int64)
             chunks.append(_Chunk(first, end, keys, counters, HostCopy(counters)))
-        stamps = self._empty(frame_count + 1, wp.int64)
+        times = HostInput(wp.zeros(frame_count + 2, dtype=wp.int64, device=self.device))
         return _Scan(
+            number=next(self._scan_number),
             chunks=chunks,
             done=Milestone(self.device),
-            stamps_on_host=_pinned(stamps),
-            stamps=stamps,
+            times=times,
+            since_reset_ns=times.array[:1],
+            stamps=times.array[1:],
             row_limit=wp.full(frame_count, self.height, dtype=wp.int32, device=self.device),
         )
 
@@ -448,14 +605,19 @@ class EventCamera:
         flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
         return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
 
-    def _launch(self, scan: _Scan, *, tabulate: bool) -> None:
-        """Scan a stack from the state before it; done again, it gives the same state after it."""
+    def _launch(self, scan: _Scan, *, tabulate: bool, again: bool = False) -> None:
+        """Scan a stack from the state before it; done again, it gives the same state after it.
+
+        With `again`, the same launches are expected to come again: a graph of them is kept.
+        """
         before, after = scan.state, (scan.state + 1) % len(self._last)
+        stack = scan.frames.reshape((scan.frames.shape[0], self.width * self.height))
 
         def launch(chunk: _Chunk) -> None:
+            scan.times.upload()
             chunk.counters.zero_()
             thresholds = [self.config.threshold_on, self.config.threshold_off]
-            extent = [chunk.first_pixel, chunk.end_pixel, scan.frames]
+            extent = [chunk.first_pixel, chunk.end_pixel, stack]
             frame_count = len(scan.stamps_ns)
             if self._screened:
                 wp.launch(
@@ -467,10 +629,10 @@ class EventCamera:
                 )
             block = BLOCK_SIZE if self.device.is_cuda else 1
             blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
-            noise, origin_ns = self._noise, scan.origin_us * NS_PER_US
+            noise = self._noise
             own = [*thresholds] if noise is None else noise.inputs()
             frames = [self._lead] if noise is None else []
-            since = [] if noise is None else [noise.since_reset_ns(origin_ns)]
+            since = [] if noise is None else [scan.since_reset_ns]
             memory = [[] if noise is None else [noise.memory(slot)] for slot in (before, after)]
             wp.launch(
                 event_scan.scan if noise is None else noise.scan,
@@ -505,15 +667,28 @@ class EventCamera:
             )
             chunk.counters_on_host.fetch(0, 3)
 
-        if len(scan.chunks) > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(len(scan.chunks) - 1, thread_name_prefix="event-scan")
+        if self.device.is_cuda:
+            (chunk,) = scan.chunks
+            reset_ns = 0 if self._noise is None else self._noise.since_reset_ns(0)
+            key = (scan.number, before, scan.frames.ptr, len(scan.stamps_ns), chunk.keys.ptr, reset_ns)
+            if again and _GRAPHS_ON_CUDA:
+                self._graphs.run(key, lambda: launch(chunk))
+            else:
+                launch(chunk)
+        else:
+            self._share(launch, scan.chunks)
+        scan.done.set()
+
+    def _share(self, launch: Callable[[_Chunk], None], chunks: list[_Chunk]) -> None:
+        """Launch for all chunks, on the cores of a CPU."""
+        if len(chunks) > 1 and self._pool is None:
+            self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
         own = 1 + spared_count()  # chunks that this thread does one after the other
-        futures = [self._pool.submit(launch, chunk) for chunk in scan.chunks[own:]] if self._pool else []
-        for chunk in scan.chunks[:own]:
+        futures = [self._pool.submit(launch, chunk) for chunk in chunks[own:]] if self._pool else []
+        for chunk in chunks[:own]:
             launch(chunk)
         for future in futures:
             future.result()
-        scan.done.set()
 
     def _take_over(self) -> None:
         """Wait for the oldest scan, redo it if its buffer was too small, and append its keys."""
@@ -540,10 +715,15 @@ class EventCamera:
             elif count > 0:
                 self._copy_keys(chunk.keys, 0, count, self._keys, start, step_us)
             start += count
-        self._taken.set()
+        if self._drafts is not None:
+            self._drafts.note(self._key_count)
+        self._finish(self._under_way.popleft())
+
+    def _finish(self, scan: _Scan) -> None:
+        """Note that the oldest scan is read."""
         self._now_ns = int(scan.stamps_ns[-1])
         scan.frames = None
-        self._idle.append(self._under_way.popleft())
+        self._idle.append(scan)
 
     def _read_counts(self, scan: _Scan) -> list[int]:
         """Wait for a scan and return the number of events of each chunk."""
@@ -648,6 +828,12 @@ class EventCamera:
         if self._readout is not None:
             self._read_out(self._readout)
         columns, cuts = self._decode(ends) if self._key_count > 0 else ([], [0] * len(ends))
+        packets = self._packets(ends, columns, cuts)
+        self._carry_over(cuts[-1])
+        return packets
+
+    def _packets(self, ends: list[int], columns: list[Any], cuts: list[int]) -> list[Events]:
+        """Return the packets of windows, each of which ends at a place in the columns."""
         packets = []
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
             dropped = sum(lost for stamp_ns, lost in self._dropped if stamp_ns <= end_ns)
@@ -674,7 +860,6 @@ class EventCamera:
             )
             self._sequence += 1
             self._window_start_ns = end_ns
-        self._carry_over(cuts[-1])
         return packets
 
     def _read_out(self, readout: Readout) -> None:
@@ -778,6 +963,12 @@ def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
             f"stamps_ns must be strictly increasing, got {stamps[index + 1]} after {stamps[index]}"
         )
     return stamps
+
+
+def _are_ends(ends_ns: Sequence[int], start_ns: int, now_ns: int) -> bool:
+    """Return whether windows that begin at a stamp can end so."""
+    bounds = [start_ns, *ends_ns]
+    return all(b - a >= NS_PER_US for a, b in itertools.pairwise(bounds)) and bounds[-1] <= now_ns
 
 
 def _invalid_message(count: int, first: str) -> str:

@@ -1,0 +1,242 @@
+"""Windows cut before they are asked for are those that are cut when they are, whatever was guessed wrong."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from neurosim_core.packets import Events
+from neurosim_core.sensors import event_ahead
+from neurosim_core.sensors.event_config import ShotNoiseConfig
+from neurosim_core.sensors.events import EventCamera, EventCameraConfig
+
+WIDTH, HEIGHT = 9, 7
+FRAME_NS = 1_700
+WINDOW_NS = 5_005
+
+# neither the device nor the size of the smallest guess changes between examples
+relaxed = settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+@pytest.fixture
+def tight_guesses(monkeypatch):
+    """Let guesses be as tight for a few events as they are for many: some prove too small."""
+    monkeypatch.setattr(event_ahead, "_ROOM_MIN", 8)
+
+
+def make_camera(device: str, *, cut_ahead: bool, lanes: int = 1, **config: Any) -> EventCamera:
+    return EventCamera(
+        EventCameraConfig(**config),
+        width=WIDTH,
+        height=HEIGHT,
+        device=device,
+        scan_count_max=lanes,
+        on_host=True,
+        cut_ahead=cut_ahead,
+    )
+
+
+def draw_stacks(
+    rng: np.random.Generator, lengths: list[int], loudness: list[float]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return a first frame, and stacks that go on from there, by steps of given sizes."""
+    shape = (HEIGHT, WIDTH)
+    frame = rng.normal(scale=0.3, size=shape).astype(np.float32)
+    first, stacks = frame, []
+    for length, scale in zip(lengths, loudness, strict=True):
+        steps = rng.normal(scale=scale, size=(length, *shape)).astype(np.float32)
+        stacks.append(frame + steps.cumsum(axis=0, dtype=np.float32))
+        frame = stacks[-1][-1]
+    return first, stacks
+
+
+def ends_until(start_ns: int, end_ns: int) -> list[int]:
+    """Return the ends of windows in (start_ns, end_ns], none shorter than a camera takes."""
+    return [n * WINDOW_NS for n in range((start_ns + 999) // WINDOW_NS + 1, end_ns // WINDOW_NS + 1)]
+
+
+def fly(
+    camera: EventCamera,
+    stacks: list[np.ndarray],
+    *,
+    lanes: int,
+    guesses: list[str],
+    reads: list[str],
+) -> list[Events]:
+    """Feed stacks ahead of what is read; say for each where windows end, as guessed, and read it somehow."""
+    device, packets = camera.device, []
+    fed_ns, read_ns = camera.stamp_ns, camera.stamp_ns
+    under_way: deque[int] = deque()
+
+    def read() -> None:
+        nonlocal read_ns
+        number, how = len(stacks) - len(waiting) - len(under_way), reads
+        end_ns = under_way.popleft()
+        if how[number] == "all":
+            while under_way:
+                end_ns = under_way.popleft()
+            packets.extend(camera.collect_windows(ends_until(read_ns, end_ns)))
+        elif how[number] == "collect":
+            while under_way:
+                end_ns = under_way.popleft()
+            packets.append(camera.collect())
+        elif how[number] == "early":  # as where a collision ends a run
+            packets.extend(camera.collect_windows(ends_until(read_ns, end_ns)[:-1], scan_count=1))
+            read_ns = camera.window_start_ns
+            return
+        else:
+            packets.extend(camera.collect_windows(ends_until(read_ns, end_ns), scan_count=1))
+        read_ns = end_ns
+
+    waiting = deque(zip(stacks, guesses, strict=True))
+    kept = []
+    while waiting:
+        stack, guess = waiting.popleft()
+        stamps = fed_ns + FRAME_NS * np.arange(1, len(stack) + 1)
+        ends: list[int] | None = ends_until(fed_ns, int(stamps[-1]))
+        fed_ns = int(stamps[-1])
+        if guess == "none":
+            ends = None
+        elif guess == "more":
+            ends = sorted({*ends_until(int(stamps[0]) - FRAME_NS, fed_ns), int(stamps[0]), fed_ns})
+        elif guess == "fewer":
+            ends = []
+        kept.append(wp.array(stack, device=device))
+        camera.feed_device(kept[-1], stamps, ends_ns=ends)
+        under_way.append(fed_ns)
+        if len(under_way) == lanes:
+            read()
+    while under_way:
+        read()
+    return [*packets, camera.collect()]
+
+
+def assert_same(ahead: list[Events], plain: list[Events]) -> None:
+    assert len(ahead) == len(plain)
+    for a, b in zip(ahead, plain, strict=True):
+        assert (a.start_ns, a.stamp_ns, a.sequence, a.dropped_count) == (
+            b.start_ns, b.stamp_ns, b.sequence, b.dropped_count,
+        )  # fmt: skip
+        for first, second in zip(a.numpy(), b.numpy(), strict=True):
+            assert first.dtype == second.dtype
+            np.testing.assert_array_equal(first, second)
+
+
+def fly_both(
+    device: str, first: np.ndarray, stacks: list[np.ndarray], *, lanes: int, config: Any, **how: Any
+) -> EventCamera:
+    """Compare the packets of a camera that cuts ahead with those of one that does not; return the first."""
+    cameras = [make_camera(device, cut_ahead=ahead, lanes=lanes, **config) for ahead in (True, False)]
+    flown = []
+    for camera in cameras:
+        camera.reset(first)
+        flown.append(fly(camera, stacks, lanes=lanes, **how))
+    assert_same(*flown)
+    assert cameras[1].ahead_count == 0
+    return cameras[0]
+
+
+@relaxed
+@given(data=st.data(), lanes=st.integers(1, 3), seed=st.integers(0, 2**32 - 1))
+def test_packets_are_the_same_whatever_was_guessed(data, lanes, seed, device, tight_guesses):
+    """Wrong ends, none, bursts of events, too many of them, reads in any order: nothing of it shows."""
+    count = data.draw(st.integers(2, 12))
+
+    def lists(values: Any) -> Any:
+        return data.draw(st.lists(values, min_size=count, max_size=count))
+
+    lengths = lists(st.integers(1, 6))
+    loudness = lists(st.sampled_from([0.0, 0.1, 0.3, 0.3, 2.0]))
+    guesses = lists(st.sampled_from(["right", "right", "right", "none", "more", "fewer"]))
+    reads = lists(st.sampled_from(["one", "one", "one", "all", "collect", "early"]))
+    config = data.draw(
+        st.sampled_from([{}, {"event_count_max": 60}, {"shot_noise": ShotNoiseConfig(rate_hz=2e4)}])
+    )
+    first, stacks = draw_stacks(np.random.default_rng(seed), lengths, loudness)
+    fly_both(device, first, stacks, lanes=lanes, config=config, guesses=guesses, reads=reads)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 3])
+def test_a_steady_run_is_cut_ahead_from_the_second_stack_on(device, lanes):
+    count = 24
+    first, stacks = draw_stacks(np.random.default_rng(3), [4] * count, [0.3] * count)
+    camera = fly_both(
+        device,
+        first,
+        stacks,
+        lanes=lanes,
+        config={},
+        guesses=["right"] * count,
+        reads=["one"] * count,
+    )
+    assert camera.ahead_count == count - 1
+
+
+@pytest.mark.parametrize(
+    "case",
+    ["ends", "burst", "limit"],
+)
+def test_what_was_guessed_wrong_is_done_again_and_the_rest_is_kept(device, case):
+    """One stack in the middle is foreseen wrongly: only that one, and no more."""
+    count, wrong = 12, 6
+    loudness, guesses = [0.3] * count, ["right"] * count
+    config: dict[str, Any] = {}
+    if case == "ends":
+        guesses[wrong] = "fewer"
+    elif case == "burst":
+        loudness[wrong] = 3.0
+    else:
+        loudness[wrong] = 3.0
+        config["event_count_max"] = 400
+    first, stacks = draw_stacks(np.random.default_rng(5), [4] * count, loudness)
+    camera = fly_both(device, first, stacks, lanes=3, config=config, guesses=guesses, reads=["one"] * count)
+    assert camera.ahead_count == count - 2
+
+
+def test_values_that_are_no_log_radiance_are_named(device):
+    camera = make_camera(device, cut_ahead=True)
+    frames = np.zeros((2, HEIGHT, WIDTH), np.float32)
+    camera.reset(frames[0])
+    for turn in range(2):
+        start_ns = camera.stamp_ns
+        camera.feed_device(
+            wp.array(frames, device=device), [start_ns + 1000, start_ns + 2000], ends_ns=[start_ns + 2000]
+        )
+        if turn == 0:
+            camera.collect_windows([start_ns + 2000], scan_count=1)
+            frames[1, 2, 3] = np.nan
+    with pytest.raises(ValueError, match=r"1 values are not, the first at \[1, 2, 3\]"):
+        camera.collect_windows([4000], scan_count=1)
+    camera.reset(np.zeros((HEIGHT, WIDTH), np.float32), 5000, sequence=7)
+    frames[1] = 1.0
+    camera.feed_device(wp.array(frames, device=device), [6000, 7000], ends_ns=[7000])
+    (packet,) = camera.collect_windows([7000], scan_count=1)
+    assert (packet.sequence, packet.start_ns) == (7, 5000)
+    assert len(packet.t) > 0
+
+
+def test_events_stay_as_they_are_while_the_camera_goes_on(device):
+    """What was handed out is not overwritten, however many packets are kept."""
+    count = 40
+    first, stacks = draw_stacks(np.random.default_rng(8), [3] * count, [0.3] * count)
+    camera = make_camera(device, cut_ahead=True)
+    camera.reset(first)
+    kept, copies = [], []
+    for stack in stacks:
+        stamps = camera.stamp_ns + FRAME_NS * np.arange(1, 4)
+        camera.feed_device(wp.array(stack, device=device), stamps, ends_ns=[stamps[-1]])
+        (packet,) = camera.collect_windows([int(stamps[-1])], scan_count=1)
+        kept.append(packet.numpy())
+        copies.append([np.array(column) for column in packet.numpy()])
+    assert camera.ahead_count == count - 1
+    for columns, copied in zip(kept, copies, strict=True):
+        for a, b in zip(columns, copied, strict=True):
+            np.testing.assert_array_equal(a, b)
