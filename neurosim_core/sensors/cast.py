@@ -355,8 +355,19 @@ def scan_events(cast: CastState, instants: Instants) -> None:
             channel.camera.reset(log_radiance[0], instants.stamps_ns[0], sequence=channel.sequence)
             channel.watching = True
             first = 1
-        if len(instants.stamps_ns) > first:
-            channel.camera.feed_device(log_radiance[first:], instants.stamps_ns[first:])
+        stamps_ns = instants.stamps_ns[first:]
+        if stamps_ns:
+            channel.camera.feed_device(
+                log_radiance[first:] if first else log_radiance,
+                stamps_ns,
+                ends_ns=_window_ends(channel, stamps_ns),
+            )
+
+
+def _window_ends(channel: EventChannel, stamps_ns: Sequence[int]) -> list[int]:
+    """Return the instants at which packets end."""
+    ticks = channel.packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
+    return [tick for tick in ticks if tick in stamps_ns]
 
 
 def read_events(cast: CastState, instants: Instants, *, until_ns: int) -> list[Events]:
@@ -365,8 +376,7 @@ def read_events(cast: CastState, instants: Instants, *, until_ns: int) -> list[E
     for name in instants.events:
         channel = cast.events[name]
         begun_ns = channel.camera.window_start_ns
-        stamps = (stamp for stamp in instants.stamps_ns if begun_ns < stamp <= until_ns)
-        ends = [stamp for stamp in stamps if channel.packets.has_tick(stamp)]
+        ends = [end for end in _window_ends(channel, instants.stamps_ns) if begun_ns < end <= until_ns]
         fed = instants.stamps_ns[-1] > channel.camera.stamp_ns
         channel.seen_ns = max((s for s in instants.stamps_ns if s <= until_ns), default=channel.seen_ns)
         packets += channel.camera.collect_windows(ends, scan_count=int(fed))
