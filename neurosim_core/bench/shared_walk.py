@@ -27,7 +27,7 @@ from neurosim_core.packets import EventArrays
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig, WalkConfig
 from neurosim_core.render.embree import EmbreeError
-from neurosim_core.render.tile_walk import ASK, WalkData, find_face
+from neurosim_core.render.tile_walk import ASK, WalkData, together_finder
 from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.sensors.rig import EventSensorConfig
@@ -85,6 +85,9 @@ class WalkResult:
     costs: tuple[WalkCost, ...]
 
 
+_find_face = together_finder(1)
+
+
 @wp.kernel(enable_backward=False)
 def _count_asked(
     # Model:
@@ -109,9 +112,8 @@ def _count_asked(
     row = (tile // tile_columns) * 8 + in_tile // 8
     outside = col >= width or row >= height
     ray_C = rays[0, wp.min(row, height - 1) * width + wp.min(col, width - 1)]
-    q = q_WC[instant]
     walk = instant // data.instants
-    face = find_face(
+    found = _find_face(
         mesh,
         data.faces,
         (walk * data.bounds.shape[0] + tile) * data.limit,
@@ -119,13 +121,13 @@ def _count_asked(
         data.reach[walk, tile],
         float(_FAR_M),
         data.bounds[tile],
-        wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
-        wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
-        wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
-        p_WC[instant],
-        wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2])),
+        p_WC,
+        q_WC,
+        instant,
+        1,
+        wp.vec3(ray_C[0], ray_C[1], ray_C[2]),
     )
-    if face == wp.static(ASK) and not outside:
+    if found[0] == wp.static(ASK) and not outside:
         wp.atomic_add(asked_out, instant, 1)
 
 
@@ -233,7 +235,7 @@ def _eyes(flown: Flown, lens: PinholeConfig, instants: tuple[int, ...], quick: b
     """Return renderers: alone, by Embree if it is there, and of so many instants to a walk."""
     light = LightingConfig(mode="unshadowed" if quick else "baked", ambient_ray_count=4, shadow_ray_count=1)
     plain = RenderConfig(lighting=light, exposure=1.0)
-    configs: dict[str | int, dict[str, Any]] = {"alone": {"cpu_traversal": "warp"}}
+    configs: dict[str | int, dict[str, Any]] = {"alone": {"cpu_traversal": "warp", "shared_walk": None}}
     if wp.get_device(flown.model.device).is_cpu:
         configs["embree"] = {"cpu_traversal": "embree"}
     configs |= {count: {"shared_walk": WalkConfig(instants=count)} for count in instants}

@@ -48,10 +48,12 @@ class RenderConfig(Settings):
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
     """Who finds what rays hit on a CPU device. `embree`: Embree, in packets of rays, several times faster.
-    `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp with a `shared_walk`."""
-    shared_walk: WalkConfig | None = None
+    `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp where a `shared_walk` is asked
+    for."""
+    shared_walk: WalkConfig | Literal["auto"] | None = "auto"
     """The rays of a tile of pixels share one walk through Warp's tree over several instants, instead of one
-    for each ray: the same pictures and events to the last bit, sooner. null: each ray walks by itself."""
+    for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 4
+    instants or more and the lens looks forward. null: each ray walks by itself."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
@@ -72,7 +74,7 @@ class RenderConfig(Settings):
 
     @model_validator(mode="after")
     def _walks_are_in_the_tree_of_warp(self) -> RenderConfig:
-        if self.shared_walk is not None and self.cpu_traversal == "embree":
+        if isinstance(self.shared_walk, WalkConfig) and self.cpu_traversal == "embree":
             raise ValueError("shared_walk is for Warp's tree: cpu_traversal must be auto or warp, got embree")
         return self
 

@@ -19,11 +19,21 @@ from typing import NamedTuple
 import warp as wp
 
 from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
 from neurosim_core.render.packet_shading import packet_eye, packet_shader
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.tile_walk import ASK, TILE, WalkData, find_face, find_faces, leave, meet_face
+from neurosim_core.render.tile_walk import (
+    ASK,
+    TILE,
+    WalkData,
+    find_faces,
+    group_size,
+    leave,
+    meet_face,
+    together_finder,
+)
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
@@ -59,13 +69,13 @@ class Terms(NamedTuple):
     """Worlds are in different scenes."""
     world_lenses: bool = False
     """Worlds look through different lenses."""
-    walked: bool = False
-    """Rays of a tile share a walk through the tree (`tile_walk`), a block of 64 threads at a time. Pixels of
-    which the lists do not tell are left to the kernel of the same terms with `asking`."""
+    walked: int = 0
+    """Rays of a tile share a walk through the tree (`tile_walk`): a block of 64 threads looks at so many
+    instants together. Pixels of which the lists do not tell are left to the kernel with `asking`."""
     asking: bool = False
     """Of the pixels that `walked` left, and no others: each ray walks by itself."""
     by_tile: bool = False
-    """With `walked`: on a CPU, a thread for each tile, which leaves nothing."""
+    """`walked` means a thread for each tile, which leaves nothing: on a CPU."""
 
 
 @wp.struct
@@ -128,8 +138,9 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     worlds = terms.worlds
     world_scenes = terms.world_scenes
     world_lenses = terms.world_lenses
-    walked = terms.walked
+    walked = terms.walked > 0
     leaving = walked and not terms.by_tile
+    group = group_of(terms)
     asking = terms.asking
 
     @wp.func
@@ -407,13 +418,8 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
             first_ray = world_data.lens[world] * width * height
         col = (tile % tile_columns) * 8 + in_tile % 8
         row = (tile // tile_columns) * 8 + in_tile // 8
-        outside = col >= width or row >= height
-        if wp.static(not leaving):
-            if outside:
-                return
-        else:  # what the block does together, all threads do
-            col = wp.min(col, width - 1)
-            row = wp.min(row, height - 1)
+        if col >= width or row >= height:
+            return
         slot = int(-1)
         if wp.static(with_images):
             slot = image_slot[instant]
@@ -424,7 +430,6 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         q = q_WC[instant]
         pixel = first_ray + row * width + col
         radiance = wp.vec3(0.0)
-        left = bool(False)
         for layer in range(rays.shape[0]):
             if wp.static(supersampled):
                 # Layer 0 goes through the centre and is for geometry, the others are for radiance.
@@ -432,30 +437,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     continue
             ray_C = rays[layer, pixel]
             ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-            if wp.static(leaving):
-                walk = instant // walk_data.instants
-                face = find_face(
-                    scene.mesh,
-                    walk_data.faces,
-                    (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
-                    walk_data.count[walk, tile],
-                    walk_data.reach[walk, tile],
-                    _FAR_M,
-                    walk_data.bounds[tile],
-                    wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
-                    wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
-                    wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
-                    origin,
-                    ray,
-                )
-                if outside or left:
-                    continue
-                hit = meet_listed(scene, origin, ray, face)
-                if hit.face == ASK:
-                    left = True
-                    continue
-            else:
-                hit = meet_scene(scene, origin, ray)
+            hit = meet_scene(scene, origin, ray)
             body = int(-1)
             if wp.static(with_bodies):
                 hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
@@ -467,12 +449,132 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     write_geometry(
                         scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
                     )
-        if wp.static(leaving):
-            leave(left, index, walk_data.left, walk_data.left_count)
-            if outside or left:
-                return
         if wp.static(with_radiance):
             write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
+
+    find_together = together_finder(group) if leaving else None
+
+    @wp.func
+    def see_together(
+        index: int,
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        bodies: BodyData,
+        world_data: WorldData,
+        walk_data: WalkData,
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ):
+        # A pixel of a group of instants, of which `index` tells; what blocks do together, all threads do.
+        in_tile = index % 64
+        block = index // 64
+        group_count = (instant_count + group - 1) // group
+        first = (block % group_count) * group
+        tile = block // group_count
+        instants = wp.min(instant_count - first, group)
+        tile_columns = (width + 7) // 8
+        world = int(0)
+        block = tile * instant_count + first  # of the first instant, as `see` counts
+        if wp.static(worlds):
+            tile_count = tile_columns * ((height + 7) // 8)
+            world = tile // tile_count
+            tile -= world * tile_count
+            first += world * world_data.stride
+            if world_data.active[world] == 0:
+                return
+        col = (tile % tile_columns) * 8 + in_tile % 8
+        row = (tile // tile_columns) * 8 + in_tile // 8
+        outside = col >= width or row >= height
+        pixel = wp.min(row, height - 1) * width + wp.min(col, width - 1)
+        walk = first // walk_data.instants
+        layer_count = rays.shape[0]
+        radiance = wp.vec3(0.0)
+        left = bool(False)
+        for layer in range(layer_count):
+            ray_C = rays[layer, pixel]
+            faces = find_together(
+                scene.mesh,
+                walk_data.faces,
+                (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
+                walk_data.count[walk, tile],
+                walk_data.reach[walk, tile],
+                _FAR_M,
+                walk_data.bounds[tile],
+                p_WC,
+                q_WC,
+                first,
+                instants,
+                wp.vec3(ray_C[0], ray_C[1], ray_C[2]),
+            )
+            for member in range(instants):
+                instant = first + member
+                slot = int(-1)
+                if wp.static(with_images):
+                    slot = image_slot[instant]
+                seen = not outside and not left
+                if wp.static(with_images and not with_log):
+                    seen = seen and slot >= 0
+                if wp.static(supersampled):
+                    seen = seen and (layer > 0 or (slot >= 0 and wp.static(with_geometry)))
+                if seen:
+                    origin = p_WC[instant]
+                    q = q_WC[instant]
+                    ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+                    hit = meet_listed(scene, origin, ray, faces[member])
+                    left = hit.face == ASK
+                    if not left:
+                        body = int(-1)
+                        if wp.static(with_bodies):
+                            hit, body = meet_bodies(
+                                bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
+                            )
+                        if wp.static(with_radiance):
+                            if wp.static(not supersampled) or layer > 0:
+                                radiance += radiance_of(
+                                    scene, bodies, instant, body, q, ray, origin, ray_C[3], hit
+                                )
+                        if wp.static(with_geometry):
+                            if slot >= 0 and layer == 0:
+                                write_geometry(
+                                    scene,
+                                    ray,
+                                    ray_C[2],
+                                    hit,
+                                    slot,
+                                    row,
+                                    col,
+                                    depth_out,
+                                    normal_out,
+                                    instance_out,
+                                )
+                if layer == layer_count - 1:
+                    leave(left, (block + member) * 64 + in_tile, walk_data.left, walk_data.left_count)
+                    if wp.static(with_radiance):
+                        if seen and not left:
+                            write_radiance(
+                                scene,
+                                radiance,
+                                layer_count,
+                                instant,
+                                slot,
+                                row,
+                                col,
+                                log_radiance_out,
+                                rgb_out,
+                            )
+                    radiance = wp.vec3(0.0)
+                    left = bool(False)
+
+    look = see_together if leaving else see
 
     @wp.kernel(module="unique", enable_backward=False)
     def raycast(
@@ -500,14 +602,20 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         begin = first + wp.tid()
         end = begin + 1
         step = int(1)
+        listed = bool(False)
         if wp.static(asking):
             end = walk_data.left_count[0]
             step = walk_data.left_threads
+            listed = end <= walk_data.left.shape[0]
+            if not listed:  # all pixels
+                end = instant_count * walk_data.bounds.shape[0] * 64
+                if wp.static(worlds):
+                    end *= world_data.active.shape[0]
         for place in range(begin, end, step):
             index = place
-            if wp.static(asking):
+            if listed:
                 index = walk_data.left[place]
-            see(
+            look(
                 index,
                 scene,
                 rays,
@@ -644,9 +752,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     walk_data.reach[walk, tile],
                     _FAR_M,
                     walk_data.bounds[tile],
-                    wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0)),
-                    wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0)),
-                    wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0)),
+                    q,
                     origin,
                     ray,
                     face,
@@ -756,10 +862,27 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     """
     if terms.walked and (terms.world_scenes or terms.world_lenses):
         raise ValueError("rays share walks where worlds have one scene and one lens")
+    if not terms.walked:
+        terms = terms._replace(by_tile=False)
     unknown = sorted(set(outputs) - set(OUTPUTS))
     if unknown or not outputs:
         raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")
     return _kernel(tuple(name for name in OUTPUTS if name in outputs), terms)
+
+
+def with_walks(terms: Terms, walk: WalkConfig | None, *, group: int | None = None) -> Terms:
+    """Return terms for rays that share walks, or do not; a group of instants divides those of a walk."""
+    if walk is None:
+        return terms._replace(walked=0, by_tile=False)
+    return terms._replace(walked=group or group_size(walk.instants))
+
+
+def group_of(terms: Terms) -> int:
+    """Return how many instants a thread of `raycast_kernel` looks at; 1 where threads are tiles or packets.
+
+    Samples of a pixel are added up one instant at a time.
+    """
+    return terms.walked if terms.walked and not (terms.by_tile or terms.supersampled) else 1
 
 
 def asking_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel | None:
@@ -769,4 +892,4 @@ def asking_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel | None:
     """
     if not terms.walked or terms.by_tile:
         return None
-    return raycast_kernel(outputs, terms._replace(walked=False, asking=True))
+    return raycast_kernel(outputs, terms._replace(walked=0, asking=True))

@@ -43,6 +43,7 @@ Hurley (2005), Multi-Level Ray Tracing Algorithm.
 
 import math
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -72,6 +73,11 @@ _REACH_M = wp.constant(0.01)
 """How much further than the furthest of the rays that are cast a list reaches: a share, and a length [m]."""
 _COSINE_MIN = wp.constant(0.2)
 """Between the axis of a frustum and its rays; turned by more within M instants, a tile has no list."""
+_AUTO_INSTANTS_MIN = 4
+"""With fewer a walk takes as long as it saves."""
+_LEFT_SHARE = 8
+"""There is room for one in so many pixels to be left; if there are more, the launch is done again by rays
+that walk by themselves."""
 _THREADS_PER_MULTIPROCESSOR = 640
 """Of those that render what is left: as many as run at a time."""
 _CONSTANTS = """
@@ -97,9 +103,9 @@ class WalkData:
     bounds: wp.array[wp.vec4]
     """Least and largest x / z, least and largest y / z of the rays of a tile in C, shape [tile]."""
     left: wp.array[int]
-    """Threads whose pixels are left for rays that walk by themselves, in any order; empty on a CPU."""
+    """Pixels that are left for rays that walk by themselves, in any order; empty on a CPU."""
     left_count: wp.array[int]
-    """How many there are, shape [1]."""
+    """How many there are, also where there is no room for them, shape [1]."""
     left_threads: int
     """How many threads share them."""
 
@@ -265,26 +271,24 @@ _FACE_TEST = (
         vec3 n; float unused_too;
     };
     const Mesh mesh = mesh_get(id);
-#ifdef __CUDA_ARCH__
-    __shared__ vec3 border[4], corner[4];  // of the tile: planes through its sides, rays through its corners
-    const int lane = threadIdx.x, lanes = 64;
-    __syncthreads();
-#else
-    vec3 border[4], corner[4];
-    const int lane = 0, lanes = 1;
-#endif
-    for (int side = lane; side < 4; side += lanes) {
+    // The sides of a tile at an instant, which are planes, and its corners, which are rays.
+    struct Tile {
+        vec3 border[4], corner[4];
+    };
+    auto bound = [&](int side, const quat& q, Tile& to) {
+        const vec3 x = quat_rotate(q, vec3(1.0f, 0.0f, 0.0f)), y = quat_rotate(q, vec3(0.0f, 1.0f, 0.0f)),
+                   z = quat_rotate(q, vec3(0.0f, 0.0f, 1.0f));
         const float slope = bounds[side];
-        border[side] = normalize((side % 2 ? -1.0f : 1.0f) * ((side < 2 ? x : y) - slope * z));
-        corner[side] = normalize(bounds[side % 2] * x + bounds[2 + side / 2] * y + z);
-    }
-    auto prepare = [&](int face, Face& to) {
+        to.border[side] = normalize((side % 2 ? -1.0f : 1.0f) * ((side < 2 ? x : y) - slope * z));
+        to.corner[side] = normalize(bounds[side % 2] * x + bounds[2 + side / 2] * y + z);
+    };
+    auto prepare = [&](int face, const vec3& origin, const Tile& tile, Face& to) {
         const vec3 a = mesh.points[mesh.indices[3 * face]] - origin;
         const vec3 b = mesh.points[mesh.indices[3 * face + 1]] - origin;
         const vec3 c = mesh.points[mesh.indices[3 * face + 2]] - origin;
         const float size = wp::sqrt(wp::max(dot(a, a), wp::max(dot(b, b), dot(c, c))));
-        for (int k = 0; k < 4; ++k)
-            if (wp::max(dot(border[k], a), wp::max(dot(border[k], b), dot(border[k], c))) < -1.0e-6f * size)
+        for (const vec3& side : tile.border)
+            if (wp::max(dot(side, a), wp::max(dot(side, b), dot(side, c))) < -1.0e-6f * size)
                 return false;
         const vec3 ab = b - a, bc = c - b, ca = a - c;
         const float ab2 = dot(ab, ab), bc2 = dot(bc, bc), ca2 = dot(ca, ca);
@@ -306,10 +310,10 @@ _FACE_TEST = (
         to.n = scale * to.n;
         to.slack *= wp::abs(scale);
         float u = -FLT_MAX, v = -FLT_MAX, w = -FLT_MAX;
-        for (int k = 0; k < 4; ++k) {
-            u = wp::max(u, dot(to.u, corner[k]));
-            v = wp::max(v, dot(to.v, corner[k]));
-            w = wp::max(w, dot(to.w, corner[k]));
+        for (const vec3& corner : tile.corner) {
+            u = wp::max(u, dot(to.u, corner));
+            v = wp::max(v, dot(to.v, corner));
+            w = wp::max(w, dot(to.w, corner));
         }
         return wp::min(u, wp::min(v, w)) >= -to.slack;
     };
@@ -342,34 +346,57 @@ _FACE_TEST = (
 """
 )
 
-_FIND_FACE = (
+# A thread prepares a triangle for one of the instants; then each tests its rays against those of theirs.
+_FIND_TOGETHER = (
     _FACE_TEST
     + """
-    float best = 0.0f, next = 0.0f, unsure = 0.0f;
-    int which = ASK;
-    if (count < 0)
-        return which;
+    float best[GROUP] = {}, next[GROUP] = {}, unsure[GROUP] = {};
+    int which[GROUP];
+    vec3 ray[GROUP];
+    for (int k = 0; k < GROUP; ++k) {
+        which[k] = ASK;
+        ray[k] = quat_rotate(q_WC.data[first + wp::min(k, instants - 1)], ray_C);
+    }
 #ifdef __CUDA_ARCH__
-    __shared__ Face tested[64];
-    __shared__ int tested_count;
-    for (int first = 0; first < count; first += lanes) {
+    constexpr int EACH = 64 / GROUP;
+    __shared__ Tile tiles[GROUP];
+    __shared__ Face tested[GROUP][EACH];
+    __shared__ int tested_count[2][GROUP];
+    const int lane = threadIdx.x, own = lane % GROUP;
+    const vec3 origin = p_WC.data[first + wp::min(own, instants - 1)];
+    __syncthreads();
+    if (lane < 4 * GROUP)
+        bound(lane / GROUP, q_WC.data[first + wp::min(own, instants - 1)], tiles[own]);
+    if (lane < GROUP)
+        tested_count[0][lane] = 0;
+    for (int place = 0, turn = 0; place < count; place += EACH, turn ^= 1) {
         __syncthreads();
-        if (lane == 0)
-            tested_count = 0;
-        __syncthreads();
+        if (lane < GROUP)
+            tested_count[turn ^ 1][lane] = 0;
+        const int k = place + lane / GROUP;
         Face face;
-        if (first + lane < count && prepare(faces.data[begin + first + lane], face))
-            tested[atomicAdd(&tested_count, 1)] = face;
+        if (k < count && own < instants && prepare(faces.data[begin + k], origin, tiles[own], face))
+            tested[own][atomicAdd(&tested_count[turn][own], 1)] = face;
         __syncthreads();
-        for (int k = 0; k < tested_count; ++k)
-            test(tested[k], ray[0], ray[1], ray[2], best, next, unsure, which);
+#pragma unroll
+        for (int k = 0; k < GROUP; ++k)
+            for (int j = 0; j < tested_count[turn][k]; ++j)
+                test(tested[k][j], ray[k][0], ray[k][1], ray[k][2], best[k], next[k], unsure[k], which[k]);
     }
 #else
-    for (int k = 0; k < count; ++k)
-        if (Face face; prepare(faces.data[begin + k], face))
-            test(face, ray[0], ray[1], ray[2], best, next, unsure, which);
+    for (int k = 0; k < instants; ++k) {
+        Tile tile;
+        for (int side = 0; side < 4; ++side)
+            bound(side, q_WC.data[first + k], tile);
+        for (int j = 0; j < count; ++j)
+            if (Face face; prepare(faces.data[begin + j], p_WC.data[first + k], tile, face))
+                test(face, ray[k][0], ray[k][1], ray[k][2], best[k], next[k], unsure[k], which[k]);
+    }
 #endif
-    return decide(best, next, unsure, which);
+    vec_t<GROUP, int> found;
+    for (int k = 0; k < GROUP; ++k)
+        found[k] = count < 0 ? ASK : decide(best[k], next[k], unsure[k], which[k]);
+    return found;
 """
 )
 
@@ -384,8 +411,11 @@ _FIND_FACES = (
         ray_y[pixel] = rays.data[pixel][1];
         ray_z[pixel] = rays.data[pixel][2];
     }
+    Tile tile;
+    for (int side = 0; side < 4; ++side)
+        bound(side, q, tile);
     for (int k = 0; k < count; ++k)
-        if (Face face; prepare(faces.data[begin + k], face))
+        if (Face face; prepare(faces.data[begin + k], origin, tile, face))
             for (int pixel = 0; pixel < 64; ++pixel)
                 test(face, ray_x[pixel], ray_y[pixel], ray_z[pixel], best[pixel], next[pixel], unsure[pixel],
                      which[pixel]);
@@ -396,41 +426,63 @@ _FIND_FACES = (
 )
 
 
-@wp.func_native(_FIND_FACE.replace("ASK", str(ASK)))
-def find_face(
-    id: wp.uint64,
-    faces: wp.array[int],
-    begin: int,
-    count: int,
-    reach: float,
-    far_m: float,
-    bounds: wp.vec4,
-    x: wp.vec3,
-    y: wp.vec3,
-    z: wp.vec3,
-    origin: wp.vec3,
-    ray: wp.vec3,
-) -> int:
-    """Return the triangle that a ray hits first, of a list; -1: it hits nothing, ASK: that is not sure.
-
-    On CUDA a block of 64 threads, the rays of a tile at one instant, calls it together: the triangles are
-    prepared once for all of them.
+def shared_walk(
+    asked: WalkConfig | Literal["auto"] | None,
+    rays: NDArray[np.float32],
+    *,
+    instant_count: int,
+    is_cuda: bool,
+) -> WalkConfig | None:
+    """Return how rays share walks; None: each walks by itself.
 
     Args:
-        id: The mesh.
-        faces: Lists.
-        begin: Where that of the tile begins.
-        count: Its length; -1: there is none.
-        reach: Distance up to which it is complete [m].
-        far_m: What counts as infinitely far [m].
-        bounds: `WalkData.bounds` of the tile.
-        x: The camera's x axis in W.
-        y: Likewise.
-        z: Likewise.
-        origin: Of the ray, in W [m].
-        ray: Its direction in W, of unit length.
+        asked: `RenderConfig.shared_walk`.
+        rays: Rays of the pixels in C, shape [layer, H * W, 4].
+        instant_count: The most instants of a launch, of one world.
+        is_cuda: Where they are rendered.
     """
-    ...
+    if asked != "auto":
+        return asked
+    return WalkConfig() if is_cuda and instant_count >= _AUTO_INSTANTS_MIN and looks_forward(rays) else None
+
+
+def group_size(instants: int) -> int:
+    """Return how many of the instants that share a walk a block looks at together: 4, 2 or 1, a divisor."""
+    return math.gcd(instants, 4)
+
+
+@cache
+def together_finder(group: int) -> wp.Function:
+    """Return the function that finds what a pixel sees at up to `group` instants; a divisor of 64.
+
+    It returns, for each instant, the triangle that the pixel's ray hits first, of a list; -1: it hits
+    nothing, ASK: that is not sure; as a vector of `group` integers. On CUDA a block of 64 threads, the
+    pixels of a tile, calls it together: triangles are prepared once for all of them.
+
+    Its parameters: the mesh; the lists; where that of the tile begins; its length, -1: there is none; the
+    distance up to which it is complete, and what counts as infinitely far [m]; `WalkData.bounds` of the tile;
+    the positions [m] and orientations of the camera in W; the first instant, and how many are looked at;
+    the direction of the pixel's ray in C, of unit length.
+    """
+    found = wp.types.vector(length=group, dtype=int)
+
+    @wp.func_native(_FIND_TOGETHER.replace("ASK", str(ASK)).replace("GROUP", str(group)))
+    def find_together(
+        id: wp.uint64,
+        faces: wp.array[int],
+        begin: int,
+        count: int,
+        reach: float,
+        far_m: float,
+        bounds: wp.vec4,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        first: int,
+        instants: int,
+        ray_C: wp.vec3,
+    ) -> found: ...
+
+    return find_together
 
 
 @wp.func_native(_FIND_FACES.replace("ASK", str(ASK)))
@@ -442,14 +494,26 @@ def find_faces(
     reach: float,
     far_m: float,
     bounds: wp.vec4,
-    x: wp.vec3,
-    y: wp.vec3,
-    z: wp.vec3,
+    q: wp.quat,
     origin: wp.vec3,
     rays: wp.array[wp.vec3],
     face_out: wp.array[int],
 ):
-    """`find_face` of all 64 rays of a tile at one instant, for CPU kernels: vectorised over rays."""
+    """Find what all 64 rays of a tile at one instant hit, for CPU kernels: vectorised over rays.
+
+    Args:
+        id: The mesh.
+        faces: Lists.
+        begin: Where that of the tile begins.
+        count: Its length; -1: there is none.
+        reach: Distance up to which it is complete [m].
+        far_m: What counts as infinitely far [m].
+        bounds: `WalkData.bounds` of the tile.
+        q: Orientation of the camera in W.
+        origin: Of the rays, in W [m].
+        rays: Their directions in W, of unit length.
+        face_out: The triangle that each hits first; -1: nothing, ASK: that is not sure.
+    """
     ...
 
 
@@ -465,11 +529,14 @@ def find_faces(
 #else
     const int place = is_left ? __atomic_fetch_add(count.data, 1, __ATOMIC_RELAXED) : 0;
 #endif
-    if (is_left)
+    if (is_left && place < left.shape[0])
         left.data[place] = index;
 """)
 def leave(is_left: wp.bool, index: int, left: wp.array[int], count: wp.array[int]):
-    """Note that the pixel of a thread is left; all threads of a block call it together."""
+    """Note that the pixel of a thread is left, and count it, also where there is no room for it.
+
+    All threads of a block call it together.
+    """
     ...
 
 
@@ -584,6 +651,12 @@ def walk_kernel(lanes: int) -> wp.Kernel:
     return walk_tiles
 
 
+def looks_forward(rays: NDArray[np.float32]) -> bool:
+    """Return whether `tile_bounds` takes the rays of a lens."""
+    x, y, z = np.moveaxis(rays[..., :3].astype(np.float64), -1, 0)
+    return bool((z > 0.0).all() and (np.maximum(np.abs(x), np.abs(y)) <= _SLOPE_MAX * z).all())
+
+
 def tile_bounds(rays: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Return the least and largest x / z and the least and largest y / z of the rays of each tile.
 
@@ -690,7 +763,7 @@ class TileWalk:
         self.data.reach = wp.zeros((walks, len(bounds)), dtype=float, device=self._device)
         self.data.bounds = wp.array(bounds, dtype=wp.vec4, device=self._device)
         self.data.left_count = wp.zeros(1, dtype=int, device=self._device)
-        room = instant_count * len(bounds) * BLOCK if leaves else 0
+        room = instant_count * len(bounds) * BLOCK // _LEFT_SHARE if leaves else 0
         self.data.left = wp.zeros(room, dtype=int, device=self._device)
         processors = mesh.device.sm_count if mesh.device.is_cuda else 0
         self.data.left_threads = max(1, processors * _THREADS_PER_MULTIPROCESSOR)

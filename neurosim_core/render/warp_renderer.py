@@ -20,7 +20,7 @@ from neurosim_core.render.body_arrays import (
     upload_bodies,
 )
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.config import RenderConfig
+from neurosim_core.render.config import RenderConfig, WalkConfig
 from neurosim_core.render.embree import PACKET, EmbreeError, EmbreeTree, packet_width
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import (
@@ -31,9 +31,16 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.raycast import Terms, WorldData, asking_kernel, raycast_kernel
+from neurosim_core.render.raycast import (
+    Terms,
+    WorldData,
+    asking_kernel,
+    group_of,
+    raycast_kernel,
+    with_walks,
+)
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
+from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData, shared_walk
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
@@ -109,8 +116,7 @@ def upload_scene(
         finest_level=textured and config.texture_filter != "trilinear",
         nearest_texel=textured and config.texture_filter == "nearest",
         bodies=bool(bodies),
-        walked=config.shared_walk is not None,
-        by_tile=config.shared_walk is not None and wp.get_device(device).is_cpu,
+        by_tile=wp.get_device(device).is_cpu,
     )
     start = time.perf_counter()
     light: NDArray[np.float32] | None = None
@@ -195,7 +201,8 @@ def upload_scene(
 
 def _embree_width(config: RenderConfig, device: str) -> int:
     """Return how many rays Embree casts at once, 0 if Warp casts them."""
-    if config.cpu_traversal == "warp" or config.shared_walk or not wp.get_device(device).is_cpu:
+    asked = isinstance(config.shared_walk, WalkConfig)
+    if config.cpu_traversal == "warp" or asked or not wp.get_device(device).is_cpu:
         return 0
     try:
         return packet_width()
@@ -299,8 +306,13 @@ class WarpRenderer:
             ValueError: If an output is unknown or none is asked for, the instants have more than 2^31 - 1
                 rays of a layer together, or rays that share a walk do not look forward or are too many.
         """
-        self._kernel = raycast_kernel(outputs, arrays.terms)
-        self._asking = asking_kernel(outputs, arrays.terms)
+        rays = ray_layers(lens, arrays.config.samples_per_pixel)
+        is_cuda = wp.get_device(arrays.device).is_cuda
+        shared = shared_walk(arrays.config.shared_walk, rays, instant_count=instant_count, is_cuda=is_cuda)
+        terms = with_walks(arrays.terms, shared)
+        self._kernel = raycast_kernel(outputs, terms)
+        self._asking = asking_kernel(outputs, terms)
+        self._group = group_of(terms)
         self._arrays = arrays
         self._width, self._height = lens.width, lens.height
         self._thread_count = thread_count
@@ -311,22 +323,21 @@ class WarpRenderer:
                 f"{instant_count} instants of {lens.width} x {lens.height} px are more than 2^31 - 1 rays a "
                 f"launch: at most {most} instants of this size (instants_per_launch), or take fewer pixels"
             )
-        rays_together = TILE * TILE if arrays.terms.by_tile else PACKET if arrays.terms.embree else 1
+        rays_together = TILE * TILE if terms.by_tile else PACKET if terms.embree else 1
         self._instant_threads = tiles * TILE * TILE // rays_together
-        rays = ray_layers(lens, arrays.config.samples_per_pixel)
         device = arrays.device
         self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
         self._world_data = WorldData()
         self.walk = None
-        if arrays.config.shared_walk is not None:
+        if shared is not None:
             self.walk = TileWalk(
                 arrays.mesh,
                 rays,
                 width=lens.width,
                 height=lens.height,
                 extent_m=float(np.abs(arrays.scene.bounds_m).max()),
-                config=arrays.config.shared_walk,
+                config=shared,
                 instant_count=instant_count,
                 leaves=self._asking is not None,
                 thread_count=thread_count,
@@ -389,7 +400,7 @@ class WarpRenderer:
         device = self._arrays.device
         launch_split(
             self._kernel,
-            dim=instant_count * self._instant_threads,
+            dim=-(-instant_count // self._group) * self._instant_threads,
             inputs=inputs,
             outputs=outputs,
             device=device,

@@ -11,10 +11,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.body_arrays import make_body_data, place_camera
+from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.raycast import WorldData, asking_kernel, raycast_kernel
-from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData
+from neurosim_core.render.raycast import WorldData, asking_kernel, group_of, raycast_kernel, with_walks
+from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData, shared_walk
 from neurosim_core.render.warp_renderer import SceneArrays, ray_layers
 from neurosim_core.scene.bodies import BodyConfig, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig
@@ -76,8 +77,18 @@ class WorldCast:
         self._size = cast.lens.width, cast.lens.height
         lenses, chosen = lens_tables(cast, rigs)
         terms = terms._replace(world_lenses=len(lenses) > 1)
-        if terms.world_scenes or terms.world_lenses:  # walks change nothing but the speed
-            terms = terms._replace(walked=False, by_tile=False)
+        rays = np.concatenate([ray_layers(lens, arrays.config.samples_per_pixel) for lens in lenses], axis=1)
+        walk = None
+        if not (terms.world_scenes or terms.world_lenses):  # walks change nothing but the speed
+            walk = shared_walk(
+                arrays.config.shared_walk,
+                rays,
+                instant_count=instant_count,
+                is_cuda=wp.get_device(device).is_cuda,
+            )
+        # groups end with the instants of a world
+        terms = with_walks(terms, walk, group=1 << min(2, instant_count.bit_length() - 1))
+        self._group = group_of(terms)
         room = capacity or max(1024, 2 * cast.lens.width * cast.lens.height)
         if cast.event_cameras and world_count * room > _INDEX_MAX:
             raise ValueError(
@@ -94,10 +105,9 @@ class WorldCast:
             )
         self._kernel = raycast_kernel(cast.outputs, terms)
         self._asking = asking_kernel(cast.outputs, terms)
-        rays = np.concatenate([ray_layers(lens, arrays.config.samples_per_pixel) for lens in lenses], axis=1)
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
         self._scene = arrays.data
-        self._walk = self._make_walk(arrays, rays) if terms.walked else None
+        self._walk = None if walk is None else self._make_walk(arrays, rays, walk)
         self._worlds = self._make_worlds(scenes, chosen if len(lenses) > 1 else None)
         self._p_BC = wp.vec3d(*cast.mount.position_m)
         self._q_BC = wp.quatd(*cast.mount.optical_quaternion())
@@ -203,7 +213,7 @@ class WorldCast:
             WalkData() if self._walk is None else self._walk.data,
         ]
         outputs = [self._outputs["log_radiance"], self._outputs["rgb"], self._outputs["depth"], None, None]
-        dim = self._count * instant_count * self._instant_threads
+        dim = self._count * -(-instant_count // self._group) * self._instant_threads
         launch_split(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
         if self._asking is not None and self._walk is not None:
             dim = self._walk.data.left_threads
@@ -222,17 +232,15 @@ class WorldCast:
             worlds.lens = wp.array(lens, dtype=int, device=self._device)
         return worlds
 
-    def _make_walk(self, arrays: SceneArrays, rays: NDArray[np.float32]) -> TileWalk:
+    def _make_walk(self, arrays: SceneArrays, rays: NDArray[np.float32], config: WalkConfig) -> TileWalk:
         """Return walks that the instants of a tile share in each world."""
-        shared = arrays.config.shared_walk
-        assert shared is not None
         return TileWalk(
             arrays.mesh,
             rays,
             width=self._size[0],
             height=self._size[1],
             extent_m=float(np.abs(arrays.scene.bounds_m).max()),
-            config=shared.model_copy(update={"instants": self._stride}),
+            config=config.model_copy(update={"instants": self._stride}),
             instant_count=self._count * self._stride,
             leaves=self._asking is not None,
         )

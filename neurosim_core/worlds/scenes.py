@@ -14,6 +14,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.raycast import Terms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.warp_renderer import SceneArrays
@@ -94,7 +95,8 @@ def make_scene_table(
         )
     if models is not None:
         _check_models(models, config)
-    if config.render.shared_walk is not None and (lenses_differ or len(scenes or models or ()) > 1):
+    asked = isinstance(config.render.shared_walk, WalkConfig)
+    if asked and (lenses_differ or len(scenes or models or ()) > 1):
         _logger.info("render.shared_walk is left out: worlds differ in their scenes or lenses")
         alone = config.render.model_copy(update={"shared_walk": None})  # Embree may do it on a CPU
         config = config.model_copy(update={"render": alone})

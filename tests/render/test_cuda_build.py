@@ -13,7 +13,7 @@ def test_kernels_build_for_sm_90(tmp_path):
     everything = Terms(textured=True, emissive=True, baked=True, supersampled=False, bodies=True)
     kernels = (
         raycast_kernel(OUTPUTS, everything),
-        raycast_kernel(("log_radiance",), everything._replace(walked=True)),
+        raycast_kernel(("log_radiance",), everything._replace(walked=4)),
         walk_kernel(BLOCK),
     )
     for module in (*(kernel.module for kernel in kernels), lighting):

@@ -21,7 +21,7 @@ from neurosim_core.scene.bodies import BodyConfig, body_poses, make_bodies, make
 from neurosim_core.scene.scene import Material
 
 LENS = PinholeConfig(width=45, height=34, fx=40.0, fy=38.0, cx=21.0, cy=18.5)  # no multiples of a tile
-ALONE = UNSHADOWED.model_copy(update={"cpu_traversal": "warp"})
+ALONE = UNSHADOWED.model_copy(update={"cpu_traversal": "warp", "shared_walk": None})
 
 
 def together(config=UNSHADOWED, **walk) -> RenderConfig:
@@ -57,7 +57,7 @@ def assert_same(got, expected):
 
 def compare(scene, poses, device, *, config=UNSHADOWED, **walk):
     """Render with and without shared walks, in both forms; return the former."""
-    alone = config.model_copy(update={"cpu_traversal": "warp"})
+    alone = config.model_copy(update={"cpu_traversal": "warp", "shared_walk": None})
     expected = render(scene, LENS, poses, outputs=OUTPUTS, config=alone, device=device)
     arrays = upload_scene(scene, together(config, **walk), device)
     for form in (arrays, by_block(arrays)):
@@ -302,7 +302,7 @@ def test_lists_are_short_and_used(device):
         """Render with what the lists are replaced by, not walking again."""
         data.count.zero_()
         data.reach.assign(np.broadcast_to(np.asarray(reach, np.float32), true_reach.shape))
-        renderer.walk.launch = lambda *_, **__: None
+        renderer.walk.launch = lambda *_, **__: data.left_count.zero_()
         renderer.render(*arguments, instant_count=8)
         return renderer.log_radiance.numpy().copy()
 
@@ -401,7 +401,7 @@ def test_events_of_a_flight_are_the_same():
 def test_what_does_not_go_together_is_refused():
     with pytest.raises(ValueError, match="cpu_traversal must be auto or warp, got embree"):
         RenderConfig(cpu_traversal="embree", shared_walk=WalkConfig())
-    terms = Terms(textured=False, emissive=False, baked=False, supersampled=False, walked=True, worlds=True)
+    terms = Terms(textured=False, emissive=False, baked=False, supersampled=False, walked=1, worlds=True)
     for term in ("world_scenes", "world_lenses"):
         with pytest.raises(ValueError, match="share walks where worlds have one scene and one lens"):
             raycast_kernel(("log_radiance",), terms._replace(**{term: True}))
