@@ -122,6 +122,8 @@ class Link:
         """The highest number of a ring that was mapped."""
         self._given_up = 0
         """The publisher writes to no ring of a lower number any more."""
+        self._reached = 0
+        """The highest sequence that the publisher is known to have reached."""
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
@@ -367,6 +369,7 @@ class Link:
         answer = parse_answer(frame)
         first = not self.attached
         self.attached = True
+        self._reached = max(self._reached, answer.sequence)
         self._column = answer.column
         if answer.column is None and not self._large_subscribed:
             self.socket.subscribe(self._large_head)
@@ -381,7 +384,7 @@ class Link:
                 self._shorten()
         if first and self._offer is not None and self._offer.taken():
             self._use_pipe(self._offer)
-        if not first or self.expected >= 0:
+        if self.expected >= 0:
             return []
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
@@ -481,6 +484,8 @@ class Link:
         self._newest_ring = -1
         if self._pipe is not None:
             self._use_socket()
+        elif self._offer is not None:  # the publisher may have written there
+            self._offer.silence()
         if not self._large_subscribed:
             self.socket.subscribe(self._large_head)
             self._large_subscribed = True
@@ -488,6 +493,11 @@ class Link:
         self.socket.unsubscribe(self._key)
         self._column = None
         self._ask(shared_memory=False)
+
+    def end(self) -> None:
+        """The publisher has left, and all that came of it was read: what it has published besides is lost."""
+        if 0 <= self.expected < self._reached:
+            self.advance(self._reached, 0)
 
     def close(self) -> None:
         """Disconnect. Messages that the user still holds stay valid.

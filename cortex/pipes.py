@@ -193,9 +193,13 @@ class Pipes:
                     reader.has_last = True
                 except zmq.Again:
                     pass
-            written = reader.has_last and reader.pipe.flush()
-            done &= written or waited_s >= max(linger_s, reader.timeout_s)
+            done &= _has_all(reader) or waited_s >= max(linger_s, reader.timeout_s)
         return done
+
+    def unfinished(self) -> list[Reader]:
+        """Who has not got all yet, after `finish`: what is left will not come."""
+        self._take_back()
+        return [reader for reader in self._direct if not _has_all(reader)]
 
     def close(self) -> None:
         """Write no more."""
@@ -205,3 +209,9 @@ class Pipes:
             self._relay.close()
         self._relay = None
         self._route()
+
+
+def _has_all(reader: Reader) -> bool:
+    """Whether everything has been written into a reader's pipe, the last frame of all included."""
+    assert reader.pipe is not None
+    return reader.has_last and reader.pipe.flush()

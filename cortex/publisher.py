@@ -31,7 +31,9 @@ from cortex.wire import (
     RECORD,
     REST,
     TAIL,
+    AttachAnswer,
     AttachKey,
+    answer_frame,
     message_head,
     prefix,
 )
@@ -47,6 +49,8 @@ READERS_MAX = 1024
 SILENCE_MAX_NS = 30_000_000_000
 SILENCE_NS = 100_000_000
 """After so long without a message readers are told how many there have been."""
+TELL_AGAIN_S = 0.02
+"""A reader that was late when the publisher is closed is told this often how many messages there were."""
 LINGER_S = 0.5
 """How long `close` waits for whom it owes nothing: lossy readers, and slots that nobody has given back."""
 
@@ -112,6 +116,8 @@ class Publisher(Generic[T]):
         self._was_large = False
         self._crowded = False
         self._told = 0
+        self._untold: list[Outlet] = []
+        self._tell_again_s = 0.0
         self._tell_after_ns = SILENCE_NS
         self._late: dict[Outlet, int] = {}
         """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
@@ -668,6 +674,7 @@ class Publisher(Generic[T]):
                     self._flush()
                     self._tell_sequence(monotonic_ns())
             finally:
+                self._untold = list(self._strict_outlets)
                 self._closed = True
                 self._gate.refresh_ns = 0  # so that `publish` looks
 
@@ -679,11 +686,40 @@ class Publisher(Generic[T]):
             self._outlets.refresh()
             last = self._batch_head + REST.pack(self._gate.sequence, 0, monotonic_ns(), 0, 0)
             written = self._pipes.finish(last, waited_s, linger_s)
-            return written and (waited_s >= linger_s or self._large.taken_in)
+            told = self._tell_outlets(last, waited_s, linger_s)
+            return written and told and (waited_s >= linger_s or self._large.taken_in)
+
+    def _tell_outlets(self, last: bytes, waited_s: float, linger_s: float) -> bool:
+        """Send a last frame through strict outlets until all have it; whether each has had its time.
+
+        While a reader is late, libzmq drops it: it is sent now and then, until the reader says that it reads.
+        """
+        if waited_s >= self._tell_again_s:
+            self._tell_again_s = waited_s + TELL_AGAIN_S
+            self._untold = [each for each in self._untold if not each.try_send(last) or each in self._late]
+        timeouts_s = [r.timeout_s for r in self._readers.values() if r.outlet in self._untold]
+        return not self._untold or waited_s >= max([linger_s, *timeouts_s])
+
+    def _tell_who_lost(self) -> None:
+        """Let readers that had too little time count what they lost; the lock is held."""
+        last = self._batch_head + REST.pack(self._gate.sequence, 0, monotonic_ns(), 0, 0)
+        for outlet in self._untold:
+            outlet.send_anyway(last)
+        unfinished = self._pipes.unfinished()
+        for reader in unfinished:  # their pipes are full, their sockets are not
+            answer = AttachAnswer(self._gate.sequence, reader.column, (), b"")
+            reader.outlet.try_send(answer_frame(reader.key, answer))
+        count = sum(reader.request.strict for reader in unfinished)
+        if count:
+            self._outlets.note(
+                f"{self.topic}: {count} reliable subscribers had no time to read everything at the end"
+            )
 
     def _end(self) -> None:
         """Let go of everything."""
         with self._lock:
+            if not self._outlets.closed:
+                self._tell_who_lost()
             self._pipes.close()
             self._readers.clear()
             self._route()

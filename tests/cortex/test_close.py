@@ -15,7 +15,7 @@ import cortex.gate
 import cortex.large
 import cortex.pipes
 import cortex.publisher
-from cortex import native
+from cortex import native, reliable
 from cortex.context import Closed
 
 PATIENT = ["reliable", {"timeout_s": SOON_S}]  # as long as a machine may stand still
@@ -226,3 +226,66 @@ def test_a_forked_child_hears_that_it_may_not_publish(make_node, start_child):
     publisher.close()
     waiting.join(SOON_S)
     assert not waiting.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("relayed", "policy", "size"),
+    [
+        (False, "reliable", 16_300),
+        (False, "keep_last", 16_300),
+        (True, "reliable", 16_300),
+        (True, "keep_last", 1000),
+    ],
+)
+def test_what_a_reader_has_no_time_for_is_counted(
+    make_node, start_child, monkeypatch, caplog, relayed, policy, size
+):
+    """It stands still until its publisher has given up; the last frame may have been cut."""
+    if relayed:
+        if native.NativeRelay is None:
+            pytest.skip("no C module")
+        monkeypatch.setattr(cortex.pipes, "PIPES_MAX", 0)
+        monkeypatch.setattr(cortex.large, "PIPES_MAX", 0)
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    options = {"timeout_s": 0.01} if policy == "reliable" else {"depth": 8}
+    (child,) = subscribe(publisher, start_child, [policy, options])
+    sent = Sent(publisher, size)
+    with child.stopped():
+        for _ in range(2000):
+            sent()
+        publisher.close(linger_s=0.0)
+    found = wait_for(
+        lambda: (heard := child.ask())["count"] + heard["overtaken"] + heard["lost"] >= sent.count and heard
+    )
+    assert (found["torn"], found["rejected"]) == (0, 0)
+    assert found["count"] + found["overtaken"] + found["lost"] == sent.count
+    assert found["lost"] > 0
+    node.close()
+    said = [record.getMessage() for record in caplog.records if "had no time" in record.getMessage()]
+    assert len(said) == (policy == "reliable")
+
+
+def test_what_a_reader_without_a_pipe_loses_at_the_end_is_counted(make_node):
+    """One of the same process: it has room again, and hears of it, before the linger is over."""
+    node = make_node()
+    publisher = node.publisher("/blocks", Block)
+    subscriber = node.subscriber("/blocks", Block, policy=reliable(1, 0.01))
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    sent = Sent(publisher, 100)
+    while sent.refused < 5:
+        sent()
+    thread = begin_close(publisher, linger_s=SOON_S)
+    count = 0
+
+    def all_accounted() -> bool:
+        nonlocal count
+        with contextlib.suppress(TimeoutError):
+            subscriber.recv(0.0)
+            count += 1
+        return count + subscriber.counters.lost == sent.count
+
+    wait_for(all_accounted, every_s=0.0)
+    assert subscriber.counters.lost == sent.refused
+    thread.join(SOON_S)
+    assert not thread.is_alive()

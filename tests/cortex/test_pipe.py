@@ -15,9 +15,11 @@ import zmq
 from peer import Block, is_whole, make_block
 from processes import ROOT, SOON_S, wait_for
 
+import cortex.link
 import cortex.subscriber
 from cortex import keep_last, native, pipe, reliable
 from cortex.host import pipe_path, sweep
+from cortex.shm import ShmUnavailable
 from cortex.wire import BATCH, HEADER_SIZE, LARGE, MESSAGE, SLOT, Header, pack_header
 
 WRITERS = [pipe.PyWriter] + ([native.NativePipeWriter] if native.NativePipeWriter else [])
@@ -329,6 +331,32 @@ def test_a_pipe_is_read_to_its_end_however_long_that_takes(make_node, start_chil
     assert [subscriber.recv(SOON_S).number for _ in range(40)] == list(range(40))
     wait_for(lambda: not subscriber._links)
     assert subscriber.counters.lost == 0
+
+
+@pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)
+def test_a_reader_that_cannot_map_the_first_ring(make_node, start_child, monkeypatch, policy):
+    """It attaches anew: the latched message comes all the same, and the pipe that it offered wakes nobody."""
+
+    def refuse(*_):
+        raise ShmUnavailable("not here")
+
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block", latch=True)
+    child.ask(do="publish", topic="/blocks", count=1, start=7, size=100_000)
+    monkeypatch.setattr(cortex.link, "RingView", refuse)
+    subscriber = make_node().subscriber("/blocks", Block, policy=policy)
+    block = subscriber.recv(SOON_S)
+    assert (block.number, is_whole(block)) == (7, True)
+    (link,) = subscriber._links
+    assert link._pipe is None
+    poll = select.poll()
+    poll.register(link._offer.fd, select.POLLIN)
+    assert not poll.poll(0)
+    child.ask(do="publish", topic="/blocks", count=2, start=8, size=100_000)
+    assert [subscriber.recv(SOON_S).number for _ in range(2)] == [8, 9]
+    assert subscriber.counters.lost == subscriber.counters.rejected == 0
+    child.finish()
 
 
 def test_a_reader_in_the_same_process_needs_no_pipe(make_node, runtime):
