@@ -32,7 +32,11 @@ class Peer:
             stderr=subprocess.PIPE,
         )
         self._rest = b""
-        assert self.line() == "ready"
+        try:
+            assert self.line() == "ready"
+        except BaseException:
+            self.end()  # which says why, if it ended by itself
+            raise
 
     def has_line(self, timeout_s: float = 0.0) -> bool:
         """Whether it has printed a line that was not taken yet."""
@@ -43,7 +47,7 @@ class Peer:
             if not select.select([self.process.stdout], [], [], left_s)[0]:
                 return False
             chunk = os.read(self.process.stdout.fileno(), 65536)
-            assert chunk, "the C++ program has ended"
+            assert chunk, f"the C++ program has ended: {self.end()}"
             self._rest += chunk
         return True
 

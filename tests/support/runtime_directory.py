@@ -74,5 +74,6 @@ def _end_registries(base: Path) -> None:
     for lock in base.glob(f"*/{REGISTRY_LOCK}"):
         text = lock.read_text()
         if text and int(text) in processes_with(str(base)):
-            os.kill(int(text), signal.SIGTERM)
+            with contextlib.suppress(ProcessLookupError):  # its two seconds are over
+                os.kill(int(text), signal.SIGTERM)
     wait_for(lambda: not processes_with(str(base)))
