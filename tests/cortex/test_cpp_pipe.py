@@ -8,6 +8,7 @@ import os
 import random
 import select
 import shutil
+import signal
 import termios
 import time
 from array import array
@@ -147,15 +148,50 @@ def test_slow_reader_of_cpp_knows_what_it_missed(
     assert counters.rejected == 0
 
 
-def test_third_reader_is_served_by_zeromq(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
-    """A publisher in C++ writes two pipes; all readers get everything."""
+def test_many_readers_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
+    """More than a publisher writes to itself: all get everything through pipes, while others come and go."""
     node = make_node()
     readers = [node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) for _ in range(4)]
-    peer = start("publish", "/scan", 400, "10,20000", "", 4)
-    for number in range(400):  # each in turn, as a reliable one holds up the publisher
-        assert [reader.recv(SOON_S).stamp_ns for reader in readers] == [number] * 4
+    peer = start("publish", "/scan", 1200, "10,10,20000", "", 4)
+    passers = []
+    for number in range(1200):  # each in turn, as a reliable one holds up the publisher
+        assert {reader.recv(SOON_S).stamp_ns for reader in readers} == {number}
+        if number == 0:
+            assert len(pipes_of(peer.process.pid)) == 4
+        if number % 100 == 50:
+            passers.append(node.subscriber("/scan", Scan, policy=keep_last(4)))
+        elif number % 100 == 0 and passers:
+            passers.pop().close()
+        elif number in (410, 810):  # at last it writes all pipes itself
+            readers.pop().close()
     assert all(reader.counters.lost == 0 for reader in readers)
-    assert len(pipes_of(peer.process.pid)) == 2
+    assert result_of(peer) == {"published": 1200, "refused": 0, "timeouts": 0}
+
+
+@pytest.mark.parametrize("policy", ["4", "brief"])
+def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
+    start: Callable[..., Peer], make_node: Callable[..., Node], policy: str
+) -> None:
+    """It loses what it is too late for, and counts that; it gets the rest once it goes on."""
+    node = make_node()
+    stopped = start("count", "/scan", policy, 0, 0)
+    others = [node.subscriber("/scan", Scan, policy=reliable(64, SOON_S)) for _ in range(3)]
+    writer = start("publish", "/scan", 9000, "10", "", 4)
+    for number in range(9000):
+        assert {other.recv(SOON_S).stamp_ns for other in others} == {number}
+        if number in (500, 8000):  # meanwhile comes more than its pipe and the relay hold
+            stopped.process.send_signal(signal.SIGSTOP if number == 500 else signal.SIGCONT)
+    assert all(other.counters.lost == 0 for other in others)
+    result = result_of(writer)
+    assert (result["timeouts"] > 0) == (policy == "brief")
+
+    def counted() -> list[int]:
+        replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
+        return [
+            found.received + found.lost + found.overtaken for reply in replies for found in reply.subscribers
+        ]
+
+    wait_for(lambda: counted() == [9000])
 
 
 def test_reader_without_pipe(
@@ -175,13 +211,16 @@ def test_reader_without_pipe(
     assert not pipes_of(peer.process.pid)
 
 
+@pytest.mark.parametrize("others", [0, 2])
 def test_killed_cpp_reader_with_a_full_pipe(
-    start: Callable[..., Peer], make_node: Callable[..., Node]
+    start: Callable[..., Peer], make_node: Callable[..., Node], others: int
 ) -> None:
     """The publisher waits for a reliable reader; when that dies it goes on, and no signal kills it."""
     node = make_node()
     slow = start("count", "/scan", "reliable", 50_000, 3)
-    writer = start("publish", "/scan", -1, "10")
+    for _ in range(others):
+        start("count", "/scan", "64", 0, 0)
+    writer = start("publish", "/scan", -1, "10", "", 1 + others)
 
     def published() -> int:
         replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]

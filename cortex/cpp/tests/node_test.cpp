@@ -97,6 +97,45 @@ void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic,
   expect(every.counters().lost == 0 && every.counters().rejected == 0, "nothing is lost");
 }
 
+// Reads scans that count up until this one.
+void hear_all(cortex::Subscription<Scan> subscription, int until) {
+  for (int number = 0; number < until; ++number) {
+    const auto scan = subscription.receive(60s);
+    expect(scan && (*scan)->stamp_ns == number && is_whole(**scan), "every scan arrives, in order");
+    if (!scan) return;
+  }
+  expect(subscription.counters().lost == 0, "nothing is lost");
+}
+
+// More readers than a publisher writes to itself: those that may miss nothing get all, in order, while others leave,
+// and also what has not been written when the publisher leaves.
+void fan_out(cortex::Node& talker, cortex::Node& hearer) {
+  constexpr int count = 2000;
+  auto publisher = std::make_unique<cortex::Publisher<Scan>>(talker.advertise<Scan>("/fan"));
+  std::vector<std::thread> threads;
+  for (const int until : {count, count, count / 4, count / 2}) {
+    threads.emplace_back(hear_all, hearer.subscribe<Scan>("/fan", cortex::reliable(16, 60s)), until);
+  }
+  std::atomic<bool> done{false};
+  std::thread lossy([&done, subscription = hearer.subscribe<Scan>("/fan", cortex::keep_last(64))]() mutable {
+    std::int64_t last = -1;
+    while (!done || last < 0) {
+      const auto scan = subscription.receive(10ms);
+      if (!scan) continue;
+      expect((*scan)->stamp_ns > last && is_whole(**scan), "scans arrive in order");
+      last = (*scan)->stamp_ns;
+    }
+  });
+  expect(publisher->wait_for_subscribers(5, 60s), "all attach");
+  for (int number = 0; number < count; ++number) {
+    expect(publisher->publish(scan_of(number, number % 100 == 0 ? 6000 : 10)), "reliable subscribers keep up");
+  }
+  publisher.reset();
+  for (auto& thread : threads) thread.join();
+  done = true;
+  lossy.join();
+}
+
 // Publishes until the pipe of a reliable subscriber is full; how many messages were taken.
 int fill(cortex::Publisher<Scan>& publisher) {
   int taken = 0;
@@ -135,7 +174,7 @@ void read_late(cortex::Node& talker, cortex::Node& hearer) {
   while (subscription.publisher_count() > 0) std::this_thread::sleep_for(1ms);
   std::this_thread::sleep_for(2500ms);  // more than what is on its way would need
   for (int number = 0; number < taken; ++number) {
-    const auto scan = subscription.receive(10s);
+    const auto scan = subscription.receive(60s);
     expect(scan && (*scan)->stamp_ns == number, "every scan arrives, in order");
     if (!scan) return;
   }
@@ -147,9 +186,9 @@ void end_early() {
   auto hearer = std::make_unique<cortex::Node>("hearer", alone({talker->control_address()}));
   auto publisher = talker->advertise<Scan>("/end");
   auto subscription = hearer->subscribe<Scan>("/end", cortex::reliable(4, 100ms));
-  expect(publisher.wait_for_subscribers(1, 10s), "the subscriber attaches");
+  expect(publisher.wait_for_subscribers(1, 60s), "the subscriber attaches");
   expect(publisher.publish(scan_of(7, 50'000)), "a large scan is published");
-  auto kept = subscription.receive(10s);
+  auto kept = subscription.receive(60s);
   expect(kept.has_value(), "it arrives");
   std::thread waiting([&subscription] {
     while (auto scan = subscription.receive(30s)) expect(is_whole(**scan), "a whole scan");
@@ -180,6 +219,7 @@ int main() {
     std::thread large([&] { share(talker, hearer, "/large", 8000, 150); });
     share(talker, hearer, "/small", 10, 500);
     large.join();
+    fan_out(talker, hearer);
     share_the_room(talker, hearer);
     read_late(talker, hearer);
     auto wrong = talker.advertise<Scan>("/wrong");

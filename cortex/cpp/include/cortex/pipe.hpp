@@ -195,15 +195,28 @@ class Writer {
     return true;
   }
 
-  // Bytes that are left of a frame.
+  int fd() const noexcept { return write_.get(); }
+
+  // Bytes that are to be written before anything else.
   std::size_t left() const noexcept { return rest_.size() - written_; }
 
-  // Writes what is left of a frame; whether all is written.
+  // Keeps more that is to be written; takes it out of what it was in.
+  void queue(std::vector<std::uint8_t>& bytes) {
+    if (rest_.empty()) {
+      rest_.swap(bytes);
+    } else {
+      rest_.insert(rest_.end(), bytes.begin(), bytes.end());
+      bytes.clear();
+    }
+  }
+
+  // Writes what is left; whether all is written.
   bool flush() {
     if (rest_.empty()) return true;
     written_ += write_some({rest_.data() + written_, rest_.size() - written_});
     if (written_ < rest_.size()) return false;
-    rest_ = {};
+    rest_.clear();
+    if (rest_.capacity() > kept_bytes) rest_ = {};
     written_ = 0;
     return true;
   }
@@ -227,7 +240,7 @@ class Writer {
 
   runtime::Descriptor write_;
   runtime::Descriptor read_;
-  std::vector<std::uint8_t> rest_;  // of a frame that was written in part
+  std::vector<std::uint8_t> rest_;  // of a frame that was written in part, or more
   std::size_t written_ = 0;         // of the rest
 };
 

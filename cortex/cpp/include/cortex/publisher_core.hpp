@@ -151,12 +151,12 @@ class PublisherCore {
   void tend(std::int64_t now_ns) {
     const Lock lock(outlets_->mutex, std::try_to_lock);
     if (!lock.owns_lock() || closed_ || outlets_->closed) return;
-    for (const auto& reader : readers_.piped()) reader->pipe->flush();
+    readers_.flush();
     if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
     zmq::message_t frame(wire::header_size);
     write_header(static_cast<std::uint8_t*>(frame.data()), 'B', sequence_, 0, 0, 0);
     bool sent = !is_late_;
-    for (const auto& reader : readers_.piped()) sent &= reader->pipe->write(net::bytes(frame));
+    for (const auto& reader : readers_.piped()) sent &= readers_.write(*reader, net::bytes(frame));
     if (has_sockets(outlets_->lossy)) outlets_->lossy.try_send(share(frame));
     if (has_sockets(outlets_->strict)) sent &= outlets_->strict.try_send(std::move(frame));
     if (sent) told_ = sequence_;
@@ -169,7 +169,8 @@ class PublisherCore {
     if (reader->pipe != nullptr) {  // this tells the reader that all else comes there
       std::uint8_t nothing[wire::header_size];
       write_header(nothing, 'B', sequence_, 0, 0, 0);
-      reader->pipe->write({nothing, sizeof nothing});
+      readers_.write(*reader, {nothing, sizeof nothing});
+      readers_.settle();
     }
     answer(*reader, latched_);
   }
@@ -311,7 +312,7 @@ class PublisherCore {
   bool send_piped(Lock& lock, Span<const std::uint8_t> frame) {
     Readers::List full;
     for (const auto& reader : readers_.piped()) {
-      if (reader->pipe->write(frame)) {
+      if (readers_.write(*reader, frame)) {
         reader->late = false;
       } else if (reader->request.strict) {
         full.push_back(reader);
@@ -319,7 +320,7 @@ class PublisherCore {
     }
     bool on_time = true;
     for (const auto& reader : full) {
-      const auto attempt = [&] { return reader->left || reader->pipe->write(frame); };
+      const auto attempt = [&] { return reader->left || readers_.write(*reader, frame); };
       if (!reader->late) reader->late = !await_room(lock, reader->request.timeout_ms, attempt);
       on_time &= !reader->late;
     }

@@ -7,11 +7,13 @@
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <system_error>
 #include <utility>
 #include <vector>
 
 #include "cortex/outlet.hpp"
 #include "cortex/pipe.hpp"
+#include "cortex/relay.hpp"
 #include "cortex/ring.hpp"
 #include "cortex/wire.hpp"
 
@@ -24,6 +26,7 @@ struct Reader {
   Outlet* outlet = nullptr;
   std::uint32_t column = wire::no_column;
   std::unique_ptr<pipe::Writer> pipe;  // where its frames go; null: through the outlet
+  std::shared_ptr<pipe::Relay::Member> member;  // of the relay that writes the pipe; null: we do
   bool late = false;  // its pipe was full for too long: it holds up nothing until it has room again
   bool left = false;
 };
@@ -49,9 +52,7 @@ class Readers {
     reader->request = request;
     reader->outlet = &outlet;
     if (request.shared_memory && shared_memory) reader->column = free_column();
-    if (reader->column != wire::no_column && piped_.size() < pipes_max) {
-      reader->pipe = pipe::Writer::open(folder, request.reader);
-    }
+    if (reader->column != wire::no_column) reader->pipe = pipe::Writer::open(folder, request.reader);
     if (reader->pipe == nullptr) {
       ++(outlet.strict ? strict_ : lossy_);
     } else {
@@ -68,13 +69,42 @@ class Readers {
     const std::shared_ptr<Reader> reader = std::move(*found);
     all_.erase(found);
     if (reader->pipe == nullptr) --(reader->outlet->strict ? strict_ : lossy_);
+    take_back(*reader);
     piped_.erase(std::remove(piped_.begin(), piped_.end(), reader), piped_.end());
     reader->left = true;
+    settle();
     return reader;
+  }
+
+  // Lets a relay write the pipes if there are many, else their publisher; what is to be written directly is written.
+  void settle() {
+    if (piped_.size() <= direct_max) return end_relay();
+    try {
+      if (relay_ == nullptr) relay_ = std::make_unique<pipe::Relay>();
+    } catch (const std::system_error&) {
+      return;  // slower, but as well
+    }
+    for (const auto& reader : piped_) {
+      if (reader->member == nullptr) reader->member = relay_->add(*reader->pipe);
+    }
+  }
+
+  // Writes a frame into a reader's pipe, or as much of it as there is room for, and keeps the rest; false if there is
+  // no room.
+  bool write(Reader& reader, Span<const std::uint8_t> frame) {
+    return reader.member == nullptr ? reader.pipe->write(frame) : relay_->put(*reader.member, frame);
+  }
+
+  // Writes what is left of frames.
+  void flush() {
+    for (const auto& reader : piped_) {
+      if (reader->member == nullptr) reader->pipe->flush();
+    }
   }
 
   // Gives all readers away.
   List release() noexcept {
+    end_relay();
     for (const auto& reader : all_) reader->left = true;
     piped_.clear();
     lossy_ = strict_ = 0;
@@ -130,8 +160,19 @@ class Readers {
   }
 
  private:
-  // A publisher writes each pipe itself; of further readers ZeroMQ takes care, in a thread of its own.
-  static constexpr std::size_t pipes_max = 2;
+  // So many pipes a publisher writes itself: what is quickest for one reader is a storm of wake-ups for many.
+  static constexpr std::size_t direct_max = 2;
+
+  void take_back(Reader& reader) noexcept {
+    if (reader.member != nullptr) relay_->remove(reader.member);
+    reader.member.reset();
+  }
+
+  void end_relay() noexcept {
+    if (relay_ == nullptr) return;
+    for (const auto& reader : piped_) take_back(*reader);
+    relay_.reset();
+  }
 
   std::uint32_t free_column() const noexcept {
     for (std::uint32_t column = 0; column < wire::column_count; ++column) {
@@ -144,6 +185,7 @@ class Readers {
 
   List all_;
   List piped_;
+  std::unique_ptr<pipe::Relay> relay_;
   std::size_t lossy_ = 0;
   std::size_t strict_ = 0;
 };
