@@ -7,7 +7,10 @@
 #include <string.h>
 #include <unistd.h>
 
-enum { READ_BYTES = 1 << 16 };
+enum {
+    READ_BYTES = 1 << 16,
+    KEPT_BYTES = 1 << 20, /* a buffer that grew beyond this for one frame is let go after it */
+};
 
 static PyObject *dont_wait, *no_flags; /* of ZeroMQ, as ints */
 static PyObject *reader_take(PyObject *self, int may_wait);
@@ -182,20 +185,32 @@ static Py_ssize_t frame_size(const char *data, Py_ssize_t available) {
     return (data[3] == 'M' || data[3] == 'B') && body <= (uint64_t)1 << 30 ? HEADER_SIZE + (Py_ssize_t)body : -1;
 }
 
-/* Make room for a frame of `size` bytes from `begin` on, and for a read; 0: no memory. */
+/* Give what has come of a frame another place; 0: no memory. */
+static int move_to(PipeReader *reader, Py_ssize_t capacity) {
+    const Py_ssize_t held = reader->end - reader->begin;
+    char *other = PyMem_Malloc((size_t)capacity);
+    if (other == NULL) return 0;
+    memcpy(other, reader->buffer + reader->begin, (size_t)held);
+    PyMem_Free(reader->buffer);
+    reader->buffer = other;
+    reader->capacity = capacity;
+    reader->begin = 0;
+    reader->end = held;
+    return 1;
+}
+
+/* Make room for a read behind what has come of a frame of `size` bytes; 0: no memory.
+
+   Memory grows with what has come, not with what a header says will come. */
 static int make_room(PipeReader *reader, Py_ssize_t size) {
     const Py_ssize_t held = reader->end - reader->begin;
-    const Py_ssize_t wanted = (size > READ_BYTES ? size : READ_BYTES) + READ_BYTES;
-    if (reader->capacity < wanted) {
-        char *larger = PyMem_Malloc((size_t)wanted);
-        if (larger == NULL) return 0;
-        memcpy(larger, reader->buffer + reader->begin, (size_t)held);
-        PyMem_Free(reader->buffer);
-        reader->buffer = larger;
-        reader->capacity = wanted;
-    } else if (reader->begin > 0) {
-        memmove(reader->buffer, reader->buffer + reader->begin, (size_t)held);
+    if (!held && reader->capacity > KEPT_BYTES) return move_to(reader, 2 * READ_BYTES);
+    if (reader->capacity - reader->end >= READ_BYTES) return 1;
+    if (reader->capacity - held < READ_BYTES) {
+        const Py_ssize_t most = (size > held ? size : held) + READ_BYTES;
+        return move_to(reader, most < 2 * reader->capacity ? most : 2 * reader->capacity);
     }
+    memmove(reader->buffer, reader->buffer + reader->begin, (size_t)held);
     reader->begin = 0;
     reader->end = held;
     return 1;
@@ -214,11 +229,9 @@ static const char *peek_frame(PipeReader *reader, Py_ssize_t *size) {
             reader->begin += *size;
             return reader->buffer + reader->begin - *size;
         }
-        if (reader->capacity - reader->end < READ_BYTES || *size > reader->capacity - reader->begin) {
-            if (!make_room(reader, *size)) {
-                PyErr_NoMemory();
-                return NULL;
-            }
+        if (!make_room(reader, *size)) {
+            PyErr_NoMemory();
+            return NULL;
         }
         ssize_t count;
         do count = read(reader->fd, reader->buffer + reader->end, READ_BYTES);

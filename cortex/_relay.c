@@ -9,7 +9,8 @@
    cannot stay attached to it: a reliable one holds up the publisher (`Again`) until `give_up`; then, as a lossy one at
    once, it gets what waits for it as a copy of its own, and loses what comes until half of that is written.
 
-   The lock is held for moments only, never while writing. The thread knows nothing of Python. */
+   The lock is held for moments only, never while writing, and whoever holds it is as urgent as who waits for it (the
+   publisher does, with the GIL). The thread is as urgent as who publishes. It knows nothing of Python. */
 
 #include "_native.h"
 
@@ -18,6 +19,7 @@
 #include <limits.h>
 #include <poll.h>
 #include <pthread.h>
+#include <sched.h>
 #include <signal.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -36,7 +38,7 @@ enum {
 typedef struct {
     int fd; /* -1: nobody */
     int strict;
-    int detached; /* loses what comes: it has a copy of what waited for it */
+    int detached; /* loses what comes: it has a copy of what waited for it, or its pipe is full */
     int full;     /* had no room at the last write */
     int dead;     /* takes everything: whoever reads it will be removed */
     int writing;  /* by the thread, which does not hold the lock: its part of the ring must stay */
@@ -50,7 +52,7 @@ typedef struct {
     PyObject *again;
     pid_t owner; /* the thread lives in this process only */
     pthread_t thread;
-    int started, closed;
+    int started, closed, adopted;
     pthread_mutex_t lock; /* of all that follows */
     pthread_cond_t written;
     Member members[MEMBERS_MAX];
@@ -64,7 +66,8 @@ typedef struct {
 } Relay;
 
 static int is_behind(const Relay *relay, const Member *member) {
-    return member->fd >= 0 && !member->dead && (member->rest_at < member->rest_size || member->sent < relay->head);
+    return member->fd >= 0 && !member->dead
+           && (member->rest_at < member->rest_size || member->sent < relay->head || member->detached);
 }
 
 static void drop_rest(Member *member) {
@@ -109,6 +112,10 @@ static void note_written(Member *member, size_t written) {
 static void serve(Relay *relay, Member *member) {
     struct iovec parts[PARTS];
     const int count = next_parts(relay, member, parts);
+    if (!count) { /* nothing waits for it, and its pipe has room */
+        note_written(member, 0);
+        return;
+    }
     size_t wanted = 0;
     for (int part = 0; part < count; ++part) wanted += parts[part].iov_len;
     const int fd = member->fd;
@@ -221,6 +228,16 @@ static int is_in_the_way(const Relay *relay, const Member *member, size_t size) 
     return member->fd >= 0 && !member->dead && relay->head - member->sent > most;
 }
 
+/* Make the thread as urgent as the caller; where that is not allowed it stays as it is. */
+static void adopt(Relay *relay) {
+    relay->adopted = 1;
+#ifdef __linux__
+    struct sched_param parameters;
+    const int policy = sched_getscheduler(0); /* of this thread; what pthread_getschedparam says may be out of date */
+    if (policy >= 0 && sched_getparam(0, &parameters) == 0) (void)pthread_setschedparam(relay->thread, policy, &parameters);
+#endif
+}
+
 static int is_late(const Member *member) { return member->fd >= 0 && member->strict && member->detached && !member->dead; }
 
 static int any_late(const Relay *relay) {
@@ -281,6 +298,7 @@ static void append(Relay *relay, const char *data, size_t size) {
 /* Put a frame into the ring: True, or False if a reliable member that is late loses it; `again` if it has no place. */
 static PyObject *put(Relay *relay, PyObject *frame, int while_late) {
     if (relay->closed) Py_RETURN_TRUE;
+    if (!relay->adopted) adopt(relay);
     const size_t size = (size_t)PyBytes_GET_SIZE(frame);
     pthread_mutex_lock(&relay->lock);
     const int late = any_late(relay);
@@ -315,20 +333,21 @@ static PyObject *relay_offer(Relay *relay, PyObject *const *arguments, Py_ssize_
 }
 
 PyDoc_STRVAR(add_doc,
-"add($self, fd, left, strict, /)\n--\n\n"
+"add($self, fd, left, strict, late, /)\n--\n\n"
 "Write to one more pipe, from the next frame on.\n\n"
 "Args:\n"
 "    fd: Its descriptor, non-blocking; belongs to the relay from now on, unless this raises.\n"
 "    left: Bytes to be written there first.\n"
-"    strict: Whether it holds up the publisher.\n\n"
+"    strict: Whether it holds up the publisher.\n"
+"    late: Whether it loses what comes until it has read some of what waits.\n\n"
 "Returns:\n"
 "    Its number, for `remove`.\n");
 
 static PyObject *relay_add(Relay *relay, PyObject *arguments) {
-    int fd, strict;
+    int fd, strict, late;
     const char *left;
     Py_ssize_t size;
-    if (!PyArg_ParseTuple(arguments, "iy#p:add", &fd, &left, &size, &strict)) return NULL;
+    if (!PyArg_ParseTuple(arguments, "iy#pp:add", &fd, &left, &size, &strict, &late)) return NULL;
     if (relay->closed) {
         PyErr_SetString(PyExc_ValueError, "the relay is closed");
         return NULL;
@@ -341,8 +360,8 @@ static PyObject *relay_add(Relay *relay, PyObject *arguments) {
     while (place < MEMBERS_MAX && relay->members[place].fd >= 0) ++place;
     if (place < MEMBERS_MAX) {
         if (place == relay->used) relay->used += 1;
-        relay->members[place] =
-            (Member){.fd = fd, .strict = strict, .sent = relay->head, .rest = copy, .rest_size = (size_t)size};
+        relay->members[place] = (Member){.fd = fd, .strict = strict, .detached = late, .full = late, .sent = relay->head,
+                                         .rest = copy, .rest_size = (size_t)size};
         wake(relay);
     }
     pthread_mutex_unlock(&relay->lock);
@@ -370,15 +389,18 @@ PyDoc_STRVAR(take_doc,
 "take($self, number, /)\n--\n\n"
 "Write to a member no more.\n\n"
 "Returns:\n"
-"    The descriptor of its pipe, which is the caller's now, and the bytes that are to be written there first.\n");
+"    The descriptor of its pipe, which is the caller's now, the bytes that are to be written there first, and\n"
+"    whether it is late.\n");
 
 static PyObject *relay_take(Relay *relay, PyObject *number) {
     Member *member = member_argument(relay, number);
     if (member == NULL) return NULL;
     PyObject *taken = NULL;
     pthread_mutex_lock(&relay->lock);
+    const int late = member->detached;
     if (detach(relay, member)) {
-        taken = Py_BuildValue("iy#", member->fd, member->rest, (Py_ssize_t)member->rest_size);
+        taken = Py_BuildValue(
+            "iy#N", member->fd, member->rest, (Py_ssize_t)member->rest_size, PyBool_FromLong(late));
         if (taken != NULL) forget(member);
     } else {
         PyErr_NoMemory();
@@ -441,9 +463,10 @@ static PyObject *relay_is_idle(Relay *relay, PyObject *unused) {
     return PyBool_FromLong(idle);
 }
 
-/* End the thread; in a forked child there is none, and nobody knows who holds the lock. */
+/* End the thread; in a forked child there is none, and nobody knows who holds the lock, or what it was freeing. */
 static void stop(Relay *relay) {
-    if (relay->started && relay->owner == getpid()) {
+    const int ours = relay->owner == getpid();
+    if (relay->started && ours) {
         pthread_mutex_lock(&relay->lock);
         relay->stopping = 1;
         wake(relay);
@@ -454,7 +477,7 @@ static void stop(Relay *relay) {
     }
     for (int place = 0; place < MEMBERS_MAX; ++place) {
         if (relay->members[place].fd >= 0) close(relay->members[place].fd);
-        forget(&relay->members[place]);
+        if (ours) forget(&relay->members[place]);
     }
     if (relay->wake_read >= 0) close(relay->wake_read);
     if (relay->wake_write >= 0) close(relay->wake_write);
@@ -474,13 +497,28 @@ static PyObject *relay_close(Relay *relay, PyObject *unused) {
 
 static int open_wake(Relay *relay) {
     int fds[2];
+#ifdef __linux__ /* at once, as another thread may start a program in between */
+    if (pipe2(fds, O_NONBLOCK | O_CLOEXEC) < 0) return 0;
+    relay->wake_read = fds[0];
+    relay->wake_write = fds[1];
+#else
     if (pipe(fds) < 0) return 0;
     relay->wake_read = fds[0];
     relay->wake_write = fds[1];
     for (int end = 0; end < 2; ++end) {
         if (fcntl(fds[end], F_SETFL, O_NONBLOCK) < 0 || fcntl(fds[end], F_SETFD, FD_CLOEXEC) < 0) return 0;
     }
+#endif
     return 1;
+}
+
+/* Whoever holds the lock becomes as urgent as who waits for it, where the system can do that. */
+static void make_lock(pthread_mutex_t *lock) {
+    pthread_mutexattr_t attributes;
+    pthread_mutexattr_init(&attributes);
+    pthread_mutexattr_setprotocol(&attributes, PTHREAD_PRIO_INHERIT);
+    if (pthread_mutex_init(lock, &attributes)) pthread_mutex_init(lock, NULL);
+    pthread_mutexattr_destroy(&attributes);
 }
 
 static PyObject *relay_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
@@ -493,7 +531,7 @@ static PyObject *relay_new(PyTypeObject *type, PyObject *arguments, PyObject *ke
     relay->owner = getpid();
     relay->wake_read = relay->wake_write = -1;
     for (int place = 0; place < MEMBERS_MAX; ++place) relay->members[place].fd = -1;
-    pthread_mutex_init(&relay->lock, NULL);
+    make_lock(&relay->lock);
     pthread_cond_init(&relay->written, NULL);
     relay->capacity = RING_BYTES;
     relay->ring = malloc(RING_BYTES);

@@ -64,12 +64,12 @@ class Writer(Protocol):
 class Relay(Protocol):
     """Writes frames into the pipes of many readers, in a thread of its own."""
 
-    def add(self, fd: int, left: bytes, strict: bool, /) -> int:
+    def add(self, fd: int, left: bytes, strict: bool, late: bool, /) -> int:
         """Write to one more pipe; see `_relay.c`."""
         ...
 
-    def take(self, member: int | None, /) -> tuple[int, bytes]:
-        """Give a pipe back: its descriptor, and what is to be written there first."""
+    def take(self, member: int | None, /) -> tuple[int, bytes, bool]:
+        """Give a pipe back: its descriptor, what is to be written there first, and whether it is late."""
         ...
 
     def remove(self, member: int | None, /) -> None:
@@ -191,7 +191,7 @@ class PyReader:
         self._fd = fd
         self._receive = receive
         self._wait_ms = wait_ms
-        self._buffer = b""
+        self._buffer = bytearray()
         self._at = 0
         self.broken = False
         self._poll = select.poll()
@@ -213,9 +213,9 @@ class PyReader:
             size = frame_size(self._buffer, self._at)
             if size < 0:
                 self.broken = True
-                return self._buffer[self._at :]
+                return bytes(self._buffer[self._at :])
             if 0 < size <= len(self._buffer) - self._at:
-                frame = self._buffer[self._at : self._at + size]
+                frame = bytes(memoryview(self._buffer)[self._at : self._at + size])
                 self._at += size
                 return frame
             try:
@@ -224,11 +224,13 @@ class PyReader:
                 return None
             if not more:
                 return None
-            self._buffer, self._at = self._buffer[self._at :] + more, 0
+            del self._buffer[: self._at]
+            self._buffer += more
+            self._at = 0
         return None
 
 
-def frame_size(buffer: bytes, offset: int) -> int:
+def frame_size(buffer: bytes | bytearray, offset: int) -> int:
     """Size of the frame that begins in a buffer; 0: its header is not there yet; -1: it is no frame."""
     if len(buffer) - offset < HEADER_SIZE:
         return 0

@@ -67,22 +67,32 @@ class Pipes:
         if many and self._direct:
             self._relay = self._relay or make_relay()
             if self._relay is not None:
-                for reader in self._direct:
-                    assert reader.pipe is not None
-                    fd, left = reader.pipe.detach()
-                    reader.member = self._relay.add(fd, left, reader.request.strict)
-                self._relayed += self._direct
-                self._direct = []
-                self._route()
+                self._hand_over(self._relay)
                 return True
         return not many and self._take_back()
+
+    def _hand_over(self, relay: Relay) -> None:
+        """Let a relay write all pipes; those for which there is no memory we go on to write ourselves."""
+        while self._direct:
+            reader = self._direct.pop(0)
+            assert reader.pipe is not None
+            fd, left = reader.pipe.detach()
+            try:
+                reader.member = relay.add(fd, left, reader.request.strict, reader.late)
+            except MemoryError:
+                reader.pipe = make_writer(fd, left)
+                self._direct.insert(0, reader)
+                break
+            self._relayed.append(reader)
+        self._route()
 
     def _take_back(self) -> bool:
         """Write all pipes ourselves; whether that is new."""
         if self._relay is None:
             return False
         for reader in self._relayed:
-            reader.pipe = make_writer(*self._relay.take(reader.member))
+            fd, left, reader.late = self._relay.take(reader.member)
+            reader.pipe = make_writer(fd, left)
         self._direct += self._relayed
         self._relayed = []
         self._relay.close()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -141,6 +142,28 @@ def test_a_frame_larger_than_the_pipe_goes_through_in_parts(ends):
     assert ends.writer.flush()
     ends.writer.send(frame(1))
     assert ends.take() == frame(1)
+
+
+def test_memory_grows_with_what_has_come(ends):
+    """A header that says a gigabyte takes none; what a large frame took is let go after it."""
+    large = pack_header(Header(MESSAGE, 1, 2, 0, None, 3, 20_000_000, 0)) + bytes(20_000_000)
+    huge = pack_header(Header(MESSAGE, 1, 2, 0, None, 3, 1 << 30, 0))
+    tracemalloc.start()
+    try:
+        ends.writer.send(large)
+        found = None
+        while found is None:
+            found = ends.take()
+            ends.writer.flush()
+        assert found == large
+        del found
+        ends.writer.send(huge + bytes(50_000))
+        assert ends.take() is None
+        size, peak = tracemalloc.get_traced_memory()
+        assert size < 1_000_000
+        assert peak < 70_000_000  # the frame, the buffer, and while it grows that before it
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("cut", [1, 3, 63, 64, 100, 4063])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import select
@@ -51,7 +52,7 @@ class End:
         os.set_blocking(write, False)
         self.write_fd = write
         self.stream = bytearray()
-        self.member = relay.add(write, left, strict)
+        self.member = relay.add(write, left, strict, False)
 
     def read(self) -> bool:
         """Take what is there; whether there was something."""
@@ -252,9 +253,10 @@ def test_a_pipe_is_taken_over_and_given_back_between_any_two_bytes(relay, ends):
     count = 1
     while takes(relay, frame(count, 3000)):
         count += 1
-    fd, left = relay.take(reader.member)
+    fd, left, late = relay.take(reader.member)
     assert fd == reader.write_fd
     assert left
+    assert not late
     assert relay.is_idle()
     writer = native.NativePipeWriter(fd, zmq.Again, left)
     with pytest.raises(zmq.Again):
@@ -263,7 +265,7 @@ def test_a_pipe_is_taken_over_and_given_back_between_any_two_bytes(relay, ends):
     wait_for(lambda: (reader.read(), takes(writer, frame(count, 100_000)))[1])
     wait_for(lambda: (reader.read(), writer.flush())[1])
     fd, left = writer.detach()
-    again = relay.add(fd, left, True)
+    again = relay.add(fd, left, True, False)
     relay.send(frame(count + 1, 10))
     reader.read_until(5064 + (count - 1) * 3064 + 100_064 + 74)
     assert numbers_of(bytes(reader.stream)) == list(range(count + 2))
@@ -272,13 +274,60 @@ def test_a_pipe_is_taken_over_and_given_back_between_any_two_bytes(relay, ends):
         relay.take(again)
 
 
+def test_one_that_is_late_when_it_comes_holds_up_nobody(relay):
+    """Its pipe is full, and nothing is left of a frame; it gets what comes once it reads."""
+    fd, write = os.pipe()
+    for end in (fd, write):
+        os.set_blocking(end, False)
+    before = 0
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            before += os.write(write, frame(0, 1000))
+    cut = before % 1064
+    member = relay.add(write, frame(0, 1000)[cut:] if cut else b"", True, True)
+    for number in range(1000):  # more than the ring holds
+        assert relay.offer(frame(number, 1000)) is False
+        with pytest.raises(zmq.Again):
+            relay.send(frame(number, 1000))
+    assert not relay.in_the_way(frame(0, 1000))
+    stream = os.read(fd, 1 << 20)
+    wait_for(lambda: takes(relay, frame(7, 10)))
+    wait_for(relay.is_idle)
+    stream += os.read(fd, 1 << 20)
+    assert numbers_of(stream) == [0] * ((len(stream) - 74) // 1064) + [7]
+    end, left, late = relay.take(member)
+    assert (end, left, late) == (write, b"", False)
+    for each in (fd, write):
+        os.close(each)
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="no such policy")
+def test_the_thread_is_as_urgent_as_who_publishes(ends):
+    """Whoever made it: a thread of a lower priority, that of a node, perhaps."""
+    before = set(os.listdir("/proc/self/task"))
+    relay = native.NativeRelay(zmq.Again)
+    (thread,) = set(os.listdir("/proc/self/task")) - before
+    assert os.sched_getscheduler(int(thread)) == os.sched_getscheduler(0)
+
+    def publish() -> None:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        relay.send(frame(0, 10))
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    publisher.join()
+    assert os.sched_getscheduler(int(thread)) == os.SCHED_BATCH
+    assert os.sched_getscheduler(0) != os.SCHED_BATCH
+    relay.close()
+
+
 def test_a_relay_has_a_limit_and_leaves_nothing(ends):
     before = sorted(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))
     relay = native.NativeRelay(zmq.Again)
     made = [End(relay, strict=True) for _ in range(64)]
     reader, write = os.pipe()
     with pytest.raises(ValueError, match="at most 64"):
-        relay.add(write, b"", True)
+        relay.add(write, b"", True, False)
     relay.send(frame(0, 10))
     relay.close()
     relay.close()
@@ -313,15 +362,11 @@ def test_only_frames_are_sent(relay, wrong):
 def test_news_for_all_reaches_all_that_have_room():
     """A reliable reader that is late keeps it from nobody."""
     pipes = cortex.pipes.Pipes(lambda send, timeout_s: False)
-    fds, readers = [], []
+    fds = []
     for strict in (True, True, False):
-        fd, write = os.pipe()
-        os.set_blocking(fd, False)
-        os.set_blocking(write, False)
+        fd, reader = open_reader(strict=strict)
         fds.append(fd)
-        request = AttachKey(1, 2, True, strict, 4, 100)
-        readers.append(cortex.large.Reader(os.urandom(4), request, None, 0, make_writer(write)))
-        pipes.admit(readers[-1])
+        pipes.admit(reader)
     assert pipes.settle()
     streams = [bytearray() for _ in fds]
 
@@ -340,6 +385,90 @@ def test_news_for_all_reaches_all_that_have_room():
     pipes.offer(frame(count + 1, 0))
     wait_for(lambda: [read(1), read(2)] and numbers_of(bytes(streams[1]))[-1] == count + 1)
     wait_for(lambda: [read(1), read(2)] and numbers_of(bytes(streams[2]))[-1] == count + 1)
+    pipes.close()
+    for fd in fds:
+        os.close(fd)
+
+
+def open_reader(*, strict: bool) -> tuple[int, cortex.large.Reader]:
+    """A pipe that nobody has written to: the descriptor to read from, and who is served so."""
+    fd, write = os.pipe()
+    for end in (fd, write):
+        os.set_blocking(end, False)
+    request = AttachKey(1, 2, True, strict, 4, 100)
+    return fd, cortex.large.Reader(os.urandom(4), request, None, 0, make_writer(write))
+
+
+@pytest.mark.parametrize("size", [1000, 16_300])
+def test_who_is_late_stays_so_whoever_writes(monkeypatch, size):
+    """One that does not read is waited for once, and not again as its pipe goes to a relay and comes back."""
+    waits = []
+    pipes = cortex.pipes.Pipes(lambda send, timeout_s: waits.append(timeout_s))
+    fd, reader = open_reader(strict=True)
+    pipes.admit(reader)
+    count = 0
+    while pipes.send(frame(count, size)):
+        count += 1
+    for most in (0, 2, 0):
+        monkeypatch.setattr(cortex.pipes, "PIPES_MAX", most)
+        assert pipes.settle()
+        for _ in range(2 * RING_BYTES // size):
+            assert not pipes.send(frame(count, size))
+    assert len(waits) == 1
+    stream = bytearray()
+
+    def read() -> bool:
+        with contextlib.suppress(BlockingIOError):
+            stream.extend(os.read(fd, 1 << 20))
+        return pipes.send(frame(count + 1, 0))
+
+    wait_for(read)
+    wait_for(lambda: (read(), numbers_of(bytes(stream))[-1] == count + 1)[1])
+    numbers = numbers_of(bytes(stream))
+    assert numbers[:count] == list(range(count))
+    assert set(numbers[count:]) == {count + 1}
+    assert len(waits) == 1
+    pipes.close()
+    os.close(fd)
+
+
+def test_without_memory_for_a_relay_pipes_are_written_as_before(monkeypatch):
+    class Poor:
+        """A relay with memory for one reader."""
+
+        def __init__(self) -> None:
+            self.relay = native.NativeRelay(zmq.Again)
+            self.count = 0
+
+        def add(self, *arguments):
+            self.count += 1
+            if self.count > 1:
+                raise MemoryError
+            return self.relay.add(*arguments)
+
+        def __getattr__(self, name):
+            return getattr(self.relay, name)
+
+    monkeypatch.setattr(cortex.pipes, "make_relay", Poor)
+    pipes = cortex.pipes.Pipes(lambda send, timeout_s: False)
+    fds = []
+    for _ in range(3):
+        fd, reader = open_reader(strict=True)
+        fds.append(fd)
+        pipes.admit(reader)
+    pipes.send(frame(0, 10))
+    assert pipes.settle()
+    pipes.send(frame(1, 10))
+    streams = [bytearray() for _ in fds]
+
+    def read() -> bool:
+        for fd, stream in zip(fds, streams, strict=True):
+            with contextlib.suppress(BlockingIOError):
+                stream.extend(os.read(fd, 1 << 20))
+        return all(len(stream) == 2 * 74 for stream in streams)
+
+    wait_for(read)
+    assert [numbers_of(bytes(stream)) for stream in streams] == [[0, 1]] * 3
     pipes.close()
     for fd in fds:
         os.close(fd)
