@@ -64,7 +64,6 @@ class Rate:
 
     def stamps(self, start_ns: int, end_ns: int) -> Iterator[int]:
         """Yield the stamps of all ticks in [start_ns, end_ns); TypeError if they are no integers."""
-        tick, end_ns = self.first_tick(start_ns), operator.index(end_ns)
-        while (stamp := self.stamp_ns(tick)) < end_ns:
-            yield stamp
-            tick += 1
+        numerator, denominator = self._period
+        for tick in range(self.first_tick(start_ns), self.first_tick(end_ns)):
+            yield tick * numerator // denominator

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -53,7 +54,7 @@ class Model:
         present = {} if terms is None else terms._asdict()
         return tuple(name for name, value in present.items() if value)
 
-    @property
+    @functools.cached_property
     def duration_ns(self) -> int:
         """Length of the run [ns]."""
         return to_ns(self.config.duration_s)

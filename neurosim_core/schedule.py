@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from neurosim_core.clock import Rate
 
@@ -30,8 +31,7 @@ class Schedule:
         return self.instants_per_launch * (TICKS_PER_INSTANT if cast in self.sparse else 1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Boundary:
+class Boundary(NamedTuple):
     """An instant at which the integration stops because something happens."""
 
     stamp_ns: int
@@ -56,21 +56,14 @@ def batch_end_ns(schedule: Schedule, start_ns: int, limit_ns: int) -> int:
 
 def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]:
     """Return the boundaries in (start_ns, end_ns] in order of time; the last is always at `end_ns`."""
-
-    def ticks(rate: Rate) -> set[int]:
-        return set(rate.stamps(start_ns + 1, end_ns + 1))
-
-    control = ticks(schedule.control)
-    samplers = [ticks(rate) for rate in schedule.samplers]
-    casts = [ticks(rate) for rate in schedule.casts]
+    marks = {end_ns: 0}
+    for place, rate in enumerate((schedule.control, *schedule.samplers, *schedule.casts)):
+        mark = 1 << place
+        for stamp_ns in rate.stamps(start_ns + 1, end_ns + 1):
+            marks[stamp_ns] = marks.get(stamp_ns, 0) | mark
+    sampler_count, cast_count = len(schedule.samplers), len(schedule.casts)
     return [
-        Boundary(
-            stamp_ns=stamp_ns,
-            control=stamp_ns in control,
-            samplers=_indices(samplers, stamp_ns),
-            casts=_indices(casts, stamp_ns),
-        )
-        for stamp_ns in sorted(control.union({end_ns}, *samplers, *casts))
+        Boundary(stamp_ns, *_due(marks[stamp_ns], sampler_count, cast_count)) for stamp_ns in sorted(marks)
     ]
 
 
@@ -87,5 +80,9 @@ def _tick_after(rate: Rate, stamp_ns: int, count: int) -> int:
     return rate.stamp_ns(rate.first_tick(stamp_ns + 1) + count - 1)
 
 
-def _indices(ticks: Sequence[set[int]], stamp_ns: int) -> tuple[int, ...]:
-    return tuple(index for index, stamps in enumerate(ticks) if stamp_ns in stamps)
+@functools.cache
+def _due(mark: int, sampler_count: int, cast_count: int) -> tuple[bool, tuple[int, ...], tuple[int, ...]]:
+    """Return whether a command is due, and the samplers and casts that are: from the lowest bit on."""
+    samplers = tuple(index for index in range(sampler_count) if mark >> (1 + index) & 1)
+    casts = tuple(index for index in range(cast_count) if mark >> (1 + sampler_count + index) & 1)
+    return bool(mark & 1), samplers, casts

@@ -215,6 +215,8 @@ class EventCamera:
                 device=self.device,
             )
         self._drafts: Drafts | None = None
+        self._draft: Draft | None = None  # the last that was launched
+        self._carried: Draft | None = None  # it holds the keys that are carried over; None: `_keys` does
         wanted = self.device.is_cuda and _CUT_AHEAD_ON_CUDA if cut_ahead is None else cut_ahead
         if wanted and self._on_host and self._readout is None and len(self._chunk_bounds()) == 1:
             self._drafts = Drafts(
@@ -229,6 +231,8 @@ class EventCamera:
 
         self._now_ns: int | None = None
         self._fed_ns = 0
+        self._window_start_ns = self._drafted_ns = 0
+        self._key_count = 0
         self._origin_us = 0
         self._state = 0
         self._forget()
@@ -532,8 +536,7 @@ class EventCamera:
             if self._drafts is not None and scan.draft is not None:
                 self._drafts.drop(scan.draft)
                 scan.draft = None
-        self._draft: Draft | None = None
-        self._carried: Draft | None = None
+        self._draft = self._carried = None
         self._state = 0
         self._key_count = 0
         self._read_count = 0
@@ -951,14 +954,14 @@ def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
     stamps = np.asarray(stamps_ns)
     if stamps.size == 0:
         stamps = stamps.astype(np.int64)
-    if stamps.ndim != 1 or not np.issubdtype(stamps.dtype, np.integer):
+    if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
         raise ValueError(
             f"stamps_ns must be integers of shape [K], got {stamps.dtype} of shape {list(stamps.shape)}"
         )
     stamps = stamps.astype(np.int64)
-    steps = np.diff(stamps)
-    if (steps <= 0).any():
-        index = int(np.argmax(steps <= 0))
+    falls = stamps[1:] <= stamps[:-1]
+    if falls.any():
+        index = int(np.argmax(falls))
         raise ValueError(
             f"stamps_ns must be strictly increasing, got {stamps[index + 1]} after {stamps[index]}"
         )
