@@ -58,10 +58,11 @@ def choose(model: Model, state: State, batch: Batch, casts: Collection[int] | No
             chosen.append([])
             continue
         close_eyes(cast, batch.wanted)
+        always = any(name in batch.wanted for name in cast.events)
         due = [
             place
             for place, boundary in enumerate(batch.boundaries)
-            if index in boundary.casts and is_due(cast, boundary.stamp_ns, batch.wanted)
+            if index in boundary.casts and (always or is_due(cast, boundary.stamp_ns, batch.wanted))
         ]
         if cast.rule is not None:
             with timed(state.wall_s, "choice of renders"), on(state.choice_stream):

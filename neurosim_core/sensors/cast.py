@@ -293,7 +293,7 @@ def plan_look(
     image_slots = []
     used = 0
     for stamp_ns in stamps_ns:
-        due = _pictures_due(cast, stamp_ns, wanted)
+        due = _pictures_due(cast, stamp_ns, wanted) if cast.images else ()
         pictures += [(stamp_ns, used, name) for name in due]
         image_slots.append(used if due else -1)
         used += bool(due)
