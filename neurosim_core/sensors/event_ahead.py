@@ -86,7 +86,7 @@ def gather(
         found_keys: Keys of the scan; those that did not fit are missing.
         counters: Of the scan: the first is how many it found.
         keys_out: Keys, in any order.
-        tally_out: How many there are, and how many of them are held.
+        tally_out: How many there are, how many of them are held, and that none is in a window.
     """
     event = wp.tid()
     first = carried_tally[_CUT]
@@ -106,6 +106,7 @@ def gather(
     if event == 0:
         tally_out[_TOTAL] = carried + found
         tally_out[_HELD] = wp.min(carried + found, room)
+        tally_out[_CUT] = 0
 
 
 @wp.kernel
@@ -119,13 +120,11 @@ def cut(
     # Out:
     tally_out: wp.array[wp.int32],
 ) -> None:
-    """Find where each window ends in the sorted keys; threads are the windows, and one if there is none."""
+    """Find where each window ends in the sorted keys; threads are the windows."""
     window = wp.tid()
-    end = wp.int32(0)
-    if window < window_count:
-        end = count_until(bounds[window], keys, room, time_shift)
-        tally_out[_ENDS + window] = end
-    if window >= window_count - 1:
+    end = count_until(bounds[window], keys, room, time_shift)
+    tally_out[_ENDS + window] = end
+    if window == window_count - 1:
         tally_out[_CUT] = end
 
 
@@ -280,14 +279,16 @@ class Drafts:
         end_bit = min(63, self._time_shift + (now_ns // NS_PER_US - origin_us + 1).bit_length())
         key = (self._last, self._capacity, keys.ptr, counters.ptr, room, len(ends_ns), end_bit)
         self._graphs.run(key, lambda: self._cut(draft, before, keys, counters, end_bit))
-        draft.block = self._blocks.take(_EVENT_BYTES * room)
-        wp.copy(draft.block.array, self._columns, count=_EVENT_BYTES * room)
+        if ends_ns:
+            draft.block = self._blocks.take(_EVENT_BYTES * room)
+            wp.copy(draft.block.array, self._columns, count=_EVENT_BYTES * room)
         draft.done.set()
         return draft
 
     def take(self, draft: Draft) -> list[NDArray[Any]]:
-        """Return the columns of a draft that is done; they are the caller's."""
-        assert draft.block is not None
+        """Return the columns of a draft that is done, none without windows; they are the caller's."""
+        if draft.block is None:
+            return []
         room = draft.room
         rows = self._blocks.lend(draft.block, _EVENT_BYTES * room)
         draft.block = None
@@ -322,10 +323,13 @@ class Drafts:
             ],
             [draft.keys, draft.tally],
         )
+        if window_count == 0:  # all is carried over, in whatever order
+            draft.tally_on_host.fetch(0, int(_ENDS))
+            return
         wp.utils.radix_sort_pairs(draft.keys, self._order, room, begin_bit=SUB_BITS - 1, end_bit=end_bit)
         self._launch(
             cut,
-            max(1, window_count),
+            window_count,
             [draft.keys, room, draft.bounds, window_count, self._time_shift],
             [draft.tally],
         )

@@ -53,6 +53,7 @@ from neurosim_core.sensors.event_scan import (
     LIMIT,
     OPEN,
     PUT,
+    call_up,
     key_after,
     level_at,
     quiet_range,
@@ -360,6 +361,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         table_out: wp.array2d[wp.int32],
     ):
         """Take one pixel from its state before a stack to that after it."""
+        call_up(log_radiance, pixel, frame_count)
         row = pixel // width
         place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
         state = _Pixel()

@@ -284,6 +284,19 @@ def _next_loud(
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int frame = 0; frame < frame_count; ++frame) {
+        const float* sample = log_radiance.data + (size_t)frame * log_radiance.shape[1] + pixel;
+        asm volatile("prefetch.global.L1 [%0];" :: "l"(sample));
+    }
+#endif
+""")
+def call_up(log_radiance: wp.array2d[wp.float32], pixel: wp.int32, frame_count: wp.int32) -> None:
+    """Have the samples of a pixel come near, on CUDA, before they are read one after the other."""
+    ...
+
+
 @wp.func
 def walk(
     tabulate: wp.bool,

@@ -614,12 +614,12 @@ class EventCamera:
         With `again`, the same launches are expected to come again: a graph of them is kept.
         """
         before, after = scan.state, (scan.state + 1) % len(self._last)
-        stack = scan.frames.reshape((scan.frames.shape[0], self.width * self.height))
 
         def launch(chunk: _Chunk) -> None:
             scan.times.upload()
             chunk.counters.zero_()
             thresholds = [self.config.threshold_on, self.config.threshold_off]
+            stack = scan.frames.reshape((scan.frames.shape[0], self.width * self.height))
             extent = [chunk.first_pixel, chunk.end_pixel, stack]
             frame_count = len(scan.stamps_ns)
             if self._screened:
