@@ -25,7 +25,7 @@ _GRAPH_COUNT_MAX = 512
 in two states of the pixels; batches that are streamed take turns among slots: each combination is a graph.
 With fewer places than a cycle has, each would be given up before it comes again."""
 
-_LENT_BYTES_MAX = 64 << 20
+_LENT_BYTES_MAX = 256 << 20
 """Most memory of one kind that is lent out: pages that are pinned are nobody else's."""
 
 
@@ -175,7 +175,7 @@ class LentBlock:
 class LentBlocks:
     """Blocks that go round: who gets one may keep it, and it comes back when its last view is gone.
 
-    So nothing is copied for those who read and forget. Who keeps more than 64 MB gets copies.
+    So nothing is copied for those who read and forget. Who keeps more than 256 MB gets copies.
 
     Args:
         device: What copies to them.
@@ -185,25 +185,29 @@ class LentBlocks:
         self._device = device
         self._free: deque[LentBlock] = deque()
         self._made_count = 0
+        self._taken_count = 0
 
     def take(self, size: int) -> LentBlock:
         """Return a block of at least so many bytes that nobody reads."""
+        self._taken_count += 1
         while self._free:
             block = self._free.popleft()  # the one that came back first
             if block.array.shape[0] >= size:
                 return block
             self._made_count -= 1
         self._made_count += 1
-        return LentBlock(1 << max(0, size - 1).bit_length(), self._device)
+        return LentBlock(size, self._device)
 
     def give_back(self, block: LentBlock) -> None:
         """Let a block be taken again: its content is not wanted."""
+        self._taken_count -= 1
         self._free.append(block)
 
     def lend(self, block: LentBlock, size: int) -> NDArray[np.uint8]:
         """Return the first bytes of a block for the caller to keep, or a copy; the block is not theirs."""
-        away_count = self._made_count - len(self._free)
-        if away_count * block.array.shape[0] > _LENT_BYTES_MAX:
+        self._taken_count -= 1
+        lent_count = self._made_count - len(self._free) - self._taken_count  # with this one
+        if lent_count * block.array.shape[0] > _LENT_BYTES_MAX:
             rows = np.array(block.rows()[:size])
             self._free.append(block)
             return rows

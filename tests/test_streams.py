@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 import warp as wp
 
 from neurosim_core import streams
-from neurosim_core.streams import Graphs, HostCopy, Milestone, make_stream, on
+from neurosim_core.streams import Graphs, HostCopy, LentBlocks, Milestone, make_stream, on
 
 
 @wp.kernel
@@ -71,3 +73,37 @@ def test_a_stream_can_wait_for_another(device):
         done.hold()
         wp.copy(out, values)
         assert (out.numpy() == 50.0).all()
+
+
+def test_a_block_comes_back_when_its_last_view_is_gone(device):
+    blocks = LentBlocks(device)
+    first = blocks.take(100)
+    address = first.array.ptr
+    rows = blocks.lend(first, 100)
+    rows[:] = 7
+    view = rows[3:80].view(np.uint8)[5:]
+    del rows, first
+    second = blocks.take(100)
+    assert second.array.ptr != address  # the view is still read
+    second.rows()[:] = 1
+    assert view.tolist() == [7] * 72
+    blocks.give_back(second)
+    del view
+    gc.collect()
+    assert {blocks.take(90).array.ptr for _ in range(2)} == {address, second.array.ptr}
+    assert blocks.take(200).array.shape[0] >= 200
+
+
+def test_who_keeps_too_much_gets_copies(device, monkeypatch):
+    monkeypatch.setattr(streams, "_LENT_BYTES_MAX", 350)
+    blocks = LentBlocks(device)
+    kept = []
+    for number in range(6):
+        block = blocks.take(100)
+        block.rows()[:] = number
+        kept.append(blocks.lend(block, 100))
+    assert [rows.tolist() for rows in kept] == [[number] * 100 for number in range(6)]
+    assert [rows.flags.owndata for rows in kept] == [False] * 3 + [True] * 3
+    kept.clear()
+    gc.collect()
+    assert not blocks.lend(blocks.take(100), 100).flags.owndata

@@ -530,9 +530,10 @@ class EventCamera:
                 self._under_way.append(scan)
 
     def _forget(self) -> None:
-        self._idle += self._under_way
+        scans = [*self._idle, *self._under_way]
+        self._idle = deque(sorted(scans, key=lambda scan: scan.number))  # as at the first time: same graphs
         self._under_way.clear()
-        for scan in self._idle:
+        for scan in scans:
             if self._drafts is not None and scan.draft is not None:
                 self._drafts.drop(scan.draft)
                 scan.draft = None
