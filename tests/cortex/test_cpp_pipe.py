@@ -148,6 +148,12 @@ def test_slow_reader_of_cpp_knows_what_it_missed(
     assert counters.rejected == 0
 
 
+def counted(node: Node) -> list[int]:
+    """How many messages each subscription of the C++ programs knows of: received, lost or overtaken."""
+    replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
+    return [found.received + found.lost + found.overtaken for reply in replies for found in reply.subscribers]
+
+
 def test_many_readers_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
     """More than a publisher writes to itself: all get everything through pipes, while others come and go."""
     node = make_node()
@@ -184,14 +190,7 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(
     assert all(other.counters.lost == 0 for other in others)
     result = result_of(writer)
     assert (result["timeouts"] > 0) == (policy == "brief")
-
-    def counted() -> list[int]:
-        replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
-        return [
-            found.received + found.lost + found.overtaken for reply in replies for found in reply.subscribers
-        ]
-
-    wait_for(lambda: counted() == [9000])
+    wait_for(lambda: counted(node) == [9000])
 
 
 def test_reader_without_pipe(
@@ -260,10 +259,13 @@ class SlowReader:
 
     Args:
         node: Who knows the publisher.
+        publisher: Its program.
         topic: Its topic.
     """
 
-    def __init__(self, node: Node, topic: str) -> None:
+    def __init__(self, node: Node, publisher: Peer, topic: str) -> None:
+        self.publisher = publisher
+
         def found() -> list[tuple[int, str]]:
             return [
                 (publisher.source, record.endpoints[0].strict)
@@ -280,11 +282,15 @@ class SlowReader:
         self._socket = self._context.socket(zmq.SUB)
         self._socket.connect(address)
         self._socket.subscribe(self.key)
-        assert self._socket.poll(1e3 * SOON_S), "the publisher does not answer"
-        column = wire.parse_answer(self._socket.recv()).column
+        column = self.answer().column
         assert column is not None
         assert self._offer.taken()
         self.column: int = column
+
+    def answer(self) -> wire.AttachAnswer:
+        """The publisher's next answer."""
+        assert self._socket.poll(1e3 * SOON_S), "the publisher does not answer"
+        return wire.parse_answer(self._socket.recv())
 
     @property
     def waiting(self) -> int:
@@ -321,7 +327,7 @@ def attach(
     def run(most: int, size: int) -> tuple[SlowReader, dict[str, int]]:
         node = make_node()
         peer = start("fill", "/scan", most, size)
-        readers.append(SlowReader(node, "/scan"))
+        readers.append(SlowReader(node, peer, "/scan"))
         return readers[-1], result_of(peer)
 
     yield run
@@ -346,6 +352,40 @@ def test_closed_publisher_finishes_a_frame(
     last = reader.frame()
     assert (last[3:4], len(last), sequence_of(last)) == (b"B", wire.HEADER_SIZE, result["published"])
     assert result["published"] == result["taken"] + 1
+
+
+def test_publisher_that_ends_tells_what_there_was(
+    attach: Callable[..., tuple[SlowReader, dict[str, int]]],
+) -> None:
+    """Its node does not wait for ever: a reader with a full pipe is told through its socket."""
+    reader, result = attach(10**9, 10)
+    reader.publisher.end()
+    assert reader.answer().sequence == result["published"] > result["taken"]
+
+
+def test_cpp_reader_counts_what_it_had_no_time_for(
+    start: Callable[..., Peer], make_node: Callable[..., Node]
+) -> None:
+    """It stands still until a publisher in Python, and another one in C++, have ended."""
+    watcher, node = make_node(), make_node()
+    reader = start("count", "/scan", "brief", 0, 0)
+    scans = node.publisher("/scan", Scan)
+    assert scans.wait_for_subscribers(1, SOON_S)
+    reader.process.send_signal(signal.SIGSTOP)
+    sent = 1
+    while scans.publish(scan(sent, 10)):
+        sent += 1
+    node.close()
+    reader.process.send_signal(signal.SIGCONT)
+    wait_for(lambda: counted(watcher) == [sent])
+
+    writer = start("fill", "/scan", 10**9, 10)
+    wait_for(lambda: is_piped(reader, writer.process.pid) or writer.has_line())  # or one message was late
+    reader.process.send_signal(signal.SIGSTOP)
+    sent += result_of(writer)["published"]
+    writer.end()
+    reader.process.send_signal(signal.SIGCONT)
+    wait_for(lambda: counted(watcher) == [sent])
 
 
 def is_ring(place: wire.RingPlace) -> bool:

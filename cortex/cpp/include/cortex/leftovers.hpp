@@ -16,11 +16,14 @@
 
 namespace cortex::detail {
 
+struct Outlet;
+
 // Of one publisher: the rests of frames that pipes had room for in part only, behind them the number of the message
 // that would have come next, by which readers know what they lost, and messages in slots.
 struct Leftover {
   struct Reader {
     std::string key;
+    Outlet* outlet = nullptr;
     std::uint32_t column = wire::no_column;
     std::unique_ptr<pipe::Writer> pipe;  // null: it has got all that it can get
     bool told = false;                   // that this was all
@@ -28,6 +31,7 @@ struct Leftover {
 
   std::vector<Reader> readers;
   std::vector<std::shared_ptr<Ring>> rings;
+  std::uint64_t sequence = 0;                       // of the message that would have come next
   std::array<std::uint8_t, wire::header_size> end{};  // the last frame
 
   // Writes what there is room for, and lets the rings go that nobody reads; whether there was room in some pipe.
@@ -84,6 +88,7 @@ class Leftovers {
   }
 
   bool empty() const noexcept { return list_.empty(); }
+  const std::vector<Leftover>& all() const noexcept { return list_; }
   void clear() noexcept { list_.clear(); }
 
  private:

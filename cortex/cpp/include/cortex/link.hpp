@@ -84,6 +84,15 @@ class Link {
     if (leaving_ns != 0) leaving_ns = now_ns;
   }
 
+  // The publisher has left, and all that came of it has been read: what it has published besides is lost.
+  void end() {
+    try {
+      if (known_ && expected_ < reached_) advance(reached_, 0);
+    } catch (const MalformedMessage& error) {
+      reject(error.what());
+    }
+  }
+
   // Reads at most `budget` frames into the queue, those of the pipe first; false if there may be more.
   bool drain(std::deque<Item>& queue, std::size_t budget, Pace& pace) {
     for (; budget > 0; --budget) {
@@ -368,6 +377,7 @@ class Link {
     const wire::AttachAnswer answer = wire::read_answer(bytes);
     const bool first = !attached_;
     attached_ = true;
+    reached_ = std::max(reached_, answer.sequence);
     column_ = answer.column;
     if (column_ == wire::no_column) {
       subscribe_large(true);  // the publisher cannot share memory any more
@@ -450,6 +460,7 @@ class Link {
   bool large_subscribed_ = true;
   bool known_ = false;  // whether `expected_` is
   std::uint64_t expected_ = 0;
+  std::uint64_t reached_ = 0;  // the highest number below which all has been given away
   std::uint64_t sample_ = 0;
   std::uint32_t column_ = wire::no_column;
   std::map<std::uint32_t, std::shared_ptr<RingView>> rings_;

@@ -121,7 +121,7 @@ class Node {
     {
       const std::lock_guard<std::mutex> lock(outlets_->mutex);
       outlets_->closed = true;
-      outlets_->leftovers.clear();
+      outlets_->give_up();
       outlets_->lossy.socket.close();
       outlets_->strict.socket.close();
     }

@@ -62,6 +62,22 @@ class Outlets {
   // Reads who has come and gone; the caller holds the lock.
   inline void refresh();
 
+  // Tells those who will not get the rest of what has been published how much that was, through their sockets, in which
+  // there is room, and lets go of it; the caller holds the lock.
+  void give_up() {
+    for (const auto& leftover : leftovers.all()) {
+      for (const auto& reader : leftover.readers) {
+        if (reader.pipe == nullptr) continue;
+        wire::AttachAnswer answer;
+        answer.sequence = leftover.sequence;
+        answer.column = reader.column;
+        zmq::message_t frame = message_of(wire::pack_answer(reader.key, answer));
+        if (!reader.outlet->try_send(share(frame)) && reader.outlet->strict) reader.outlet->send_anyway(std::move(frame));
+      }
+    }
+    leftovers.clear();
+  }
+
   std::mutex mutex;
   const std::string folder;  // where the unix sockets lie, and readers offer pipes
   Outlet lossy;

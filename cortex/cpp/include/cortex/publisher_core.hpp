@@ -247,6 +247,7 @@ class PublisherCore {
   void leave_behind() {
     Leftover leftover;
     write_header(leftover.end.data(), 'B', sequence_, 0, 0, 0);
+    leftover.sequence = sequence_;
     leftover.rings = rings_.release();
     if (!outlets_->closed && told_ != sequence_) {
       zmq::message_t frame(leftover.end.data(), leftover.end.size());
@@ -254,7 +255,8 @@ class PublisherCore {
       if (has_sockets(outlets_->strict)) outlets_->strict.send_anyway(std::move(frame));
     }
     for (const auto& reader : readers_.release()) {
-      leftover.readers.push_back({reader->key, reader->column, std::move(reader->pipe), told_ == sequence_});
+      leftover.readers.push_back(
+          {reader->key, reader->outlet, reader->column, std::move(reader->pipe), told_ == sequence_});
     }
     if (!outlets_->closed) outlets_->leftovers.add(std::move(leftover));
   }
