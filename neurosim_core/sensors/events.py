@@ -28,6 +28,7 @@ from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_ahead import WINDOW_COUNT_MAX, Draft, Drafts
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, EventKeys, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise, terms_of
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
@@ -41,13 +42,6 @@ _CUT_AHEAD_ON_CUDA = True
 _GRAPHS_ON_CUDA = True
 """A scan is replayed as a graph where it comes again."""
 _PIXELS_PER_THREAD_MIN = 16_384
-_ROOM_PER_PIXEL = 16
-"""Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
-and memory follows the events, in place of doubling in the middle of a run."""
-_TOUCHED_COUNT_MAX = 1 << 18
-"""Keys of that room that are written to at once: the first busy moment of a run needs no new pages."""
-_COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
-"""Types of the times, columns, rows and polarities that are handed out."""
 
 
 @dataclass
@@ -198,13 +192,14 @@ class EventCamera:
         self._graphs = Graphs(device)
         self._reader = make_stream(device, urgent=True)
         self._taken = Milestone(device)
-        self._read = Milestone(device)
         self._on_host = on_host or self.device.is_cpu
-        self._keys = self._key_buffer(0)
-        self._spare_keys = self._key_buffer(0)
-        self._order = self._empty(0, wp.int32)
-        self._columns: list[tuple[Any, HostCopy]] = []
-        self._make_window_buffers(16)
+        self._keys = EventKeys(
+            pixel_count=pixel_count,
+            row_shift=self._row_shift,
+            time_shift=self._time_shift,
+            device=self.device,
+            on_host=self._on_host,
+        )
         self._readout: Readout | None = None
         if config.readout is not None:
             self._readout = Readout(
@@ -216,7 +211,7 @@ class EventCamera:
             )
         self._drafts: Drafts | None = None
         self._draft: Draft | None = None  # the last that was launched
-        self._carried: Draft | None = None  # it holds the keys that are carried over; None: `_keys` does
+        self._carried: Draft | None = None  # it holds what is carried over; None: `_keys` do
         wanted = self.device.is_cuda and _CUT_AHEAD_ON_CUDA if cut_ahead is None else cut_ahead
         if wanted and self._on_host and self._readout is None and len(self._chunk_bounds()) == 1:
             self._drafts = Drafts(
@@ -232,8 +227,6 @@ class EventCamera:
         self._now_ns: int | None = None
         self._fed_ns = 0
         self._window_start_ns = self._drafted_ns = 0
-        self._key_count = 0
-        self._origin_us = 0
         self._state = 0
         self._forget()
 
@@ -350,7 +343,7 @@ class EventCamera:
         scan.stamps_ns = stamps
         scan.ends_ns = None if ends_ns is None else tuple(int(end) for end in ends_ns)
         ahead = self._can_cut_ahead(scan)
-        scan.origin_us = self._drafted_ns // NS_PER_US if ahead else self._origin_us
+        scan.origin_us = self._drafted_ns // NS_PER_US if ahead else self._keys.origin_us
         scan.state = self._state
         origin_ns = scan.origin_us * NS_PER_US
         times = scan.times.rows
@@ -385,7 +378,7 @@ class EventCamera:
             )
         if stamps[0] <= self._fed_ns:
             raise ValueError(f"stamps_ns must be later than {self._fed_ns}, got {stamps[0]}")
-        span_us = int(stamps[-1]) // NS_PER_US - self._origin_us
+        span_us = int(stamps[-1]) // NS_PER_US - self._keys.origin_us
         if span_us * NS_PER_US >= self.span_max_ns:
             limit_s = self.span_max_ns / 1e9
             raise ValueError(
@@ -462,7 +455,7 @@ class EventCamera:
         assert self._drafts is not None
         assert scan.ends_ns is not None
         if self._draft is None:
-            self._drafts.seed(self._keys, self._key_count, self._origin_us)
+            self._drafts.seed(self._keys.keys, self._keys.count, self._keys.origin_us)
         (chunk,) = scan.chunks
         scan.draft = self._draft = self._drafts.launch(
             chunk.keys,
@@ -498,7 +491,7 @@ class EventCamera:
         self._carried = draft
         self._finish(scan)
         packets = self._packets(list(draft.ends_ns), columns, cuts)
-        self._origin_us = self._window_start_ns // NS_PER_US
+        self._keys.clear(self._window_start_ns // NS_PER_US)
         return packets
 
     def _leave_drafts(self) -> None:
@@ -512,11 +505,8 @@ class EventCamera:
         carried, self._carried, self._draft = self._carried, None, None
         if carried is not None:
             self._drafts.grown.hold()
-            first, self._key_count = carried.carried()
-            self._reserve_keys(kept=0)
-            if self._key_count > 0:
-                step_us = self._origin_us - carried.origin_us
-                self._copy_keys(carried.keys, first, self._key_count, self._keys, 0, step_us)
+            first, count = carried.carried()
+            self._keys.append(carried.keys, first, count, carried.origin_us)
 
     def _take_up_drafts(self) -> None:
         """Cut the windows of the scans under way ahead again, from the keys that there are now."""
@@ -539,13 +529,11 @@ class EventCamera:
                 scan.draft = None
         self._draft = self._carried = None
         self._state = 0
-        self._key_count = 0
-        self._read_count = 0
         self._dropped: list[tuple[int, int]] = []
         self._drop_reported = False
         self._sequence = 0
         self._window_start_ns = self._drafted_ns = self._now_ns or 0
-        self._origin_us = self._window_start_ns // NS_PER_US
+        self._keys.clear(self._window_start_ns // NS_PER_US)
 
     def _require_reset(self) -> int:
         if self._now_ns is None:
@@ -570,7 +558,7 @@ class EventCamera:
         for first, end in bounds:
             counters = self._empty(3, wp.int64)
             if self.device.is_cpu:
-                keys = self._roomy_keys(_ROOM_PER_PIXEL * (end - first), _TOUCHED_COUNT_MAX // len(bounds))
+                keys = roomy_keys(ROOM_PER_PIXEL * (end - first), TOUCHED_COUNT_MAX // len(bounds))
             else:
                 keys = self._empty(2 * (end - first), wp.int64)
             chunks.append(_Chunk(first, end, keys, counters, HostCopy(counters)))
@@ -584,12 +572,6 @@ class EventCamera:
             stamps=times.array[1:],
             row_limit=wp.full(frame_count, self.height, dtype=wp.int32, device=self.device),
         )
-
-    def _make_window_buffers(self, window_count: int) -> None:
-        self._bounds = self._empty(window_count, wp.int64)
-        self._bounds_on_host = _pinned(self._bounds)
-        self._found = wp.zeros(window_count, dtype=wp.int32, device=self.device)
-        self._found_on_host = HostCopy(self._found)
 
     def _as_warp(self, value: Any, shape: tuple[int, ...]) -> Any:
         """Return an array as a contiguous float32 Warp array of this shape on the device."""
@@ -709,18 +691,11 @@ class EventCamera:
         if limited:
             scan.row_limit.fill_(self.height)
 
-        start = self._key_count
-        self._key_count += sum(counts)
-        self._reserve_keys(kept=start)
-        step_us = self._origin_us - scan.origin_us
         for count, chunk in zip(counts, scan.chunks, strict=True):
-            if count > 0 and step_us == 0:
-                wp.copy(self._keys, chunk.keys, dest_offset=start, count=count)
-            elif count > 0:
-                self._copy_keys(chunk.keys, 0, count, self._keys, start, step_us)
-            start += count
+            self._keys.append(chunk.keys, 0, count, scan.origin_us)
+        self._taken.set()
         if self._drafts is not None:
-            self._drafts.note(self._key_count)
+            self._drafts.note(self._keys.count)
         self._finish(self._under_way.popleft())
 
     def _finish(self, scan: _Scan) -> None:
@@ -771,69 +746,18 @@ class EventCamera:
         self._launch(scan, tabulate=False)
         return True
 
-    def _key_buffer(self, count: int) -> wp.array[wp.int64]:
-        """Return a buffer for keys that are to be sorted: the radix sort on CUDA wants twice the room."""
-        keys: wp.array[wp.int64] = self._empty(2 * count if self.device.is_cuda else count, wp.int64)
-        return keys
-
-    def _roomy_keys(self, count: int, touched_count: int) -> wp.array[wp.int64]:
-        """Return a buffer on a CPU for more keys than will come, the first of which have pages already."""
-        keys: wp.array[wp.int64] = self._empty(count, wp.int64)
-        keys.numpy()[:touched_count] = 0
-        return keys
-
-    def _reserve_keys(self, *, kept: int) -> None:
-        """Make room for the keys there are now, of which the first `kept` are in the buffer."""
-        if self._key_count * (2 if self.device.is_cuda else 1) <= self._keys.shape[0]:
-            return
-        room = 1 << (self._key_count - 1).bit_length()
-        if self.device.is_cpu:
-            room = max(room, _ROOM_PER_PIXEL * self.width * self.height)
-            keys = self._roomy_keys(room, _TOUCHED_COUNT_MAX)
-        else:
-            keys = self._key_buffer(room)
-        if kept > 0:
-            wp.copy(keys, self._keys, count=kept)
-        self._keys = keys
-        self._spare_keys = self._key_buffer(room)
-        if self.device.is_cuda:
-            self._order = self._empty(2 * room, wp.int32)
-            if self._on_host:
-                columns = [self._empty(room, dtype) for dtype in _COLUMN_TYPES]
-                self._columns = [(column, HostCopy(column)) for column in columns]
-
-    def _copy_keys(
-        self, keys: Any, first: int, count: int, keys_out: Any, first_out: int, origin_step_us: int
-    ) -> None:
-        wp.launch(
-            event_scan.carry_over,
-            dim=count,
-            inputs=[keys, first, origin_step_us, self._time_shift],
-            outputs=[keys_out, first_out],
-            device=self.device,
-        )
-
-    def _sort_keys(self) -> None:
-        if self.device.is_cpu:
-            self._keys.numpy()[: self._key_count].sort()  # ten times as fast as Warp's radix sort on a CPU
-            return
-        span_us = self._require_reset() // NS_PER_US - self._origin_us
-        end_bit = self._time_shift + span_us.bit_length()
-        if self._readout is not None:
-            end_bit = 63  # events may be read later than now
-        wp.utils.radix_sort_pairs(
-            self._keys, self._order, self._key_count, begin_bit=SUB_BITS - 1, end_bit=end_bit
-        )
-
     def _cut(self, ends: list[int]) -> list[Events]:
         """Sort the keys, hand out those of the windows that end so, and carry the others over."""
         if not ends:
             return []
         if self._readout is not None:
-            self._read_out(self._readout)
-        columns, cuts = self._decode(ends) if self._key_count > 0 else ([], [0] * len(ends))
+            self._keys.read_out(self._readout, self._require_reset())
+        span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
+        # with a readout events may be read later than now
+        end_bit = self._time_shift + span_us.bit_length() if self._readout is None else 63
+        columns, cuts = self._keys.cut(ends, end_bit)
         packets = self._packets(ends, columns, cuts)
-        self._carry_over(cuts[-1])
+        self._keys.carry_over(cuts[-1], self._window_start_ns // NS_PER_US)
         return packets
 
     def _packets(self, ends: list[int], columns: list[Any], cuts: list[int]) -> list[Events]:
@@ -845,7 +769,7 @@ class EventCamera:
             if self._readout is not None:
                 dropped += self._readout.take_dropped(end_ns)
             t, x, y, polarity = (
-                [column[start:cut] for column in columns] if cut > start else self._no_events()
+                [column[start:cut] for column in columns] if cut > start else self._keys.no_events()
             )
             packets.append(
                 Events(
@@ -865,90 +789,6 @@ class EventCamera:
             self._sequence += 1
             self._window_start_ns = end_ns
         return packets
-
-    def _read_out(self, readout: Readout) -> None:
-        """Put the events that the arbiter reads until now in place of those that have happened."""
-        first, count = self._read_count, self._key_count - self._read_count
-        if count == 0 and readout.waiting_count == 0:
-            return
-        self._key_count += readout.waiting_count
-        self._reserve_keys(kept=first + count)
-        read = readout.read(
-            self._keys,
-            first=first,
-            count=count,
-            spare=self._spare_keys,
-            order=self._order,
-            origin_us=self._origin_us,
-            now_ns=self._require_reset(),
-        )
-        self._key_count = first + read
-
-    def _decode(self, ends: list[int]) -> tuple[list[Any], list[int]]:
-        """Sort the keys and return them as columns, and the index of the first key after each window."""
-        count = self._key_count
-        if len(ends) > self._bounds.shape[0]:
-            self._make_window_buffers(len(ends))
-        self._bounds_on_host.numpy()[: len(ends)] = np.array(ends) - self._origin_us * NS_PER_US
-        if self.device.is_cuda:
-            wp.copy(self._bounds, self._bounds_on_host, count=len(ends))
-        wp.launch(
-            event_scan.mark_late,
-            dim=count,
-            inputs=[self._bounds, len(ends), self._time_shift],
-            outputs=[self._keys],
-            device=self.device,
-        )
-        self._sort_keys()
-        wp.launch(
-            event_scan.find_ends,
-            dim=len(ends),
-            inputs=[self._keys, count, self._bounds, self._time_shift],
-            outputs=[self._found],
-            device=self.device,
-        )
-        self._found_on_host.fetch(0, len(ends))
-        copied = self._on_host and self.device.is_cuda
-        columns = [c for c, _ in self._columns] if copied else [self._empty(count, d) for d in _COLUMN_TYPES]
-        wp.launch(
-            event_scan.decode,
-            dim=count,
-            inputs=[self._keys, self._origin_us, self._row_shift, self._time_shift],
-            outputs=columns,
-            device=self.device,
-        )
-        if copied:
-            for _, copy in self._columns:
-                copy.fetch(0, count)
-        self._read.set()
-        self._read.wait()
-        cuts = self._found_on_host.rows(0, len(ends)).tolist()
-        if copied:
-            columns = [copy.rows(0, cuts[-1]) for _, copy in self._columns]
-        elif self._on_host:
-            columns = [column.numpy() for column in columns]
-        return columns, cuts
-
-    def _no_events(self) -> list[Any]:
-        if self._on_host:
-            return [np.zeros(0, wp.dtype_to_numpy(dtype)) for dtype in _COLUMN_TYPES]
-        return [self._empty(0, dtype) for dtype in _COLUMN_TYPES]  # Warp refuses an empty slice
-
-    def _carry_over(self, first: int) -> None:
-        """Keep the keys from `first` on for later windows, with their time from the last window's end."""
-        origin_us = self._window_start_ns // NS_PER_US
-        count = self._key_count - first
-        if count > 0:
-            self._copy_keys(self._keys, first, count, self._spare_keys, 0, origin_us - self._origin_us)
-            self._keys, self._spare_keys = self._spare_keys, self._keys
-        self._key_count = count
-        self._read_count = count
-        self._origin_us = origin_us
-
-
-def _pinned(array: Any) -> Any:
-    """Return an array of the host to upload from; the array itself if it is there."""
-    return wp.empty_like(array, device="cpu", pinned=True) if array.device.is_cuda else array
 
 
 def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:

@@ -1,0 +1,207 @@
+# mypy: disable-error-code="no-untyped-call,attr-defined"
+"""Keys of events that the host has counted: gathered, sorted, cut into windows and taken apart.
+
+Keys are as in `event_scan`. What no window has taken yet stays, and its time goes on from the last cut.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from neurosim_core.clock import NS_PER_US
+from neurosim_core.sensors import event_scan
+from neurosim_core.sensors.event_readout import Readout
+from neurosim_core.sensors.event_scan import SUB_BITS
+from neurosim_core.streams import HostCopy, HostInput, Milestone
+
+ROOM_PER_PIXEL = 16
+"""Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
+and memory follows the events, in place of doubling in the middle of a run."""
+TOUCHED_COUNT_MAX = 1 << 18
+"""Keys of that room that are written to at once: the first busy moment of a run needs no new pages."""
+_COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
+"""Types of the times, columns, rows and polarities that are handed out."""
+
+
+def roomy_keys(count: int, touched_count: int) -> wp.array[wp.int64]:
+    """Return a buffer on a CPU for more keys than will come, the first of which have pages already."""
+    keys: wp.array[wp.int64] = wp.empty(count, dtype=wp.int64, device="cpu")
+    keys.numpy()[:touched_count] = 0
+    return keys
+
+
+class EventKeys:
+    """The keys of one camera, of all that has been read from its scans.
+
+    Args:
+        pixel_count: Pixels of the camera.
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        device: Where they are.
+        on_host: Take events apart for the host.
+
+    Attributes:
+        keys: The first `count` of them are keys, in any order; its room is at least that.
+        count: How many there are.
+        origin_us: Origin of their time [us].
+    """
+
+    def __init__(
+        self, *, pixel_count: int, row_shift: int, time_shift: int, device: Any, on_host: bool
+    ) -> None:
+        self._pixel_count = pixel_count
+        self._row_shift, self._time_shift = row_shift, time_shift
+        self._device = device
+        self._on_host = on_host
+        self.keys = self._buffer(0)
+        self.count = 0
+        self.origin_us = 0
+        self._read_count = 0
+        self._spare = self._buffer(0)
+        self._order = self._empty(0, wp.int32)
+        self._columns: list[tuple[Any, HostCopy]] = []
+        self._read = Milestone(device)
+        self._make_window_buffers(16)
+
+    def clear(self, origin_us: int) -> None:
+        """Forget all keys; those that come have their time from an origin [us]."""
+        self.count = self._read_count = 0
+        self.origin_us = origin_us
+
+    def append(self, keys: wp.array[wp.int64], first: int, count: int, origin_us: int) -> None:
+        """Add `count` keys from `first` on, whose time has its own origin [us]."""
+        start = self.count
+        self.count += count
+        self._reserve(kept=start)
+        if count > 0 and origin_us == self.origin_us:
+            wp.copy(self.keys, keys, src_offset=first, dest_offset=start, count=count)
+        elif count > 0:
+            self._move(keys, first, count, self.keys, start, self.origin_us - origin_us)
+
+    def read_out(self, readout: Readout, now_ns: int) -> None:
+        """Put the events that the arbiter reads until now in place of those that have happened."""
+        first, count = self._read_count, self.count - self._read_count
+        if count == 0 and readout.waiting_count == 0:
+            return
+        self.count += readout.waiting_count
+        self._reserve(kept=first + count)
+        read = readout.read(
+            self.keys,
+            first=first,
+            count=count,
+            spare=self._spare,
+            order=self._order,
+            origin_us=self.origin_us,
+            now_ns=now_ns,
+        )
+        self.count = first + read
+
+    def cut(self, ends_ns: Sequence[int], end_bit: int) -> tuple[list[Any], list[int]]:
+        """Sort the keys and return them as columns, and the index of the first event after each window.
+
+        Args:
+            ends_ns: Ends of the windows [ns], at least one.
+            end_bit: Beyond the highest bit that a key may have.
+        """
+        count = self.count
+        if count == 0:
+            return [], [0] * len(ends_ns)
+        if len(ends_ns) > self._found.shape[0]:
+            self._make_window_buffers(len(ends_ns))
+        bounds = self._bounds.array
+        self._bounds.rows[: len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
+        self._bounds.upload()
+        self._launch(event_scan.mark_late, count, [bounds, len(ends_ns), self._time_shift], [self.keys])
+        self._sort(end_bit)
+        self._launch(
+            event_scan.find_ends,
+            len(ends_ns),
+            [self.keys, count, bounds, self._time_shift],
+            [self._found],
+        )
+        self._found_on_host.fetch(0, len(ends_ns))
+        copied = self._on_host and self._device.is_cuda
+        columns = [c for c, _ in self._columns] if copied else [self._empty(count, d) for d in _COLUMN_TYPES]
+        self._launch(
+            event_scan.decode, count, [self.keys, self.origin_us, self._row_shift, self._time_shift], columns
+        )
+        if copied:
+            for _, copy in self._columns:
+                copy.fetch(0, count)
+        self._read.set()
+        self._read.wait()
+        cuts: list[int] = self._found_on_host.rows(0, len(ends_ns)).tolist()
+        if copied:
+            columns = [copy.rows(0, cuts[-1]) for _, copy in self._columns]
+        elif self._on_host:
+            columns = [column.numpy() for column in columns]
+        return columns, cuts
+
+    def no_events(self) -> list[Any]:
+        """Return columns without an event."""
+        if self._on_host:
+            return [np.zeros(0, wp.dtype_to_numpy(dtype)) for dtype in _COLUMN_TYPES]
+        return [self._empty(0, dtype) for dtype in _COLUMN_TYPES]  # Warp refuses an empty slice
+
+    def carry_over(self, first: int, origin_us: int) -> None:
+        """Keep the keys from `first` on for later windows, with their time from an origin [us]."""
+        count = self.count - first
+        if count > 0:
+            self._move(self.keys, first, count, self._spare, 0, origin_us - self.origin_us)
+            self.keys, self._spare = self._spare, self.keys
+        self.count = self._read_count = count
+        self.origin_us = origin_us
+
+    def _move(
+        self, keys: Any, first: int, count: int, keys_out: Any, first_out: int, origin_step_us: int
+    ) -> None:
+        self._launch(
+            event_scan.carry_over,
+            count,
+            [keys, first, origin_step_us, self._time_shift],
+            [keys_out, first_out],
+        )
+
+    def _sort(self, end_bit: int) -> None:
+        if self._device.is_cpu:
+            self.keys.numpy()[: self.count].sort()  # ten times as fast as Warp's radix sort on a CPU
+            return
+        wp.utils.radix_sort_pairs(self.keys, self._order, self.count, begin_bit=SUB_BITS - 1, end_bit=end_bit)
+
+    def _buffer(self, count: int) -> wp.array[wp.int64]:
+        """Return a buffer for keys that are to be sorted: the radix sort on CUDA wants twice the room."""
+        keys: wp.array[wp.int64] = self._empty(2 * count if self._device.is_cuda else count, wp.int64)
+        return keys
+
+    def _reserve(self, *, kept: int) -> None:
+        """Make room for the keys there are now, of which the first `kept` are in the buffer."""
+        if self.count * (2 if self._device.is_cuda else 1) <= self.keys.shape[0]:
+            return
+        room = 1 << (self.count - 1).bit_length()
+        if self._device.is_cpu:
+            room = max(room, ROOM_PER_PIXEL * self._pixel_count)
+            keys = roomy_keys(room, TOUCHED_COUNT_MAX)
+        else:
+            keys = self._buffer(room)
+        if kept > 0:
+            wp.copy(keys, self.keys, count=kept)
+        self.keys = keys
+        self._spare = self._buffer(room)
+        if self._device.is_cuda:
+            self._order = self._empty(2 * room, wp.int32)
+            if self._on_host:
+                columns = [self._empty(room, dtype) for dtype in _COLUMN_TYPES]
+                self._columns = [(column, HostCopy(column)) for column in columns]
+
+    def _make_window_buffers(self, window_count: int) -> None:
+        self._bounds = HostInput(self._empty(window_count, wp.int64))
+        self._found = wp.zeros(window_count, dtype=wp.int32, device=self._device)
+        self._found_on_host = HostCopy(self._found)
+
+    def _launch(self, kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
+
+    def _empty(self, count: int, dtype: Any) -> Any:
+        return wp.empty(count, dtype=dtype, device=self._device)
