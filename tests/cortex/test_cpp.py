@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from cpp_client import Impostor, Peer, bad_frames, make_frame, make_rich
 from cpp_messages import OtherScan, Picture, Rich, Scan
-from cpp_programs import CPP, needs_compiler, programs, short, start
+from cpp_programs import CPP, PATIENCE_S, needs_compiler, programs, short, start
 from processes import SOON_S, shared_mappings, wait_for
 
 import cortex.messages
@@ -53,7 +53,7 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
         input="\n".join(lines) + "\n",
         capture_output=True,
         text=True,
-        timeout=120.0,
+        timeout=PATIENCE_S,
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
@@ -63,7 +63,7 @@ def test_vectors_and_damaged_bodies(programs: Path) -> None:
 def test_pipe_ends(programs: Path) -> None:
     """Whole frames in order however they are cut; what is damaged does no harm (ASan, UBSan)."""
     done = subprocess.run(
-        [programs / "pipe_test"], capture_output=True, text=True, timeout=300.0, check=False
+        [programs / "pipe_test"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
@@ -72,7 +72,7 @@ def test_pipe_ends(programs: Path) -> None:
 def test_between_threads(programs: Path, what: str) -> None:
     """Under the thread sanitizer: nothing is torn, lost or written while somebody looks at it."""
     done = subprocess.run(
-        [programs / f"{what}_test"], capture_output=True, text=True, timeout=300.0, check=False
+        [programs / f"{what}_test"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr[-4000:]
 
@@ -83,7 +83,7 @@ def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
         [programs / "node_test"],
         capture_output=True,
         text=True,
-        timeout=120.0,
+        timeout=PATIENCE_S,
         check=False,
         env={**os.environ, "TSAN_OPTIONS": f"suppressions={CPP}/tests/tsan.supp"},
     )
@@ -442,8 +442,8 @@ def test_example_reads_the_other(programs: Path, runtime: Path) -> None:
     listener = subprocess.Popen([programs / "listener", "5"], stdout=subprocess.PIPE, text=True)
     lidar = subprocess.Popen([programs / "lidar", "100000"])  # goes on for longer than it takes to meet
     try:
-        assert listener.communicate(timeout=300.0)[0] == "steered by 5 scans\n"
-        few = subprocess.run([programs / "lidar", "3"], stdout=subprocess.PIPE, text=True, timeout=300.0)
+        assert listener.communicate(timeout=PATIENCE_S)[0] == "steered by 5 scans\n"
+        few = subprocess.run([programs / "lidar", "3"], stdout=subprocess.PIPE, text=True, timeout=PATIENCE_S)
         assert few.stdout == "published 3 scans\n"
     finally:
         for process in (listener, lidar):

@@ -44,7 +44,7 @@ def _compile(text: str, tmp_path: Path, body: str = "") -> subprocess.CompletedP
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=300.0,
+        timeout=900.0,  # it takes a second; a hang takes longer, also on a machine that does a lot besides
         check=False,
     )
 

@@ -19,7 +19,7 @@ int main(int argc, char** argv) {
 
   int used = 0;
   while (left-- > 0) {
-    const auto scan = scans.receive(10s);
+    const auto scan = scans.receive(60s);
     if (!scan) break;
     const auto& ranges = (*scan)->ranges;  // looks into the publisher's memory, as long as `scan` lives
     if (ranges.empty()) continue;
