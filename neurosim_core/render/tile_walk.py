@@ -318,17 +318,22 @@ _FACE_TEST = (
         return wp::min(u, wp::min(v, w)) >= -to.slack;
     };
     // The best so far, the runner-up, and the nearest that may or may not be hit: one over the distance.
-    auto test = [](const Face& face, float x, float y, float z, float& best, float& next, float& unsure,
-                   int& which) {
-        const float u = face.u[0] * x + face.u[1] * y + face.u[2] * z;
-        const float v = face.v[0] * x + face.v[1] * y + face.v[2] * z;
-        const float w = face.w[0] * x + face.w[1] * y + face.w[2] * z;
+    auto along = [](const vec3& n, float x, float y, float z) {
+#ifdef __CUDA_ARCH__
+        return fmaf(n[0], x, fmaf(n[1], y, n[2] * z));
+#else
+        return n[0] * x + n[1] * y + n[2] * z;
+#endif
+    };
+    auto test = [&](const Face& face, float x, float y, float z, float& best, float& next, float& unsure,
+                    int& which) {
+        const float u = along(face.u, x, y, z), v = along(face.v, x, y, z), w = along(face.w, x, y, z);
         const float low = wp::min(u, wp::min(v, w));
         if (face.slack < 0.0f) {
             const bool missed = low < face.slack && wp::max(u, wp::max(v, w)) > -face.slack;
             unsure = missed ? unsure : FLT_MAX;
         } else {
-            const float inverse = face.n[0] * x + face.n[1] * y + face.n[2] * z;
+            const float inverse = along(face.n, x, y, z);
             const float maybe = low > -face.slack ? wp::max(inverse, FLT_MIN) : 0.0f;
             const float hit = low > face.slack ? inverse : 0.0f;
             unsure = wp::max(unsure, low > face.slack ? 0.0f : maybe);
