@@ -16,7 +16,7 @@ typedef struct {
     PyObject *latency;
     int64_t clock_offset_ns;
     char exhausted;
-    int64_t left, until_ns;
+    int64_t left, until_ns, taken_ns;
 } Inlet;
 
 PyDoc_STRVAR(inlet_doc,
@@ -48,9 +48,10 @@ static int set_number(PyObject *object, PyObject *name, long long number) {
 }
 
 /* Account for a message that was read; 0 with an error set. */
-static int inlet_count(const Inlet *inlet, PyObject *link, int64_t expected, int64_t publish_ns, int64_t now_ns) {
+static int inlet_count(Inlet *inlet, PyObject *link, int64_t expected, int64_t publish_ns, int64_t now_ns) {
     const int64_t sent_ns = publish_ns + inlet->clock_offset_ns;
     if (now_ns < sent_ns) now_ns = monotonic_ns(); /* it was sent after we had looked at the clock */
+    inlet->taken_ns = now_ns;
     const long long received = number_of(inlet->counters, received_name);
     return !PyErr_Occurred() && set_number(link, expected_name, expected + 1)
         && set_number(inlet->counters, received_name, received + 1) && note_latency(inlet->latency, now_ns - sent_ns);
@@ -125,10 +126,6 @@ int inlet_take_soon(PyObject *self, PyObject **message) {
     const int may_go_on = inlet->left > 0 && now_ns < inlet->until_ns;
     inlet->left -= may_go_on;
     *message = may_go_on ? inlet_take(inlet, 0, now_ns) : Py_NewRef(inlet->nothing);
-    if (may_go_on && *message == inlet->nothing && inlet->exhausted && inlet->link != NULL) {
-        Py_DECREF(*message); /* a stream that keeps up with us brings the next one before a coroutine is made */
-        *message = inlet_take(inlet, 0, now_ns);
-    }
     return *message != inlet->nothing;
 }
 
@@ -233,6 +230,7 @@ static PyGetSetDef inlet_properties[] = {
 static PyMemberDef inlet_members[] = {
     {"exhausted", T_BOOL, offsetof(Inlet, exhausted), 0, "Whether the last look found nothing."},
     {"left", T_LONGLONG, offsetof(Inlet, left), 0, "Messages that `soon` may still take."},
+    {"taken_ns", T_LONGLONG, offsetof(Inlet, taken_ns), READONLY, "When the last message was taken."},
     {"until_ns", T_LONGLONG, offsetof(Inlet, until_ns), 0, "How long it may do so, on the monotonic clock."},
     {NULL, 0, 0, 0, NULL},
 };

@@ -49,6 +49,11 @@ class Inlet(Protocol):
         """Whether there is a link to read."""
         ...
 
+    @property
+    def taken_ns(self) -> int:
+        """When the last message was taken, on the monotonic clock."""
+        ...
+
     def open(self, link: Link | None, coder: Any, /) -> None:
         """Read a link from now on; None: every message goes the long way. The lock is held."""
         ...
@@ -78,6 +83,7 @@ class PyInlet:
         self.exhausted = True
         self.left = 0
         self.until_ns = 0
+        self.taken_ns = 0
         self._turn = turn
         self._queue = queue
         self._counters = counters
@@ -113,7 +119,8 @@ class PyInlet:
                 return NOTHING
             link.expected += 1
             self._counters.received += 1
-            note_latency(self._counters.latency, monotonic_ns() - found[1] - link.clock_offset_ns)
+            self.taken_ns = monotonic_ns()
+            note_latency(self._counters.latency, self.taken_ns - found[1] - link.clock_offset_ns)
             return found[2]
 
     def soon(self) -> Any:
