@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import mmap
 import struct
 import time
@@ -127,8 +126,6 @@ class LargeSender:
         self._returned: deque[Slot] = deque()
         self._private_bytes = {False: 0, True: 0}
         self._unavailable_until_s = 0.0
-        self.wait_until_s = math.inf
-        """Nobody is waited for after this, on the monotonic clock [s]."""
         # What follows from who reads and from the ring in use; see `_plan`.
         self._shares = 1
         self._ring: Ring | None = None
@@ -305,8 +302,12 @@ class LargeSender:
         """Whether a reliable reader was late and gets nothing, as of the last `grant`."""
         return bool(self._late)
 
-    def await_strict(self, ring: Ring | None) -> bool:
+    def await_strict(self, ring: Ring | None, sleep: Callable[[Backoff], bool]) -> bool:
         """Wait until every reliable reader can take one more; the lock is held, and let go while sleeping.
+
+        Args:
+            ring: Where the message lies.
+            sleep: Sleeps once, see `Patience.sleep`.
 
         Returns:
             False if one could not within its own time: it loses the message.
@@ -318,16 +319,10 @@ class LargeSender:
                     return not self.is_leaving_out
                 self._give_up(ring)
                 return False
-            self._outlets.lock.release()
-            try:
-                more = backoff.wait()
-            finally:
-                self._outlets.lock.acquire()
-            if not more or time.monotonic() >= self.wait_until_s:
+            if not sleep(backoff):
                 if ring is not None:
                     self._give_up(ring)
                 return False
-            self._outlets.refresh()
             self._prune()
         return not self.is_leaving_out
 

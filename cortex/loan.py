@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from cortex.large import Slot
+import numpy as np
+
+from cortex.large import LargeSender, Slot
 from cortex.shm import Room
 
 
@@ -26,14 +29,12 @@ class Loan:
         slot: Slot,
         room: Room | None,
         *,
-        inline: bool,
-        publish: Callable[[Any, Slot, bool], bool],
+        publish: Callable[[Any, Slot], bool],
         drop: Callable[[Slot], object],
     ) -> None:
         self.draft = draft
         self._slot: Slot | None = slot
         self._room = room
-        self._inline = inline
         self._publish = publish
         self._drop = drop
 
@@ -52,7 +53,7 @@ class Loan:
         slot = self._end()
         if slot is None:
             raise RuntimeError("this loan was published or dropped before")
-        return self._publish(self.draft, slot, self._inline)
+        return self._publish(self.draft, slot)
 
     def drop(self) -> None:
         """Give the slot back unpublished; does nothing after `publish`."""
@@ -65,3 +66,36 @@ class Loan:
         if self._room is not None:
             self._room.on_forgotten = None
         return slot
+
+
+def lend(
+    slot: Slot,
+    make_draft: Callable[[np.ndarray], Any],
+    publish: Callable[[Any, Slot], bool],
+    large: LargeSender,
+    warn: Callable[[], object],
+) -> Loan:
+    """Begin a message in a slot, which is given back if that fails.
+
+    Args:
+        slot: Where it is written.
+        make_draft: Makes the draft in the slot's memory.
+        publish: Sends the draft, which lies in the slot.
+        large: Takes the slot back.
+        warn: Called when the loan was forgotten, by the garbage collector.
+    """
+    room = None if slot.ring is None else slot.ring.room(slot.number)
+    try:
+        draft = make_draft(slot.buffer if room is None else room.view(np.ndarray))
+    except BaseException:
+        large.give_back(slot)
+        raise
+    if room is not None:
+        room.on_forgotten = partial(_recall, slot, large, warn)
+    return Loan(draft, slot, room, publish=publish, drop=large.give_back)
+
+
+def _recall(slot: Slot, large: LargeSender, warn: Callable[[], object]) -> None:
+    """Take back the slot of a loan that nobody can publish any more; takes no lock, see `Room`."""
+    large.give_back(slot)
+    warn()

@@ -9,7 +9,6 @@ written directly (12-20 on a busy machine), 450-560 by a relay; 160-230 through 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -26,15 +25,17 @@ class Pipes:
     Args:
         await_room: Calls a function until it returns true, for so many seconds at most, and says whether it
             did; the lock is let go meanwhile.
+        is_over: Says whether nobody is waited for any more.
     """
 
-    def __init__(self, await_room: Callable[[Callable[[], bool], float], bool]) -> None:
+    def __init__(
+        self, await_room: Callable[[Callable[[], bool], float], bool], is_over: Callable[[], bool]
+    ) -> None:
         self._await_room = await_room
+        self._is_over = is_over
         self._direct: list[Reader] = []
         self._relayed: list[Reader] = []
         self._relay: Relay | None = None
-        self.close_by_s = math.inf
-        """Nobody is waited for after this, on the monotonic clock [s]."""
         self.lossy: tuple[Callable[..., Any], ...] = ()
         """Take a frame and flags; never refuse one."""
         self.strict: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
@@ -168,11 +169,9 @@ class Pipes:
             timeout_s = min((r.timeout_s for r in self._relayed if r.member in slow), default=0.0)
             if self._await_room(send, timeout_s - (time.monotonic() - begin_s)):
                 break
-            now_s = time.monotonic()
+            waited_s, is_over = time.monotonic() - begin_s, self._is_over()
             for reader in self._relayed:
-                if reader.member in slow and (
-                    reader.timeout_s <= now_s - begin_s or self.close_by_s <= now_s
-                ):
+                if reader.member in slow and (is_over or reader.timeout_s <= waited_s):
                     relay.give_up(frame, reader.member)
         return on_time
 

@@ -11,6 +11,7 @@ import pytest
 from peer import Block, make_block
 from processes import SOON_S, wait_for
 
+import cortex.batch
 import cortex.gate
 import cortex.large
 import cortex.pipes
@@ -34,7 +35,7 @@ def fill(publisher, publish) -> None:
 
     Frames of four pages and a little: the little goes into pages that were begun, four do not go up.
     """
-    (reader,) = publisher._pipes._direct
+    (reader,) = publisher._fanout.pipes._direct
     while reader.pipe.flush():
         publish()
 
@@ -103,7 +104,7 @@ def test_a_batch_that_finds_no_room_is_sent(make_node, start_child, monkeypatch)
     """Held back by a publisher that coalesces, for a reader whose pipe is full."""
     for module, name in [
         (cortex.publisher, "BURST_NS"),
-        (cortex.publisher, "BATCH_NS"),
+        (cortex.batch, "BATCH_NS"),
         (cortex.gate, "BATCH_NS"),
     ]:
         monkeypatch.setattr(module, name, 10**15)
@@ -113,7 +114,7 @@ def test_a_batch_that_finds_no_room_is_sent(make_node, start_child, monkeypatch)
     sent = Sent(publisher, 208)
     with child.stopped():
         fill(publisher, lambda: [sent() for _ in range(64)])
-        while len(publisher._batch) < 3:
+        while len(publisher._batch.records) < 3:
             sent()
         thread = threading.Thread(target=publisher.close)
         thread.start()
@@ -143,7 +144,7 @@ def test_a_publisher_that_stops_waiting_holds_up_nobody(make_node, start_child, 
     with child.stopped():
         thread = threading.Thread(target=publish)
         thread.start()
-        wait_for(lambda: publisher._blocked)
+        wait_for(lambda: publisher._patience.is_waiting)
         node.stop_waiting()
         thread.join(SOON_S)
         assert not thread.is_alive()
@@ -186,7 +187,7 @@ def test_nobody_holds_up_a_node_for_long(make_node, start_child, monkeypatch, re
     with child.stopped():
         waiting = threading.Thread(target=flood, args=(publisher,))
         waiting.start()
-        wait_for(lambda: publisher._blocked)
+        wait_for(lambda: publisher._patience.is_waiting)
         thread = threading.Thread(target=node.close)
         thread.start()
         thread.join(SOON_S)
@@ -213,7 +214,7 @@ def test_a_forked_child_hears_that_it_may_not_publish(make_node, start_child):
     with reader.stopped():
         waiting = threading.Thread(target=flood, args=(publisher,))
         waiting.start()
-        wait_for(lambda: publisher._blocked)
+        wait_for(lambda: publisher._patience.is_waiting)
         child = os.fork()
         if child == 0:
             signal.alarm(int(SOON_S))

@@ -531,7 +531,7 @@ def test_a_ring_whose_announcement_was_dropped_is_found(make_node):
     thread = threading.Thread(target=publish, daemon=True)
     thread.start()
     try:
-        wait_for(lambda: publisher._blocked)
+        wait_for(lambda: publisher._patience.is_waiting)
     finally:
         subscriber._turn.lock.release()
     received = [len(subscriber.recv(SOON_S).ranges) for _ in range(1500)]

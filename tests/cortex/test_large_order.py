@@ -27,7 +27,7 @@ def node(make_node):
 @contextmanager
 def announcements_held(publisher: Publisher[Scan]) -> Iterator[Callable[[], None]]:
     """Keep back what the socket would bring to the only reader; the function sends it."""
-    (reader,) = publisher._readers.values()
+    (reader,) = publisher._fanout.readers.values()
     held: list[bytes] = []
     send = reader.outlet.send
 
@@ -207,7 +207,7 @@ def test_an_interrupted_publish_gives_its_slot_back(node, monkeypatch):
     publisher.publish(scan(0))
     wait_for(lambda: is_shared(subscriber.recv(SOON_S)))
 
-    def interrupted(_ring: object) -> bool:
+    def interrupted(*_: object) -> bool:
         raise Interrupted
 
     accepted: list[int] = []

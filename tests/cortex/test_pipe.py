@@ -311,7 +311,7 @@ def test_a_pipe_that_brings_nonsense_is_left_for_the_socket(make_node, start_chi
     child = start_child("endless_subscriber", topic="/blocks", policy=["reliable", {"timeout_s": SOON_S}])
     child.hear()
     assert publisher.wait_for_subscribers(timeout_s=SOON_S)
-    (reader,) = publisher._pipes._direct
+    (reader,) = publisher._fanout.pipes._direct
     sent = 0
 
     def publish() -> None:
@@ -334,7 +334,7 @@ def test_a_pipe_that_brings_nonsense_is_left_for_the_socket(make_node, start_chi
     for _ in range(20):
         publish()
     wait_for(lambda: child.ask()["count"] == sent - lost)
-    assert not publisher._pipes._direct
+    assert not publisher._fanout.pipes._direct
 
 
 def test_a_pipe_is_read_to_its_end_however_long_that_takes(make_node, start_child, runtime, monkeypatch):

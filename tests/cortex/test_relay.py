@@ -361,7 +361,7 @@ def test_only_frames_are_sent(relay, wrong):
 
 def test_news_for_all_reaches_all_that_have_room():
     """A reliable reader that is late keeps it from nobody."""
-    pipes = cortex.pipes.Pipes(lambda send, timeout_s: False)
+    pipes = cortex.pipes.Pipes(lambda send, timeout_s: False, lambda: False)
     fds = []
     for strict in (True, True, False):
         fd, reader = open_reader(strict=strict)
@@ -403,7 +403,7 @@ def open_reader(*, strict: bool) -> tuple[int, cortex.large.Reader]:
 def test_who_is_late_stays_so_whoever_writes(monkeypatch, size):
     """One that does not read is waited for once, and not again as its pipe goes to a relay and comes back."""
     waits = []
-    pipes = cortex.pipes.Pipes(lambda send, timeout_s: waits.append(timeout_s))
+    pipes = cortex.pipes.Pipes(lambda send, timeout_s: waits.append(timeout_s), lambda: False)
     fd, reader = open_reader(strict=True)
     pipes.admit(reader)
     count = 0
@@ -450,7 +450,7 @@ def test_without_memory_for_a_relay_pipes_are_written_as_before(monkeypatch):
             return getattr(self.relay, name)
 
     monkeypatch.setattr(cortex.pipes, "make_relay", Poor)
-    pipes = cortex.pipes.Pipes(lambda send, timeout_s: False)
+    pipes = cortex.pipes.Pipes(lambda send, timeout_s: False, lambda: False)
     fds = []
     for _ in range(3):
         fd, reader = open_reader(strict=True)
@@ -487,7 +487,7 @@ def subscribers(start_child, count: int, *, policy: list) -> list:
 
 
 def is_relaying(publisher) -> bool:
-    return publisher._pipes._relay is not None
+    return publisher._fanout.pipes._relay is not None
 
 
 def test_readers_come_and_go_and_lose_nothing(make_node, start_child, runtime):

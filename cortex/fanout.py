@@ -1,0 +1,266 @@
+"""The readers of one publisher: who they are, and how its frames reach each of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+from cortex.gate import Gate
+from cortex.large import LargeSender, Reader
+from cortex.outlet import DONTWAIT, Outlet, Outlets
+from cortex.patience import Patience
+from cortex.pipes import Pipes
+from cortex.wire import REST, AttachAnswer, AttachKey, answer_frame
+
+READERS_MAX = 1024
+SILENCE_MAX_NS = 30_000_000_000
+SILENCE_NS = 100_000_000
+"""After so long without a message readers are told how many there have been."""
+TELL_AGAIN_S = 0.02
+"""A reader that was late when the publisher is closed is told this often how many messages there were."""
+
+
+class Fanout:
+    """Sends frames to all readers, through pipes and sockets. The caller holds the outlets' lock.
+
+    Args:
+        topic: For what is logged.
+        batch_head: What a batch begins with: one of nothing tells how many messages there have been.
+        gate: Sends where this says, if nothing special is to be done.
+        large: Sends large messages, and knows who reads them.
+        outlets: Tell who has come and gone.
+        patience: Waits for reliable readers.
+        plain: Whether the gate may send messages.
+        next_sequence: Says with which sequence a reader that comes now begins.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        batch_head: bytes,
+        *,
+        gate: Gate,
+        large: LargeSender,
+        outlets: Outlets,
+        patience: Patience,
+        plain: bool,
+        next_sequence: Callable[[], int],
+    ) -> None:
+        self._topic = topic
+        self._batch_head = batch_head
+        self._gate = gate
+        self._large = large
+        self._outlets = outlets
+        self._patience = patience
+        self._plain = plain
+        self._next_sequence = next_sequence
+        self.readers: dict[bytes, Reader] = {}
+        self.pipes = Pipes(self._await_room, patience.is_over)
+        self.late: dict[Outlet, int] = {}
+        """Strict outlets on which a reader was too late, and the sequence from which on it may get messages.
+
+        libzmq sends it nothing until it has caught up."""
+        self.latched = b""
+        """The frame that a reader gets when it comes, if any."""
+        self.timeouts = 0
+        """Messages that some reliable reader lost."""
+        self.closed = False
+        self._lossy_sends: tuple[Callable[..., Any], ...] = ()
+        self._strict_outlets: tuple[Outlet, ...] = ()
+        self._retries: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
+        """What to call where one of the gate's `sends` refuses."""
+        self._crowded = False
+        self._told = 0
+        self._tell_after_ns = SILENCE_NS
+        self._untold: list[Outlet] = []
+        self._tell_again_s = 0.0
+
+    # Who comes and goes; called by the outlets
+
+    def attach(self, outlet: Outlet, key: bytes, request: AttachKey) -> None:
+        """Take a reader in."""
+        if key in self.readers or self.closed:
+            return
+        if len(self.readers) >= READERS_MAX:
+            if not self._crowded:
+                self._outlets.note(f"{self._topic}: has {READERS_MAX} subscribers, further ones are refused")
+            self._crowded = True
+            return
+        reader = self._large.admit(key, request, outlet)
+        self.readers[key] = reader
+        sequence = self._next_sequence()
+        if reader.pipe is not None:
+            reader.pipe.offer(self._news(sequence))  # this tells the reader that all else comes there
+            self.pipes.admit(reader)
+            if not self._patience.is_waiting:
+                self.pipes.settle()
+        self.route()
+        answer = self._large.answer(reader, sequence, self.latched)
+        if outlet.strict:
+            if not outlet.try_send(answer):
+                outlet.send_anyway(answer)
+        else:
+            outlet.send(answer, DONTWAIT)
+
+    def detach(self, outlet: Outlet, request: AttachKey) -> None:
+        """Let a reader go."""
+        for key, reader in self.readers.items():
+            if reader.request.reader == request.reader and reader.outlet is outlet:
+                del self.readers[key]
+                self._large.dismiss(reader)
+                self.pipes.dismiss(reader)
+                self.late.pop(outlet, None)
+                self.route()
+                return
+
+    def resume(self, outlet: Outlet, sequence: int) -> None:
+        """A reader that was too late has caught up to a sequence."""
+        if sequence >= self.late.get(outlet, 0):  # else it was too late once more since
+            self.late.pop(outlet, None)
+            self.route()
+
+    def route(self) -> None:
+        """Work out where messages go, when readers or what is sent have changed."""
+        readers = self.readers.values()
+        outlets = {reader.outlet for reader in readers if reader.pipe is None}
+        sends: list[Callable[..., Any]] = [outlet.send for outlet in outlets if not outlet.strict]
+        self._lossy_sends = tuple(sends)
+        self._strict_outlets = tuple(outlet for outlet in outlets if outlet.strict)
+        usual = self._plain and not self.late
+        retries = {outlet.send: self._retry_strict(outlet) for outlet in self._strict_outlets}
+        self._retries = retries | self.pipes.strict
+        self._gate.sends = (*self._lossy_sends, *self.pipes.lossy, *self._retries) if usual else ()
+        self.arm()
+
+    def arm(self) -> None:
+        """Let the gate send large messages, or not: when readers, the ring, or who is late has changed."""
+        self._gate.ledger = self._large.short_cut if self._plain and not self.late else None
+
+    def tick(self, now_ns: int) -> None:
+        """Write what did not fit, see who writes the pipes, end a burst; called now and then."""
+        self.pipes.flush()
+        if self._patience.is_waiting:
+            return
+        if self.pipes.settle():
+            self.route()
+        sequence, silent_ns = self._gate.sequence, now_ns - self._gate.refresh_ns
+        if self._told != sequence:
+            self._told, self._tell_after_ns = sequence, SILENCE_NS
+        if self.readers and silent_ns > self._tell_after_ns and self._next_sequence() == sequence:
+            self.tell()
+            # After ever longer times again: where the queue is full, it gets lost like what it tells of.
+            self._tell_after_ns = min(2 * self._tell_after_ns, silent_ns + SILENCE_MAX_NS)
+
+    # Sending
+
+    def send(self, frame: bytes) -> bool:
+        """Send a frame to all, waiting for reliable readers; False if one of them lost it."""
+        for send in self._lossy_sends:
+            send(frame, DONTWAIT)
+        on_time = not self.late
+        for outlet in self._strict_outlets:
+            try:
+                outlet.send(frame, DONTWAIT)
+            except zmq.Again:
+                on_time &= self.send_strict(outlet, frame, 0)
+        on_time &= self.pipes.send(frame)
+        if not on_time:
+            self.timeouts += 1
+        return on_time
+
+    def retry(self, frame: bytes, send: Callable[..., Any]) -> bool:
+        """Send what one of the gate's `sends` refused, waiting; False if a reliable reader lost it."""
+        retry = self._retries.get(send)  # None: it has left since
+        on_time = retry is None or retry(frame)
+        if not on_time:
+            self.timeouts += 1
+        return on_time
+
+    def _retry_strict(self, outlet: Outlet) -> Callable[[bytes], bool]:
+        return lambda frame: self.send_strict(outlet, frame, 0)
+
+    def send_strict(self, outlet: Outlet, frame: bytes, flags: int) -> bool:
+        """Send through a strict outlet, waiting for its slowest reader; False if that one lost the frame."""
+
+        def send() -> bool:
+            return outlet.try_send(frame, flags)
+
+        readers = [r for r in self.readers.values() if r.outlet is outlet and r.pipe is None]
+        if send() or self._await_room(send, max((r.timeout_s for r in readers), default=0.0)):
+            return True
+        self.late[outlet] = self._gate.sequence
+        self.route()
+        outlet.send_anyway(frame, flags)
+        return False
+
+    def _await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
+        """Try to send until it works, or for so long [s]."""
+        if self._patience.wait_for(send, timeout_s):
+            return True
+        if not self.timeouts:
+            self._outlets.note(f"{self._topic}: a reliable subscriber was too late and lost a message")
+        return False
+
+    # Telling readers how many messages there have been
+
+    def _news(self, sequence: int) -> bytes:
+        """A batch of nothing, with the sequence that comes next."""
+        return self._batch_head + REST.pack(sequence, 0, time.monotonic_ns(), 0, 0)
+
+    def tell(self) -> None:
+        """Tell all that have room which sequence comes next, so that they learn of a loss before it."""
+        frame = self._news(self._gate.sequence)
+        for send in self._lossy_sends:
+            send(frame, DONTWAIT)
+        for outlet in self._strict_outlets:
+            outlet.try_send(frame)
+        self.pipes.offer(frame)
+
+    def stop(self) -> None:
+        """Take in no reader any more; `finish` follows."""
+        self.closed = True
+        self._untold = list(self._strict_outlets)
+
+    def finish(self, waited_s: float, linger_s: float) -> bool:
+        """Write what is left, and to each reader which sequence would come next; called again and again.
+
+        Args:
+            waited_s: For how long this has gone on [s].
+            linger_s: How long to wait for a reader that may not hold us up for longer [s].
+
+        Returns:
+            Whether each has all of it, or has had its time.
+        """
+        last = self._news(self._gate.sequence)
+        written = self.pipes.finish(last, waited_s, linger_s)
+        # Libzmq drops it while a reader is late: it is sent now and then, until that one says that it reads.
+        if waited_s >= self._tell_again_s:
+            self._tell_again_s = waited_s + TELL_AGAIN_S
+            self._untold = [each for each in self._untold if not each.try_send(last) or each in self.late]
+        timeouts_s = [r.timeout_s for r in self.readers.values() if r.outlet in self._untold]
+        told = not self._untold or waited_s >= max([linger_s, *timeouts_s])
+        return written and told
+
+    def give_up(self) -> None:
+        """Let readers that had too little time count what they lost."""
+        sequence = self._gate.sequence
+        for outlet in self._untold:
+            outlet.send_anyway(self._news(sequence))
+        unfinished = self.pipes.unfinished()
+        for reader in unfinished:  # their pipes are full, their sockets are not
+            answer = AttachAnswer(sequence, reader.column, (), b"")
+            reader.outlet.try_send(answer_frame(reader.key, answer))
+        count = sum(reader.request.strict for reader in unfinished)
+        if count:
+            self._outlets.note(
+                f"{self._topic}: {count} reliable subscribers had no time to read everything at the end"
+            )
+
+    def close(self) -> None:
+        """Send no more."""
+        self.pipes.close()
+        self.readers.clear()
+        self.route()

@@ -1,0 +1,67 @@
+"""How a publisher waits for reliable readers that have no room: one thread at a time, without the lock."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+from cortex.gate import Gate
+from cortex.outlet import Backoff, Outlets
+
+
+class Patience:
+    """The waiting of one publisher. A block of it is the time of one message; the caller holds the lock.
+
+    Args:
+        outlets: Whose lock it is; who has come and gone meanwhile is looked at after each sleep.
+        gate: Lets no other message pass meanwhile.
+        check_open: Raises once the publisher is closed.
+    """
+
+    def __init__(self, outlets: Outlets, gate: Gate, check_open: Callable[[], None]) -> None:
+        self._outlets = outlets
+        self._gate = gate
+        self._check_open = check_open
+        self.until_s = math.inf
+        """Nobody is waited for after this, on the monotonic clock [s]; set by any thread, without lock."""
+        self.is_waiting = False
+        """Whether a thread is held up: others wait until its message is sent."""
+
+    def __enter__(self) -> None:
+        self.is_waiting = True
+        self._gate.refresh_ns = 0  # other threads look at this
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.is_waiting = False
+
+    def is_over(self) -> bool:
+        """Whether nobody is waited for any more."""
+        return time.monotonic() >= self.until_s
+
+    def sleep(self, backoff: Backoff) -> bool:
+        """Sleep once, without the lock; False when its time is over, or everybody's.
+
+        Raises:
+            Closed: The publisher was closed meanwhile.
+        """
+        self._outlets.lock.release()
+        try:
+            more = backoff.wait()
+        finally:
+            self._outlets.lock.acquire()
+        self._check_open()
+        self._outlets.refresh()
+        return more and not self.is_over()
+
+    def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Call a function until it returns true, for so long at most [s]; whether it did."""
+        backoff = Backoff(timeout_s)
+        with self:
+            while not condition():
+                if not self.sleep(backoff):
+                    return False
+        return True
