@@ -176,13 +176,18 @@ def _latest(name: str, *, busy: bool) -> Case:
 
 
 def _memory(name: str, size: str) -> Case:
+    ways = tuple(_cortex(how, how=how) for how in ("callback", "recv", "async"))
     return Case(
         name,
-        f"memory of both sides over 10^6 messages of {_LABELS[size]}",
+        f"memory of both sides over 10^6 messages of {_LABELS[size]}, by each way to receive",
         _SAMPLE,
         SIZES[size],
-        (_cortex(),),
-        (Bar("cortex", (), "<=", 1024.0, "grown_kb"), Bar("cortex", (), "<=", 0.0, "shm_files")),
+        ways,
+        tuple(
+            Bar(way.name, (), "<=", bound, metric)
+            for way in ways
+            for metric, bound in (("grown_kb", 1024.0), ("shm_files", 0.0))
+        ),
         metrics=("rate", "grown_kb", "shm_files"),
         count=1_000_000,
         repeats=1,
