@@ -43,6 +43,9 @@ LoopMode = Literal["lockstep", "streaming"]
 
 TRANSPORT_BAR_S = (0.2e-3, 0.5e-3)
 """What the median and the 99th percentile of the transport are to stay under [s]."""
+_SPIN_S = 1e-3
+"""In lockstep the controller looks for an image for so long before it sleeps [s]; if that is not enough, it
+sleeps at once."""
 _CAMERA = "camera"
 _OPTIONS = {
     f"sensors.{_CAMERA}.lens.width": "--width",
@@ -163,6 +166,7 @@ def measure_loop(
                     warm_up_s=min(0.5 * seconds, 1.0) if warm_up_s is None else warm_up_s,
                     watch_rotors=not _obeys_at_once(config),
                     check=simulator.check,
+                    spin_s=_SPIN_S if config.live.mode == "lockstep" else 0.0,
                 )
             except ProbeError as error:
                 raise ProbeError(f"{error}; the simulator: {simulator.last_words()}") from None

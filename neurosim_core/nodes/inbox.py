@@ -16,6 +16,7 @@ from neurosim_core.control.modes import MODES, CommandMode
 from neurosim_core.nodes.helm import Command
 from neurosim_core.nodes.topics import COMMANDS, command_topic
 from neurosim_core.nodes.translate import setpoint_of
+from neurosim_core.render.launch import core_count
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +25,8 @@ _DRAIN_MAX = 1024
 _BLOCK_S = 0.02
 """Longest wait for the mode that came last before the others are looked at; from there on `recv` waits in the
 socket itself, which is the fastest way to be woken."""
+_SPIN_S = 300e-6
+"""In lockstep, how long to look for a command before sleeping [s]: most come sooner than one is woken."""
 _LOG_INTERVAL_S = 1.0
 
 
@@ -70,6 +73,7 @@ class Inbox:
         self._superseded = 0
         self._before = InboxCounts()
         self._hot = next(iter(self._subscribers))
+        self._may_spin = lockstep and core_count() > 1
         self._logged_s = -_LOG_INTERVAL_S
 
     @property
@@ -130,11 +134,13 @@ class Inbox:
         """
         while True:
             left_s = _BLOCK_S if deadline_s is None else deadline_s - time.monotonic()
+            if self._may_spin:
+                self._subscribers[self._hot].look_out(_SPIN_S)
             found = self._take(self._hot, min(max(left_s, 0.0), _BLOCK_S))
             if found is None:
                 newest = self._newest(self._read(), fits)
             else:
-                newest = self._newest([found], fits)
+                newest = found if fits(found) else self._newest([found], fits)
             if newest is not None:
                 self._hot = newest.mode
                 return newest

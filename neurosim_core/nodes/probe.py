@@ -43,6 +43,7 @@ def answer_images(
     warm_up_s: float,
     watch_rotors: bool,
     check: Check,
+    spin_s: float = 0.0,
 ) -> LoopTrace:
     """Be a controller that answers each image with a numbered command, and note when that happens.
 
@@ -55,6 +56,7 @@ def answer_images(
         warm_up_s: How long to fly before that [wall-clock s].
         watch_rotors: Listen to the rotors all the time, not only before the measurement.
         check: Called about five times a second while nothing comes.
+        spin_s: How long to look for an image before sleeping (`Subscriber.look_out`) [s].
 
     Raises:
         ProbeError: Nothing came for a long time.
@@ -95,6 +97,8 @@ def answer_images(
             check()
 
         while not end_ns or time.monotonic_ns() < end_ns or len(images) - begin < _IMAGES_MIN:
+            if spin_s:
+                pictures.look_out(spin_s)
             image, info = _receive(pictures, idle, _SILENCE_S if images else _START_S)
             if image.stamp_ns > answered[-1]:
                 command(image.stamp_ns)

@@ -21,6 +21,7 @@ from cortex.codec import codec_of
 from cortex.publisher import Closed
 from cortex.raw import RawMessage
 from cortex.schema import TypeMismatch, schema_of
+from cortex.subscriber import LOOK_EVERY
 
 LARGE = 100_000
 
@@ -56,6 +57,63 @@ def test_nothing_comes_in_time(numbers):
 
     in_time(receive, 1.0)
     with pytest.raises(TimeoutError):
+        subscriber.recv(0.0)
+
+
+def test_an_answer_is_looked_for_without_sleeping(numbers, monkeypatch):
+    publisher, subscriber = numbers
+    with pytest.raises(TimeoutError):
+        subscriber.recv(0.0)  # nothing is left of the beginning
+    looks = []
+
+    def give_up_core():
+        looks.append(len(looks))
+        if len(looks) == 3:
+            publisher.publish(Number(0, 1))
+
+    monkeypatch.setattr("cortex.subscriber.os.sched_yield", give_up_core)
+    deadline_s = time.monotonic() + SOON_S
+    while len(looks) < 3:  # it may find that something else has come
+        subscriber.look_out(SOON_S)
+        assert time.monotonic() < deadline_s
+    assert subscriber.recv(SOON_S).value == 1
+
+
+def test_after_a_look_in_vain_the_next_ones_are_left_out(numbers, monkeypatch):
+    publisher, subscriber = numbers
+    wait_for(lambda: not subscriber.look_out(1e-9))
+    looks = []
+    monkeypatch.setattr("cortex.subscriber.os.sched_yield", lambda: looks.append(1))
+    publisher.publish(Number(0, 1))
+    assert [subscriber.look_out(SOON_S) for _ in range(LOOK_EVERY - 1)] == [False] * (LOOK_EVERY - 1)
+    assert looks == []
+    assert subscriber.look_out(SOON_S)
+    assert subscriber.recv(SOON_S).value == 1
+
+
+def test_a_publisher_that_comes_while_an_answer_is_looked_for(node):
+    subscriber = node.subscriber("/numbers", Number)
+    publishers = []
+
+    def publish():
+        publishers.append(node.publisher("/numbers", Number))
+        assert publishers[0].wait_for_subscribers(timeout_s=SOON_S)
+        for value in (1, 2):
+            publishers[0].publish(Number(0, value))
+
+    later = threading.Timer(0.01, publish)
+    later.start()
+    for value in (1, 2):
+        subscriber.look_out(0.5)
+        assert subscriber.recv(SOON_S).value == value
+    later.join()
+
+
+def test_a_closed_subscriber_is_not_looked_at(numbers):
+    _, subscriber = numbers
+    subscriber.close()
+    assert subscriber.look_out(SOON_S)
+    with pytest.raises(Closed):
         subscriber.recv(0.0)
 
 

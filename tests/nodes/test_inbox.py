@@ -15,7 +15,7 @@ from processes import SOON_S, wait_for
 
 from cortex import Node, Publisher
 from cortex.messages import Imu
-from neurosim_core.nodes.inbox import Inbox
+from neurosim_core.nodes.inbox import _SPIN_S, Inbox
 from neurosim_core.nodes.topics import COMMANDS, command_topic
 from neurosim_core.nodes.translate import command_of
 
@@ -207,3 +207,22 @@ def test_reset_throws_away_and_counts_anew(desk: Desk):
     assert desk.inbox.poll() is None
     assert desk.inbox.counts.refused == 0
     assert desk.inbox.counts.superseded == 0
+
+
+@pytest.mark.parametrize(("lockstep", "cores", "looks"), [(True, 2, 3), (True, 1, 0), (False, 2, 0)])
+def test_only_lockstep_looks_for_commands_and_leaves_the_only_core_to_others(
+    shared_runtime: Path, monkeypatch: pytest.MonkeyPatch, *, lockstep: bool, cores: int, looks: int
+):
+    monkeypatch.setattr("neurosim_core.nodes.inbox.core_count", lambda: cores)
+    with Node("inbox") as node:
+        desk = Desk(node, lockstep=lockstep)
+        looked_s: list[float] = []
+        for subscriber in desk.inbox._subscribers.values():
+            monkeypatch.setattr(subscriber, "look_out", looked_s.append)
+        for stamp_ns in range(3):
+            desk.send("motor_speeds", stamp_ns=stamp_ns)
+            desk.settle(1)
+            command = desk.inbox.wait(lambda command: True, wake=lambda: False)
+            assert command is not None
+            assert command.stamp_ns == stamp_ns
+        assert looked_s == [_SPIN_S] * looks
