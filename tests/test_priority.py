@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import platform
 import sys
 import threading
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
 from neurosim_core import priority
-from neurosim_core.priority import give_way, niceness, spared_count, sparing
+from neurosim_core.priority import be_punctual, give_way, niceness, spared_count, sparing
 from neurosim_core.render import launch
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 
@@ -21,23 +26,52 @@ def _number(first: int, numbers_out: wp.array[int]) -> None:
     numbers_out[thread] = thread
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="threads have no priorities of their own")
-def test_a_thread_gives_way_with_those_that_it_starts_and_no_other():
-    before, found = niceness(), []
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="threads have no priorities of their own")
 
-    def work() -> None:
-        give_way()
-        found.append(niceness())
-        child = threading.Thread(target=lambda: found.append(niceness()))
-        child.start()
-        child.join()
 
+def in_thread(work: Callable[[], object]) -> None:
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    expected = min(before + priority._STEPS, 19)
-    assert found == [expected, expected]
-    assert niceness() == before
+
+
+def schedule() -> tuple[int, int, int]:
+    """Policy, niceness and turn [ns] of the calling thread, as the kernel says."""
+    attributes = priority._Attributes()
+    call = priority._SET_ATTRIBUTES[platform.machine()] + 1  # sched_getattr
+    size = ctypes.sizeof(attributes)
+    assert ctypes.CDLL(None).syscall(call, 0, ctypes.byref(attributes), size, 0) == 0
+    return attributes.policy, attributes.nice, attributes.runtime_ns
+
+
+@on_linux
+def test_a_thread_gives_way_with_those_that_it_starts_and_no_other():
+    before, found = schedule(), []
+
+    def work() -> None:
+        give_way()
+        found.append(schedule())
+        in_thread(lambda: found.append(schedule()))
+
+    in_thread(work)
+    nice = min(before[1] + priority._STEPS, 19)
+    turn_ns = priority._TURN_NS if before[2] else 0  # before Linux 6.12 nobody has turns of his own
+    assert found == [(os.SCHED_BATCH, nice, turn_ns)] * 2
+    assert niceness() == nice - priority._STEPS or nice == 19
+    assert schedule() == before
+
+
+@on_linux
+def test_a_thread_is_punctual_and_no_other():
+    """The kernel says how much later than asked for a thread may be woken."""
+
+    def slack_ns() -> int:
+        return int(Path(f"/proc/{threading.get_native_id()}/timerslack_ns").read_text())
+
+    before_ns, found = slack_ns(), []
+    in_thread(lambda: (be_punctual(), found.append(slack_ns())))
+    assert found == [priority._SLACK_NS]
+    assert slack_ns() == before_ns > priority._SLACK_NS
 
 
 @pytest.mark.parametrize(("cores", "spared", "used"), [(4, 0, 4), (4, 1, 3), (2, 1, 1), (1, 1, 1)])

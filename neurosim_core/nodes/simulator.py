@@ -36,6 +36,7 @@ from neurosim_core.nodes.status import Board, Meter
 from neurosim_core.nodes.streaming import Streaming
 from neurosim_core.pacing import Pacer
 from neurosim_core.packets import Packet
+from neurosim_core.priority import be_punctual
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.simulation import Model, make_fleet, warm_up
 from neurosim_core.vehicle import DynamicsError
@@ -253,6 +254,8 @@ class Simulator:
             self._take_commands(end_ns)
         for craft in self.crafts:
             craft.answers_ns = craft.outlet.publish_due(end_ns)
+        if streaming:
+            self._streaming.let_readers_go_first(end_ns, end_ns - self.stamp_ns)
         self._end_period(end_ns)
 
     def _wait_for_end(self, end_ns: int) -> bool:
@@ -482,6 +485,7 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
         gc.collect()
         gc.freeze()  # what is here stays: to look at it again would hold up time by a tenth of a second
         sys.setswitchinterval(_SWITCH_S)
+        be_punctual()
         with stop_at_signals(stop, on_stop=node.stop_waiting), simulator:
             print_plan(console, simulator.crafts, config)
             with StatusLine(console) as line:
