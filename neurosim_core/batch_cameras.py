@@ -32,7 +32,7 @@ def look_at(model: Model, state: State, batch: Batch, casts: Collection[int] | N
         casts: Which look; None: all.
     """
     due = choose(model, state, batch, casts)
-    with timed(state.wall_s, "render"), on(state.render_stream):
+    with timed(state.wall_s, "render"), on(state.render_streams[batch.number % len(state.lanes)]):
         state.flown[batch.number % state.flight_lane_count].hold()
         looks = plan_looks(state, batch, due)
         for look in looks:

@@ -99,7 +99,8 @@ class State:
     """Cameras that look, from the next batch on."""
     flight_stream: wp.Stream | None
     """Where the vehicle moves, ahead of the renderers; with one lane nothing overlaps, one stream does."""
-    render_stream: wp.Stream | None
+    render_streams: Sequence[wp.Stream | None]
+    """For each lane: the last rays of a batch and the first of the next fill the device together."""
     event_stream: wp.Stream | None
     """Where events are found, while the next batch is rendered."""
     choice_stream: wp.Stream | None
@@ -110,7 +111,7 @@ class State:
     flown: Sequence[Milestone]
     """For each batch that may be flown and not looked at, its end on `flight_stream`."""
     rendered: Milestone
-    """End of the batch launched last on `render_stream`."""
+    """End of the batch whose rendering was launched last."""
     graphs: Graphs
     stamp_ns: int = 0
     """How far packets have been returned [ns]."""
@@ -239,7 +240,7 @@ def make_state(
         make_room=make_room,
         wanted=frozenset(name for cast in model.casts for name in cast.names),
         flight_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
-        render_stream=make_stream(device) if lane_count > 1 else None,
+        render_streams=[make_stream(device) if lane_count > 1 else None for _ in range(lane_count)],
         event_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
         choice_stream=make_stream(device, urgent=True) if lane_count > 1 and model.schedule.sparse else None,
         flown=[Milestone(device) for _ in range(flight_lane_count)],

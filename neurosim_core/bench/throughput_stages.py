@@ -102,9 +102,9 @@ class _StagedCamera:
         self._camera = camera
         self._clock = clock
 
-    def feed_device(self, *arguments: Any) -> None:
+    def feed_device(self, *arguments: Any, **options: Any) -> None:
         with self._clock.stage("scan"):
-            self._camera.feed_device(*arguments)
+            self._camera.feed_device(*arguments, **options)
 
     def collect_windows(self, *arguments: Any, **options: Any) -> Any:
         with self._clock.stage("sort and decode"):
@@ -183,7 +183,7 @@ class Views:
         self.arrays = cast(SceneArrays, model.scene_on_device)
         self.lens = model.casts[0].lens
         self.count = model.config.instants_per_launch
-        self.p_WC, self.q_WC = seeing.p_WC, seeing.q_WC
+        self.p_WC, self.q_WC = seeing.p_WC[0], seeing.q_WC[0]
         renderer = self.renderer("log_radiance")
         self.render(renderer)
         self.frames = renderer.log_radiance
@@ -453,7 +453,8 @@ def events_to_host_per_s(views: Views, *, seconds: float) -> float:
 
     def feed() -> None:
         nonlocal fed
-        camera.feed_device(stacks[fed % 2], stamps + fed * stamps[-1])
+        seen = stamps + fed * stamps[-1]
+        camera.feed_device(stacks[fed % 2], seen, ends_ns=seen[-1:])
         fed += 1
 
     def read() -> int:

@@ -77,12 +77,13 @@ class CastState:
     images: dict[str, ImageChannel]
     p_BC: wp.vec3d
     q_BC: wp.quatd
-    p_WC: wp.array[wp.vec3]
-    q_WC: wp.array[wp.quat]
+    p_WC: Sequence[wp.array[wp.vec3]]
+    """Where the camera is at the instants [m], for each lane: they may be rendered at the same time."""
+    q_WC: Sequence[wp.array[wp.quat]]
     motions: wp.array[Motion] | None = None
     """Of the bodies; None: nothing moves but the vehicle."""
-    body_poses: BodyPoses | None = None
-    """Where bodies are at the instants."""
+    body_poses: Sequence[BodyPoses | None] = ()
+    """Where bodies are at the instants, for each lane."""
     slots: dict[tuple[int, ...], wp.array[int]] = field(default_factory=dict)
     """Lists of slots on the device: the same few come again and again."""
     rule: DisplacementRule | None = None
@@ -182,10 +183,10 @@ def make_cast_state(
         images=images,
         p_BC=p_BC,
         q_BC=q_BC,
-        p_WC=wp.zeros(capacity, dtype=wp.vec3, device=device),
-        q_WC=wp.zeros(capacity, dtype=wp.quat, device=device),
+        p_WC=[wp.zeros(capacity, dtype=wp.vec3, device=device) for _ in renderers],
+        q_WC=[wp.zeros(capacity, dtype=wp.quat, device=device) for _ in renderers],
         motions=upload_motions(bodies, device) if bodies else None,
-        body_poses=make_body_poses(capacity, len(bodies), device) if bodies else None,
+        body_poses=[make_body_poses(capacity, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(cast, scene, p_BC, q_BC),
         chosen_slots=[HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(lane_count)]
         if cast.max_displacement_px is not None
@@ -305,17 +306,15 @@ def plan_look(
     from_slots = _slots_on_device(cast, slots) if chosen is None else chosen.array
     to_slots = _slots_on_device(cast, image_slots)
 
+    p_WC, q_WC, body_poses = cast.p_WC[lane], cast.q_WC[lane], cast.body_poses[lane]
+
     def render() -> tuple[Any, Any]:
         if chosen is not None:
             chosen.upload()
-        trace.camera_poses(
-            from_slots, count=len(slots), p_BC=cast.p_BC, q_BC=cast.q_BC, p_WC=cast.p_WC, q_WC=cast.q_WC
-        )
-        if cast.motions is not None and cast.body_poses is not None:
-            pose_bodies(cast.motions, trace.stamps, from_slots, count=len(slots), poses=cast.body_poses)
-        cast.renderers[lane].render(
-            cast.p_WC, cast.q_WC, to_slots, instant_count=len(slots), bodies=cast.body_poses
-        )
+        trace.camera_poses(from_slots, count=len(slots), p_BC=cast.p_BC, q_BC=cast.q_BC, p_WC=p_WC, q_WC=q_WC)
+        if cast.motions is not None and body_poses is not None:
+            pose_bodies(cast.motions, trace.stamps, from_slots, count=len(slots), poses=body_poses)
+        cast.renderers[lane].render(p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses)
         for copy in cast.picture_copies[lane].values():
             copy.fetch(0, used)
         return from_slots, to_slots
