@@ -8,19 +8,21 @@ from __future__ import annotations
 import dataclasses
 import gc
 import hashlib
+import itertools
 import logging
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.bench import throughput_stages as stages
+from neurosim_core.bench.event_matching import match_events
 from neurosim_core.bench.machine import processor
 from neurosim_core.bench.step import flight_settings, fly_blind, time_steps
 from neurosim_core.bench.throughput_chapter import throughput_chapter
@@ -30,13 +32,15 @@ from neurosim_core.bench.throughput_result import (
     EXACT,
     LOOP,
     PHYSICS_ALONE,
+    RAYS_ALONE,
     READ_ALONE,
     RENDER_ALONE,
     SCAN,
     SCAN_ALONE,
-    SHARED_WALK,
+    SEEN,
     Agreement,
     Comparison,
+    EventError,
     Part,
     Roofline,
     Split,
@@ -46,10 +50,10 @@ from neurosim_core.bench.throughput_result import (
 )
 from neurosim_core.bench.throughput_scene import hall
 from neurosim_core.config import SimulationConfig, load_config
-from neurosim_core.packets import Events
-from neurosim_core.render.config import RenderConfig
+from neurosim_core.packets import EventArrays, Events
 from neurosim_core.render.launch import core_count
 from neurosim_core.render.renderer import upload_scene
+from neurosim_core.render.warp_renderer import SceneArrays
 from neurosim_core.simulation import Model, make_model, make_state, refit, run_model
 
 __all__ = ["measure_throughput", "throughput_chapter"]
@@ -79,6 +83,7 @@ class _Plan:
     repetition_s: float
     alone_s: float
     split_batches: int
+    error_batches: int
     megabytes: int
     loud_size: tuple[int, int]
     small: int
@@ -98,6 +103,7 @@ _ON_CUDA = _Plan(
     repetition_s=0.4,
     alone_s=0.4,
     split_batches=100,
+    error_batches=64,
     megabytes=512,
     loud_size=_VGA,
     small=128,
@@ -237,6 +243,7 @@ class _Study:
             events_per_s=events_per_s,
             events_failure=events_failure,
             agreements=tuple(self._agreements()),
+            event_error=self._event_error() if self._is_cuda else None,
         )
 
     def _try(self, measure: Callable[[], _T]) -> tuple[_T | None, str]:
@@ -297,27 +304,42 @@ class _Study:
                     "resolution", mode, partial(self._model, size, plan.instants, **options),
                     scene=self._base.scene.name, width=size[0], height=size[1], instants=plan.instants,
                 )  # fmt: skip
-        if "shared_walk" not in RenderConfig.model_fields:
+        if not self._is_cuda:
             return
-        self._tell("light, once more")
-        walking, failure = self._try(self._with_shared_walk)
-        for size in plan.resolutions:
-            facts: dict[str, Any] = {"width": size[0], "height": size[1], "instants": plan.instants}
-            facts["scene"] = self._base.scene.name
-            if walking is None:
-                yield StepRow(study="resolution", mode=SHARED_WALK, failure=failure, **facts)
-                continue
-            self._tell(f"whole steps, {SHARED_WALK}, {size[0]}x{size[1]}")
-            settings = self._settings(size, plan.instants, render={"shared_walk": {}})
-            make = partial(refit, walking, load_config(settings))
-            yield self._row("resolution", SHARED_WALK, make, **facts)
+        for mode, walk in ((RAYS_ALONE, None), (SEEN, {"lists": "seen"})):
+            for size in plan.resolutions:
+                self._tell(f"whole steps, {mode}, {size[0]}x{size[1]}")
+                yield self._row(
+                    "resolution", mode, partial(self._walking, size, walk),
+                    scene=self._base.scene.name, width=size[0], height=size[1], instants=plan.instants,
+                )  # fmt: skip
 
-    def _with_shared_walk(self) -> Model:
-        config = load_config(
-            self._settings(self._plan.resolutions[0], self._plan.instants, render={"shared_walk": {}})
-        )
-        uploaded = upload_scene(self._base.scene, config.render, device=self._device)
-        return dataclasses.replace(self._base, config=config, scene_on_device=uploaded)
+    def _walking(self, size: tuple[int, int], walk: dict[str, Any] | None) -> Model:
+        """Return the model whose rays share walks so; light stays as it is."""
+        config = load_config(self._settings(size, self._plan.instants, render={"shared_walk": walk}))
+        arrays = cast(SceneArrays, self._base.scene_on_device)
+        lit = dataclasses.replace(arrays, config=config.render)
+        return refit(dataclasses.replace(self._base, config=config, scene_on_device=lit), config)
+
+    def _event_error(self) -> EventError:
+        """Fly with complete lists and with those of what is seen, and compare the events."""
+        self._tell(f"the events of {SEEN}")
+
+        def compare() -> EventError:
+            exact, other = (
+                _events_of(self._walking(self._plan.launch_size, {"lists": lists}), self._plan.error_batches)
+                for lists in ("complete", "seen")
+            )
+            found = match_events(exact, other, tolerance_us=0)
+            return EventError(
+                mode=SEEN,
+                event_count=len(exact.t),
+                missing_count=len(found.missing),
+                spurious_count=len(found.spurious),
+            )
+
+        error, failure = self._try(compare)
+        return error or EventError(mode=SEEN, failure=failure)
 
     def _launches(self) -> Iterator[StepRow]:
         size = self._plan.launch_size
@@ -453,6 +475,17 @@ class _Study:
             return dataclasses.replace(make_model(config, scene=model.scene), path=model.path)
         uploaded = upload_scene(model.scene, config.render, device=device)
         return refit(dataclasses.replace(model, scene_on_device=uploaded), config)
+
+
+def _events_of(model: Model, batch_count: int) -> EventArrays:
+    """Fly for some batches, and return the events of all."""
+    state = make_state(model)
+    fly_blind(model, state, _BEGIN_S)
+    packets = []
+    for packet in itertools.islice(run_model(model, state), batch_count):
+        assert isinstance(packet, Events)
+        packets.append(packet.numpy())
+    return EventArrays(*(np.concatenate(column) for column in zip(*packets, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
