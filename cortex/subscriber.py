@@ -17,31 +17,25 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-import zmq
 
 from cortex.codec import Codec, MalformedMessage
 from cortex.context import Closed
-from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, make_arrivals, make_inlet
-from cortex.link import BLOCK_MS, WHOLE_BATCH, Item, Link, make
+from cortex.inlet import NOTHING, PAUSE_COUNT, PAUSE_NS, make_arrivals
+from cortex.intake import DRAIN_MAX, Intake
+from cortex.link import BLOCK_MS, WHOLE_BATCH, Item, Link
 from cortex.loop_reader import LoopReader
 from cortex.policy import Policy
 from cortex.schema import Schema, TypeMismatch
-from cortex.stats import SubscriberCounters, note_latency
+from cortex.stats import SubscriberCounters
 from cortex.turn import Turn
 from cortex.wakeup import Wakeup
-from cortex.wire import HEAD_SIZE, HEADER_SIZE, PREFIX_SIZE, RECORD, REST
+from cortex.wire import RECORD
 
 logger = logging.getLogger(__name__)
 monotonic_ns = time.monotonic_ns
-unpack_rest = REST.unpack_from
-DONTWAIT = int(zmq.DONTWAIT)
 
 T = TypeVar("T")
 
-DRAIN_MAX = 64
-"""Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
-DRAIN_LOSSY_MAX = 4096
-"""Where only the last messages count, all that has arrived is read: more than a socket holds."""
 FRESH_NS = 1_000_000
 """A queue that was filled longer ago is topped up before the next message is taken."""
 TOP_UP_NS = 20_000_000
@@ -91,18 +85,14 @@ class Subscriber(Generic[T]):
         self._turn = Turn()
         self._lock = self._turn.lock
         self.wakeup = Wakeup()
-        self._links: list[Link] = []
         self._leaving: dict[Link, int] = {}
-        self._queue: deque[Item] = deque()
         self._problems: deque[Exception] = deque()
-        self._drained_ns = 0
-        self._inlet = make_inlet(self._turn, self._queue, self.counters, self._accept_timed)
-        self._whole_batches = False
+        self._intake = Intake(policy, self.counters, self._turn)
+        self._links, self._queue, self._inlet = self._intake.links, self._intake.queue, self._intake.inlet
         self._on_close = on_close
         self._closed = False
         self._reader: LoopReader | None = None
         self._generation = 0
-        self._first = 0
         self._raised = 0
         self.refused: set[int] = set()
         """Publishers that this subscriber cannot be connected to; kept by the node."""
@@ -187,11 +177,12 @@ class Subscriber(Generic[T]):
         """
         if self.codec is None or self.codec.record_dtype is None:
             raise TypeError(f"{self.topic}: only a type of fixed size can be received as an array")
-        self._whole_batches = True
+        self._intake.whole_batches = True
         with self._turn:
             for link in self._links:
                 link.whole_batches = True
-        records = self._gather()
+            simple = not (self._queue or self._closed or self._problems) and self.policy.reliable
+            records = self._intake.gather(self.codec) if simple else None
         if records is None:
             records = self._receive(timeout_s, self._join, whole=True)
         return records
@@ -303,14 +294,14 @@ class Subscriber(Generic[T]):
                 problem = self._problems.popleft()
                 self._open_inlet()
                 raise problem
-            if not self.policy.reliable and (
-                not queue or self.policy.depth < DRAIN_MAX or monotonic_ns() - self._drained_ns > FRESH_NS
-            ):
-                self._drain()
+            if not self.policy.reliable:
+                is_old = monotonic_ns() - self._intake.drained_ns > FRESH_NS
+                if not queue or self.policy.depth < DRAIN_MAX or is_old:
+                    self._intake.drain()
             if not queue and whole:
-                self._drain()
+                self._intake.drain()
             if not queue:
-                self._receive_one(block=block)
+                self._intake.receive_one(block=block)
             if not queue:
                 return None
             item = queue.popleft()
@@ -387,190 +378,6 @@ class Subscriber(Generic[T]):
             raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
         return np.frombuffer(b"".join(bodies), dtype)
 
-    def _gather(self) -> np.ndarray | None:
-        """The plain messages that wait in the sockets, as one array; None if there are none."""
-        codec = self.codec
-        assert codec is not None
-        with self._turn:
-            if self._queue or self._closed or self._problems or not self.policy.reliable:
-                return None
-            for link in self._rotated():
-                if link.gather is None or link.codec is not codec:
-                    continue
-                link.expected, bodies, count, frame = link.gather(
-                    link.receive,
-                    zmq.Again,
-                    link.expected,
-                    self.policy.depth,
-                    self.counters.latency,
-                    link.clock_offset_ns,
-                )
-                if frame is not None:
-                    self._inlet.exhausted = False
-                    self._accept(link, frame, timed=True)
-                if count:
-                    self.counters.received += count
-                    return np.frombuffer(bodies, codec.record_dtype)
-                if frame is not None:
-                    return None
-        return None
-
-    def _receive_one(self, *, block: bool = False) -> None:
-        """Read one frame into the queue; the lock is held.
-
-        Finding a socket empty costs more than reading a message: that is done after one is handed out.
-        Waiting in the socket itself costs half of what waiting for its descriptor does.
-        """
-        links = self._links
-        flags = 0 if block and len(links) == 1 and not self._turn.waiting else DONTWAIT
-        self._inlet.exhausted = True
-        for link in links if len(links) == 1 else self._rotated():
-            try:
-                frame = link.receive(flags)
-            except zmq.Again:
-                continue
-            self._inlet.exhausted = False
-            self._accept(link, frame, timed=True)
-            if self._queue:
-                return
-
-    def _rotated(self) -> list[Link]:
-        """The links, a different one first each time, so that no publisher starves another."""
-        links = self._links
-        if len(links) > 1:
-            self._first = (self._first + 1) % len(links)
-            return links[self._first :] + links[: self._first]
-        return links
-
-    def _drain(self) -> None:
-        """Read what has arrived into the queue; the lock is held.
-
-        Where only the last messages count, that ends with the first message that was published meanwhile: a
-        publisher that is faster than we are would keep us here.
-        """
-        exhausted = True
-        begin_ns = monotonic_ns()
-        links, queue, reliable = self._rotated(), self._queue, self.policy.reliable
-        for index, link in enumerate(links):
-            receive = link.receive
-            budget = DRAIN_LOSSY_MAX
-            if reliable:
-                budget = -(-(self.policy.depth - len(queue)) // (len(links) - index))
-            for count in range(budget):
-                try:
-                    frame = receive(DONTWAIT)
-                except zmq.Again:
-                    exhausted &= link.receive is receive  # else what came has told it to read elsewhere
-                    break
-                self._accept(link, frame, timed=count & 7 == 0)
-                if not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns:
-                    exhausted = False
-                    break
-            else:
-                exhausted = False
-        self._inlet.exhausted = exhausted
-        self._drained_ns = monotonic_ns()
-
-    def _accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
-        """Put the message of a frame into the queue; the lock is held."""
-        if frame[:HEAD_SIZE] != link.message_head or len(frame) < HEADER_SIZE:
-            for item in link.handle(frame):
-                self._time(item.publish_ns, link)
-                self._enqueue(item)
-            return
-        sequence, stamp_ns, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
-        if size != len(frame) - HEADER_SIZE:
-            link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
-            link.skip(sequence)
-            return
-        if sequence == link.expected:
-            link.expected = sequence + 1
-        elif not link.advance(sequence):
-            return
-        if timed:
-            self._time(publish_ns, link)
-        self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
-
-    def _accept_timed(self, link: Link, frame: bytes) -> None:
-        self._accept(link, frame, timed=True)
-
-    def _drain_decoded(self, messages: deque[T], *, may_wait: bool) -> None:
-        """As `_drain`, for an empty queue that cannot overflow: messages are decoded on the spot.
-
-        This is where a stream spends its time. A message that cannot be decoded here goes to the queue, and
-        what follows it waits in the socket, so that the order is kept.
-
-        Args:
-            messages: Where they are appended.
-            may_wait: Wait up to `BLOCK_S` for the first if there is one socket only.
-        """
-        links, latency = self._rotated(), self.counters.latency
-        may_wait = may_wait and len(links) == 1 and not self._turn.waiting
-        exhausted = True
-        self._drained_ns = monotonic_ns()
-        for link in links:
-            left = min(self.policy.depth, DRAIN_MAX) - len(messages)
-            while left > 0 and not self._queue:
-                link.expected, count, frame = link.drain(
-                    link.receive,
-                    zmq.Again,
-                    messages,
-                    link.expected,
-                    left,
-                    latency,
-                    link.clock_offset_ns,
-                    may_wait,
-                )
-                may_wait = False
-                left -= count
-                if frame is None:
-                    break
-                left -= 1
-                self._take_decoded(link, frame, messages)
-                if len(messages) >= DRAIN_MAX:
-                    left = 0
-            if left <= 0 or self._queue:
-                exhausted = False
-            if self._queue:
-                break
-        self._inlet.exhausted = exhausted
-
-    def _take_decoded(self, link: Link, frame: bytes, messages: deque[T]) -> None:
-        """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
-        if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
-            link.read_batch(frame, messages)
-            return
-        self._accept(link, frame, timed=True)
-        while self._queue and self._queue[0].buffer is not None:
-            item = self._queue.popleft()
-            try:
-                messages.append(self._decode(item))
-            except MalformedMessage as error:
-                link.reject(str(error))
-
-    def _time(self, publish_ns: int, link: Link) -> None:
-        """Add to the histogram: of plain messages the first of a wake-up and every eighth (all cost 10 %)."""
-        note_latency(self.counters.latency, monotonic_ns() - publish_ns - link.clock_offset_ns)
-
-    def _enqueue(self, item: Item) -> None:
-        queue, depth = self._queue, self.policy.depth
-        queue.append(item)
-        if self.policy.reliable:
-            return
-        if not self._whole_batches:
-            if len(queue) > depth:
-                queue.popleft()
-                self.counters.overtaken += 1
-            return
-        surplus = sum(_count(waiting) for waiting in queue) - depth
-        while surplus > 0:
-            oldest = queue.popleft()
-            dropped = min(_count(oldest), surplus)
-            if dropped < _count(oldest):
-                queue.appendleft(oldest.link.cut(oldest, dropped))
-            self.counters.overtaken += dropped
-            surplus -= dropped
-
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
         with self._turn:
@@ -613,13 +420,14 @@ class Subscriber(Generic[T]):
                 problems, self._problems = self._problems, problems
             if self.policy.reliable or self.policy.depth >= DRAIN_MAX:
                 if not self._queue:
-                    self._drain_decoded(messages, may_wait=block)
+                    self._intake.drain_decoded(messages, may_wait=block)
             else:
                 if block and not self._queue:
-                    self._receive_one(block=True)
-                self._drain()
+                    self._intake.receive_one(block=True)
+                self._intake.drain()
             if self._queue:
-                items, self._queue = self._queue, items
+                items.extend(self._queue)
+                self._queue.clear()
             received = len(messages) + len(items)
             self.counters.received += received
             more = not self._inlet.exhausted or (block and received > 0)
@@ -668,11 +476,11 @@ class Subscriber(Generic[T]):
 
         So the queue keeps the last messages, not the first that filled the sockets.
         """
-        read_ns = max(self._drained_ns, self._inlet.taken_ns)
+        read_ns = max(self._intake.drained_ns, self._inlet.taken_ns)
         if now_ns - read_ns > TOP_UP_NS and self._lock.acquire(blocking=False):
             try:
                 if not self._closed:
-                    self._drain()
+                    self._intake.drain()
                     arrived = bool(self._queue)
             finally:
                 self._lock.release()
@@ -687,7 +495,7 @@ class Subscriber(Generic[T]):
                 if self._closed:
                     raise Closed(f"the subscriber of {self.topic} is closed")
                 if len(self._queue) < self.policy.depth:
-                    self._drain()
+                    self._intake.drain()
                 attached = any(link.attached for link in self._links)
                 if self._queue:
                     self.wakeup.set()  # whoever sleeps on the descriptors would not notice
@@ -709,7 +517,7 @@ class Subscriber(Generic[T]):
             if self._closed:
                 link.close()
                 return
-            link.whole_batches = self._whole_batches
+            link.whole_batches = self._intake.whole_batches
             self._links.append(link)
             self._inlet.exhausted = False  # a descriptor shows nothing until its socket was found empty once
             self._links_changed()
@@ -774,7 +582,7 @@ class Subscriber(Generic[T]):
         for link, deadline_ns in list(self._leaving.items()):
             if now_ns >= deadline_ns:
                 if self.policy.reliable:  # what is on its way stays there until there is room for it
-                    self._drain()
+                    self._intake.drain()
                     if self._queue:
                         self.wakeup.set()
                     if not self._inlet.exhausted:
@@ -800,7 +608,8 @@ class Subscriber(Generic[T]):
             self._closed = True
             self._inlet.open(None, None)
             self._queue.clear()
-            links, self._links = self._links, []
+            links = list(self._links)
+            self._links.clear()
             self._leaving.clear()
         if self._reader is not None:
             self._reader.stop()
@@ -815,11 +624,6 @@ class Subscriber(Generic[T]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _count(item: Item) -> int:
-    """Messages of an item."""
-    return item.size if item.offset == WHOLE_BATCH else 1
 
 
 class _Messages(Generic[T]):

@@ -1,0 +1,231 @@
+"""What a subscriber reads from its sockets, and keeps until it is asked for: a bounded queue."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+import zmq
+
+from cortex.codec import Codec, MalformedMessage
+from cortex.inlet import make_inlet
+from cortex.link import WHOLE_BATCH, Item, Link, make
+from cortex.outlet import DONTWAIT
+from cortex.policy import Policy
+from cortex.stats import SubscriberCounters, note_latency
+from cortex.turn import Turn
+from cortex.wire import HEAD_SIZE, HEADER_SIZE, PREFIX_SIZE, REST
+
+monotonic_ns = time.monotonic_ns
+unpack_rest = REST.unpack_from
+
+DRAIN_MAX = 64
+"""Frames that are read at a time, so that one subscriber does not keep a thread for itself."""
+DRAIN_LOSSY_MAX = 4096
+"""Where only the last messages count, all that has arrived is read: more than a socket holds."""
+
+
+class Intake:
+    """Reads the sockets of one subscriber. Every method runs under the lock of its turn."""
+
+    def __init__(self, policy: Policy, counters: SubscriberCounters, turn: Turn) -> None:
+        self.links: list[Link] = []
+        """To all publishers; always this list."""
+        self.queue: deque[Item] = deque()
+        """What has been read and not been asked for; always this one."""
+        self.inlet = make_inlet(turn, self.queue, counters, self._accept_timed)
+        """The short way past all this."""
+        self.drained_ns = 0
+        """When the sockets were last read as a whole."""
+        self.whole_batches = False
+        """Whether batches are queued in one piece."""
+        self._policy = policy
+        self._counters = counters
+        self._turn = turn
+        self._first = 0
+
+    def receive_one(self, *, block: bool = False) -> None:
+        """Read one frame into the queue.
+
+        Finding a socket empty costs more than reading a message: that is done after one is handed out.
+        Waiting in the socket itself costs half of what waiting for its descriptor does.
+        """
+        links = self.links
+        flags = 0 if block and len(links) == 1 and not self._turn.waiting else DONTWAIT
+        self.inlet.exhausted = True
+        for link in links if len(links) == 1 else self._rotated():
+            try:
+                frame = link.receive(flags)
+            except zmq.Again:
+                continue
+            self.inlet.exhausted = False
+            self.accept(link, frame, timed=True)
+            if self.queue:
+                return
+
+    def drain(self) -> None:
+        """Read what has arrived into the queue.
+
+        Where only the last messages count, that ends with the first message that was published meanwhile: a
+        publisher that is faster than we are would keep us here.
+        """
+        exhausted = True
+        begin_ns = monotonic_ns()
+        links, queue, reliable = self._rotated(), self.queue, self._policy.reliable
+        for index, link in enumerate(links):
+            receive = link.receive
+            budget = DRAIN_LOSSY_MAX
+            if reliable:
+                budget = -(-(self._policy.depth - len(queue)) // (len(links) - index))
+            for count in range(budget):
+                try:
+                    frame = receive(DONTWAIT)
+                except zmq.Again:
+                    exhausted &= link.receive is receive  # else what came has told it to read elsewhere
+                    break
+                self.accept(link, frame, timed=count & 7 == 0)
+                if not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns:
+                    exhausted = False
+                    break
+            else:
+                exhausted = False
+        self.inlet.exhausted = exhausted
+        self.drained_ns = monotonic_ns()
+
+    def drain_decoded(self, messages: deque[Any], *, may_wait: bool) -> None:
+        """As `drain`, for an empty queue that cannot overflow: messages are decoded on the spot.
+
+        This is where a stream spends its time. A message that cannot be decoded here goes to the queue, and
+        what follows it waits in the socket, so that the order is kept.
+
+        Args:
+            messages: Where they are appended.
+            may_wait: Wait up to `BLOCK_S` for the first if there is one socket only.
+        """
+        links, latency = self._rotated(), self._counters.latency
+        may_wait = may_wait and len(links) == 1 and not self._turn.waiting
+        exhausted = True
+        self.drained_ns = monotonic_ns()
+        for link in links:
+            left = min(self._policy.depth, DRAIN_MAX) - len(messages)
+            while left > 0 and not self.queue:
+                link.expected, count, frame = link.drain(
+                    link.receive,
+                    zmq.Again,
+                    messages,
+                    link.expected,
+                    left,
+                    latency,
+                    link.clock_offset_ns,
+                    may_wait,
+                )
+                may_wait = False
+                left -= count
+                if frame is None:
+                    break
+                left -= 1
+                self._take_decoded(link, frame, messages)
+                if len(messages) >= DRAIN_MAX:
+                    left = 0
+            if left <= 0 or self.queue:
+                exhausted = False
+            if self.queue:
+                break
+        self.inlet.exhausted = exhausted
+
+    def _take_decoded(self, link: Link, frame: bytes, messages: deque[Any]) -> None:
+        """Decode what a frame holds that does not simply follow; what cannot be is rejected, or queued."""
+        if frame[:PREFIX_SIZE] == link.batch_head and len(frame) >= HEADER_SIZE:
+            link.read_batch(frame, messages)
+            return
+        self.accept(link, frame, timed=True)
+        while self.queue and self.queue[0].buffer is not None:
+            item = self.queue.popleft()
+            try:
+                messages.append(item.link.codec.decode(item.buffer, item.offset, item.size))
+            except MalformedMessage as error:
+                link.reject(str(error))
+
+    def gather(self, codec: Codec) -> np.ndarray | None:
+        """The plain messages of a type that wait in the sockets, as one array; None if there are none."""
+        for link in self._rotated():
+            if link.gather is None or link.codec is not codec:
+                continue
+            link.expected, bodies, count, frame = link.gather(
+                link.receive,
+                zmq.Again,
+                link.expected,
+                self._policy.depth,
+                self._counters.latency,
+                link.clock_offset_ns,
+            )
+            if frame is not None:
+                self.inlet.exhausted = False
+                self.accept(link, frame, timed=True)
+            if count:
+                self._counters.received += count
+                return np.frombuffer(bodies, codec.record_dtype)
+            if frame is not None:
+                return None
+        return None
+
+    def accept(self, link: Link, frame: bytes, *, timed: bool) -> None:
+        """Put the message of a frame into the queue."""
+        if frame[:HEAD_SIZE] != link.message_head or len(frame) < HEADER_SIZE:
+            for item in link.handle(frame):
+                self._time(item.publish_ns, link)
+                self._enqueue(item)
+            return
+        sequence, stamp_ns, publish_ns, size, _ = unpack_rest(frame, HEAD_SIZE)
+        if size != len(frame) - HEADER_SIZE:
+            link.reject(f"a message of {len(frame)} bytes: says its body has {size}")
+            link.skip(sequence)
+            return
+        if sequence == link.expected:
+            link.expected = sequence + 1
+        elif not link.advance(sequence):
+            return
+        if timed:
+            self._time(publish_ns, link)
+        self._enqueue(make(Item, (link, frame, HEADER_SIZE, size, sequence, stamp_ns, publish_ns, None)))
+
+    def _accept_timed(self, link: Link, frame: bytes) -> None:
+        self.accept(link, frame, timed=True)
+
+    def _rotated(self) -> list[Link]:
+        """The links, a different one first each time, so that no publisher starves another."""
+        links = self.links
+        if len(links) > 1:
+            self._first = (self._first + 1) % len(links)
+            return links[self._first :] + links[: self._first]
+        return links
+
+    def _time(self, publish_ns: int, link: Link) -> None:
+        """Add to the histogram: of plain messages the first of a wake-up and every eighth (all cost 10 %)."""
+        note_latency(self._counters.latency, monotonic_ns() - publish_ns - link.clock_offset_ns)
+
+    def _enqueue(self, item: Item) -> None:
+        queue, depth = self.queue, self._policy.depth
+        queue.append(item)
+        if self._policy.reliable:
+            return
+        if not self.whole_batches:
+            if len(queue) > depth:
+                queue.popleft()
+                self._counters.overtaken += 1
+            return
+        surplus = sum(_count(waiting) for waiting in queue) - depth
+        while surplus > 0:
+            oldest = queue.popleft()
+            dropped = min(_count(oldest), surplus)
+            if dropped < _count(oldest):
+                queue.appendleft(oldest.link.cut(oldest, dropped))
+            self._counters.overtaken += dropped
+            surplus -= dropped
+
+
+def _count(item: Item) -> int:
+    """Messages of an item."""
+    return item.size if item.offset == WHOLE_BATCH else 1
