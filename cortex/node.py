@@ -11,14 +11,14 @@ import select
 import threading
 import time
 import weakref
-from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import zmq
 
+from cortex.answers import Answers
 from cortex.callbacks import CallbackThread
 from cortex.codec import MalformedMessage, codec_of
 from cortex.context import LINGER_MS, Closed, context
@@ -26,30 +26,29 @@ from cortex.control import control_types
 from cortex.discovery import Directory
 from cortex.flusher import Flusher
 from cortex.host import domain_id, host_id
-from cortex.link import Link
+from cortex.matching import Matcher
 from cortex.outlet import Outlets
-from cortex.places import Places, clock_offset_ns, reach
+from cortex.overview import (
+    TopicInfo,
+    describe_publisher,
+    describe_service,
+    describe_subscriber,
+    publisher_stats,
+    subscriber_stats,
+    topics_of,
+)
+from cortex.places import Places, clock_offset_ns
 from cortex.policy import Policy, keep_last
 from cortex.publisher import INLINE_MAX, Publisher, close_publishers
 from cortex.raw import RawCodec, RawMessage
-from cortex.records import (
-    NodeRecord,
-    PublisherRecord,
-    PublisherStats,
-    ServiceRecord,
-    StatsReply,
-    StatsRequest,
-    SubscriberRecord,
-    SubscriberStats,
-)
-from cortex.schema import Schema, SchemaError, TypeMismatch, schema_of, type_from_schema
+from cortex.records import NodeRecord, StatsReply, StatsRequest
+from cortex.schema import Schema, schema_of
 from cortex.security import Keys
 from cortex.service import Client, Place, Server, Service, service_number
-from cortex.stats import array_of
 from cortex.subscriber import Subscriber
 from cortex.topic import check_topic
 from cortex.wakeup import Wakeup
-from cortex.wire import CONTROL, REQUEST, control_frame, parse_control, unpack_header
+from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
 
@@ -64,18 +63,6 @@ BUSY_NS = 300_000_000
 CLOCK_STEP_NS = 5_000_000
 
 _nodes: weakref.WeakSet[Node] = weakref.WeakSet()
-
-
-class TopicInfo(NamedTuple):
-    """A topic as the nodes announce it."""
-
-    topic: str
-    type_name: str
-    fingerprint: int
-    schema: str
-    publishers: tuple[str, ...]
-    """Names of the nodes that publish it."""
-    subscribers: tuple[str, ...]
 
 
 class Node:
@@ -111,8 +98,6 @@ class Node:
         self.name = name
         self.domain = domain_id(domain)
         self.id = secrets.randbits(64) or 1
-        self._keys = keys
-        self._insecure = insecure
         self._pid = os.getpid()
         self._lock = threading.RLock()
         self._outlets = Outlets()
@@ -122,15 +107,13 @@ class Node:
         self._callbacks = CallbackThread(name)
         self._flusher = Flusher(name)
         self._server = Server(self._callbacks.submit)
-        self._replies: deque[tuple[zmq.Socket[bytes], bytes, bytes]] = deque()
         self._wakeup = Wakeup()
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
         self._clock_offset_ns = clock_offset_ns()
         self._closed = False
-        self.rejected = 0
-        """Control frames that made no sense."""
         self._places = Places(self.domain, self.id, self._outlets, listen, keys=keys, insecure=insecure)
         self._host = host_id()  # once the runtime directory exists: it counts
+        self._matcher = Matcher(self._host, keys, insecure=insecure)
         try:
             self._directory = Directory(
                 context(),
@@ -146,6 +129,9 @@ class Node:
             self._outlets.close()
             self._places.close()
             raise
+        self._answers = Answers(
+            name, self._server, registry=self._directory.answer, stats=self._stats, wake=self._wake
+        )
         self._thread = threading.Thread(target=self._run, name=f"{name} control", daemon=True)
         self._thread.start()
         _nodes.add(self)
@@ -272,27 +258,18 @@ class Node:
         self._clients.add(client)
         return client
 
+    @property
+    def rejected(self) -> int:
+        """Control frames that made no sense."""
+        return self._answers.rejected
+
     def nodes(self) -> list[NodeRecord]:
         """All nodes that are known now, this one included."""
         return list(self._known().values())
 
     def topics(self) -> list[TopicInfo]:
         """All topics that are published or subscribed now, one entry for each type on a topic."""
-        found: dict[tuple[str, int], TopicInfo] = {}
-        records = self.nodes()
-        for node in records:
-            for pub in node.publishers:
-                info = found.get((pub.topic, pub.fingerprint)) or TopicInfo(
-                    pub.topic, pub.type_name, pub.fingerprint, pub.schema, (), ()
-                )
-                found[pub.topic, pub.fingerprint] = info._replace(publishers=(*info.publishers, node.name))
-        for node in records:
-            for sub in node.subscribers:
-                keys = [k for k in found if k[0] == sub.topic and sub.fingerprint in (0, k[1])]
-                for key in keys or [(sub.topic, sub.fingerprint)]:
-                    info = found.get(key) or TopicInfo(sub.topic, sub.type_name, sub.fingerprint, "", (), ())
-                    found[key] = info._replace(subscribers=(*info.subscribers, node.name))
-        return [found[key] for key in sorted(found)]
+        return topics_of(self.nodes())
 
     def ask_stats(self, node: int, timeout_s: float = 1.0) -> StatsReply:
         """Ask a node for its counters.
@@ -303,7 +280,7 @@ class Node:
         """
         if node == self.id:
             return self._stats()
-        place = self._reach_control(self._known()[node])
+        place = self._matcher.reach_control(self._known()[node])
         deadline_s = time.monotonic() + timeout_s
         types = control_types(StatsReply)
         with place.open() as socket:
@@ -415,38 +392,20 @@ class Node:
             self._directory.announce()
             self._hurry()
 
+    def _wake(self) -> None:
+        """Have the control thread look at once, unless it is that which calls."""
+        if threading.current_thread() is not self._thread:
+            self._wakeup.set()
+
     def _hurry(self) -> None:
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
         self._wakeup.set()
 
     def _record(self) -> NodeRecord:
         with self._lock:
-            publishers = [
-                PublisherRecord(
-                    p.topic,
-                    p.source,
-                    p.codec.schema.name,
-                    p.codec.fingerprint,
-                    p.codec.schema.to_json(),
-                    p.latch,
-                )
-                for p in self._publishers
-            ]
-            subscribers = [
-                SubscriberRecord(
-                    s.topic,
-                    "" if s.codec is None else s.codec.schema.name,
-                    0 if s.codec is None else s.codec.fingerprint,
-                    str(s.policy),
-                )
-                for s in self._subscribers
-            ]
-        services = [
-            ServiceRecord(
-                s.name, s.number, schema_of(s.request_type).to_json(), schema_of(s.reply_type).to_json()
-            )
-            for s in self._server.services()
-        ]
+            publishers = [describe_publisher(publisher) for publisher in self._publishers]
+            subscribers = [describe_subscriber(subscriber) for subscriber in self._subscribers]
+        services = [describe_service(service) for service in self._server.services()]
         return NodeRecord(
             self.id,
             self.name,
@@ -476,88 +435,15 @@ class Node:
         """Connect a subscriber to the publishers of its topic, and let go of those that have left."""
         directory = getattr(self, "_directory", None)
         peers = list(directory.nodes.values()) if directory is not None else []
-        own = self._record()
-        wanted = {
-            publisher.source: (node, publisher)
-            for node in (own, *peers)
-            for publisher in node.publishers
-            if publisher.topic == subscriber.topic
-        }
-        subscriber.refused &= wanted.keys()
-        present = subscriber.sources()
-        for source in present - wanted.keys():
-            subscriber.forget(source)
-        for source in wanted.keys() - present:
-            if not subscriber.revive(source):
-                self._connect(subscriber, *wanted[source])
-
-    def _connect(self, subscriber: Subscriber[Any], node: NodeRecord, publisher: PublisherRecord) -> None:
-        if publisher.source in subscriber.refused:
-            return
-        try:
-            schema = Schema.from_json(publisher.schema)
-            if schema.fingerprint != publisher.fingerprint:
-                raise SchemaError("its fingerprint is another")
-            codec = subscriber.codec or codec_of(type_from_schema(schema))
-        except (SchemaError, ValueError, TypeError) as error:
-            subscriber.refused.add(publisher.source)
-            logger.warning("%s of %s: unreadable schema: %s", publisher.topic, node.name, error)
-            return
-        if codec.fingerprint != publisher.fingerprint:
-            subscriber.refused.add(publisher.source)
-            what = (
-                f"{publisher.topic}: node {node.name!r} publishes another type than this subscriber expects"
-            )
-            subscriber.complain(TypeMismatch(what, codec.schema, schema))
-            return
-        place = reach(node, self._host, self._keys, insecure=self._insecure)
-        if place is None:
-            logger.debug("%s of %s cannot be reached from here", publisher.topic, node.name)
-            return
-        offset_ns = 0 if node.host == self._host else node.clock_offset_ns - self._clock_offset_ns
-        try:
-            link = Link(
-                publisher,
-                codec,
-                place.endpoint.strict if subscriber.policy.reliable else place.endpoint.lossy,
-                policy=subscriber.policy,
-                local=place.local,
-                shared_memory=place.local,
-                counters=subscriber.counters,
-                clock_offset_ns=offset_ns,
-                secure=place.secure,
-            )
-        except (OSError, zmq.ZMQError) as error:  # tried again when something changes
-            logger.warning("%s of %s: cannot connect: %s", publisher.topic, node.name, error)
-            return
-        subscriber.connect(link)
+        self._matcher.match(subscriber, self._record(), peers)
 
     def _find_service(self, name: str, number: int, expected: Schema) -> Place | None:
-        other: str | None = None
-        for node in self._known().values():
-            for service in node.services:
-                if service.name == name and service.service == number:
-                    if node.node == self.id and self._callbacks.is_current:
-                        raise RuntimeError(
-                            f"{name} is served by the thread that calls it: a callback or handler cannot "
-                            "call a service of its own node"
-                        )
-                    place = self._reach_control(node)
-                    return Place(node.node, place.address, place.local, place.secure)
-                if service.name == name:
-                    other = service.request_schema
-        if other is not None:
-            raise TypeMismatch(
-                f"{name}: the service has other types than this client (request shown)",
-                expected,
-                Schema.from_json(other),
+        place = self._matcher.find_service(name, number, expected, self._known().values())
+        if place is not None and place.node == self.id and self._callbacks.is_current:
+            raise RuntimeError(
+                f"{name} is served by the thread that calls it: a callback or handler cannot call a service "
+                "of its own node"
             )
-        return None
-
-    def _reach_control(self, node: NodeRecord) -> Any:
-        place = reach(node, self._host, self._keys, insecure=self._insecure)
-        if place is None:
-            raise ConnectionError(f"node {node.name!r} cannot be reached from here")
         return place
 
     def _stats(self) -> StatsReply:
@@ -565,30 +451,8 @@ class Node:
             publishers, subscribers = list(self._publishers), list(self._subscribers)
         return StatsReply(
             self.id,
-            [
-                PublisherStats(
-                    p.topic,
-                    p.source,
-                    p.subscriber_count,
-                    p.counters.published,
-                    p.counters.bytes,
-                    p.counters.timeouts,
-                    p.counters.skipped,
-                )
-                for p in publishers
-            ],
-            [
-                SubscriberStats(
-                    s.topic,
-                    str(s.policy),
-                    s.counters.received,
-                    s.counters.lost,
-                    s.counters.rejected,
-                    s.counters.overtaken,
-                    array_of(s.counters.latency),
-                )
-                for s in subscribers
-            ],
+            [publisher_stats(publisher) for publisher in publishers],
+            [subscriber_stats(subscriber) for subscriber in subscribers],
             self.rejected + self._directory.rejected + self._server.rejected,
         )
 
@@ -604,7 +468,7 @@ class Node:
                 if failures & (failures - 1) == 0:
                     logger.exception("%s: a step of the control thread failed (%d)", self.name, failures)
                 time.sleep(TICK_MS * 1e-3)
-        for end in (self._send_replies, self._directory.close, self._places.close):
+        for end in (self._answers.send, self._directory.close, self._places.close):
             try:
                 end()
             except Exception:
@@ -623,11 +487,11 @@ class Node:
             self._wakeup.clear()
         for socket in routers:
             if socket in ready:
-                self._answer(socket)
+                self._answers.handle(socket)
         for socket in sockets:
             if socket in ready:
                 self._directory.handle(socket)
-        self._send_replies()
+        self._answers.send()
         self._tick()
 
     def _tick(self) -> None:
@@ -656,44 +520,6 @@ class Node:
                 poll.register(fd, select.POLLIN)
         for subscriber in {owners[fd] for fd, _ in poll.poll(0)} if owners else ():
             subscriber.top_up(now_ns)
-
-    def _answer(self, router: zmq.Socket[bytes]) -> None:
-        for _ in range(256):
-            try:
-                parts = router.recv_multipart(zmq.DONTWAIT)
-            except zmq.Again:
-                return
-            try:
-                if len(parts) != 2:
-                    raise MalformedMessage(f"a control message of {len(parts)} frames")
-                self._answer_one(router, *parts)
-            except MalformedMessage as error:
-                self.rejected += 1
-                if self.rejected == 1:
-                    logger.warning("%s: rejected a control frame: %s", self.name, error)
-
-    def _answer_one(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
-        header = unpack_header(frame)
-        if header.kind == REQUEST:
-            self._server.handle(frame, partial(self._reply, router, identity))
-        elif header.kind == CONTROL and header.fingerprint == schema_of(StatsRequest).fingerprint:
-            parse_control(frame, control_types(StatsRequest))
-            self._reply(router, identity, control_frame(self._stats(), header.sequence))
-        else:
-            answer = self._directory.answer(frame)
-            if answer is not None:
-                self._reply(router, identity, answer)
-
-    def _reply(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
-        self._replies.append((router, identity, frame))
-        if threading.current_thread() is not self._thread:
-            self._wakeup.set()
-
-    def _send_replies(self) -> None:
-        while self._replies:
-            router, identity, frame = self._replies.popleft()
-            with contextlib.suppress(zmq.Again, zmq.ZMQError):  # an asker that is gone gets nothing
-                router.send_multipart([identity, frame], zmq.DONTWAIT)
 
 
 def _after_fork_in_child() -> None:

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 from cortex.commands.session import CommandError, hint, look_around, say_empty
 from cortex.commands.text import bytes_of, entries, is_terminal, number_of, plain, rate, seconds, table
-from cortex.node import Node, TopicInfo
+from cortex.node import Node
+from cortex.overview import TopicInfo
 from cortex.records import NodeRecord, PublisherStats, StatsReply, SubscriberStats
 from cortex.schema import Schema, SchemaError, describe
 from cortex.stats import quantile_ns

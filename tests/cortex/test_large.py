@@ -348,6 +348,26 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     assert counters.lost > 0
 
 
+def test_a_message_for_which_there_is_no_memory_keeps_none_from_the_next(node, monkeypatch):
+    """Not even from one of another thread."""
+    publisher, subscriber = connected(node, Scan, keep_last())
+
+    def refuse(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as poor:
+        poor.setattr(publisher._large, "acquire", refuse)
+        with pytest.raises(MemoryError):
+            publisher.publish(scan(0))
+    sent = []
+    thread = threading.Thread(target=lambda: sent.append(publisher.publish(scan(1))), daemon=True)
+    thread.start()
+    thread.join(SOON_S)
+    assert sent == [True]
+    assert subscriber.recv(SOON_S).stamp_ns == 1
+    assert subscriber.counters.lost == 0
+
+
 # Loans
 
 

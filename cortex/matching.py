@@ -1,0 +1,142 @@
+"""Who is connected to whom: a node's subscribers to publishers, its clients to services."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from typing import Any
+
+import zmq
+
+from cortex.codec import codec_of
+from cortex.link import Link
+from cortex.places import Reach, reach
+from cortex.records import NodeRecord, PublisherRecord
+from cortex.schema import Schema, SchemaError, TypeMismatch, type_from_schema
+from cortex.security import Keys
+from cortex.service import Place
+from cortex.subscriber import Subscriber
+
+logger = logging.getLogger(__name__)
+
+
+class Matcher:
+    """Connects what one node has to what others have.
+
+    Args:
+        host: This node's host.
+        keys: CURVE keys for tcp.
+        insecure: Allow plain tcp beyond this host.
+    """
+
+    def __init__(self, host: str, keys: Keys | None, *, insecure: bool) -> None:
+        self._host = host
+        self._keys = keys
+        self._insecure = insecure
+
+    def match(self, subscriber: Subscriber[Any], own: NodeRecord, peers: Iterable[NodeRecord]) -> None:
+        """Connect a subscriber to the publishers of its topic, and let go of those that have left.
+
+        Args:
+            subscriber: Of this node.
+            own: Record of this node.
+            peers: Those of the others.
+        """
+        wanted = {
+            publisher.source: (node, publisher)
+            for node in (own, *peers)
+            for publisher in node.publishers
+            if publisher.topic == subscriber.topic
+        }
+        subscriber.refused &= wanted.keys()
+        present = subscriber.sources()
+        for source in present - wanted.keys():
+            subscriber.forget(source)
+        for source in wanted.keys() - present:
+            if not subscriber.revive(source):
+                self._connect(subscriber, *wanted[source], own.clock_offset_ns)
+
+    def _connect(
+        self, subscriber: Subscriber[Any], node: NodeRecord, publisher: PublisherRecord, clock_offset_ns: int
+    ) -> None:
+        if publisher.source in subscriber.refused:
+            return
+        try:
+            schema = Schema.from_json(publisher.schema)
+            if schema.fingerprint != publisher.fingerprint:
+                raise SchemaError("its fingerprint is another")
+            codec = subscriber.codec or codec_of(type_from_schema(schema))
+        except (SchemaError, ValueError, TypeError) as error:
+            subscriber.refused.add(publisher.source)
+            logger.warning("%s of %s: unreadable schema: %s", publisher.topic, node.name, error)
+            return
+        if codec.fingerprint != publisher.fingerprint:
+            subscriber.refused.add(publisher.source)
+            what = (
+                f"{publisher.topic}: node {node.name!r} publishes another type than this subscriber expects"
+            )
+            subscriber.complain(TypeMismatch(what, codec.schema, schema))
+            return
+        place = reach(node, self._host, self._keys, insecure=self._insecure)
+        if place is None:
+            logger.debug("%s of %s cannot be reached from here", publisher.topic, node.name)
+            return
+        offset_ns = 0 if node.host == self._host else node.clock_offset_ns - clock_offset_ns
+        try:
+            link = Link(
+                publisher,
+                codec,
+                place.endpoint.strict if subscriber.policy.reliable else place.endpoint.lossy,
+                policy=subscriber.policy,
+                local=place.local,
+                shared_memory=place.local,
+                counters=subscriber.counters,
+                clock_offset_ns=offset_ns,
+                secure=place.secure,
+            )
+        except (OSError, zmq.ZMQError) as error:  # tried again when something changes
+            logger.warning("%s of %s: cannot connect: %s", publisher.topic, node.name, error)
+            return
+        subscriber.connect(link)
+
+    def find_service(
+        self, name: str, number: int, expected: Schema, records: Iterable[NodeRecord]
+    ) -> Place | None:
+        """Return where a service is offered; None if it is not.
+
+        Args:
+            name: The service's.
+            number: That of its name and types.
+            expected: Structure of the request, to tell if there is one with other types.
+            records: Those of all nodes.
+
+        Raises:
+            TypeMismatch: There is one of that name, with other types.
+            ConnectionError: It cannot be reached from here.
+        """
+        other: str | None = None
+        for node in records:
+            for service in node.services:
+                if service.name == name and service.service == number:
+                    place = self.reach_control(node)
+                    return Place(node.node, place.address, place.local, place.secure)
+                if service.name == name:
+                    other = service.request_schema
+        if other is not None:
+            raise TypeMismatch(
+                f"{name}: the service has other types than this client (request shown)",
+                expected,
+                Schema.from_json(other),
+            )
+        return None
+
+    def reach_control(self, node: NodeRecord) -> Reach:
+        """Return where the control socket of a node is.
+
+        Raises:
+            ConnectionError: It cannot be reached from here.
+        """
+        place = reach(node, self._host, self._keys, insecure=self._insecure)
+        if place is None:
+            raise ConnectionError(f"node {node.name!r} cannot be reached from here")
+        return place
