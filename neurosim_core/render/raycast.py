@@ -27,6 +27,7 @@ from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.tile_walk import (
     ASK,
     TILE,
+    UNFUSED,
     WalkData,
     find_faces,
     group_size,
@@ -39,8 +40,6 @@ from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
 """Everything that a cast can answer."""
 
-_UNFUSED = {"fuse_fp": False}
-"""Products and sums are rounded one by one: so pixels have the same bits whichever kernel renders them."""
 _BOUNDS = (64, 14)
 """Threads and, on CUDA, blocks of a multiprocessor that registers must do for: as measured on an H200."""
 _COSINE_MIN = wp.constant(0.05)
@@ -169,7 +168,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                 hit.t = met[0]
                 hit.u = met[1]
                 hit.v = met[2]
-                hit.normal = wp.mesh_eval_face_normal(scene.mesh, face)
+                hit.normal = scene.face_normal[face]
             else:
                 hit.face = ASK
         if wp.static(not leaving):
@@ -583,7 +582,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     @wp.kernel(
         module="unique",
         enable_backward=False,
-        module_options=_UNFUSED,
+        module_options=UNFUSED,
         launch_bounds=None if leaving else _BOUNDS,
     )
     def raycast(
@@ -658,7 +657,7 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     at_once = with_log and together and not walked  # where no picture is asked for
     see_packet = packet_eye(terms.embree, textured=textured, emissive=emissive) if at_once else None
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else _UNFUSED)
+    @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else UNFUSED)
     def raycast_packets(
         first: int,
         # Model:

@@ -19,6 +19,8 @@ class SceneData:
     """`EmbreeTree.intersect`, likewise."""
     face_material: wp.array[int]
     face_instance: wp.array[int]
+    face_normal: wp.array[wp.vec3]
+    """Unit normal of each face's front; only for rays that share walks."""
     face_lod: wp.array[float]
     """log2 of texels per metre on each face."""
     corner_uv: wp.array[wp.vec2]

@@ -59,6 +59,8 @@ BLOCK = TILE * TILE
 ASK = -2
 """In place of a face: the list does not tell, ask the tree."""
 
+UNFUSED = {"fuse_fp": False}
+"""Products and sums are rounded one by one: so pixels have the same bits whichever kernel renders them."""
 _BORDER_RAD = 1.0e-5
 """By how much the rays of a tile are taken to reach beyond their border [rad]."""
 _SLOPE_MAX = 100.0
@@ -689,6 +691,23 @@ def walk_kernel(lanes: int) -> wp.Kernel:
             data.reach[walk, tile] = reach
 
     return walk_tiles
+
+
+@cache
+def _normal_kernel() -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
+    def write_normals(mesh: wp.uint64, normal_out: wp.array[wp.vec3]) -> None:
+        face = wp.tid()
+        normal_out[face] = wp.mesh_eval_face_normal(mesh, face)
+
+    return write_normals
+
+
+def face_normals(mesh: wp.Mesh) -> wp.array[wp.vec3]:
+    """Return the unit normal of each face's front, with the bits that `wp.mesh_query_ray` gives."""
+    normals = wp.empty(mesh.indices.shape[0] // 3, dtype=wp.vec3, device=mesh.device)
+    wp.launch(_normal_kernel(), dim=normals.shape[0], inputs=[mesh.id], outputs=[normals], device=mesh.device)
+    return normals
 
 
 @cache

@@ -40,7 +40,7 @@ from neurosim_core.render.raycast import (
     with_walks,
 )
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData, shared_walk
+from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData, face_normals, shared_walk
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene
@@ -142,6 +142,8 @@ def upload_scene(
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
         data.embree_intersect = wp.uint64(embree.intersect)
+    if wp.get_device(device).is_cuda or isinstance(config.shared_walk, WalkConfig):
+        data.face_normal = face_normals(tree)
     instance = scene.face_instance[mesh.origin]
     data.face_material = wp.array(np.append(material, joined.material), dtype=int, device=device)
     data.face_instance = wp.array(np.append(instance, joined.instance), dtype=int, device=device)

@@ -437,6 +437,15 @@ def test_what_does_not_go_together_is_refused():
 def test_nothing_is_allocated_without(device):
     arrays = upload_scene(scene_of(plane(1.0)), ALONE, device)
     assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=2).walk is None
+
+
+def test_walks_are_the_default_on_cuda_alone(device):
+    arrays = upload_scene(scene_of(plane(1.0)), UNSHADOWED, device)
+    is_cuda = wp.get_device(device).is_cuda
+    for count, shared in ((3, False), (4, is_cuda)):
+        renderer = WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=count)
+        assert (renderer.walk is not None) is shared
+    assert (arrays.data.face_normal is not None) is is_cuda
     shared = upload_scene(scene_of(plane(1.0)), together(instants=2, face_count_max=8), device)
     walk = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5).walk
     assert isinstance(walk, TileWalk)
