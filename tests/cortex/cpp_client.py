@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import subprocess
@@ -18,6 +19,7 @@ from processes import SOON_S
 
 from cortex import records, wire
 from cortex.host import host_id
+from cortex.node import Node
 from cortex.schema import schema_of
 
 
@@ -66,6 +68,26 @@ class Peer:
             self.process.wait()
         assert self.process.returncode in (0, -9), (self.process.returncode, errors)
         return errors.decode()
+
+
+def _stats_of_cpp(node: Node) -> list[records.StatsReply]:
+    """What those C++ programs have counted that answer soon: one may be about to leave."""
+    replies = []
+    for record in node.nodes():
+        if record.name == "cpp":
+            with contextlib.suppress(KeyError, TimeoutError):
+                replies.append(node.ask_stats(record.node))
+    return replies
+
+
+def publishers_in_cpp(node: Node) -> list[records.PublisherStats]:
+    """The counters of all publishers in C++ programs that answer soon."""
+    return [found for reply in _stats_of_cpp(node) for found in reply.publishers]
+
+
+def subscribers_in_cpp(node: Node) -> list[records.SubscriberStats]:
+    """The counters of all subscribers in C++ programs that answer soon."""
+    return [found for reply in _stats_of_cpp(node) for found in reply.subscribers]
 
 
 def _point(number: int) -> Point:

@@ -17,7 +17,15 @@ from pathlib import Path
 import cpp_messages
 import numpy as np
 import pytest
-from cpp_client import Impostor, Peer, bad_frames, make_frame, make_rich
+from cpp_client import (
+    Impostor,
+    Peer,
+    bad_frames,
+    make_frame,
+    make_rich,
+    publishers_in_cpp,
+    subscribers_in_cpp,
+)
 from cpp_messages import OtherScan, Picture, Rich, Scan
 from cpp_programs import CPP, PATIENCE_S, needs_compiler, programs, short, start
 from processes import SOON_S, shared_mappings, wait_for
@@ -119,7 +127,7 @@ def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callab
     start("echo")
     node = make_node()
     out = node.publisher("/to_cpp", Rich)
-    back = node.subscriber("/from_cpp", Rich, policy=reliable(8))
+    back = node.subscriber("/from_cpp", Rich, policy=reliable(8, SOON_S))
     assert out.wait_for_subscribers(1, SOON_S)
     assert back.wait_for_publisher(SOON_S)
     for number, (height, width) in enumerate([(0, 5), (2, 3), (4, 4), (120, 160), (7, 1), (480, 640)]):
@@ -135,7 +143,7 @@ def test_loans_arrive_as_views_of_shared_memory(
     """C++ writes into its ring, Python looks at it there; small loans travel in frames."""
     node = make_node()
     for height in (2, 600):
-        pictures = node.subscriber("/picture", Picture, policy=reliable(8))
+        pictures = node.subscriber("/picture", Picture, policy=reliable(8, SOON_S))
         peer = start("loan", 50, height)
         for number in range(50):
             picture = pictures.recv(SOON_S)
@@ -196,7 +204,7 @@ def test_slow_reader_knows_what_it_missed(
 def test_flood_from_cpp_arrives_whole(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
     node = make_node()
     for size in (10, 20_000):
-        scans = node.subscriber("/scan", Scan, policy=reliable(64))
+        scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
         peer = start("publish", "/scan", 3000, size)
         for number in range(3000):
             scan = scans.recv(SOON_S)
@@ -268,8 +276,7 @@ def test_latched_message_from_cpp(
     peer = start("publish", "/map", 3, size, "latch")
     node = make_node()
     wait_for(lambda: any(topic.topic == "/map" for topic in node.topics()))
-    cpp = next(record for record in node.nodes() if record.name == "cpp")
-    wait_for(lambda: node.ask_stats(cpp.node).publishers[0].published == 3)
+    wait_for(lambda: [found.published for found in publishers_in_cpp(node)] == [3])
     late = node.subscriber("/map", Scan)
     assert late.recv(SOON_S).stamp_ns == 2
     assert peer.process.poll() is None
@@ -305,14 +312,13 @@ def test_mismatching_types_are_told(start: Callable[..., Peer], make_node: Calla
 
 def test_counters_can_be_asked(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
     node = make_node()
-    scans = node.subscriber("/scan", Scan, policy=reliable(64))
+    scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 10, 10)
     start("count", "/other", "reliable", 0, 0)
     for _ in range(10):
         scans.recv(SOON_S)
-    replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
-    (published,) = [publisher for reply in replies for publisher in reply.publishers]
-    (subscribed,) = [subscriber for reply in replies for subscriber in reply.subscribers]
+    (published,) = wait_for(lambda: publishers_in_cpp(node))
+    (subscribed,) = wait_for(lambda: subscribers_in_cpp(node))
     assert (published.topic, published.published, published.timeouts) == ("/scan", 10, 0)
     assert published.bytes == 10 * (24 + 40)  # the fixed block and ten floats
     assert (subscribed.topic, subscribed.policy) == ("/other", "reliable(depth=64, timeout_s=60)")
@@ -332,7 +338,7 @@ def test_killed_cpp_reader_frees_its_slots(
     began_s = time.monotonic()
     for number in range(100):
         assert scans.publish(Scan(number, np.full(20_000, number, np.float32)))
-    assert time.monotonic() - began_s < 9.0  # its patience of 10 s is not used up
+    assert time.monotonic() - began_s < 50.0  # its patience of a minute is not used up
 
 
 def test_cpp_publisher_takes_slots_of_the_dead_back(
@@ -342,19 +348,15 @@ def test_cpp_publisher_takes_slots_of_the_dead_back(
     node = make_node()
     start("publish", "/scan", -1, 20_000)
     slow = start("count", "/scan", "reliable", 20_000, 3)
-
-    def published() -> int:
-        replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
-        return max((publisher.published for reply in replies for publisher in reply.publishers), default=0)
-
-    wait_for(lambda: published() > 45)  # more than the ring has slots: the reader has as many as it may
+    # More than the ring has slots: the reader has as many as it may.
+    wait_for(lambda: any(found.published > 45 for found in publishers_in_cpp(node)))
     slow.process.kill()
-    scans = node.subscriber("/scan", Scan, policy=reliable(8))
+    scans = node.subscriber("/scan", Scan, policy=reliable(8, SOON_S))
     first = scans.recv(SOON_S).stamp_ns
     began_s = time.monotonic()
     for number in range(first + 1, first + 200):
         assert scans.recv(SOON_S).stamp_ns == number
-    assert time.monotonic() - began_s < 9.0
+    assert time.monotonic() - began_s < 50.0
     assert scans.counters.lost == 0
 
 
@@ -362,7 +364,7 @@ def test_killed_cpp_publisher_leaves_no_trace(
     start: Callable[..., Peer], make_node: Callable[..., Node]
 ) -> None:
     node = make_node()
-    scans = node.subscriber("/scan", Scan, policy=reliable(64))
+    scans = node.subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     peer = start("publish", "/scan", 10, 20_000)
     held = [scans.recv(SOON_S) for _ in range(3)]
     peer.process.kill()

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from cpp_client import Impostor, Peer, make_frame
+from cpp_client import Impostor, Peer, make_frame, publishers_in_cpp, subscribers_in_cpp
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs, start
 from processes import SOON_S, wait_for
@@ -150,8 +150,7 @@ def test_slow_reader_of_cpp_knows_what_it_missed(
 
 def counted(node: Node) -> list[int]:
     """How many messages each subscription of the C++ programs knows of: received, lost or overtaken."""
-    replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
-    return [found.received + found.lost + found.overtaken for reply in replies for found in reply.subscribers]
+    return [found.received + found.lost + found.overtaken for found in subscribers_in_cpp(node)]
 
 
 def test_many_readers_of_cpp(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
@@ -222,8 +221,7 @@ def test_killed_cpp_reader_with_a_full_pipe(
     writer = start("publish", "/scan", -1, "10", "", 1 + others)
 
     def published() -> int:
-        replies = [node.ask_stats(record.node) for record in node.nodes() if record.name == "cpp"]
-        return max((publisher.published for reply in replies for publisher in reply.publishers), default=0)
+        return max((found.published for found in publishers_in_cpp(node)), default=0)
 
     wait_for(lambda: published() > 500)  # more than one message each 50 ms
     before = [0, published()]
