@@ -10,6 +10,8 @@
 enum {
     READ_BYTES = 1 << 16,
     KEPT_BYTES = 1 << 20, /* a buffer that grew beyond this for one frame is let go after it */
+    FEW_BYTES = 1 << 12,  /* who reads so few at a time, again and again, keeps up with the writer */
+    LOOK_NS = 8000,
 };
 
 static PyObject *dont_wait, *no_flags; /* of ZeroMQ, as ints */
@@ -173,6 +175,8 @@ typedef struct {
     int broken;
     char *buffer;
     Py_ssize_t begin, end, capacity;
+    int64_t read_ns; /* when something was last read */
+    int in_rush;
 } PipeReader;
 
 /* Size of the frame that begins the buffer; 0: its header is not there yet; -1: it is no frame. */
@@ -216,6 +220,20 @@ static int make_room(PipeReader *reader, Py_ssize_t size) {
     return 1;
 }
 
+/* Read from the pipe as `read` does. In a rush, a reader that keeps up would look again after each message or two, and
+   hold up the writer each time, who is slowed by a third: so it leaves some time between looks, too short to sleep. */
+static ssize_t read_some(PipeReader *reader) {
+    while (reader->in_rush && monotonic_ns() - reader->read_ns < LOOK_NS) continue;
+    ssize_t count;
+    do count = read(reader->fd, reader->buffer + reader->end, READ_BYTES);
+    while (count < 0 && errno == EINTR);
+    if (count <= 0) return count;
+    const int64_t now_ns = monotonic_ns();
+    reader->in_rush = count < FEW_BYTES && now_ns - reader->read_ns < 4 * LOOK_NS;
+    reader->read_ns = now_ns;
+    return count;
+}
+
 /* The next frame of the pipe where it lies, until the next call; NULL if there is none, perhaps with an error. */
 static const char *peek_frame(PipeReader *reader, Py_ssize_t *size) {
     while (!reader->broken) {
@@ -233,9 +251,7 @@ static const char *peek_frame(PipeReader *reader, Py_ssize_t *size) {
             PyErr_NoMemory();
             return NULL;
         }
-        ssize_t count;
-        do count = read(reader->fd, reader->buffer + reader->end, READ_BYTES);
-        while (count < 0 && errno == EINTR);
+        const ssize_t count = read_some(reader);
         if (count <= 0) return NULL;
         reader->end += count;
     }
