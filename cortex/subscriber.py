@@ -204,18 +204,20 @@ class Subscriber(Generic[T]):
         message: T
         if self._may_go_on() and (message := self._take_now()) is not NOTHING:
             return message
-        return await self._wait_async(timeout_s)
+        return await self._wait_async(timeout_s, look=True)
 
-    async def _wait_async(self, timeout_s: float | None) -> T:
+    async def _wait_async(self, timeout_s: float | None, *, look: bool) -> T:
+        """Take the next message as soon as it is there; without a `look` now if there was one in vain."""
         inlet, reader = self._inlet, self._reader
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            if inlet.left <= 0 or monotonic_ns() >= inlet.until_ns:  # others want to run, too
+            if look and (inlet.left <= 0 or monotonic_ns() >= inlet.until_ns):  # others want to run, too
                 await asyncio.sleep(0)
                 inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
-            message: T = self._take_now()
+            message: T = self._take_now() if look else NOTHING
             if message is not NOTHING:
                 return message
+            look = True
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
                 raise TimeoutError(self._nothing_came(timeout_s))
@@ -225,7 +227,7 @@ class Subscriber(Generic[T]):
             if reader is None or reader.loop is not asyncio.get_running_loop():
                 if reader is not None:
                     reader.stop()
-                reader = self._reader = LoopReader(self._watched, self._on_wake)
+                reader = self._reader = LoopReader(self._watched, lambda: self._generation, self._on_wake)
             await reader.wait(min(left_s, WAIT_MAX_S))
             inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
 
@@ -245,7 +247,8 @@ class Subscriber(Generic[T]):
 
     async def _recv_until_closed(self) -> T:
         try:
-            return await self._wait_async(None)
+            found_nothing = self._inlet.is_open and self._inlet.exhausted
+            return await self._wait_async(None, look=not found_nothing)
         except Closed:
             raise StopAsyncIteration from None
 
