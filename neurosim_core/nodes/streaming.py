@@ -20,7 +20,7 @@ BEHIND_MAX_NS = 500_000_000
 """How far the machine may be behind where camera frames give way [ns]."""
 READERS_S = 50e-6
 """What readers are left of a control period before the next one is flown [s]."""
-READERS_SHARE = 0.05
+READERS_SHARE = 0.025
 """The largest share of a period that this may be."""
 BEHIND_SHARE = 0.25
 """Share of a period that the machine may be behind, and leave readers this time."""

@@ -161,10 +161,10 @@ def test_a_request_does_not_keep_the_loop_awake():
         (1.0, 10, 0.0, 1),
         (1.0, 10, 2.0, 1),
         (1.0, 10, 3.0, 0),  # behind by more than a quarter of a period
-        (1.0, 1, 0.0, 1),
-        (1.0, 0.5, 0.0, 0),  # a tenth of a period is too much
-        (2.0, 1, 0.0, 0),
-        (0.5, 0.5, 0.0, 1),
+        (1.0, 2, 0.0, 1),
+        (1.0, 1, 0.0, 0),  # a twentieth of a period is too much
+        (2.0, 2, 0.0, 0),
+        (0.5, 1, 0.0, 1),
         (0.0, 10, 0.0, 0),  # as fast as it can
     ],
 )
