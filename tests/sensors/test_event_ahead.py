@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from late_device import LateDevice, install
 
 from neurosim_core.packets import Events
 from neurosim_core.sensors import event_ahead
@@ -22,7 +23,9 @@ WINDOW_NS = 5_005
 
 # neither the device nor the size of the smallest guess changes between examples
 relaxed = settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=150,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
 
@@ -97,7 +100,8 @@ def fly(
         read_ns = end_ns
 
     waiting = deque(zip(stacks, guesses, strict=True))
-    kept = []
+    longest = max(len(stack) for stack in stacks)
+    lane_frames = [wp.empty((longest, HEIGHT, WIDTH), dtype=float, device=device) for _ in range(lanes)]
     while waiting:
         stack, guess = waiting.popleft()
         stamps = fed_ns + FRAME_NS * np.arange(1, len(stack) + 1)
@@ -109,8 +113,9 @@ def fly(
             ends = sorted({*ends_until(int(stamps[0]) - FRAME_NS, fed_ns), int(stamps[0]), fed_ns})
         elif guess == "fewer":
             ends = []
-        kept.append(wp.array(stack, device=device))
-        camera.feed_device(kept[-1], stamps, ends_ns=ends)
+        frames = lane_frames[len(waiting) % lanes]  # the stack that was in them has been read
+        wp.copy(frames, wp.array(stack, device=device))
+        camera.feed_device(frames, stamps, ends_ns=ends)
         under_way.append(fed_ns)
         if len(under_way) == lanes:
             read()
@@ -240,3 +245,30 @@ def test_events_stay_as_they_are_while_the_camera_goes_on(device):
     for columns, copied in zip(kept, copies, strict=True):
         for a, b in zip(columns, copied, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("eagerness", [0.0, 0.7])
+@pytest.mark.parametrize("lanes", [1, 2, 3])
+@pytest.mark.parametrize("config", [{}, {"event_count_max": 300}, {"shot_noise": {"rate_hz": 2e4}}])
+def test_a_device_that_is_late_gives_the_same(monkeypatch, tight_guesses, eagerness, lanes, config):
+    """As on a GPU, streams run behind the host and beside each other: nobody reads what is not ready."""
+    count = 48
+    rng = np.random.default_rng([lanes, int(10 * eagerness)])
+    lengths = [4] * count
+    # the same few sizes come again, so that most of it is replayed
+    loudness = rng.choice([0.3, 0.3, 0.3, 1.0], size=count).tolist()
+    guesses = rng.choice(["right"] * 9 + ["none", "more", "fewer"], size=count).tolist()
+    reads = rng.choice(["one"] * 12 + ["all", "collect", "early"], size=count).tolist()
+    first, stacks = draw_stacks(rng, lengths, loudness)
+    plain_camera = make_camera("cpu", cut_ahead=False, lanes=lanes, **config)
+    plain_camera.reset(first)
+    plain = fly(plain_camera, stacks, lanes=lanes, guesses=guesses, reads=reads)
+    late = LateDevice(rng, eagerness)
+    with monkeypatch.context() as patch:
+        install(patch, late)
+        camera = make_camera("cpu", cut_ahead=True, lanes=lanes, **config)
+        camera.reset(first)
+        packets = fly(camera, stacks, lanes=lanes, guesses=guesses, reads=reads)
+    assert_same(packets, plain)
+    assert late.replayed_count > count / 6
+    assert camera.ahead_count > count / 6
