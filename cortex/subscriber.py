@@ -1,8 +1,9 @@
 """Subscribing: a bounded queue per subscriber, read by a callback, a blocking iterator or asyncio.
 
-What each costs, measured with `cortex bench receive`: the three share one path, which reads the socket where
-the message is wanted; there is no thread between socket and user. A callback runs on the node's callback
-thread.
+The three share one path, which reads the socket where the message is wanted; there is no thread between
+socket and user. `cortex bench receive` prints what each costs: at 40 B 0.60 to 0.65 us of CPU a message and
+1.4 to 1.5 M messages a second for all three, so choose by taste. A callback runs on the node's callback
+thread, `async for` on the running loop, whose other tasks get a turn after a millisecond.
 """
 
 from __future__ import annotations

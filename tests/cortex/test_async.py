@@ -118,6 +118,29 @@ def test_two_tasks_on_one_subscriber(numbers):
     assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [0, 1, 2]
 
 
+def test_each_task_has_its_own_timeout(numbers):
+    """One timer serves all of a loop's tasks: none gives up early, and none waits for another's time."""
+    publisher, subscriber = numbers
+
+    async def wait(timeout_s):
+        begin_s = time.monotonic()
+        with pytest.raises(TimeoutError):
+            await subscriber.recv_async(timeout_s)
+        return time.monotonic() - begin_s
+
+    async def run():
+        endless = asyncio.ensure_future(subscriber.recv_async())
+        await asyncio.sleep(0.01)
+        waited_s = await asyncio.gather(*map(wait, (0.15, 0.001, 0.05)))
+        assert not endless.done()
+        publisher.publish(Number(0, 7))
+        assert (await endless).value == 7
+        return waited_s
+
+    waited_s = asyncio.run(asyncio.wait_for(run(), SOON_S))
+    assert all(waited >= asked for waited, asked in zip(waited_s, (0.15, 0.001, 0.05), strict=True))
+
+
 def test_a_cancelled_task_takes_nothing_along(numbers):
     publisher, subscriber = numbers
 
