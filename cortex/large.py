@@ -34,6 +34,9 @@ from cortex.wire import (
 COLUMNS = 64
 RING_BYTES = 4 << 20
 """A ring of small slots takes this much, so that it stays in cache."""
+GROWTH_BYTES = 4 << 20
+"""What slots of a ring that replaces one for smaller messages have to spare, at most: to make a ring takes a
+millisecond or more, and who publishes waits for it."""
 DEEP_RING_BYTES = 16 << 20
 DEEP_SLOTS = 128
 """What a ring takes, and how many slots, where a reader keeps more messages than by default."""
@@ -487,6 +490,8 @@ class LargeSender:
             return current if current is not None and current.slot_bytes >= size else None
         slot_bytes = size if exact else size + size // 4
         if current is not None:
+            if not exact and current.slot_bytes < size:  # messages grow: the next ring is to last
+                slot_bytes = max(slot_bytes, size + min(size, GROWTH_BYTES))
             slot_bytes = max(slot_bytes, current.slot_bytes)
         slot_bytes = max(page, -(-slot_bytes // page) * page)
         slots = max(min(max(RING_BYTES // slot_bytes, 4), 64), self._wanted(slot_bytes))

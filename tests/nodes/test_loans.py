@@ -108,10 +108,10 @@ def test_room_that_was_given_up_is_a_lost_picture(pair):
     rows, *rest = SHAPES[0]
     picture, loan = picture_of(SHAPES[0]), PictureLoan(publisher)
     room = loan.lend(picture)
-    for size in (2, 4, 8, 16, 32):  # for each, all memory is new
+    for size in (2, 5, 11, 23, 47):  # for each, all memory is new
         publisher.publish(message_of(picture_of((size * rows, *rest))))
         subscriber.recv(60.0)
-    others = loans_of(publisher, (32 * rows, *rest))
+    others = loans_of(publisher, (47 * rows, *rest))
     assert loan.publish(message_of(room, sequence=1)) is False
     assert not loan.holds(room)
     for other in others:
