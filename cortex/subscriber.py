@@ -248,7 +248,7 @@ class Subscriber(Generic[T]):
 
     async def _recv_until_closed(self) -> T:
         try:
-            found_nothing = self._inlet.is_open and self._inlet.exhausted
+            found_nothing = self._inlet.is_open and self._inlet.exhausted and not self._queue
             return await self._wait_async(None, look=not found_nothing)
         except Closed:
             raise StopAsyncIteration from None

@@ -232,11 +232,15 @@ def test_a_loop_is_woken_by_a_publisher_that_came_later(node):
     wait_for(lambda: asyncio.run(run()) < 0.05e9)  # the machine may be busy for a while
 
 
-def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers):
-    """A task that was never suspended cannot have let another one run."""
+@pytest.mark.parametrize("where", ["socket", "queue"])
+def test_messages_that_wait_are_taken_without_a_switch_of_tasks(numbers, where, monkeypatch):
+    """A task that was never suspended cannot have let another one run; here no time is too long for that."""
+    monkeypatch.setattr("cortex.subscriber.PAUSE_NS", 10**12)
     publisher, subscriber = numbers
     for value in range(200):
         publisher.publish(Number(0, value))
+    if where == "queue":
+        wait_for(lambda: subscriber.wait_for_publisher() and len(subscriber._queue) == 200)
     turns = []
 
     async def run():
