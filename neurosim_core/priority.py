@@ -9,55 +9,27 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-import platform
 import sys
 import threading
 from collections.abc import Iterator
 
 _STEPS = 5
 """How much nicer a thread that gives way is: beside a busy program it gets a quarter of a core."""
-_TURN_NS = 20_000_000
-"""How long it may go on until the scheduler looks who has waited for longer [ns]."""
 _SLACK_NS = 1_000
 """How much later than asked for a thread that is punctual may be woken by a timer [ns]; usually 50,000."""
-_SET_ATTRIBUTES = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
-"""Numbers of the system call `sched_setattr`, which not every C library has a function for."""
 _SET_TIMER_SLACK = 29  # PR_SET_TIMERSLACK of `prctl`
 
 _own = threading.local()
 
 
-class _Attributes(ctypes.Structure):
-    """`struct sched_attr` of Linux, as far as all its versions have it."""
-
-    _fields_ = (
-        ("size", ctypes.c_uint32),
-        ("policy", ctypes.c_uint32),
-        ("flags", ctypes.c_uint64),
-        ("nice", ctypes.c_int32),
-        ("priority", ctypes.c_uint32),
-        ("runtime_ns", ctypes.c_uint64),
-        ("deadline_ns", ctypes.c_uint64),
-        ("period_ns", ctypes.c_uint64),
-    )
-
-
 def give_way() -> None:
     """Let the calling thread, and threads that it starts from now on, give way to others; for good.
 
-    It is nicer than it was, and takes no core from another when it is woken. From Linux 6.12 on its turns are
-    long, too, so that whoever is woken goes first: with turns of the same length it often had to wait for the
-    clock of the scheduler, up to 4 ms.
-
-    Only on Linux, where threads have priorities of their own.
+    Only on Linux, where threads have priorities of their own. Not by SCHED_BATCH and long turns: beside busy
+    programs of others half of the pictures were late then.
     """
-    if sys.platform != "linux":
-        return
-    nice = min(niceness() + _STEPS, 19)
-    os.setpriority(os.PRIO_PROCESS, 0, nice)
-    if os.sched_getscheduler(0) == os.SCHED_OTHER:
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        _take_turns(os.SCHED_BATCH, nice, _TURN_NS)
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, 0, min(niceness() + _STEPS, 19))
 
 
 def be_punctual() -> None:
@@ -67,15 +39,6 @@ def be_punctual() -> None:
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_TIMER_SLACK, ctypes.c_ulong(_SLACK_NS), 0, 0, 0)
-
-
-def _take_turns(policy: int, nice: int, turn_ns: int) -> None:
-    """Set how long turns of the calling thread are [ns], if the system can; the rest is what it is."""
-    call = _SET_ATTRIBUTES.get(platform.machine())
-    if call is not None:
-        size = ctypes.sizeof(_Attributes)
-        attributes = _Attributes(size=size, policy=policy, nice=nice, runtime_ns=turn_ns)
-        ctypes.CDLL(None).syscall(call, 0, ctypes.byref(attributes), 0)  # refused: turns stay as they are
 
 
 def niceness() -> int:
