@@ -21,7 +21,7 @@ import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
 from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
-from neurosim_core.render.tile_walk import BLOCK, seen_kernel, walk_kernel
+from neurosim_core.render.tile_walk import BLOCK, walk_kernel
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import TERMS, make_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
@@ -74,7 +74,6 @@ def make_kernels() -> None:
     ):
         raycast_kernel(OUTPUTS, terms)
     walk_kernel(BLOCK)
-    seen_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):

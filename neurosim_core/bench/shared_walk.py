@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -45,8 +45,6 @@ class WalkCost:
 
     part: str
     """`slow`: a drift; `fast`: a roll of 640 degrees a second."""
-    lists: str
-    """`complete` or `seen`, see `WalkConfig.lists`."""
     instants: int
     """Instants that share a walk."""
     list_mean: float
@@ -219,9 +217,9 @@ def measure_shared_walk(
         begins = range(first, first + (1 if quick else 4) * _K, _K)
         tell(f"each ray alone in the {part} part")
         alone = _look(flown, eyes["alone"], begins)
-        for key in (key for key in eyes if not isinstance(key, str)):
-            tell(f"{key.instants} instants in the {part} part, lists {key.lists}")
-            costs.append(_measure(flown, eyes, part, key, begins, alone))
+        for instants in (key for key in eyes if isinstance(key, int)):
+            tell(f"{instants} instants in the {part} part")
+            costs.append(_measure(flown, eyes, part, instants, begins, alone))
     return WalkResult(
         device=str(wp.get_device(flown.model.device).name),
         quick=quick,
@@ -233,25 +231,15 @@ def measure_shared_walk(
     )
 
 
-class _Walks(NamedTuple):
-    """How rays share walks."""
-
-    lists: Literal["complete", "seen"]
-    instants: int
-
-
-def _eyes(
-    flown: Flown, lens: PinholeConfig, instants: tuple[int, ...], quick: bool
-) -> dict[str | _Walks, _Eye]:
+def _eyes(flown: Flown, lens: PinholeConfig, instants: tuple[int, ...], quick: bool) -> dict[str | int, _Eye]:
     """Return renderers: alone, by Embree if it is there, and of so many instants to a walk."""
     light = LightingConfig(mode="unshadowed" if quick else "baked", ambient_ray_count=4, shadow_ray_count=1)
     plain = RenderConfig(lighting=light, exposure=1.0)
-    configs: dict[str | _Walks, dict[str, Any]] = {"alone": {"cpu_traversal": "warp", "shared_walk": None}}
+    configs: dict[str | int, dict[str, Any]] = {"alone": {"cpu_traversal": "warp", "shared_walk": None}}
     if wp.get_device(flown.model.device).is_cpu:
         configs["embree"] = {"cpu_traversal": "embree"}
-    walks = [*(_Walks("complete", count) for count in instants), _Walks("seen", instants[-1])]
-    configs |= {walk: {"shared_walk": WalkConfig(**walk._asdict())} for walk in walks}
-    eyes: dict[str | _Walks, _Eye] = {}
+    configs |= {count: {"shared_walk": WalkConfig(instants=count)} for count in instants}
+    eyes: dict[str | int, _Eye] = {}
     for name, changes in configs.items():
         try:
             arrays = upload_scene(flown.model.scene, plain.model_copy(update=changes), flown.model.device)
@@ -301,26 +289,19 @@ def _look(flown: Flown, eye: _Eye, begins: Sequence[int]) -> _Seen:
 
 
 def _measure(
-    flown: Flown,
-    eyes: dict[str | _Walks, _Eye],
-    part: str,
-    walks: _Walks,
-    begins: Sequence[int],
-    alone: _Seen,
+    flown: Flown, eyes: dict[str | int, _Eye], part: str, instants: int, begins: Sequence[int], alone: _Seen
 ) -> WalkCost:
-    together = _look(flown, eyes[walks], begins)
+    together = _look(flown, eyes[instants], begins)
     matching = match_events(alone.events, together.events, tolerance_us=0)
-    times: dict[str | _Walks, float] = {}
-    names: tuple[str | _Walks, ...] = ("alone", walks, "embree")
-    for name in names:
+    times = {}
+    for name in ("alone", instants, "embree"):
         if name in eyes:
             eyes[name].place(begins[0])
             times[name] = eyes[name].time_renders(3)
     lengths = together.list_lengths
     return WalkCost(
         part=part,
-        lists=walks.lists,
-        instants=walks.instants,
+        instants=instants,
         list_mean=float(lengths[lengths >= 0].mean()) if (lengths >= 0).any() else 0.0,
         too_long=float((lengths < 0).mean()),
         asked=together.asked,
@@ -329,7 +310,7 @@ def _measure(
         event_count=len(alone.events.t),
         other_event_count=len(matching.missing) + len(matching.spurious),
         walk_s=together.walk_s,
-        together_s=times[walks],
+        together_s=times[instants],
         alone_s=times["alone"],
         embree_s=times.get("embree", float("nan")),
     )
@@ -367,17 +348,12 @@ def _time_walk(eye: _Eye) -> float:
 
 def shared_walk_chapter(result: WalkResult) -> Chapter:
     """Return the answer in words and a table."""
-    exact = [c for c in result.costs if c.lists == "complete"]
-    pixels, differing = (sum(getattr(c, n) for c in exact) for n in ("pixel_count", "differing_count"))
-    events, others = (sum(getattr(c, n) for c in exact) for n in ("event_count", "other_event_count"))
-    best = {part: min((c for c in exact if c.part == part), key=lambda c: c.together_s) for part in _PARTS}
+    pixels, differing = (sum(getattr(c, n) for c in result.costs) for n in ("pixel_count", "differing_count"))
+    events, others = (sum(getattr(c, n) for c in result.costs) for n in ("event_count", "other_event_count"))
+    best = {
+        part: min((c for c in result.costs if c.part == part), key=lambda c: c.together_s) for part in _PARTS
+    }
     lines = [
-        f"- {c.part} part, lists of what is seen only: {1e3 * c.together_s:.2f} ms; of {c.event_count:,} "
-        f"events {c.other_event_count:,} are missing or there in addition."
-        for c in result.costs
-        if c.lists == "seen"
-    ]
-    lines[:0] = [
         f"- {part} part: {c.alone_s / c.together_s:.1f} times the speed of rays that each walk by themselves "
         f"({1e3 * c.together_s:.2f} ms instead of {1e3 * c.alone_s:.2f}), with {c.instants} instants to a "
         f"walk; {c.asked:.2%} of the rays walk by themselves after all."
@@ -412,7 +388,6 @@ def _table(result: WalkResult) -> Table:
         title="Shared walks by the number of instants that share one",
         columns={
             "part": "part of the flight",
-            "lists": "lists",
             "instants": "instants",
             "list_mean": "triangles listed",
             "too_long": "lists too long [%]",
@@ -428,7 +403,6 @@ def _table(result: WalkResult) -> Table:
         rows=[
             {
                 "part": c.part,
-                "lists": c.lists,
                 "instants": c.instants,
                 "list_mean": c.list_mean,
                 "too_long": 100.0 * c.too_long,

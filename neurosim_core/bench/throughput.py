@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 import hashlib
-import itertools
 import logging
 import traceback
 from collections.abc import Callable, Iterator
@@ -22,7 +21,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.bench import throughput_stages as stages
-from neurosim_core.bench.event_matching import match_events
 from neurosim_core.bench.machine import processor
 from neurosim_core.bench.step import flight_settings, fly_blind, time_steps
 from neurosim_core.bench.throughput_chapter import throughput_chapter
@@ -37,10 +35,8 @@ from neurosim_core.bench.throughput_result import (
     RENDER_ALONE,
     SCAN,
     SCAN_ALONE,
-    SEEN,
     Agreement,
     Comparison,
-    EventError,
     Part,
     Roofline,
     Split,
@@ -50,7 +46,7 @@ from neurosim_core.bench.throughput_result import (
 )
 from neurosim_core.bench.throughput_scene import hall
 from neurosim_core.config import SimulationConfig, load_config
-from neurosim_core.packets import EventArrays, Events
+from neurosim_core.packets import Events
 from neurosim_core.render.launch import core_count
 from neurosim_core.render.renderer import upload_scene
 from neurosim_core.render.warp_renderer import SceneArrays
@@ -83,7 +79,6 @@ class _Plan:
     repetition_s: float
     alone_s: float
     split_batches: int
-    error_batches: int
     megabytes: int
     loud_size: tuple[int, int]
     small: int
@@ -103,7 +98,6 @@ _ON_CUDA = _Plan(
     repetition_s=0.4,
     alone_s=0.4,
     split_batches=100,
-    error_batches=64,
     megabytes=512,
     loud_size=_VGA,
     small=128,
@@ -243,7 +237,6 @@ class _Study:
             events_per_s=events_per_s,
             events_failure=events_failure,
             agreements=tuple(self._agreements()),
-            event_error=self._event_error() if self._is_cuda else None,
         )
 
     def _try(self, measure: Callable[[], _T]) -> tuple[_T | None, str]:
@@ -306,40 +299,19 @@ class _Study:
                 )  # fmt: skip
         if not self._is_cuda:
             return
-        for mode, walk in ((RAYS_ALONE, None), (SEEN, {"lists": "seen"})):
-            for size in plan.resolutions:
-                self._tell(f"whole steps, {mode}, {size[0]}x{size[1]}")
-                yield self._row(
-                    "resolution", mode, partial(self._walking, size, walk),
-                    scene=self._base.scene.name, width=size[0], height=size[1], instants=plan.instants,
-                )  # fmt: skip
+        for size in plan.resolutions:
+            self._tell(f"whole steps, {RAYS_ALONE}, {size[0]}x{size[1]}")
+            yield self._row(
+                "resolution", RAYS_ALONE, partial(self._without_walks, size),
+                scene=self._base.scene.name, width=size[0], height=size[1], instants=plan.instants,
+            )  # fmt: skip
 
-    def _walking(self, size: tuple[int, int], walk: dict[str, Any] | None) -> Model:
-        """Return the model whose rays share walks so; light stays as it is."""
-        config = load_config(self._settings(size, self._plan.instants, render={"shared_walk": walk}))
+    def _without_walks(self, size: tuple[int, int]) -> Model:
+        """Return the model whose rays share no walks; light stays as it is."""
+        config = load_config(self._settings(size, self._plan.instants, render={"shared_walk": None}))
         arrays = cast(SceneArrays, self._base.scene_on_device)
         lit = dataclasses.replace(arrays, config=config.render)
         return refit(dataclasses.replace(self._base, config=config, scene_on_device=lit), config)
-
-    def _event_error(self) -> EventError:
-        """Fly with complete lists and with those of what is seen, and compare the events."""
-        self._tell(f"the events of {SEEN}")
-
-        def compare() -> EventError:
-            exact, other = (
-                _events_of(self._walking(self._plan.launch_size, {"lists": lists}), self._plan.error_batches)
-                for lists in ("complete", "seen")
-            )
-            found = match_events(exact, other, tolerance_us=0)
-            return EventError(
-                mode=SEEN,
-                event_count=len(exact.t),
-                missing_count=len(found.missing),
-                spurious_count=len(found.spurious),
-            )
-
-        error, failure = self._try(compare)
-        return error or EventError(mode=SEEN, failure=failure)
 
     def _launches(self) -> Iterator[StepRow]:
         size = self._plan.launch_size
@@ -475,17 +447,6 @@ class _Study:
             return dataclasses.replace(make_model(config, scene=model.scene), path=model.path)
         uploaded = upload_scene(model.scene, config.render, device=device)
         return refit(dataclasses.replace(model, scene_on_device=uploaded), config)
-
-
-def _events_of(model: Model, batch_count: int) -> EventArrays:
-    """Fly for some batches, and return the events of all."""
-    state = make_state(model)
-    fly_blind(model, state, _BEGIN_S)
-    packets = []
-    for packet in itertools.islice(run_model(model, state), batch_count):
-        assert isinstance(packet, Events)
-        packets.append(packet.numpy())
-    return EventArrays(*(np.concatenate(column) for column in zip(*packets, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,7 +12,6 @@ from neurosim_core.bench.throughput_result import (
     BARE_CAST,
     EXACT,
     RAYS_ALONE,
-    SEEN,
     STAGES,
     Agreement,
     Comparison,
@@ -66,7 +65,7 @@ def throughput_bars(result: ThroughputResult) -> list[Bar]:
             result,
             "the same in the fastest mode with less than 1 % of error in the events",
             27_000.0,
-            [EXACT, SEEN] if _is_close(result) else [EXACT],
+            [EXACT],
             VGA,
         ),
         _step_bar(result, "1280x720, whole step, exact", 6_500.0, [EXACT], HD),
@@ -114,11 +113,6 @@ def _step_bar(
         return Bar(text=text, measured=f"needs --scene with the house; here {said}", met=None)
     met = _judge(result, figure, least)
     return Bar(text=text, measured=said if met is not None else f"{_place(result)}; here {said}", met=met)
-
-
-def _is_close(result: ThroughputResult) -> bool:
-    error = result.event_error
-    return error is not None and error.share is not None and error.share < 0.01
 
 
 def _why(result: ThroughputResult, modes: Sequence[str], size: tuple[int, int]) -> str:
@@ -227,8 +221,6 @@ def _summary(result: ThroughputResult) -> str:
                 f"- {row.width}x{row.height}, {row.mode}: {row.steps_per_s:,.0f} /s, real-time factor "
                 f"{row.real_time_factor:.3g}."
             )
-    if result.event_error is not None:
-        lines.append(f"- {SEEN}: {_error(result)}.")
     slowest, step_us = result.roofline.slowest, result.roofline.step_us
     if slowest is not None and step_us is not None and slowest.per_step_us:
         lines.append(
@@ -262,21 +254,7 @@ def _step_table(result: ThroughputResult) -> Table:
         note=f"Median of the repetitions, each past another part of the scene. A step is "
         f"{1e3 / result.rate_hz:g} ms. `{ADAPTIVE}` renders when something would move further than "
         f"{result.max_displacement_px:g} px, and where a launch ends. `{RAYS_ALONE}`: without shared walks, "
-        "the same events to the last bit. "
-        f"`{SEEN}`: `render.shared_walk.lists` seen; {_error(result)}.",
-    )
-
-
-def _error(result: ThroughputResult) -> str:
-    error = result.event_error
-    if error is None:
-        return "not on a CPU"
-    if error.share is None:
-        return f"its error was not measured: {error.failure}"
-    missing, spurious = (n / error.event_count for n in (error.missing_count, error.spurious_count))
-    return (
-        f"of {error.event_count:,} events at {VGA[0]}x{VGA[1]} {missing:.2%} are missing and {spurious:.2%} "
-        "are there in addition, to the microsecond"
+        "the same events to the last bit.",
     )
 
 

@@ -12,7 +12,6 @@ Study = Literal["resolution", "launch", "triangles"]
 EXACT = "exact"
 ADAPTIVE = "adaptive"
 RAYS_ALONE = "exact, rays alone"
-SEEN = "seen lists"
 
 STAGES = ("physics", "render", "scan", "sort and decode", "copy")
 """Parts of a step that time is split into; what remains is the host's."""
@@ -25,7 +24,7 @@ class StepRow:
     study: Study
     mode: str
     """`EXACT`: a render at every step; `RAYS_ALONE`: the same with `RenderConfig.shared_walk` null;
-    `SEEN`: with its lists `seen`; `ADAPTIVE`."""
+    `ADAPTIVE`."""
     scene: str
     width: int
     height: int
@@ -155,25 +154,6 @@ class Agreement:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EventError:
-    """How the events of a mode differ from the exact ones of the same flight, to the microsecond."""
-
-    mode: str
-    event_count: int = 0
-    """Of the exact ones."""
-    missing_count: int = 0
-    spurious_count: int = 0
-    failure: str = ""
-
-    @property
-    def share(self) -> float | None:
-        """The missing or the spurious events, whichever are more, over the exact ones."""
-        if self.failure or not self.event_count:
-            return None
-        return max(self.missing_count, self.spurious_count) / self.event_count
-
-
-@dataclass(frozen=True, kw_only=True)
 class ThroughputResult:
     """All of it."""
 
@@ -198,8 +178,6 @@ class ThroughputResult:
     """Sorted, on the host, sustained [1/s]."""
     events_failure: str
     agreements: tuple[Agreement, ...]
-    event_error: EventError | None = None
-    """Of `SEEN`; None: not on a CPU."""
 
     def row(self, mode: str, width: int, height: int) -> StepRow | None:
         """Return the row of the study of resolutions that has figures, if there is one."""

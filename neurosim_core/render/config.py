@@ -34,18 +34,13 @@ class LightingConfig(Settings):
 
 
 class WalkConfig(Settings):
-    """How rays of a tile of 8 x 8 pixels share their walks through the tree."""
+    """How rays of a tile of 8 x 8 pixels share their walks through the tree; changes speed, not results."""
 
     instants: int = Field(default=16, ge=1, le=256)
     """Consecutive instants of a launch that share a walk. More are cheaper as long as the camera turns by
     less than a few tiles within them."""
     face_count_max: int = Field(default=256, ge=1, le=4096)
     """The most triangles that a walk may list: of a tile with more each ray walks by itself."""
-    lists: Literal["complete", "seen"] = "complete"
-    """What a walk lists. `complete`: every triangle that a ray can hit first: pictures are the same to the
-    last bit. `seen`: those that the pixels of the tile hit, each at one of up to four instants of the walk:
-    sooner, but what is small or comes into view within a walk may be missed; `neurosim bench shared-walk`
-    says by how many events."""
 
 
 class RenderConfig(Settings):
@@ -58,7 +53,8 @@ class RenderConfig(Settings):
     shared_walk: WalkConfig | Literal["auto"] | None = "auto"
     """The rays of a tile of pixels share one walk through Warp's tree over several instants, instead of one
     for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 4
-    instants or more and the lens looks forward. null: each ray walks by itself."""
+    instants or more, pixels are at most 0.2 degrees wide (3.5 mrad, in the median) and the lens looks
+    forward. null: each ray walks by itself."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"

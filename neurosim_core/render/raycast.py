@@ -400,11 +400,18 @@ def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         normal_out: wp.array3d[wp.vec3],
         instance_out: wp.array3d[int],
     ):
-        # A pixel of an instant, of which `index` tells.
+        # A pixel of an instant, of which `index` tells: of a tile all instants, then the next tile. Threads
+        # side by side should walk the same nodes: a block is a quarter of a tile at four instants, and
+        # what is left over the whole tile at one.
         in_tile = index % 64
         block = index // 64
-        instant = block % instant_count  # a tile of all instants, then the next: they see the same triangles
+        instant = block % instant_count
         tile = block // instant_count
+        if wp.static(not asking):
+            if instant < instant_count // 4 * 4:
+                quarter = instant % 4
+                instant += in_tile // 16 - quarter
+                in_tile = 32 * (quarter // 2) + 4 * (quarter % 2) + 8 * ((in_tile % 16) // 4) + in_tile % 4
         tile_columns = (width + 7) // 8
         world = int(0)
         first_ray = int(0)

@@ -1,7 +1,7 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
 # mypy: disable-error-code="call-overload,empty-body,no-untyped-call,untyped-decorator,valid-type"
 # mypy: disable-error-code="no-untyped-def,union-attr"
-# ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
+# ruff: noqa: UP018  (typed literals have a meaning in kernels)
 """One walk through the tree for all rays of a tile of pixels in several consecutive instants; exact.
 
 The rays of 8 x 8 pixels in M instants lie in a narrow frustum: that of the tile, swept by the motion of the
@@ -76,7 +76,8 @@ _REACH_M = wp.constant(0.01)
 _COSINE_MIN = wp.constant(0.2)
 """Between the axis of a frustum and its rays; turned by more within M instants, a tile has no list."""
 _AUTO_INSTANTS_MIN = 4
-"""With fewer a walk takes as long as it saves."""
+_AUTO_PIXEL_RAD = 3.5e-3
+"""With fewer instants a walk takes as long as it saves, and with larger pixels, whose lists are long."""
 _LEFT_SHARE = 8
 """There is room for one in so many pixels to be left; if there are more, the launch is done again by rays
 that walk by themselves."""
@@ -450,7 +451,9 @@ def shared_walk(
     """
     if asked != "auto":
         return asked
-    return WalkConfig() if is_cuda and instant_count >= _AUTO_INSTANTS_MIN and looks_forward(rays) else None
+    if not is_cuda or instant_count < _AUTO_INSTANTS_MIN or not looks_forward(rays):
+        return None
+    return WalkConfig() if np.median(rays[..., 3]) <= _AUTO_PIXEL_RAD else None
 
 
 def group_size(instants: int) -> int:
@@ -559,41 +562,6 @@ def leave(is_left: wp.bool, index: int, left: wp.array[int], count: wp.array[int
 """)
 def meet_face(id: wp.uint64, face: int, origin: wp.vec3, ray: wp.vec3) -> wp.vec3:
     """Return t [m], u and v where a ray meets a triangle, as `wp.mesh_query_ray` does; t = -1: nowhere."""
-    ...
-
-
-@wp.func_native("""
-#ifdef __CUDA_ARCH__
-    __shared__ int faces[64], found;
-    const int thread = threadIdx.x;
-    faces[thread] = face;
-    if (thread == 0)
-        found = 0;
-    __syncthreads();
-    bool is_new = face >= 0;
-    for (int k = 0; k < thread; ++k)
-        is_new &= faces[k] != face;
-    if (is_new)
-        if (const int place = atomicAdd(&found, 1); place < limit)
-            faces_out.data[begin + place] = face;
-    __syncthreads();
-    return found;
-#else
-    if (face < 0)
-        return count;
-    for (int k = 0; k < wp::min(count, limit); ++k)
-        if (faces_out.data[begin + k] == face)
-            return count;
-    if (count < limit)
-        faces_out.data[begin + count] = face;
-    return count + 1;
-#endif
-""")
-def _list_seen(face: int, count: int, limit: int, begin: int, faces_out: wp.array[int]) -> int:
-    """Add a triangle to a list if it is not there, -1: none; return the length of the list.
-
-    On CUDA a block of 64 threads calls it once, with a triangle each; the list was empty.
-    """
     ...
 
 
@@ -710,65 +678,6 @@ def face_normals(mesh: wp.Mesh) -> wp.array[wp.vec3]:
     return normals
 
 
-@cache
-def seen_kernel(lanes: int) -> wp.Kernel:
-    """Return the kernel that lists what pixels of a tile hit, one ray for each; `lanes` as `walk_kernel`.
-
-    The pixels take turns among up to four instants of the walk.
-    """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def list_seen(
-        first: int,
-        # Model:
-        mesh: wp.uint64,
-        rays: wp.array2d[wp.vec4],
-        width: int,
-        height: int,
-        extent_m: float,
-        # In:
-        instant_count: int,
-        p_WC: wp.array[wp.vec3],
-        q_WC: wp.array[wp.quat],
-        # In/out:
-        data: WalkData,
-    ) -> None:
-        index = first + wp.tid()
-        lane = index % lanes
-        tile = (index // lanes) % data.bounds.shape[0]
-        walk = index // lanes // data.bounds.shape[0]
-        begin = walk * data.instants
-        instants = wp.min(data.instants, instant_count - begin)
-        times = wp.min(instants, 4)
-        tile_columns = (width + 7) // 8
-        begin_of_list = (walk * data.bounds.shape[0] + tile) * data.limit
-        missed = float(0.0)
-        count = int(0)
-        for pixel in range(lane, wp.static(BLOCK), lanes):
-            x = pixel % 8
-            y = pixel // 8
-            turn = (x % 2 + 2 * (y % 2)) % times
-            instant = begin + turn * (instants - 1) // wp.max(times - 1, 1)
-            col = wp.min((tile % tile_columns) * 8 + x, width - 1)
-            row = wp.min((tile // tile_columns) * 8 + y, height - 1)
-            ray_C = rays[0, row * width + col]
-            ray = wp.quat_rotate(q_WC[instant], wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-            query = wp.mesh_query_ray(mesh, p_WC[instant], ray, _FAR_M)
-            face = int(-1)
-            if query.result:
-                face = query.face
-            else:
-                missed = float(1.0)
-            count = _list_seen(face, count, data.limit, begin_of_list, data.faces)
-        missed = _block_max(missed)
-        if lane == 0:
-            data.count[walk, tile] = wp.where(count > data.limit, -1, count)
-            # rays that hit nothing of a list ask the tree, unless there is sky in the tile
-            data.reach[walk, tile] = wp.where(missed > 0.0, _FAR_M, 0.5 * _FAR_M)
-
-    return list_seen
-
-
 def looks_forward(rays: NDArray[np.float32]) -> bool:
     """Return whether `tile_bounds` takes the rays of a lens."""
     x, y, z = np.moveaxis(rays[..., :3].astype(np.float64), -1, 0)
@@ -871,9 +780,7 @@ class TileWalk:
         self._mesh, self._width, self._height, self._extent_m = mesh, width, height, extent_m
         self._device = str(mesh.device)
         self._thread_count = thread_count
-        lanes = 1 if mesh.device.is_cpu else BLOCK
-        self._lanes = lanes
-        self._kernel = seen_kernel(lanes) if config.lists == "seen" else walk_kernel(lanes)
+        self._lanes = 1 if mesh.device.is_cpu else BLOCK
         self.data = WalkData()
         self.data.instants = config.instants
         self.data.limit = config.face_count_max
@@ -907,7 +814,7 @@ class TileWalk:
         walks = -(-instant_count // self.data.instants)
         self.data.left_count.zero_()
         launch_split(
-            self._kernel,
+            walk_kernel(self._lanes),
             dim=walks * self.data.bounds.shape[0] * self._lanes,
             inputs=[
                 self._mesh.id,

@@ -6,7 +6,7 @@ import warp as wp
 
 from neurosim_core.render import lighting
 from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
-from neurosim_core.render.tile_walk import BLOCK, seen_kernel, walk_kernel
+from neurosim_core.render.tile_walk import BLOCK, walk_kernel
 
 
 def test_kernels_build_for_sm_90(tmp_path):
@@ -15,7 +15,6 @@ def test_kernels_build_for_sm_90(tmp_path):
         raycast_kernel(OUTPUTS, everything),
         raycast_kernel(("log_radiance",), everything._replace(walked=4)),
         walk_kernel(BLOCK),
-        seen_kernel(BLOCK),
     )
     for module in (*(kernel.module for kernel in kernels), lighting):
         wp.compile_aot_module(module, module_dir=str(tmp_path), arch=90)

@@ -311,33 +311,6 @@ def test_lists_are_short_and_used(device):
     assert (np.abs(look(1.0e9) - sky) < 1e-6).all()  # and of an infinite one, that there is only sky
 
 
-@pytest.mark.parametrize("instants", [1, 2, 4])
-def test_pixels_are_exact_at_the_instant_that_they_are_listed_for(device, instants):
-    """With lists of what is seen: each pixel of a tile looks at one of up to four instants."""
-    scene = scene_of(plane(30.0), soup(300, 11, size_m=0.2))
-    poses = path(instants, 0.05, 0.03)
-    expected = render(scene, LENS, poses, outputs=("instance", "depth"), config=ALONE, device=device)
-    arrays = upload_scene(scene, together(instants=instants, lists="seen"), device)
-    row, col = np.indices((LENS.height, LENS.width))
-    turn = (col % 2 + 2 * (row % 2)) % instants
-    for form in (arrays, by_block(arrays)):
-        seen = render(form, LENS, poses, outputs=("instance", "depth"), device=device)
-        for name, image in expected.items():
-            for instant in range(instants):
-                there = turn == instant
-                np.testing.assert_array_equal(seen[name][instant][there], image[instant][there], err_msg=name)
-
-
-def test_sky_is_seen_beside_what_is_listed(device):
-    scene = scene_of(soup(60, 5, size_m=0.3))
-    poses = path(3, 0.02, 0.01)
-    expected = render(scene, LENS, poses, outputs=("instance",), config=ALONE, device=device)["instance"]
-    arrays = upload_scene(scene, together(instants=4, lists="seen"), device)
-    seen = render(arrays, LENS, poses, outputs=("instance",), device=device)["instance"]
-    assert 0.1 < (expected == -1).mean() < 0.9
-    assert (seen != expected).mean() < 0.02
-
-
 def test_bounds_hold_the_rays_of_a_tile():
     rays = np.stack([LENS.ray_table(o).reshape(-1, 3) for o in ((0.5, 0.5), (0.1, 0.9))])
     bounds = tile_bounds(rays, 45, 34)
