@@ -89,11 +89,11 @@ class _Plan:
 _VGA, _HD = (640, 480), (1280, 720)
 _ON_CUDA = _Plan(
     resolutions=((128, 128), (346, 260), _VGA, _HD),
-    launches=(1, 4, 16, 64),
+    launches=(1, 4, 16, 32, 64),
     launch_size=_VGA,
     triangles=(20_000, 100_000, 500_000, 2_000_000),
-    instants=16,
-    warm_up_batches=16,
+    instants=32,
+    warm_up_batches=64,  # each pattern of launches is launched, then recorded, then replayed
     repetitions=5,
     repetition_s=0.4,
     alone_s=0.4,
@@ -106,7 +106,9 @@ _ON_CUDA = _Plan(
 _ON_CPU = dataclasses.replace(
     _ON_CUDA,
     launch_size=(346, 260),
+    launches=(1, 4, 16, 64),
     triangles=(20_000, 100_000, 500_000),
+    instants=16,
     warm_up_batches=1,
     repetitions=3,
     repetition_s=0.8,

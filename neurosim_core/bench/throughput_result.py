@@ -185,3 +185,14 @@ class ThroughputResult:
             if (row.study, row.mode, row.width, row.height) == ("resolution", mode, width, height):
                 return row if row.steps_per_s is not None else None
         return None
+
+    def fastest(self, mode: str, width: int, height: int) -> StepRow | None:
+        """Return the fastest row of a mode and size in the scene that was given, whatever the launch."""
+        rows = [
+            row
+            for row in self.rows
+            if row.study in ("resolution", "launch")
+            and (row.mode, row.width, row.height) == (mode, width, height)
+            and row.steps_per_s is not None
+        ]
+        return max(rows, key=lambda row: row.steps_per_s or 0.0, default=None)

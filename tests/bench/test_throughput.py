@@ -318,7 +318,14 @@ def test_real_time_is_in_the_legend_where_its_line_is_on_the_axis(scale, shown):
 
 def test_bars_of_a_gpu():
     assert verdicts(made_up()) == GPU
-    assert verdicts(made_up(scale=0.99)) == [v and i in (7, 8) if v else v for i, v in enumerate(GPU)]
+    assert verdicts(made_up(scale=0.99)) == [v and i in (0, 7, 8) if v else v for i, v in enumerate(GPU)]
+
+
+def test_a_bar_takes_the_fastest_launch():
+    rows = [*made_up(scale=0.5).rows, dataclasses.replace(row(EXACT, 640, 480, 28_000), study="launch")]
+    exact, fast, *_ = throughput_bars(made_up(rows=tuple(rows)))
+    assert exact.met is fast.met is True
+    assert "28,000 /s (exact, 16 renders per launch" in exact.measured
 
 
 def test_a_lesser_device_meets_bars_and_misses_none():
@@ -326,7 +333,7 @@ def test_a_lesser_device_meets_bars_and_misses_none():
     others = verdicts(made_up("NVIDIA RTX 4090", scale=0.5))
     assert others == [None] * 7 + [True, True, None]
     assert (
-        "needs an H200; here 9,000 /s" in throughput_bars(made_up("NVIDIA RTX 4090", scale=0.5))[0].measured
+        "needs an H200; here 13,500 /s" in throughput_bars(made_up("NVIDIA RTX 4090", scale=0.5))[0].measured
     )
 
 
