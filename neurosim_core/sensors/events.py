@@ -688,6 +688,7 @@ class EventCamera:
                 if count > chunk.keys.shape[0]:
                     chunk.keys = self._empty(1 << (count - 1).bit_length(), wp.int64)
             self._launch(scan, tabulate=False)
+            scan.done.wait()  # the frames are the caller's again
         if limited:
             scan.row_limit.fill_(self.height)
 

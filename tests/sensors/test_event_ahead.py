@@ -272,3 +272,22 @@ def test_a_device_that_is_late_gives_the_same(monkeypatch, tight_guesses, eagern
     assert_same(packets, plain)
     assert late.replayed_count > count / 6
     assert camera.ahead_count > count / 6
+
+
+def test_frames_are_the_callers_again_when_they_have_been_read(monkeypatch):
+    """Also where a scan had to be done again for want of room, and no window ended."""
+    first, (stack,) = draw_stacks(np.random.default_rng(2), [4], [3.0])
+    stamps = FRAME_NS * np.arange(1, 5)
+    packets = []
+    for late in (False, True):
+        with monkeypatch.context() as patch:
+            if late:
+                install(patch, LateDevice(np.random.default_rng(2), 0.0))
+            camera = make_camera("cpu", cut_ahead=late)
+            camera.reset(first)
+            rows = np.array(stack)
+            camera.feed_device(wp.array(rows, dtype=wp.float32, device="cpu", copy=False), stamps)
+            camera.collect_windows([], scan_count=1)
+            rows.fill(0.0)
+            packets.append(camera.collect())
+    assert_same(*([packet] for packet in packets))
