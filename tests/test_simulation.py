@@ -131,6 +131,24 @@ def cut_ahead(request, monkeypatch):
     monkeypatch.setattr(cast_module, "EventCamera", functools.partial(EventCamera, cut_ahead=request.param))
 
 
+def test_lanes_share_no_list_of_slots(settings):
+    """A list is uploaded on the stream of one lane, and the streams of the others do not wait for it."""
+    model = simulation.make_model(ns.load_config(settings))
+    state = simulation.make_state(model, lane_count=2)
+    simulation.start(model, state)
+    (cast,) = state.casts
+    first, again, other = (
+        cast_module.plan_look(
+            cast, state.trace, [0, 0], [0, 2_000_000], lane=lane, wanted=frozenset(cast.events)
+        ).render()
+        for lane in (0, 0, 1)
+    )
+    for mine, repeated, theirs, expected in zip(first, again, other, ([0, 0], [-1, -1]), strict=True):
+        assert mine is repeated
+        assert mine.ptr != theirs.ptr
+        assert mine.numpy().tolist() == theirs.numpy().tolist() == expected
+
+
 @pytest.mark.parametrize("lane_count", [1, 2, 3])
 @pytest.mark.parametrize("instants", [4, 64])
 @pytest.mark.usefixtures("cut_ahead")

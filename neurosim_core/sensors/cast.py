@@ -84,8 +84,9 @@ class CastState:
     """Of the bodies; None: nothing moves but the vehicle."""
     body_poses: Sequence[BodyPoses | None] = ()
     """Where bodies are at the instants, for each lane."""
-    slots: dict[tuple[int, ...], wp.array[int]] = field(default_factory=dict)
-    """Lists of slots on the device: the same few come again and again."""
+    slots: dict[tuple[int, tuple[int, ...]], wp.array[int]] = field(default_factory=dict)
+    """Lists of slots on the device by lane: the same few come again and again. What one lane uploads on its
+    stream is not there yet for another, whose stream does not wait for it."""
     rule: DisplacementRule | None = None
     """Chooses the ticks that are rendered; None: all are."""
     chosen_slots: Sequence[HostInput] = ()
@@ -303,8 +304,8 @@ def plan_look(
     if cast.rule is not None:
         key, chosen = None, cast.chosen_slots[lane]
         chosen.rows[: len(slots)] = slots
-    from_slots = _slots_on_device(cast, slots) if chosen is None else chosen.array
-    to_slots = _slots_on_device(cast, image_slots)
+    from_slots = _slots_on_device(cast, lane, slots) if chosen is None else chosen.array
+    to_slots = _slots_on_device(cast, lane, image_slots)
 
     p_WC, q_WC, body_poses = cast.p_WC[lane], cast.q_WC[lane], cast.body_poses[lane]
 
@@ -442,11 +443,11 @@ def read_images(
     return packets
 
 
-def _slots_on_device(cast: CastState, slots: Sequence[int]) -> wp.array[int]:
-    """Return slots as an array that was uploaded before, if the same were."""
-    key = tuple(slots)
+def _slots_on_device(cast: CastState, lane: int, slots: Sequence[int]) -> wp.array[int]:
+    """Return slots as an array that the lane has uploaded before, if the same were."""
+    key = lane, tuple(slots)
     if key not in cast.slots:
         if len(cast.slots) >= _SLOT_LISTS_MAX:
             del cast.slots[next(iter(cast.slots))]
-        cast.slots[key] = wp.array(np.array(key, dtype=np.int32), dtype=int, device=cast.device)
+        cast.slots[key] = wp.array(np.array(slots, dtype=np.int32), dtype=int, device=cast.device)
     return cast.slots[key]
