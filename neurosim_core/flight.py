@@ -23,6 +23,7 @@ from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
+from neurosim_core.sensors.cast import render_terms
 from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.rig import Cast, EventSensorConfig
 from neurosim_core.signals import stop_at_signals
@@ -400,6 +401,6 @@ def _terms(model: Model, state: State) -> dict[str, tuple[str, ...]]:
     """What each kernel computes, beyond what every run needs."""
     terms: dict[str, tuple[str, ...]] = {"dynamics": state.vehicle.terms}
     terms |= {name: imu.terms for name, imu in state.imus.items()}
-    for cast in model.casts:
-        terms[", ".join(cast.names)] = (*sorted(cast.outputs), *model.render_terms)
+    for cast, seeing in zip(model.casts, state.casts, strict=True):
+        terms[", ".join(cast.names)] = (*sorted(cast.outputs), *render_terms(seeing))
     return terms

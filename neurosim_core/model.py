@@ -47,13 +47,6 @@ class Model:
     setup_s: Mapping[str, float]
     """Wall-clock time that each part of the set-up took [s]."""
 
-    @property
-    def render_terms(self) -> tuple[str, ...]:
-        """What the renderer computes because of the scene and its settings."""
-        terms = getattr(self.scene_on_device, "terms", None)
-        present = {} if terms is None else terms._asdict()
-        return tuple(name for name, value in present.items() if value)
-
     @functools.cached_property
     def duration_ns(self) -> int:
         """Length of the run [ns]."""

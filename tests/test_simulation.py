@@ -131,6 +131,18 @@ def cut_ahead(request, monkeypatch):
     monkeypatch.setattr(cast_module, "EventCamera", functools.partial(EventCamera, cut_ahead=request.param))
 
 
+def test_terms_are_those_that_the_kernels_have(settings):
+    """Walks are shared or not by the lens, the launch and the device, not by the scene alone."""
+    found = {}
+    for walk in (None, {"instants": 4}):
+        render = {**settings["render"], "cpu_traversal": "warp", "shared_walk": walk}
+        model = simulation.make_model(ns.load_config({**settings, "render": render}))
+        (cast,) = simulation.make_state(model).casts
+        found[walk is None] = set(cast_module.render_terms(cast))
+    assert found[False] - found[True] == {"walked"} | ({"by_tile"} if settings["device"] == "cpu" else set())
+    assert not found[True] & {"walked", "by_tile", "asking"}
+
+
 def test_lanes_share_no_list_of_slots(settings):
     """A list is uploaded on the stream of one lane, and the streams of the others do not wait for it."""
     model = simulation.make_model(ns.load_config(settings))

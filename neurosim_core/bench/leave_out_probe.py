@@ -227,12 +227,13 @@ def _second_half(state: State, packets: Iterator[Packet]) -> tuple[float, float]
 
 def _terms(model: Model, state: State) -> dict[str, list[str]]:
     """What each kernel computes beyond what every run needs."""
+    from neurosim_core.sensors.cast import render_terms
+
     terms = {"dynamics": list(state.vehicle.terms)}
     terms |= {name: list(imu.terms) for name, imu in state.imus.items()}
-    for cast in model.casts:
-        terms[", ".join(cast.names)] = [*sorted(cast.outputs), *model.render_terms]
-    for cast_state in state.casts:
-        terms |= {f"pixel of {name}": list(e.camera.terms) for name, e in cast_state.events.items()}
+    for cast, seeing in zip(model.casts, state.casts, strict=True):
+        terms[", ".join(cast.names)] = [*sorted(cast.outputs), *render_terms(seeing)]
+        terms |= {f"pixel of {name}": list(e.camera.terms) for name, e in seeing.events.items()}
     return terms
 
 

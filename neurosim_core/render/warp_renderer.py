@@ -282,6 +282,7 @@ class WarpRenderer:
         instance: int32, shape [M, H, W].
         rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W].
         walk: What the rays of a tile share; None: each walks by itself.
+        terms: What its kernels compute because of the scene, the settings, and the lens.
     """
 
     def __init__(
@@ -311,7 +312,7 @@ class WarpRenderer:
         rays = ray_layers(lens, arrays.config.samples_per_pixel)
         is_cuda = wp.get_device(arrays.device).is_cuda
         shared = shared_walk(arrays.config.shared_walk, rays, instant_count=instant_count, is_cuda=is_cuda)
-        terms = with_walks(arrays.terms, shared)
+        self.terms = terms = with_walks(arrays.terms, shared)
         self._kernel = raycast_kernel(outputs, terms)
         self._asking = asking_kernel(outputs, terms)
         self._group = group_of(terms)

@@ -208,6 +208,13 @@ def _make_rule(cast: Cast, scene: SceneOnDevice, p_BC: wp.vec3d, q_BC: wp.quatd)
     )
 
 
+def render_terms(cast: CastState) -> tuple[str, ...]:
+    """Return what the renderer of a cast computes because of the scene, its settings, and the lens."""
+    terms = getattr(cast.renderers[0], "terms", None)  # only Warp's has a kernel made to measure
+    present = {} if terms is None else terms._asdict()
+    return tuple(name for name, value in present.items() if value)
+
+
 def is_due(cast: CastState, stamp_ns: int, wanted: Collection[str]) -> bool:
     """Return whether a camera that is wanted sees the tick of a cast."""
     return any(name in wanted for name in cast.events) or bool(_pictures_due(cast, stamp_ns, wanted))
