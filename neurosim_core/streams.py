@@ -29,6 +29,12 @@ _LENT_BYTES_MAX = 256 << 20
 """Most memory of one kind that is lent out: pages that are pinned are nobody else's."""
 
 
+def size_class(size: int) -> int:
+    """Return the least of 2^n and 3 * 2^n that is not below a size, at least 1: few sizes serve for many."""
+    power = 1 << max(0, size - 1).bit_length()
+    return power // 4 * 3 if power >= 4 and size <= power // 4 * 3 else power
+
+
 def make_stream(device: Any, *, urgent: bool = False) -> wp.Stream | None:
     """Return a new stream; None on a CPU.
 
@@ -164,53 +170,73 @@ class LentBlock:
     """Memory of the host that the device copies to, pinned on CUDA, and that is lent to who reads it."""
 
     def __init__(self, size: int, device: Any) -> None:
+        self.size = size
         self.array = wp.empty(size, dtype=wp.uint8, device="cpu", pinned=wp.get_device(device).is_cuda)
 
     def rows(self) -> NDArray[np.uint8]:
         """Return all of it; as a new array, which lives as long as it or a view of it is held."""
-        size = self.array.shape[0]
-        return np.frombuffer((ctypes.c_uint8 * size).from_address(self.array.ptr), dtype=np.uint8)
+        return np.frombuffer((ctypes.c_uint8 * self.size).from_address(self.array.ptr), dtype=np.uint8)
 
 
 class LentBlocks:
     """Blocks that go round: who gets one may keep it, and it comes back when its last view is gone.
 
-    So nothing is copied for those who read and forget. Who keeps more than 256 MB gets copies.
+    So nothing is copied for those who read and forget. Who keeps more than 256 MB gets copies. Blocks come
+    in few sizes and stay: to pin memory takes milliseconds, in which the device stands still.
 
     Args:
         device: What copies to them.
+
+    Attributes:
+        made_count: Blocks that were made.
     """
 
     def __init__(self, device: Any) -> None:
         self._device = device
-        self._free: deque[LentBlock] = deque()
-        self._made_count = 0
-        self._taken_count = 0
+        self._free: dict[int, deque[LentBlock]] = {}
+        """By size."""
+        self.made_count = 0
+        self._made_bytes = 0
+        self._taken_bytes = 0
+
+    def reserve(self, size: int, count: int) -> None:
+        """Have so many blocks of at least so many bytes that nobody reads."""
+        size = size_class(size)
+        free = self._free.setdefault(size, deque())
+        while len(free) < count:
+            free.append(self._make(size))
 
     def take(self, size: int) -> LentBlock:
-        """Return a block of at least so many bytes that nobody reads."""
-        self._taken_count += 1
-        while self._free:
-            block = self._free.popleft()  # the one that came back first
-            if block.array.shape[0] >= size:
-                return block
-            self._made_count -= 1
-        self._made_count += 1
-        return LentBlock(size, self._device)
+        """Return a block of at least so many bytes that nobody reads: the least that has come back."""
+        for known in sorted(self._free):
+            if known >= size and self._free[known]:
+                block = self._free[known].popleft()  # the one that came back first
+                break
+        else:
+            block = self._make(size_class(size))
+        self._taken_bytes += block.size
+        return block
 
     def give_back(self, block: LentBlock) -> None:
         """Let a block be taken again: its content is not wanted."""
-        self._taken_count -= 1
-        self._free.append(block)
+        self._taken_bytes -= block.size
+        self._free[block.size].append(block)
 
     def lend(self, block: LentBlock, size: int) -> NDArray[np.uint8]:
         """Return the first bytes of a block for the caller to keep, or a copy; the block is not theirs."""
-        self._taken_count -= 1
-        lent_count = self._made_count - len(self._free) - self._taken_count  # with this one
-        if lent_count * block.array.shape[0] > _LENT_BYTES_MAX:
+        self._taken_bytes -= block.size
+        free = self._free[block.size]
+        free_bytes = sum(known * len(blocks) for known, blocks in self._free.items())
+        if self._made_bytes - free_bytes - self._taken_bytes > _LENT_BYTES_MAX:  # with this one
             rows = np.array(block.rows()[:size])
-            self._free.append(block)
+            free.append(block)
             return rows
         rows = block.rows()
-        weakref.finalize(rows, self._free.append, block).atexit = False
-        return rows
+        weakref.finalize(rows, free.append, block).atexit = False
+        return rows[:size]
+
+    def _make(self, size: int) -> LentBlock:
+        self.made_count += 1
+        self._made_bytes += size
+        self._free.setdefault(size, deque())
+        return LentBlock(size, self._device)

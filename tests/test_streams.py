@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from neurosim_core import streams
-from neurosim_core.streams import Graphs, HostCopy, LentBlocks, Milestone, make_stream, on
+from neurosim_core.streams import Graphs, HostCopy, LentBlocks, Milestone, make_stream, on, size_class
 
 
 @wp.kernel
@@ -95,7 +95,7 @@ def test_a_block_comes_back_when_its_last_view_is_gone(device):
 
 
 def test_who_keeps_too_much_gets_copies(device, monkeypatch):
-    monkeypatch.setattr(streams, "_LENT_BYTES_MAX", 350)
+    monkeypatch.setattr(streams, "_LENT_BYTES_MAX", 400)
     blocks = LentBlocks(device)
     kept = []
     for number in range(6):
@@ -107,3 +107,25 @@ def test_who_keeps_too_much_gets_copies(device, monkeypatch):
     kept.clear()
     gc.collect()
     assert not blocks.lend(blocks.take(100), 100).flags.owndata
+
+
+def test_blocks_that_were_reserved_serve_all_sizes_below(device):
+    blocks = LentBlocks(device)
+    blocks.reserve(1000, 3)
+    made_count = blocks.made_count
+    assert made_count == 3
+    for size in (1, 999, 17, 1000, 500):
+        views = [blocks.lend(blocks.take(size), size) for _ in range(3)]
+        assert [view.shape for view in views] == [(size,)] * 3
+        del views
+        gc.collect()
+    assert blocks.made_count == made_count
+    taken = [blocks.take(10) for _ in range(4)]  # one more than there are
+    assert len({block.array.ptr for block in taken}) == 4
+    assert blocks.made_count == made_count + 1
+
+
+def test_a_size_class_is_seldom_much_larger():
+    classes = [size_class(size) for size in range(1, 5000)]
+    assert all(size <= known <= 1.5 * size for size, known in enumerate(classes, 1))
+    assert len(set(classes)) < 26

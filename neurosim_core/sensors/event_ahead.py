@@ -3,16 +3,17 @@
 
 What follows a scan (keys merged with those carried over from the windows before, sorted, cut and taken apart)
 needs to know how many keys there are, and only the device does. So the host guesses a size from what came
-before, with some room; keys that stand for nothing fill it and sort last. It also has to say at once where
+before, with much room; keys that stand for nothing fill it and sort last. It also has to say at once where
 windows will end. All of it is then one sequence of launches, replayed as a graph, and the copy of the events
-to the host. When the host comes to read, it compares what it guessed with what was counted. Where it guessed
-wrong nothing is lost: the keys of the scan and those carried over are still there, and `EventCamera` does the
-same the other way.
+to the host: of nearly as many as there were lately, and where more have come the host asks again. When it
+comes to read, it compares what it guessed with what was counted. Where it guessed wrong nothing is lost: the
+keys of the scan and those carried over are still there, and `EventCamera` does the same the other way.
 
 A draft reads what the draft before it carried over, so there is one more of them than may be under way: the
 one that the host has read last stays whole.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,17 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors.event_scan import SUB_BITS, count_until, mark, move_origin, take_apart
-from neurosim_core.streams import Graphs, HostCopy, HostInput, LentBlock, LentBlocks, Milestone
+from neurosim_core.streams import (
+    Graphs,
+    HostCopy,
+    HostInput,
+    LentBlock,
+    LentBlocks,
+    Milestone,
+    make_stream,
+    on,
+    size_class,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,8 +41,14 @@ WINDOW_COUNT_MAX = 16
 """Most windows of a draft."""
 _ROOM_MIN = 1024
 _ROOM_MAX = 1 << 26
-_RECENT = 8
-"""Drafts that the guess of the next size looks back at."""
+_ROOM_PER_PIXEL = 1
+"""Keys for which there is room before any have come."""
+_RECENT = 16
+"""Drafts that the guess of the next size looks back at; there is room for twice the largest of them."""
+_FADING = 1024
+"""Drafts after which room for the largest of all is worth 1/e of it, if none of its size has come."""
+_SPARE_BLOCKS = 3
+"""Blocks for the host beyond those that drafts under way are copied to: what readers hold."""
 
 # what a draft counts, then the ends of its windows
 _TOTAL = wp.constant(0)
@@ -45,7 +62,9 @@ _ENDS = wp.constant(3)
 _ORIGIN_US = wp.constant(0)
 _STEP_US = wp.constant(1)
 """From the origin of the keys carried over to its own."""
-_BOUNDS = 2
+_COPIED = wp.constant(2)
+"""Events for which the columns have room; a multiple of 2."""
+_BOUNDS = 3
 
 _COLUMN_TYPES = tuple(np.dtype(name) for name in ("int64", "uint16", "uint16", "uint8"))
 """Types of the times, columns, rows and polarities of events."""
@@ -137,17 +156,22 @@ def decode_windows(
     row_shift: wp.int32,
     time_shift: wp.int32,
     # Out:
-    t_out: wp.array[wp.int64],
-    x_out: wp.array[wp.uint16],
-    y_out: wp.array[wp.uint16],
-    polarity_out: wp.array[wp.uint8],
+    columns_8: wp.array[wp.int64],
+    columns_2: wp.array[wp.uint16],
+    columns_1: wp.array[wp.uint8],
 ) -> None:
-    """Take the keys of all windows apart, like `event_scan.decode`."""
+    """Take the keys of all windows apart, like `event_scan.decode`, as far as there is room.
+
+    The outputs are one block of memory as three types: the columns of events are in it one after the other.
+    """
     event = wp.tid()
-    if event < tally[_CUT]:
-        take_apart(
-            keys[event], event, told[_ORIGIN_US], row_shift, time_shift, t_out, x_out, y_out, polarity_out
-        )
+    room = wp.int32(told[_COPIED])
+    if event < wp.min(tally[_CUT], room):
+        found = take_apart(keys[event], row_shift, time_shift)
+        columns_8[event] = told[_ORIGIN_US] + found.time_us
+        columns_2[4 * room + event] = found.x
+        columns_2[5 * room + event] = found.y
+        columns_1[12 * room + event] = found.polarity
 
 
 @wp.kernel
@@ -171,11 +195,13 @@ class Draft:
     """Twice the capacity: the sort wants that."""
     room: int = 0
     """Keys that fit, as it was guessed."""
+    copied: int = 0
+    """Events for which its columns have room; where there are more, they are copied once more."""
     ends_ns: tuple[int, ...] = ()
     origin_us: int = 0
     """Origin of its keys' time."""
     block: LentBlock | None = None
-    """The columns of its events on the host, one after the other, each with the whole room."""
+    """The columns of its events on the host, one after the other, each with room for `copied`."""
 
     def total(self) -> int:
         """Return how many keys there were, once it is done: with more than `room` it is of no use."""
@@ -196,6 +222,7 @@ class Drafts:
     """Cuts the windows of one scan after the other, on the device; for keys as in `event_scan`.
 
     Args:
+        pixel_count: Pixels of the camera.
         row_shift: Bits of a key below its row.
         time_shift: Bits of a key below its microseconds.
         under_way_max: How many scans may be under way.
@@ -205,19 +232,26 @@ class Drafts:
         grown: Comes after the copies into new buffers: who reads keys of a draft on another stream waits.
     """
 
-    def __init__(self, *, row_shift: int, time_shift: int, under_way_max: int, device: Any) -> None:
+    def __init__(
+        self, *, pixel_count: int, row_shift: int, time_shift: int, under_way_max: int, device: Any
+    ) -> None:
         self._row_shift, self._time_shift = row_shift, time_shift
         self._device = device
         self._graphs = Graphs(device)
+        self._reader = make_stream(device, urgent=True)
         self._drafts = [self._make_draft() for _ in range(under_way_max + 1)]
         self._last = 0
         self._capacity = 0
         self._order = self._empty(0, wp.int32)
         self._columns = self._empty(0, wp.uint8)
+        self._more_columns = self._empty(0, wp.uint8)
         self._blocks = LentBlocks(device)
+        self._reserved_bytes = 0
         self.grown = Milestone(device)
-        self._recent: list[int] = []
-        self._room = _ROOM_MIN
+        self._recent: deque[int] = deque(maxlen=_RECENT)
+        self._most = 0
+        self._room = size_class(max(_ROOM_MIN, _ROOM_PER_PIXEL * pixel_count))
+        self._copied = self._room
         wp.load_module(__name__, device=device)
 
     @property
@@ -226,8 +260,19 @@ class Drafts:
         return bool(self._recent)
 
     def note(self, key_count: int) -> None:
-        """Learn how many keys there were after a scan, with those carried over."""
-        self._recent = [*self._recent[1 - _RECENT :], key_count]
+        """Learn how many keys there were after a scan, with those carried over.
+
+        The room changes seldom, as each size has its graphs.
+        """
+        self._recent.append(key_count)
+        self._most = max(key_count, self._most - self._most // _FADING)
+        recent = max(self._recent)
+        room = min(size_class(max(_ROOM_MIN, 2 * recent, self._most)), _ROOM_MAX)
+        if room > self._room or 4 * room <= self._room:
+            self._room = room
+        rise = 2 * key_count - self._recent[-min(4, len(self._recent))]  # or they go on to rise
+        step = max(16, 1 << max(0, recent.bit_length() - 5))
+        self._copied = min(-(-(9 * max(recent, rise) // 8 + 1) // step) * step, self._room)
 
     def seed(self, keys: wp.array[wp.int64], count: int, origin_us: int) -> None:
         """Let the next draft carry over keys that the host has counted; no draft is wanted any more.
@@ -238,7 +283,7 @@ class Drafts:
             origin_us: Origin of their time [us].
         """
         draft = self._drafts[self._last]
-        self._make_room(max(count, self._guess()))
+        self._make_room(max(count, self._room))
         if count > 0:
             wp.copy(draft.keys, keys, count=count)
         wp.launch(carry_all, dim=1, inputs=[count], outputs=[draft.tally], device=self._device)
@@ -264,24 +309,27 @@ class Drafts:
             origin_us: Origin of the keys' time, at most that of the scan's first event [us].
             now_ns: Last frame of the scan [ns].
         """
-        room = self._guess()
+        room = self._room
         self._make_room(room)
         before = self._drafts[self._last]
         self._last = (self._last + 1) % len(self._drafts)
         draft = self._drafts[self._last]
         draft.room, draft.ends_ns, draft.origin_us = room, ends_ns, origin_us
+        draft.copied = self._copied
         told = draft.told.rows
+        told[int(_COPIED)] = draft.copied
         told[int(_ORIGIN_US)] = origin_us
         told[int(_STEP_US)] = origin_us - before.origin_us
         for window, end_ns in enumerate(ends_ns, _BOUNDS):
             told[window] = end_ns - origin_us * NS_PER_US
         # beyond the span all ones, which sort last
         end_bit = min(63, self._time_shift + (now_ns // NS_PER_US - origin_us + 1).bit_length())
-        key = (self._last, self._capacity, keys.ptr, counters.ptr, room, len(ends_ns), end_bit)
+        found = (keys.ptr, keys.shape[0], counters.ptr)
+        key = (self._last, self._capacity, found, room, len(ends_ns), end_bit)
         self._graphs.run(key, lambda: self._cut(draft, before, keys, counters, end_bit))
         if ends_ns:
-            draft.block = self._blocks.take(_EVENT_BYTES * room)
-            wp.copy(draft.block.array, self._columns, count=_EVENT_BYTES * room)
+            draft.block = self._blocks.take(_EVENT_BYTES * draft.copied)
+            wp.copy(draft.block.array, self._columns, count=_EVENT_BYTES * draft.copied)
         draft.done.set()
         return draft
 
@@ -289,13 +337,30 @@ class Drafts:
         """Return the columns of a draft that is done, none without windows; they are the caller's."""
         if draft.block is None:
             return []
-        room = draft.room
+        count = draft.cuts()[-1]
+        if count > draft.copied:
+            self._copy_again(draft, count)
+        room = draft.copied
         rows = self._blocks.lend(draft.block, _EVENT_BYTES * room)
         draft.block = None
         columns = []
         for offset, dtype in zip(_OFFSETS, _COLUMN_TYPES, strict=True):
             columns.append(rows[offset * room : (offset + dtype.itemsize) * room].view(dtype))
         return columns
+
+    def _copy_again(self, draft: Draft, count: int) -> None:
+        """Copy all events of a draft that is done, more than were copied, and wait for them."""
+        self.drop(draft)
+        draft.copied = count + count % 2
+        draft.block = self._blocks.take(_EVENT_BYTES * draft.copied)
+        draft.told.rows[int(_COPIED)] = draft.copied
+        with on(self._reader):
+            self.grown.hold()
+            draft.told.upload()
+            self._decode(draft, count, self._more_columns)
+            wp.copy(draft.block.array, self._more_columns, count=_EVENT_BYTES * draft.copied)
+            draft.done.set()
+        draft.done.wait()
 
     def drop(self, draft: Draft) -> None:
         """Forget a draft that is not wanted any more."""
@@ -334,33 +399,32 @@ class Drafts:
             [draft.tally],
         )
         draft.tally_on_host.fetch(0, int(_ENDS) + window_count)
+        self._decode(draft, room, self._columns)
+
+    def _decode(self, draft: Draft, count: int, columns: wp.array[wp.uint8]) -> None:
+        """Take at most so many keys apart, as far as the draft says that there is room."""
         self._launch(
             decode_windows,
-            room,
-            [told, draft.keys, draft.tally, self._row_shift, self._time_shift],
+            count,
+            [draft.told.array, draft.keys, draft.tally, self._row_shift, self._time_shift],
             [
-                wp.array(ptr=self._columns.ptr + offset * room, dtype=dtype, shape=room, device=self._device)
-                for offset, dtype in zip(_OFFSETS, (wp.int64, wp.uint16, wp.uint16, wp.uint8), strict=True)
+                wp.array(ptr=columns.ptr, dtype=dtype, shape=columns.shape[0] // size, device=self._device)
+                for dtype, size in ((wp.int64, 8), (wp.uint16, 2), (wp.uint8, 1))
             ],
         )
 
     def _launch(self, kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
 
-    def _guess(self) -> int:
-        """Return for how many keys there should be room; it changes seldom, as each size has its graphs."""
-        if self._recent:
-            last = self._recent[-1]
-            most = max(
-                *self._recent, 2 * last - self._recent[-min(4, len(self._recent))]
-            )  # or they go on to rise
-            if not 1.06 * most <= self._room <= 1.4 * most + _ROOM_MIN:
-                step = max(_ROOM_MIN, 1 << max(0, most.bit_length() - 4))
-                self._room = min(-(-int(1.125 * most + 1) // step) * step, _ROOM_MAX)
-        return self._room
-
     def _make_room(self, count: int) -> None:
-        """Let the buffers hold so many keys, and keep the keys that the next draft carries over."""
+        """Let the buffers hold so many keys, and keep the keys that the next draft carries over.
+
+        With them come blocks for half as many events: twice the largest of the last batches.
+        """
+        wanted_bytes = _EVENT_BYTES * max(self._room // 2, self._copied)
+        if wanted_bytes > self._reserved_bytes:
+            self._blocks.reserve(wanted_bytes, len(self._drafts) + _SPARE_BLOCKS)
+            self._reserved_bytes = size_class(wanted_bytes)
         if count <= self._capacity:
             return
         self._capacity = 1 << (count - 1).bit_length()
@@ -371,6 +435,7 @@ class Drafts:
                 wp.copy(draft.keys, before)
         self._order = self._empty(2 * self._capacity, wp.int32)
         self._columns = self._empty(_EVENT_BYTES * self._capacity, wp.uint8)
+        self._more_columns = self._empty(_EVENT_BYTES * self._capacity, wp.uint8)
         self.grown.set()
 
     def _make_draft(self) -> Draft:

@@ -184,6 +184,7 @@ class EventKeys:
             room = max(room, ROOM_PER_PIXEL * self._pixel_count)
             keys = roomy_keys(room, TOUCHED_COUNT_MAX)
         else:
+            room = max(2 * room, 4 * self._pixel_count)  # pinned memory takes long to come by
             keys = self._buffer(room)
         if kept > 0:
             wp.copy(keys, self.keys, count=kept)

@@ -708,26 +708,29 @@ def find_ends(
     end_out[window] = count_until(stamps[window], keys, key_count, time_shift)
 
 
+@wp.struct
+class Event:
+    """What a key says."""
+
+    time_us: wp.int64
+    """From the keys' time origin."""
+    x: wp.uint16
+    y: wp.uint16
+    polarity: wp.uint8
+
+
 @wp.func
-def take_apart(
-    key: wp.int64,
-    event: wp.int32,
-    time_origin_us: wp.int64,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    t_out: wp.array[wp.int64],
-    x_out: wp.array[wp.uint16],
-    y_out: wp.array[wp.uint16],
-    polarity_out: wp.array[wp.uint8],
-) -> None:
-    """Write what a key says into the columns of an event; parameters as for `decode`."""
+def take_apart(key: wp.int64, row_shift: wp.int32, time_shift: wp.int32) -> Event:
+    """Return what a key says; parameters as for `decode`."""
     one = wp.int64(1)
     row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
     column_mask = (one << (wp.int64(row_shift) - COLUMN_SHIFT)) - one
-    t_out[event] = time_origin_us + (key >> wp.int64(time_shift))
-    x_out[event] = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
-    y_out[event] = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
-    polarity_out[event] = wp.uint8((key >> wp.int64(10)) & one)
+    found = Event()
+    found.time_us = key >> wp.int64(time_shift)
+    found.x = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
+    found.y = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
+    found.polarity = wp.uint8((key >> wp.int64(10)) & one)
+    return found
 
 
 @wp.kernel
@@ -756,4 +759,8 @@ def decode(
         polarity_out: 1: brighter, 0: darker.
     """
     event = wp.tid()
-    take_apart(keys[event], event, time_origin_us, row_shift, time_shift, t_out, x_out, y_out, polarity_out)
+    found = take_apart(keys[event], row_shift, time_shift)
+    t_out[event] = time_origin_us + found.time_us
+    x_out[event] = found.x
+    y_out[event] = found.y
+    polarity_out[event] = found.polarity

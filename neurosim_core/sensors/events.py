@@ -42,6 +42,8 @@ _CUT_AHEAD_ON_CUDA = True
 _GRAPHS_ON_CUDA = True
 """A scan is replayed as a graph where it comes again."""
 _PIXELS_PER_THREAD_MIN = 16_384
+_KEYS_PER_PIXEL = 4
+"""Events of a scan for which there is room on CUDA before any have come."""
 
 
 @dataclass
@@ -187,6 +189,7 @@ class EventCamera:
         self._scan_count_max = scan_count_max
         self._scan_number = itertools.count()
         scan_count = len(ring) if self.device.is_cuda else scan_count_max
+        self._key_room = _KEYS_PER_PIXEL * pixel_count
         self._idle = deque(self._make_scan(16) for _ in range(scan_count))
         self._under_way: deque[_Scan] = deque()
         self._graphs = Graphs(device)
@@ -215,6 +218,7 @@ class EventCamera:
         wanted = self.device.is_cuda and _CUT_AHEAD_ON_CUDA if cut_ahead is None else cut_ahead
         if wanted and self._on_host and self._readout is None and len(self._chunk_bounds()) == 1:
             self._drafts = Drafts(
+                pixel_count=pixel_count,
                 row_shift=self._row_shift,
                 time_shift=self._time_shift,
                 under_way_max=scan_count_max,
@@ -339,6 +343,8 @@ class EventCamera:
         count = len(stamps)
         if count > scan.row_limit.shape[0]:
             scan = self._make_scan(count)
+        elif self.device.is_cuda and scan.chunks[0].keys.shape[0] < self._key_room:
+            scan.chunks[0].keys = self._empty(self._key_room, wp.int64)
         scan.frames = log_radiance
         scan.stamps_ns = stamps
         scan.ends_ns = None if ends_ns is None else tuple(int(end) for end in ends_ns)
@@ -486,6 +492,8 @@ class EventCamera:
         assert draft is not None
         self.ahead_count += 1
         self._drafts.note(draft.total())
+        if self.device.is_cuda:
+            self._expect_keys(scan.chunks[0].counters_on_host.view(0, 1).item())
         cuts = draft.cuts()
         columns = self._drafts.take(draft)
         self._carried = draft
@@ -560,7 +568,7 @@ class EventCamera:
             if self.device.is_cpu:
                 keys = roomy_keys(ROOM_PER_PIXEL * (end - first), TOUCHED_COUNT_MAX // len(bounds))
             else:
-                keys = self._empty(2 * (end - first), wp.int64)
+                keys = self._empty(self._key_room, wp.int64)
             chunks.append(_Chunk(first, end, keys, counters, HostCopy(counters)))
         times = HostInput(wp.zeros(frame_count + 2, dtype=wp.int64, device=self.device))
         return _Scan(
@@ -656,7 +664,8 @@ class EventCamera:
         if self.device.is_cuda:
             (chunk,) = scan.chunks
             reset_ns = 0 if self._noise is None else self._noise.since_reset_ns(0)
-            key = (scan.number, before, scan.frames.ptr, len(scan.stamps_ns), chunk.keys.ptr, reset_ns)
+            keys = (chunk.keys.ptr, chunk.keys.shape[0])
+            key = (scan.number, before, scan.frames.ptr, len(scan.stamps_ns), keys, reset_ns)
             if again and _GRAPHS_ON_CUDA:
                 self._graphs.run(key, lambda: launch(chunk))
             else:
@@ -687,6 +696,8 @@ class EventCamera:
             for count, chunk in zip(counts, scan.chunks, strict=True):
                 if count > chunk.keys.shape[0]:
                     chunk.keys = self._empty(1 << (count - 1).bit_length(), wp.int64)
+            if self.device.is_cuda:
+                self._expect_keys(counts[0])
             self._launch(scan, tabulate=False)
             scan.done.wait()  # the frames are the caller's again
         if limited:
@@ -698,6 +709,11 @@ class EventCamera:
         if self._drafts is not None:
             self._drafts.note(self._keys.count)
         self._finish(self._under_way.popleft())
+
+    def _expect_keys(self, count: int) -> None:
+        """Have room in scans for twice as many keys as one has found; they grow when they are idle."""
+        if 2 * count > self._key_room:
+            self._key_room = 1 << (2 * count - 1).bit_length()
 
     def _finish(self, scan: _Scan) -> None:
         """Note that the oldest scan is read."""

@@ -204,8 +204,9 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         if module is not streams:
             monkeypatch.setattr(module, "Milestone", lambda _: _LateMilestone(device), raising=False)
             monkeypatch.setattr(module, "Graphs", lambda _: _LateGraphs(device), raising=False)
-    monkeypatch.setattr(events, "on", device.on)
-    monkeypatch.setattr(events, "make_stream", device.make_stream)
+    for module in (events, event_ahead):
+        monkeypatch.setattr(module, "on", device.on)
+        monkeypatch.setattr(module, "make_stream", device.make_stream)
     monkeypatch.setattr(streams.HostInput, "__init__", host_input)
     monkeypatch.setattr(streams.HostCopy, "__init__", host_copy)
     monkeypatch.setattr(wp.array, "numpy", late_numpy)
