@@ -20,7 +20,7 @@ import warp as wp
 import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
-from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
+from neurosim_core.render.raycast import OUTPUTS, Terms, asking_kernel, raycast_kernel
 from neurosim_core.render.tile_walk import BLOCK, walk_kernel
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import TERMS, make_scan
@@ -73,6 +73,7 @@ def make_kernels() -> None:
         everything._replace(walked=4, worlds=True, supersampled=False),
     ):
         raycast_kernel(OUTPUTS, terms)
+        asking_kernel(OUTPUTS, terms)
     walk_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

@@ -445,7 +445,7 @@ def shared_walk(
 
     Args:
         asked: `RenderConfig.shared_walk`.
-        rays: Rays of the pixels in C, shape [layer, H * W, 4].
+        rays: Rays of the pixels in C, shape [layer, H * W, 4], as `warp_renderer.ray_layers` gives them.
         instant_count: The most instants of a launch, of one world.
         is_cuda: Where they are rendered.
     """
@@ -453,7 +453,9 @@ def shared_walk(
         return asked
     if not is_cuda or instant_count < _AUTO_INSTANTS_MIN or not looks_forward(rays):
         return None
-    return WalkConfig() if np.median(rays[..., 3]) <= _AUTO_PIXEL_RAD else None
+    sample_count = max(1, len(rays) - 1)  # each of which has its share of the pixel
+    pixel_rad = float(np.median(rays[..., 3])) * math.sqrt(sample_count)
+    return WalkConfig() if pixel_rad <= _AUTO_PIXEL_RAD else None
 
 
 def group_size(instants: int) -> int:

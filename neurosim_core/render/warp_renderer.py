@@ -142,7 +142,8 @@ def upload_scene(
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
         data.embree_intersect = wp.uint64(embree.intersect)
-    if wp.get_device(device).is_cuda or isinstance(config.shared_walk, WalkConfig):
+    asked = isinstance(config.shared_walk, WalkConfig)
+    if asked or (config.shared_walk == "auto" and wp.get_device(device).is_cuda):
         data.face_normal = face_normals(tree)
     instance = scene.face_instance[mesh.origin]
     data.face_material = wp.array(np.append(material, joined.material), dtype=int, device=device)

@@ -15,8 +15,8 @@ from neurosim_core import run
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig, WalkConfig
 from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
-from neurosim_core.render.tile_walk import TileWalk, tile_bounds
-from neurosim_core.render.warp_renderer import WarpRenderer, upload_scene
+from neurosim_core.render.tile_walk import TileWalk, shared_walk, tile_bounds
+from neurosim_core.render.warp_renderer import WarpRenderer, ray_layers, upload_scene
 from neurosim_core.scene.bodies import BodyConfig, body_poses, make_bodies, make_body_poses
 from neurosim_core.scene.scene import Material
 
@@ -409,7 +409,20 @@ def test_what_does_not_go_together_is_refused():
 
 def test_nothing_is_allocated_without(device):
     arrays = upload_scene(scene_of(plane(1.0)), ALONE, device)
-    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=2).walk is None
+    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=8).walk is None
+    assert arrays.data.face_normal is None
+
+
+@pytest.mark.parametrize(("pixel_rad", "shared"), [(3.3e-3, True), (3.7e-3, False), (6.5e-3, False)])
+@pytest.mark.parametrize("samples", [1, 4])
+def test_the_default_is_for_small_pixels_whatever_their_samples(pixel_rad, shared, samples):
+    lens = PinholeConfig(width=16, height=16, fx=1.0 / pixel_rad, fy=1.0 / pixel_rad, cx=8.0, cy=8.0)
+    rays = ray_layers(lens, samples)
+    walk = shared_walk("auto", rays, instant_count=4, is_cuda=True)
+    assert (walk is not None) is shared
+    assert shared_walk("auto", rays, instant_count=3, is_cuda=True) is None
+    assert shared_walk("auto", rays, instant_count=4, is_cuda=False) is None
+    assert shared_walk("auto", -rays, instant_count=4, is_cuda=True) is None
 
 
 def test_walks_are_the_default_on_cuda_alone(device):
