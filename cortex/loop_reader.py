@@ -90,6 +90,7 @@ class LoopReader:
             self._forget()
             if self._timer is not None:
                 self._timer.cancel()
+                self._timer = None  # a task that goes on to wait needs another
             for waiter in self._waiters:
                 _resolve(waiter)
 

@@ -133,6 +133,8 @@ class Subscriber(Generic[T]):
         if self._looks_left_out > 0:
             return False
         with self._turn:
+            if not (self._closed or self._queue or self._inlet.exhausted):
+                self._intake.receive_one()  # a descriptor does not show what was read along with the last one
             if self._closed or self._queue:
                 return True
             poll = self._poll or self._new_poll()
@@ -209,7 +211,8 @@ class Subscriber(Generic[T]):
 
     async def _wait_async(self, timeout_s: float | None, *, look: bool) -> T:
         """Take the next message as soon as it is there; without a `look` now if there was one in vain."""
-        inlet, reader = self._inlet, self._reader
+        inlet = self._inlet
+        reader: LoopReader | None = None
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             if look and (inlet.left <= 0 or monotonic_ns() >= inlet.until_ns):  # others want to run, too
@@ -225,12 +228,20 @@ class Subscriber(Generic[T]):
             if self._queue or not inlet.exhausted:  # what came could not be read
                 await asyncio.sleep(0)
                 continue
-            if reader is None or reader.loop is not asyncio.get_running_loop():
-                if reader is not None:
-                    reader.stop()
-                reader = self._reader = LoopReader(self._watched, lambda: self._generation, self._on_wake)
+            if (
+                reader is None
+            ):  # not before: other tasks of the loop, which share it, may have made it meanwhile
+                reader = self._reader_of_loop()
             await reader.wait(min(left_s, WAIT_MAX_S))
             inlet.left, inlet.until_ns = PAUSE_COUNT - 1, monotonic_ns() + PAUSE_NS
+
+    def _reader_of_loop(self) -> LoopReader:
+        reader = self._reader
+        if reader is None or reader.loop is not asyncio.get_running_loop():
+            if reader is not None:
+                reader.stop()
+            reader = self._reader = LoopReader(self._watched, lambda: self._generation, self._on_wake)
+        return reader
 
     def _may_go_on(self) -> bool:
         """Whether an asyncio task may take one more message before other tasks get a turn."""

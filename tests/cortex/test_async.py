@@ -13,6 +13,7 @@ from processes import SOON_S, wait_for
 
 from cortex import keep_last, latest, reliable
 from cortex.inlet import PAUSE_COUNT
+from cortex.loop_reader import LoopReader
 
 STREAM = 12 * PAUSE_COUNT
 
@@ -116,6 +117,44 @@ def test_two_tasks_on_one_subscriber(numbers):
         return sorted(message.value for message in await asyncio.gather(*tasks))
 
     assert asyncio.run(asyncio.wait_for(run(), SOON_S)) == [0, 1, 2]
+
+
+def test_the_tasks_of_a_loop_are_woken_by_one_reader(numbers, monkeypatch):
+    """A loop calls one function for a descriptor: of two readers, one would sleep until its time is over."""
+    publisher, subscriber = numbers
+    made = []
+
+    class Counted(LoopReader):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            made.append(self)
+
+    monkeypatch.setattr("cortex.subscriber.LoopReader", Counted)
+
+    async def run():
+        tasks = [asyncio.ensure_future(subscriber.recv_async()) for _ in range(3)]
+        while sum(len(reader._waiters) for reader in made) < 3:
+            await asyncio.sleep(0)
+        for value in range(3):
+            publisher.publish(Number(0, value))
+        await asyncio.gather(*tasks)
+
+    asyncio.run(asyncio.wait_for(run(), SOON_S))
+    assert len(made) == 1
+
+
+def test_who_waits_on_after_the_reader_was_stopped_has_a_timer():
+    """Another loop may have stopped it, while a task of this one goes on to wait."""
+
+    async def run():
+        reader = LoopReader(lambda: (0, []), lambda: 0, lambda _: None)
+        waiting = asyncio.ensure_future(reader.wait(0.2))
+        await asyncio.sleep(0)
+        reader.stop()
+        await waiting
+        await asyncio.wait_for(reader.wait(0.2), SOON_S)
+
+    asyncio.run(run())
 
 
 def test_each_task_has_its_own_timeout(numbers):

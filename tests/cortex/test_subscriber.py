@@ -91,6 +91,21 @@ def test_after_a_look_in_vain_the_next_ones_are_left_out(numbers, monkeypatch):
     assert subscriber.recv(SOON_S).value == 1
 
 
+def test_what_was_read_along_with_the_last_message_is_not_waited_for(numbers, monkeypatch):
+    """It lies in the reader of the pipe: no descriptor shows it."""
+    publisher, subscriber = numbers
+    wait_for(lambda: not subscriber.look_out(1e-9))  # nothing is left of the beginning
+    subscriber._looks_left_out = 0
+    looks = []
+    monkeypatch.setattr("cortex.subscriber.os.sched_yield", lambda: looks.append(1))
+    for value in (1, 2):
+        publisher.publish(Number(0, value))
+    assert subscriber.recv(SOON_S).value == 1
+    assert subscriber.look_out(SOON_S)
+    assert looks == []
+    assert subscriber.recv(0.0).value == 2
+
+
 def test_a_publisher_that_comes_while_an_answer_is_looked_for(node):
     subscriber = node.subscriber("/numbers", Number)
     publishers = []
