@@ -413,7 +413,7 @@ class Publisher(Generic[T]):
     def subscriber_count(self) -> int:
         """Subscribers that are attached now."""
         with self._lock:
-            if not self._outlets.closed:
+            if not (self._closed or self._outlets.closed):
                 self._outlets.refresh()
             return len(self._fanout.readers)
 
@@ -429,7 +429,9 @@ class Publisher(Generic[T]):
 
     def disown(self) -> None:
         """Give up without touching the sockets, which belong to the process that this one was forked from."""
-        self._lock = threading.Lock()  # the old one may have been held at the fork
+        self._lock = threading.Lock()  # the old ones may have been held at the fork
+        self._large_lock = threading.Lock()
+        self._batch.records.clear()  # the parent sends them
         self._gate = LongGate(self._publish_slowly)
         self._patience.is_waiting = False  # who was held up at the fork is not here
         self._closing = self._closed = True

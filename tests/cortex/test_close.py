@@ -229,6 +229,36 @@ def test_a_forked_child_hears_that_it_may_not_publish(make_node, start_child):
     assert not waiting.is_alive()
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # the threads of the node
+@pytest.mark.parametrize("use", ["lend", "flush", "count"])
+def test_a_forked_child_leaves_a_publisher_alone(make_node, use):
+    """Also where a large message is written, or a batch waits, at the moment of the fork."""
+    node = make_node(registry="off")
+    publisher = node.publisher("/blocks", Block, coalesce=True)
+    subscriber = node.subscriber("/blocks", Block)
+    assert publisher.wait_for_subscribers(timeout_s=SOON_S)
+    with publisher._large_lock, publisher._lock:
+        publisher._batch.records.append(b"of the parent")
+        child = os.fork()
+        if child == 0:
+            signal.alarm(int(SOON_S))
+            try:
+                publisher._fanout.send = lambda frame: os._exit(1)
+                if use == "lend":
+                    with pytest.raises(Closed):
+                        publisher.try_loan(n=100_000)
+                elif use == "flush":
+                    publisher.flush()
+                else:
+                    assert publisher.subscriber_count == 1
+                os._exit(0)
+            except BaseException:
+                os._exit(2)
+        publisher._batch.records.clear()
+        assert os.waitpid(child, 0)[1] == 0
+    subscriber.close()
+
+
 @pytest.mark.parametrize(
     ("relayed", "policy", "size"),
     [
