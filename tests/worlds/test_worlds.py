@@ -16,7 +16,7 @@ from neurosim_core.packets import Collision, Events
 from neurosim_core.render import launch
 from neurosim_core.simulation import StartState
 from neurosim_core.vehicle.status import STATUS_TERMS
-from neurosim_core.worlds import make_worlds, world_events
+from neurosim_core.worlds import cameras, make_worlds, world_events
 from neurosim_core.worlds import worlds as worlds_module
 
 
@@ -131,13 +131,25 @@ def test_pixels_and_lenses_of_their_own(noisy, plain):
             assert_same(seen[step][world], packets)
 
 
-def test_walks_that_rays_share(textured):
-    """The instants of a tile share a walk through the tree in each world, which changes nothing."""
-    rig = {"front": RIG["front"], "rgb": RIG["rgb"]}
-    walking = {"lighting": {"mode": "unshadowed"}, "shared_walk": {}}
+@pytest.mark.parametrize("form", ["tiles", "blocks", "blocks that leave too much"])
+def test_walks_that_rays_share(textured, monkeypatch, form):
+    """The instants of a tile share a walk through the tree in each world, which changes nothing.
+
+    Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel.
+    """
+    if form != "tiles":
+        ours = cameras.with_walks
+        monkeypatch.setattr(cameras, "with_walks", lambda *a, **k: ours(*a, **k)._replace(by_tile=False))
+    front = {**RIG["front"], "sampling_rate_hz": 600}  # 6 instants: 4 together, then 2
+    rig = {"front": front, "rgb": RIG["rgb"]}
+    limit = 2 if "too much" in form else 256
+    walking = {"lighting": {"mode": "unshadowed"}, "shared_walk": {"face_count_max": limit}}
     commands = commands_of("rates", 4, 2)
     worlds = make_worlds(settings(textured, sensors=rig, render=walking), count=2)
     seen = record(worlds, commands)
+    (cast,) = worlds._casts
+    left, left_room = int(cast._walk.data.left_count.numpy()[0]), cast._walk.data.left.shape[0]
+    assert (left > 0, left > left_room) == (form != "tiles", "too much" in form)
     for world in range(2):
         for render in (walking, {"lighting": {"mode": "unshadowed"}, "cpu_traversal": "warp"}):
             config = settings(textured, seed=7 + world, sensors=rig, render=render)
