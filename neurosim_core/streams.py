@@ -175,7 +175,8 @@ class LentBlock:
 
     def rows(self) -> NDArray[np.uint8]:
         """Return all of it; as a new array, which lives as long as it or a view of it is held."""
-        return np.frombuffer((ctypes.c_uint8 * self.size).from_address(self.array.ptr), dtype=np.uint8)
+        memory: Any = (ctypes.c_uint8 * self.size).from_address(self.array.ptr)
+        return np.frombuffer(memory, dtype=np.uint8)
 
 
 class LentBlocks:

@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False})
 
 SUB_BITS = 11
 """Bits of a key below the column: polarity and nanoseconds."""
-BLOCK_SIZE = 256
+BLOCK_SIZE = wp.constant(256)
 """Threads of a block on CUDA."""
 TILE_SIZE = wp.constant(256)
 """Pixels that a thread of `screen` takes."""
@@ -40,6 +40,9 @@ LOG_RADIANCE_MAX = 1.0e3
 OPEN = wp.constant(0)
 PUT = wp.constant(1)
 CLOSE = wp.constant(2)
+READ = wp.constant(3)
+_BLOCKS_SHARE = wp.constant(True)
+"""Whether the threads of a block on CUDA share the work of turning crossings into keys."""
 
 _HALF_ULP = wp.constant(wp.float64(2.0**-24))
 """Of a float32 in [1, 2)."""
@@ -114,13 +117,80 @@ def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    constexpr int SIZE = 1024;
+    __shared__ int words[6][SIZE];
+    __shared__ unsigned kept_count;
+    if (step == 1) {
+        const unsigned slot = atomicAdd(&kept_count, 1u);
+        if (slot >= SIZE) return 0;
+        words[0][slot] = frame;
+        words[1][slot] = __float_as_int(last);
+        words[2][slot] = __float_as_int(sample);
+        words[3][slot] = up;
+        words[4][slot] = down;
+        words[5][slot] = 2 * (int)threadIdx.x + polarity;
+        return 1;
+    }
+    if (step == 0) {
+        if (threadIdx.x == 0) kept_count = 0;
+        __syncthreads();
+        return 0;
+    }
+    if (step == 2) {
+        __syncthreads();
+        return kept_count < SIZE ? (int)kept_count : SIZE;
+    }
+    return words[place][index];
+#else
+    return 0;
+#endif
+""")
+def keep_crossing(
+    step: wp.int32,
+    frame: wp.int32,
+    last: wp.float32,
+    sample: wp.float32,
+    up: wp.int32,
+    down: wp.int32,
+    polarity: wp.int32,
+    place: wp.int32,
+    index: wp.int32,
+) -> wp.int32:
+    """Keep crossings (step PUT) for the whole block to turn into keys, on CUDA: few lanes find one together.
+
+    Every thread of a block comes here once before with OPEN. Returns for PUT whether there was room; for
+    CLOSE, to which all threads come, how many are kept; and for READ a word of one, in the order of the
+    parameters, where the last is twice the thread that kept it plus the polarity. On a CPU there is no room.
+    """
+    ...
+
+
+@wp.func
+def _read_crossing(word: wp.int32, index: wp.int32) -> wp.int32:
+    return keep_crossing(READ, 0, wp.float32(0.0), wp.float32(0.0), 0, 0, 0, word, index)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __dmul_rn(a, b);
+#else
+    return a * b;
+#endif
+""")
+def _product(a: wp.float64, b: wp.float64) -> wp.float64:
+    """Return a product, on CUDA not joined with a sum: a level has the same bits wherever it is asked."""
+    ...
+
+
 @wp.func
 def level_at(
     base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
 ) -> wp.float64:
     """Return the level after so many crossings, from the log radiance of the reset."""
-    rise = wp.float64(up) * threshold_on
-    fall = wp.float64(down) * threshold_off
+    rise = _product(wp.float64(up), threshold_on)
+    fall = _product(wp.float64(down), threshold_off)
     step = rise - fall
     if wp.abs(step) <= _ROUNDING * (rise + fall):
         return base
@@ -143,6 +213,32 @@ def _bound(level: wp.float64, base: wp.float64, half_ulp: wp.float64, direction:
 
 
 @wp.func
+def _lower(
+    base: wp.float64,
+    up: wp.int32,
+    down: wp.int32,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+) -> wp.float32:
+    """Return the largest sample that reaches the level below."""
+    level = level_at(base, up, down + 1, threshold_on, threshold_off)
+    return _bound(level, base, _half_ulp(wp.float32(base)), wp.float64(-1.0))
+
+
+@wp.func
+def _upper(
+    base: wp.float64,
+    up: wp.int32,
+    down: wp.int32,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+) -> wp.float32:
+    """Return the least sample that reaches the level above."""
+    level = level_at(base, up + 1, down, threshold_on, threshold_off)
+    return _bound(level, base, _half_ulp(wp.float32(base)), wp.float64(1.0))
+
+
+@wp.func
 def quiet_range(
     base: wp.float64,
     up: wp.int32,
@@ -151,11 +247,9 @@ def quiet_range(
     threshold_off: wp.float64,
 ) -> wp.vec2:
     """Return the samples that reach the level below and the level above; between them a pixel is quiet."""
-    half_ulp = _half_ulp(wp.float32(base))
-    lower = level_at(base, up, down + 1, threshold_on, threshold_off)
-    upper = level_at(base, up + 1, down, threshold_on, threshold_off)
     return wp.vec2(
-        _bound(lower, base, half_ulp, wp.float64(-1.0)), _bound(upper, base, half_ulp, wp.float64(1.0))
+        _lower(base, up, down, threshold_on, threshold_off),
+        _upper(base, up, down, threshold_on, threshold_off),
     )
 
 
@@ -298,8 +392,15 @@ def call_up(log_radiance: wp.array2d[wp.float32], pixel: wp.int32, frame_count: 
 
 
 @wp.func
+def _place(pixel: wp.int32, row: wp.int32, width: wp.int32, row_shift: wp.int32) -> wp.int64:
+    """Return the bits of a key that say which pixel it is."""
+    return (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+
+
+@wp.func
 def walk(
     tabulate: wp.bool,
+    kept: wp.bool,
     pixel: wp.int32,
     row: wp.int32,
     place: wp.int64,
@@ -319,18 +420,19 @@ def walk(
 ) -> Pixel:
     """Take one pixel over a stack of frames, and write its events, or enter their number in the table.
 
-    The first `lead` frames are known to be quiet.
+    The first `lead` frames are known to be quiet. With `kept`, events are left to the block.
     """
     base = wp.float64(base_32)
     up = state.up
     down = state.down
-    quiet = quiet_range(base, up, down, threshold_on, threshold_off)
+    low = _lower(base, up, down, threshold_on, threshold_off)
+    high = _upper(base, up, down, threshold_on, threshold_off)
     last = state.last
     invalid_count = wp.int32(0)
     invalid_first = wp.int32(0)
     after = wp.int32(0)  # the first frame that comes after those that `last` knows of
 
-    frame = _next_loud(log_radiance, pixel, lead, frame_count, quiet[0], quiet[1])
+    frame = _next_loud(log_radiance, pixel, lead, frame_count, low, high)
     while frame < frame_count:
         if frame > after:
             last = log_radiance[frame - 1, pixel]
@@ -338,26 +440,28 @@ def walk(
         if wp.abs(sample) <= LIMIT:
             up_before = up
             down_before = down
-            while sample >= quiet[1]:
+            while sample >= high:
                 up += 1
-                quiet = quiet_range(base, up, down, threshold_on, threshold_off)
-            while sample <= quiet[0]:
+                high = _upper(base, up, down, threshold_on, threshold_off)
+            if up > up_before:
+                low = _lower(base, up, down, threshold_on, threshold_off)
+            while sample <= low:
                 down += 1
-                quiet = quiet_range(base, up, down, threshold_on, threshold_off)
+                low = _lower(base, up, down, threshold_on, threshold_off)
+            if down > down_before:
+                high = _upper(base, up, down, threshold_on, threshold_off)
             found = up - up_before + down - down_before
             if tabulate:
                 wp.atomic_add(table, frame, row, found)
             elif row < row_limit[frame]:
                 polarity = wp.where(up > up_before, 1, 0)
                 for event in range(found):
-                    step = event + 1
-                    level = level_at(
-                        base,
-                        up_before + step * polarity,
-                        down_before + step * (1 - polarity),
-                        threshold_on,
-                        threshold_off,
-                    )
+                    up_then = up_before + (event + 1) * polarity
+                    down_then = down_before + (event + 1) * (1 - polarity)
+                    if kept:  # noqa: SIM102, one of them is for the compiler
+                        if keep_crossing(PUT, frame, last, sample, up_then, down_then, polarity, 0, 0) == 1:
+                            continue
+                    level = level_at(base, up_then, down_then, threshold_on, threshold_off)
                     key = _key(
                         level,
                         wp.float64(last),
@@ -375,7 +479,7 @@ def walk(
                 invalid_first = frame
             invalid_count += 1
         after = frame + 1
-        frame = _next_loud(log_radiance, pixel, after, frame_count, quiet[0], quiet[1])
+        frame = _next_loud(log_radiance, pixel, after, frame_count, low, high)
     if after < frame_count:
         last = log_radiance[frame_count - 1, pixel]
 
@@ -411,6 +515,56 @@ def scan_pixel(
     table_out: wp.array2d[wp.int32],
 ) -> None:
     """Take one pixel from its state before a stack to that after it; parameters as for `scan`."""
+    scan_pixel_keeping(
+        False,
+        threshold_on,
+        threshold_off,
+        width,
+        row_shift,
+        time_shift,
+        pixel,
+        log_radiance,
+        stamps,
+        frame_count,
+        lead,
+        row_limit,
+        base,
+        last,
+        crossed,
+        tabulate,
+        last_out,
+        crossed_out,
+        keys_out,
+        counters_out,
+        table_out,
+    )
+
+
+@wp.func
+def scan_pixel_keeping(
+    kept: wp.bool,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    width: wp.int32,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    pixel: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    stamps: wp.array[wp.int64],
+    frame_count: wp.int32,
+    lead: wp.array[wp.int32],
+    row_limit: wp.array[wp.int32],
+    base: wp.array[wp.float32],
+    last: wp.array[wp.float32],
+    crossed: wp.array[wp.vec2i],
+    tabulate: wp.bool,
+    last_out: wp.array[wp.float32],
+    crossed_out: wp.array[wp.vec2i],
+    keys_out: wp.array[wp.int64],
+    counters_out: wp.array[wp.int64],
+    table_out: wp.array2d[wp.int32],
+) -> None:
+    """Do what `scan_pixel` does; with `kept`, events are left to the block where it has room for them."""
     state = Pixel()
     before = crossed[pixel]
     state.up = before[0]
@@ -420,9 +574,10 @@ def scan_pixel(
     else:
         state.last = last[pixel]
         row = pixel // width
-        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+        place = _place(pixel, row, width, row_shift)
         state = walk(
             tabulate,
+            kept,
             pixel,
             row,
             place,
@@ -577,10 +732,13 @@ def scan(
             first of these in the stack, as frame_count * pixel_count minus it.
         table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
     """
-    pixel = first_pixel + wp.tid()
+    thread = wp.tid()
+    pixel = first_pixel + thread
     write_key(OPEN, wp.int64(0), keys_out, counters_out)
+    keep_crossing(OPEN, 0, wp.float32(0.0), wp.float32(0.0), 0, 0, 0, 0, 0)
     if pixel < end_pixel:
-        scan_pixel(
+        scan_pixel_keeping(
+            _BLOCKS_SHARE,
             threshold_on,
             threshold_off,
             width,
@@ -602,6 +760,31 @@ def scan(
             counters_out,
             table_out,
         )
+    lane = thread % BLOCK_SIZE
+    kept_count = keep_crossing(CLOSE, 0, wp.float32(0.0), wp.float32(0.0), 0, 0, 0, 0, 0)
+    for index in range(lane, kept_count, BLOCK_SIZE):
+        frame = _read_crossing(0, index)
+        who = _read_crossing(5, index)
+        polarity = who & 1
+        kept_pixel = pixel - lane + (who >> 1)
+        level = level_at(
+            wp.float64(base[kept_pixel]),
+            _read_crossing(3, index),
+            _read_crossing(4, index),
+            threshold_on,
+            threshold_off,
+        )
+        key = _key(
+            level,
+            wp.float64(wp.cast(_read_crossing(1, index), wp.float32)),
+            wp.float64(wp.cast(_read_crossing(2, index), wp.float32)),
+            stamps[frame],
+            stamps[frame + 1],
+            _place(kept_pixel, kept_pixel // width, width, row_shift),
+            time_shift,
+            polarity,
+        )
+        write_key(PUT, key, keys_out, counters_out)
     write_key(CLOSE, wp.int64(0), keys_out, counters_out)
 
 

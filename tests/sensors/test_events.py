@@ -719,3 +719,20 @@ def test_wrong_configuration_is_refused(config):
 def test_wrong_size_is_refused(size):
     with pytest.raises(ValueError, match=r"must be in \[1, 65536\]"):
         EventCamera(EventCameraConfig(), width=size[0], height=size[1])
+
+
+def test_more_events_than_a_block_shares_come_out_the_same(device):
+    """Neighbours fire dozens of times a frame, which threads share on CUDA as far as there is room."""
+    rng = np.random.default_rng(12)
+    frames = rng.normal(scale=3.0, size=(9, 24, 40)).astype(np.float32)
+    stamps = 1000 * np.arange(1, 9)
+    together = EventCamera(EventCameraConfig(), width=40, height=24, device=device)
+    alone = EventCamera(EventCameraConfig(), width=40, height=24, device="cpu")
+    together.reset(frames[0])
+    alone.reset(frames[0])
+    found = together.feed(frames[1:], stamps).numpy()
+    pieces = [alone.feed(frames[k : k + 1], stamps[k - 1 : k]).numpy() for k in range(1, 9)]
+    assert len(found.t) > 8 * 1024 * (24 * 40 // 256)
+    for name in ("t", "x", "y", "polarity"):
+        expected = np.concatenate([getattr(piece, name) for piece in pieces])
+        np.testing.assert_array_equal(getattr(found, name), expected)
