@@ -33,9 +33,9 @@ def give_way() -> None:
 
 
 def be_punctual() -> None:
-    """Let sleeps and timed waits of the calling thread end when they are to, on Linux; for good.
+    """Let sleeps and timed waits of the calling thread, and of those that it starts, end when they are to.
 
-    Others are woken up to 50 us later, so that a core can sleep on.
+    For good, and only on Linux. Others are woken up to 50 us later, so that a core can sleep on.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_TIMER_SLACK, ctypes.c_ulong(_SLACK_NS), 0, 0, 0)

@@ -117,7 +117,7 @@ class _StagedCamera:
 def measure_split(model: Model, *, batch_count: int, begin_s: float) -> Split:
     """Fly with one batch under way at a time, and return what each part of a step takes.
 
-    The parts do not overlap: a run with two batches under way is faster than their sum.
+    The parts do not overlap: a run with several batches under way is faster than their sum.
 
     Args:
         model: With one event camera that is not adaptive, and nothing else.
