@@ -55,10 +55,9 @@ class RerunViewer:
             ViewerEnded: It ended at once, or does not listen in time.
         """
         import_rerun()
-        data_port = _free_port()
+        page_port, data_port = _free_ports(port if web else 0, 0)
         options = ["--bind", HOST, "--port", str(data_port), "--server-memory-limit", _SERVER_MEMORY]
         if web:
-            page_port = _free_port(port)
             options += ["--serve-web", "--web-viewer-port", str(page_port)]
         else:
             options += ["--memory-limit", _WINDOW_MEMORY, "--hide-welcome-screen", "--expect-data-soon"]
@@ -161,14 +160,19 @@ def _executable() -> str:
     return str(bundled if bundled.exists() else folder / "rerun")
 
 
-def _free_port(wanted: int = 0) -> int:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, wanted))
-        except OSError as error:
-            raise OSError(f"port {wanted} cannot be used: {error.strerror}") from None
-        return int(probe.getsockname()[1])
+def _free_ports(*wanted: int) -> list[int]:
+    """Return ports that are free and differ, in place of 0 any."""
+    ports = []
+    with contextlib.ExitStack() as held:
+        for port in wanted:
+            probe = held.enter_context(socket.socket())
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, port))
+            except OSError as error:
+                raise OSError(f"port {port} cannot be used: {error.strerror}") from None
+            ports.append(int(probe.getsockname()[1]))
+    return ports
 
 
 def _end_with_parent() -> Callable[[], None] | None:

@@ -15,7 +15,7 @@ import zmq
 from hypothesis import given
 from random_schemas import any_message, flat_schemas
 
-from cortex import gate, native, packer, publisher
+from cortex import gate, native, packer
 from cortex.codec import codec_of
 from cortex.message import Array, Float32, Int8, UInt64, message
 from cortex.schema import schema_of
@@ -299,23 +299,23 @@ def test_a_gate_adds_to_a_batch_that_has_begun():
     taken, coder = Taken(), coder_of(Sample, HEAD)
     first = coder.record(sample(0), 1, 1000)
     taken.gate.records, taken.gate.batch_start_ns = [first], time.monotonic_ns() + 10**12
-    for k in range(1, publisher.BATCH_COUNT - 1):
+    for k in range(1, gate.BATCH_COUNT - 1):
         assert taken.gate(sample(k)) is True
     records = taken.gate.records
-    assert [len(record) for record in records] == [len(first)] * (publisher.BATCH_COUNT - 1)
-    assert taken.gate.batch_bytes == len(first) * (publisher.BATCH_COUNT - 2)
+    assert [len(record) for record in records] == [len(first)] * (gate.BATCH_COUNT - 1)
+    assert taken.gate.batch_bytes == len(first) * (gate.BATCH_COUNT - 2)
     frame = bytes(64) + b"".join(records)
     assert coder.records(frame, len(records)) == [sample(k) for k in range(len(records))]
     assert taken.flushed == 0
     assert taken.gate(sample(63)) is True
     assert (taken.flushed, taken.sent, taken.slow) == (1, [], [])
     taken.gate.records.append(first)
-    taken.gate.batch_start_ns = time.monotonic_ns() - publisher.BATCH_NS
+    taken.gate.batch_start_ns = time.monotonic_ns() - gate.BATCH_NS
     taken.gate(sample())
     assert taken.flushed == 2
     taken.gate.records.append(first)
     taken.gate.batch_start_ns = time.monotonic_ns() + 10**12
-    taken.gate.batch_bytes = publisher.BATCH_BYTES - 50
+    taken.gate.batch_bytes = gate.BATCH_BYTES - 50
     taken.gate(sample())
     assert taken.flushed == 3
 

@@ -369,6 +369,7 @@ def test_no_room_for_a_picture_that_is_due(make_stand: Callable[..., Stand]):
     stand.outlet.lateness_ns = lambda stamp_ns: 5 * MS - stamp_ns
     assert stand.outlet.make_room("rgb", 5 * MS, like) is None
     assert stand.outlet.make_room("rgb", 6 * MS, like) is not None
+    stand.outlet.drop_loans()
 
 
 def test_room_is_given_back_at_a_reset_and_before_topics_close(make_stand: Callable[..., Stand]):

@@ -15,7 +15,7 @@ import pytest
 import rerun as rr
 from processes import SOON_S, wait_for
 
-from neurosim_core.view import RerunViewer, ViewerEnded
+from neurosim_core.view import RerunViewer, ViewerEnded, rerun_viewer
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
@@ -48,6 +48,12 @@ def test_it_listens_on_this_machine_only():
         recording.disconnect()
         assert not viewer.ended
     assert viewer.ended
+
+
+def test_ports_differ():
+    """A port that was free a moment ago is often the next one that is handed out."""
+    for _ in range(50):
+        assert len(set(rerun_viewer._free_ports(0, 0, 0))) == 3
 
 
 def test_a_port_is_kept_to():
