@@ -18,7 +18,7 @@ DTYPES = {3: np.uint8, 2: np.float32}
 
 @pytest.fixture
 def pair(request):
-    """A publisher of images, and a subscriber that gets all of them, unless a test asks for another policy."""
+    """A publisher of images, and a subscriber that gets all of them, or as the policy of a test says."""
     policy = getattr(request, "param", reliable())
     with Node("camera") as node, Node("viewer") as viewer:
         publisher = node.publisher("/picture", Image)
