@@ -293,6 +293,8 @@ class Subscriber(Generic[T]):
                     raise TimeoutError(self._nothing_came(timeout_s))
             if item is None:  # else what came could not be read: look for the next
                 self._wait(min(left_s, WAIT_MAX_S))
+                if deadline_s is not None:
+                    left_s = deadline_s - time.monotonic()
 
     def _take(self, *, whole: bool = False, block: bool = False) -> Item | None:
         """The next item, or None if nothing is there.

@@ -9,6 +9,7 @@ import itertools
 import queue
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,12 +17,12 @@ import zmq
 from peer import Block, Number, OtherNumber, Scan, is_whole, make_block
 from processes import SOON_S, in_time, wait_for
 
-from cortex import keep_last, reliable
+from cortex import keep_last, latest, reliable
 from cortex.codec import codec_of
 from cortex.publisher import Closed
 from cortex.raw import RawMessage
 from cortex.schema import TypeMismatch, schema_of
-from cortex.subscriber import LOOK_EVERY
+from cortex.subscriber import BLOCK_S, LOOK_EVERY
 
 LARGE = 100_000
 
@@ -58,6 +59,24 @@ def test_nothing_comes_in_time(numbers):
     in_time(receive, 1.0)
     with pytest.raises(TimeoutError):
         subscriber.recv(0.0)
+
+
+@pytest.mark.parametrize("timeout_s", [0.03, 0.05, 0.09, 0.25])
+def test_what_is_left_of_a_timeout_is_not_waited_for_twice(node, monkeypatch, timeout_s):
+    """Asleep for all of it, nothing blocks in the socket after that; the clock stands but for these."""
+    subscriber = node.subscriber("/numbers", Number, policy=latest())
+    now_s = 0.0
+
+    def wait(duration_s):
+        nonlocal now_s
+        now_s += duration_s
+
+    monkeypatch.setattr("cortex.subscriber.time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr(subscriber, "_wait", wait)
+    monkeypatch.setattr(subscriber, "_take", lambda *, whole, block: wait(BLOCK_S) if block else None)
+    with pytest.raises(TimeoutError):
+        subscriber.recv(timeout_s)
+    assert now_s == pytest.approx(timeout_s)
 
 
 def test_an_answer_is_looked_for_without_sleeping(numbers, monkeypatch):
