@@ -399,10 +399,12 @@ class EventCamera:
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
         with on(self._reader):
+            self._taken.hold()
             self._leave_drafts()
             while self._under_way:
                 self._take_over()
             packets = self._cut([self._require_reset()])
+            self._drafted_ns = self._window_start_ns
             self._taken.set()
             return packets[0]
 
@@ -429,7 +431,11 @@ class EventCamera:
             scan_count = len(self._under_way)
         if scan_count == 1 and self._is_foreseen(self._under_way[0], ends):
             return self._hand_out_draft()
+        if scan_count == 1 and not ends and self._is_alone():
+            self._take_over()
+            return []
         with on(self._reader):
+            self._taken.hold()
             self._leave_drafts()
             for _ in range(scan_count):
                 self._take_over()
@@ -443,6 +449,11 @@ class EventCamera:
             self._taken.set()
             self._take_up_drafts()
             return packets
+
+    def _is_alone(self) -> bool:
+        """Return whether one scan is under way, and taking it over on this stream holds up no other."""
+        stream = self.device.stream if self.device.is_cuda else None
+        return len(self._under_way) == 1 and self._draft is None and stream is self._feeder
 
     def _can_cut_ahead(self, scan: _Scan) -> bool:
         """Return whether the windows of the next scan can be cut: those of all under way before it were."""
@@ -724,16 +735,16 @@ class EventCamera:
     def _read_counts(self, scan: _Scan) -> list[int]:
         """Wait for a scan and return the number of events of each chunk."""
         scan.done.wait()
-        counters = np.stack([chunk.counters_on_host.rows(0, 3) for chunk in scan.chunks])
-        if invalid_count := int(counters[:, 1].sum()):
-            first = len(scan.stamps_ns) * self.width * self.height - int(counters[:, 2].max())
+        counters = [chunk.counters_on_host.view(0, 3).tolist() for chunk in scan.chunks]
+        if invalid_count := sum(invalid for _, invalid, _ in counters):
+            first = len(scan.stamps_ns) * self.width * self.height - max(place for *_, place in counters)
             frame, pixel = divmod(first, self.width * self.height)
             row, col = divmod(pixel, self.width)
             self._now_ns = None
             self._idle += self._under_way
             self._under_way.clear()
             raise ValueError(_invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
-        return [int(count) for count in counters[:, 0]]
+        return [count for count, _, _ in counters]
 
     def _limit_rows(self, scan: _Scan) -> bool:
         """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""

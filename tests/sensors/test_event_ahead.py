@@ -340,3 +340,32 @@ def test_a_flight_of_changing_views_needs_no_memory_and_few_second_looks(monkeyp
     assert ordered[-count // 10] > 10 * ordered[count // 10]
     assert made == []
     assert camera.ahead_count - ahead_count >= count - 3
+
+
+@pytest.mark.parametrize("eagerness", [0.0, 0.5])
+@pytest.mark.parametrize("cut_ahead", [False, True])
+def test_frames_that_are_counted_one_by_one_on_a_late_device_give_the_same(monkeypatch, eagerness, cut_ahead):
+    """The host reads each count and takes windows now and then."""
+    rng = np.random.default_rng(21)
+    first, stacks = draw_stacks(rng, [1] * 40, rng.choice([0.0, 0.3, 3.0], size=40).tolist())
+    packets: list[list[Events]] = []
+    for late in (False, True):
+        with monkeypatch.context() as patch:
+            if late:
+                install(patch, LateDevice(rng, eagerness))
+            camera = make_camera("cpu", cut_ahead=late and cut_ahead)
+            camera.reset(first)
+            found = []
+            for number, stack in enumerate(stacks, 1):
+                rows = np.array(stack)
+                frames = wp.array(rows, dtype=wp.float32, device="cpu", copy=False)
+                camera.feed_device(frames, [FRAME_NS * number])
+                found += camera.collect_windows([], scan_count=1)
+                rows.fill(0.0)
+                if number % 7 == 0:
+                    found.append(camera.collect())
+                elif number % 5 == 0:
+                    found += camera.collect_windows([FRAME_NS * number], scan_count=0)
+            packets.append([*found, camera.collect()])
+    assert len(packets[0]) > 10
+    assert_same(*packets)
