@@ -280,20 +280,22 @@ def test_a_device_that_is_late_gives_the_same(monkeypatch, tight_guesses, eagern
 
 def test_frames_are_the_callers_again_when_they_have_been_read(monkeypatch):
     """Also where a scan had to be done again for want of room, and no window ended."""
-    first, (stack,) = draw_stacks(np.random.default_rng(2), [4], [3.0])
-    stamps = FRAME_NS * np.arange(1, 5)
     packets = []
     for late in (False, True):
         with monkeypatch.context() as patch:
             if late:
                 install(patch, LateDevice(np.random.default_rng(2), 0.0))
-            camera = make_camera("cpu", cut_ahead=late)
-            camera.reset(first)
-            rows = np.array(stack)
-            camera.feed_device(wp.array(rows, dtype=wp.float32, device="cpu", copy=False), stamps)
-            camera.collect_windows([], scan_count=1)
-            rows.fill(0.0)
+            camera = make_camera("cpu", cut_ahead=False, threshold_on=0.25)
+            camera.reset(np.zeros((HEIGHT, WIDTH), np.float32))
+            # three events a pixel fit; the five after them do not, where all of them do
+            for number, levels in enumerate((3.1, 8.1), 1):
+                rows = np.full((1, HEIGHT, WIDTH), 0.25 * levels, np.float32)
+                frames = wp.array(rows, dtype=wp.float32, device="cpu", copy=False)
+                camera.feed_device(frames, [FRAME_NS * number])
+                camera.collect_windows([], scan_count=1)
+                rows.fill(0.0)
             packets.append(camera.collect())
+    assert len(packets[0].t) == 8 * HEIGHT * WIDTH
     assert_same(*([packet] for packet in packets))
 
 
