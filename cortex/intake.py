@@ -65,13 +65,16 @@ class Intake:
             if self.queue:
                 return
 
-    def drain(self) -> None:
+    def drain(self) -> list[Link]:
         """Read what has arrived into the queue.
 
         Where only the last messages count, that ends with the first message that was published meanwhile: a
         publisher that is faster than we are would keep us here.
+
+        Returns:
+            The links that were not found empty.
         """
-        exhausted = True
+        unread: list[Link] = []
         begin_ns = monotonic_ns()
         links, queue, reliable = self._rotated(), self.queue, self._policy.reliable
         for index, link in enumerate(links):
@@ -83,16 +86,18 @@ class Intake:
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
-                    exhausted &= link.receive is receive  # else what came has told it to read elsewhere
+                    if link.receive is not receive:  # what came has told it to read elsewhere
+                        unread.append(link)
                     break
                 self.accept(link, frame, timed=count & 7 == 0)
                 if not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns:
-                    exhausted = False
+                    unread.append(link)
                     break
             else:
-                exhausted = False
-        self.inlet.exhausted = exhausted
+                unread.append(link)
+        self.inlet.exhausted = not unread
         self.drained_ns = monotonic_ns()
+        return unread
 
     def drain_decoded(self, messages: deque[Any], *, may_wait: bool) -> None:
         """As `drain`, for an empty queue that cannot overflow: messages are decoded on the spot.

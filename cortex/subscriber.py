@@ -134,7 +134,7 @@ class Subscriber(Generic[T]):
             return False
         with self._turn:
             if not (self._closed or self._queue or self._inlet.exhausted):
-                self._intake.receive_one()  # a descriptor does not show what was read along with the last one
+                self._intake.receive_one()  # descriptors show what comes after a look in vain
             if self._closed or self._queue:
                 return True
             poll = self._poll or self._new_poll()
@@ -599,11 +599,11 @@ class Subscriber(Generic[T]):
         for link, deadline_ns in list(self._leaving.items()):
             if now_ns >= deadline_ns:
                 if self.policy.reliable:  # what is on its way stays there until there is room for it
-                    self._intake.drain()
+                    unread = self._intake.drain()
                     if self._queue:
                         self.wakeup.set()
-                    if not self._inlet.exhausted:
-                        return
+                    if link in unread:
+                        continue
                 link.end()
                 link.close()
                 self._links.remove(link)

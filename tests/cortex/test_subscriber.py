@@ -110,8 +110,8 @@ def test_after_a_look_in_vain_the_next_ones_are_left_out(numbers, monkeypatch):
     assert subscriber.recv(SOON_S).value == 1
 
 
-def test_what_was_read_along_with_the_last_message_is_not_waited_for(numbers, monkeypatch):
-    """It lies in the reader of the pipe: no descriptor shows it."""
+def test_what_came_along_with_the_last_message_is_not_waited_for(numbers, monkeypatch):
+    """It lies in the socket, or in the reader of the pipe: no descriptor shows it."""
     publisher, subscriber = numbers
     wait_for(lambda: not subscriber.look_out(1e-9))  # nothing is left of the beginning
     subscriber._looks_left_out = 0
@@ -576,6 +576,29 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
         return not subscriber.fds()
 
     wait_for(closed)
+
+
+def test_a_publisher_that_left_is_let_go_while_another_waits_for_room(node, monkeypatch):
+    """All that came of it was read; that more of the other is on its way is nothing to it."""
+    monkeypatch.setattr("cortex.subscriber.LEAVING_NS", 0)
+    subscriber = node.subscriber("/numbers", Number, policy=reliable(4, 60.0))
+    busy = node.publisher("/numbers", Number)
+    assert busy.wait_for_subscribers(timeout_s=SOON_S)
+    for value in range(500):
+        busy.publish(Number(0, value))
+    with node.publisher("/numbers", Number) as brief:
+        assert brief.wait_for_subscribers(timeout_s=SOON_S)
+        brief.publish(Number(0, -1))
+    wait_for(lambda: subscriber._leaving or len(subscriber._links) == 1)
+    values = []
+    while len(subscriber._links) > 1:
+        values.append(subscriber.recv(SOON_S).value)
+        subscriber.dismiss(time.monotonic_ns())
+        assert len(values) < 100
+    while len(values) < 501:
+        values.append(subscriber.recv(SOON_S).value)
+    assert sorted(values) == list(range(-1, 500))
+    assert subscriber.counters.lost == 0
 
 
 def test_iteration_goes_on_after_a_mismatch(node):
