@@ -47,6 +47,8 @@ _RECENT = 16
 """Drafts that the guess of the next size looks back at; there is room for twice the largest of them."""
 _FADING = 1024
 """Drafts after which room for the largest of all is worth 1/e of it, if none of its size has come."""
+_ROOMY_BYTES_MAX = 256 << 20
+"""Most memory of the host for twice as many events as have come."""
 _SPARE_BLOCKS = 3
 """Blocks for the host beyond those that drafts under way are copied to: what readers hold."""
 
@@ -419,11 +421,14 @@ class Drafts:
     def _make_room(self, count: int) -> None:
         """Let the buffers hold so many keys, and keep the keys that the next draft carries over.
 
-        With them come blocks for half as many events: twice the largest of the last batches.
+        With them come blocks of the host, for as many events; for about half as many where that is much.
         """
-        wanted_bytes = _EVENT_BYTES * max(self._room // 2, self._copied)
+        block_count = len(self._drafts) + _SPARE_BLOCKS
+        wanted_bytes = _EVENT_BYTES * self._room
+        if block_count * wanted_bytes > _ROOMY_BYTES_MAX:
+            wanted_bytes = _EVENT_BYTES * max(self._room // 2, self._copied)
         if wanted_bytes > self._reserved_bytes:
-            self._blocks.reserve(wanted_bytes, len(self._drafts) + _SPARE_BLOCKS)
+            self._blocks.reserve(wanted_bytes, block_count)
             self._reserved_bytes = size_class(wanted_bytes)
         if count <= self._capacity:
             return
