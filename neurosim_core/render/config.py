@@ -36,10 +36,10 @@ class LightingConfig(Settings):
 class WalkConfig(Settings):
     """How rays of a tile of 8 x 8 pixels share their walks through the tree; changes speed, not results."""
 
-    instants: int = Field(default=16, ge=1, le=256)
+    instants: int = Field(default=32, ge=1, le=256)
     """Consecutive instants of a launch that share a walk. More are cheaper as long as the camera turns by
     less than a few tiles within them."""
-    face_count_max: int = Field(default=256, ge=1, le=4096)
+    face_count_max: int = Field(default=384, ge=1, le=4096)
     """The most triangles that a walk may list: of a tile with more each ray walks by itself."""
 
 
