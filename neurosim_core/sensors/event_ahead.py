@@ -202,6 +202,8 @@ class Draft:
     ends_ns: tuple[int, ...] = ()
     origin_us: int = 0
     """Origin of its keys' time."""
+    dropped: bool = False
+    """Nobody has waited for it."""
     block: LentBlock | None = None
     """The columns of its events on the host, one after the other, each with room for `copied`."""
 
@@ -316,6 +318,9 @@ class Drafts:
         before = self._drafts[self._last]
         self._last = (self._last + 1) % len(self._drafts)
         draft = self._drafts[self._last]
+        if draft.dropped:  # it may still have to read what it was told, for buffers that were smaller
+            draft.done.wait()
+            draft.dropped = False
         draft.room, draft.ends_ns, draft.origin_us = room, ends_ns, origin_us
         draft.copied = self._copied
         told = draft.told.rows
@@ -366,6 +371,7 @@ class Drafts:
 
     def drop(self, draft: Draft) -> None:
         """Forget a draft that is not wanted any more."""
+        draft.dropped = True
         if draft.block is not None:
             self._blocks.give_back(draft.block)
             draft.block = None
