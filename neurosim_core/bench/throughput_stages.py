@@ -45,6 +45,8 @@ _COLUMN_BYTES = 13
 """Of an event that is handed out: 8 for time, 2 and 2 for the pixel, 1 for polarity."""
 _LOUD = 0.35
 """Step of log radiance that makes an event or two in every pixel and frame."""
+_LOUD_FRAMES = 16
+"""Of a stack of such frames: more events than fit into the memory that is lent would be copied."""
 
 
 class StageClock:
@@ -443,12 +445,13 @@ def events_to_host_per_s(views: Views, *, seconds: float) -> float:
     """
     camera = _camera(views, scan_count_max=2)
     base = views.frames.numpy()[0]
-    steps = np.arange(1, views.count + 1, dtype=np.float32)[:, None, None] * np.float32(_LOUD)
+    count_of_frames = min(views.count, _LOUD_FRAMES)
+    steps = np.arange(1, count_of_frames + 1, dtype=np.float32)[:, None, None] * np.float32(_LOUD)
     up = base + steps
     down = up[-1] - steps
     stacks = [wp.array(stack, dtype=float, device=views.device) for stack in (up, down)]
     camera.reset(views.frames[0], 0)
-    stamps: NDArray[np.int64] = np.arange(1, views.count + 1, dtype=np.int64) * _FRAME_US * NS_PER_US
+    stamps: NDArray[np.int64] = np.arange(1, count_of_frames + 1, dtype=np.int64) * _FRAME_US * NS_PER_US
     fed = 0
 
     def feed() -> None:

@@ -43,10 +43,13 @@ _ROOM_MIN = 1024
 _ROOM_MAX = 1 << 26
 _ROOM_PER_PIXEL = 1
 """Keys for which there is room before any have come."""
-_RECENT = 16
-"""Drafts that the guess of the next size looks back at; there is room for twice the largest of them."""
-_FADING = 1024
-"""Drafts after which room for the largest of all is worth 1/e of it, if none of its size has come."""
+_RECENT = 4
+"""Drafts that the guess of the next size looks back at; there is room for twice the largest of them.
+
+Keys that fill the room are sorted like others. On a tour of a house, 32 ms a draft, there is room for 2.8
+times as many keys as come, and one in 140 is guessed wrong; looking back at 16, and never forgetting the
+most, there was room for 9.3 times as many.
+"""
 _ROOMY_BYTES_MAX = 256 << 20
 """Most memory of the host for twice as many events as have come."""
 _SPARE_BLOCKS = 3
@@ -253,7 +256,6 @@ class Drafts:
         self._reserved_bytes = 0
         self.grown = Milestone(device)
         self._recent: deque[int] = deque(maxlen=_RECENT)
-        self._most = 0
         self._room = size_class(max(_ROOM_MIN, _ROOM_PER_PIXEL * pixel_count))
         self._copied = self._room
         wp.load_module(__name__, device=device)
@@ -269,10 +271,9 @@ class Drafts:
         The room changes seldom, as each size has its graphs.
         """
         self._recent.append(key_count)
-        self._most = max(key_count, self._most - self._most // _FADING)
         recent = max(self._recent)
-        room = min(size_class(max(_ROOM_MIN, 2 * recent, self._most)), _ROOM_MAX)
-        if room > self._room or 4 * room <= self._room:
+        room = min(size_class(max(_ROOM_MIN, 2 * recent)), _ROOM_MAX)
+        if room > self._room or 2 * room <= self._room:
             self._room = room
         rise = 2 * key_count - self._recent[-min(4, len(self._recent))]  # or they go on to rise
         step = max(16, 1 << max(0, recent.bit_length() - 5))

@@ -341,7 +341,7 @@ def test_a_flight_of_changing_views_needs_no_memory_and_few_second_looks(monkeyp
     ordered = sorted(found[warm:])
     assert ordered[-count // 10] > 10 * ordered[count // 10]
     assert made == []
-    assert camera.ahead_count - ahead_count >= count - 3
+    assert camera.ahead_count - ahead_count >= 0.85 * count  # one of several jumps at a time is a second look
 
 
 @pytest.mark.parametrize("eagerness", [0.0, 0.5])
