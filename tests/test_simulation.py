@@ -515,7 +515,7 @@ def test_a_setpoint_is_what_its_controller_makes_of_the_state(outside_model, mod
     """Independent: the controller's host form computes rotor speeds, which are commanded as such."""
     model = outside_model
     direct, by_hand = simulation.make_state(model), simulation.make_state(model)
-    controller = make_controller(mode, model.airframe, model.config.control.gains, device="cpu")
+    controller = make_controller(mode, model.airframe, model.config.control.gains, device=model.device)
     for _ in range(6):
         a = simulation.step(model, direct, setpoint, mode=mode)
         now = simulation.observe(by_hand)

@@ -234,13 +234,17 @@ class WorldCast:
 
     def _make_walk(self, arrays: SceneArrays, rays: NDArray[np.float32], config: WalkConfig) -> TileWalk:
         """Return walks that the instants of a tile share in each world."""
+        changes = {"instants": self._stride}
+        if arrays.config.shared_walk == "auto":  # lists are counted in 32 bits
+            tiles = -(-self._size[0] // TILE) * -(-self._size[1] // TILE)
+            changes["face_count_max"] = min(config.face_count_max, _INDEX_MAX // (self._count * tiles))
         return TileWalk(
             arrays.mesh,
             rays,
             width=self._size[0],
             height=self._size[1],
             extent_m=float(np.abs(arrays.scene.bounds_m).max()),
-            config=config.model_copy(update={"instants": self._stride}),
+            config=config.model_copy(update=changes),
             instant_count=self._count * self._stride,
             leaves=self._asking is not None,
         )

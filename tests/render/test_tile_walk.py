@@ -428,8 +428,9 @@ def test_the_default_is_for_small_pixels_whatever_their_samples(pixel_rad, share
 def test_walks_are_the_default_on_cuda_alone(device):
     arrays = upload_scene(scene_of(plane(1.0)), UNSHADOWED, device)
     is_cuda = wp.get_device(device).is_cuda
-    for count, shared in ((3, False), (4, is_cuda)):
-        renderer = WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=count)
+    narrow = PinholeConfig(width=45, height=34, fx=400.0, fy=380.0, cx=21.0, cy=18.5)
+    for lens, count, shared in ((narrow, 3, False), (narrow, 4, is_cuda), (LENS, 4, False)):
+        renderer = WarpRenderer(arrays, lens, outputs=("depth",), instant_count=count)
         assert (renderer.walk is not None) is shared
     assert (arrays.data.face_normal is not None) is is_cuda
     shared = upload_scene(scene_of(plane(1.0)), together(instants=2, face_count_max=8), device)
