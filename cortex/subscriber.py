@@ -103,6 +103,8 @@ class Subscriber(Generic[T]):
     def recv(self, timeout_s: float | None = None) -> T:
         """Take the next message.
 
+        A signal handler that interrupts it may set a flag or raise, but not use the subscriber.
+
         Args:
             timeout_s: Longest wait [s]; None waits for ever.
 

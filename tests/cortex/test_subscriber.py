@@ -7,6 +7,7 @@ import contextlib
 import gc
 import itertools
 import queue
+import signal
 import threading
 import time
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ import zmq
 from peer import Block, Number, OtherNumber, Scan, is_whole, make_block
 from processes import SOON_S, in_time, wait_for
 
-from cortex import keep_last, latest, reliable
+from cortex import keep_last, latest, reliable, turn
 from cortex.codec import codec_of
 from cortex.publisher import Closed
 from cortex.raw import RawMessage
@@ -152,6 +153,25 @@ def test_a_closed_subscriber_is_not_looked_at(numbers):
 
 
 @pytest.mark.alone
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers that send signals")
+def test_a_handler_that_uses_the_subscriber_it_has_interrupted_is_told_so(numbers, monkeypatch):
+    """It would wait for a lock that its own thread holds."""
+    if threading.current_thread() is not threading.main_thread():
+        pytest.skip("only the main thread handles signals")
+    publisher, subscriber = numbers
+    monkeypatch.setattr(turn, "PATIENCE_S", 0.05)
+    before = signal.signal(signal.SIGALRM, lambda *_: subscriber.publisher_count)
+    signal.setitimer(signal.ITIMER_REAL, 0.2, 0.2)  # again where it came between two waits
+    try:
+        with pytest.raises(RuntimeError, match="a signal handler cannot use a subscriber that it has interr"):
+            subscriber.recv(SOON_S)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    publisher.publish(Number(0, 7))
+    assert subscriber.recv(SOON_S) == Number(0, 7)
+
+
 def test_a_message_wakes_who_waits(numbers):
     """It does not wait for the next look: a tenth of a second would be that."""
     publisher, subscriber = numbers
