@@ -24,6 +24,7 @@ Q_FORWARD_OPTICAL = (-0.5, 0.5, -0.5, 0.5)
 """Quaternion that takes optical coordinates to those of a forward, left, up frame that looks the same way."""
 
 _FEW = 16
+"""Numbers that are checked one by one: up to here that is quicker than by NumPy."""
 UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion that is given as a rotation may be from 1."""
 
@@ -91,7 +92,7 @@ def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.floa
     rows = np.asarray(value, dtype=np.float64)
     if rows.shape not in ((width,), (1, width), (count, width)):
         raise ValueError(f"{name} must have shape [{count}, {width}] or [{width}], got {list(rows.shape)}")
-    few = rows.size <= _FEW  # then Python is quicker than NumPy
+    few = rows.size <= _FEW
     if not (all(map(math.isfinite, rows.ravel().tolist())) if few else np.isfinite(rows).all()):
         raise ValueError(f"{name} must be finite, got {rows.tolist()}")
     if rows.size == count * width:

@@ -275,7 +275,7 @@ class Drafts:
         room = min(size_class(max(_ROOM_MIN, 2 * recent)), _ROOM_MAX)
         if room > self._room or 2 * room <= self._room:
             self._room = room
-        rise = 2 * key_count - self._recent[-min(4, len(self._recent))]  # or they go on to rise
+        rise = 2 * key_count - self._recent[0]  # or they go on to rise
         step = max(16, 1 << max(0, recent.bit_length() - 5))
         self._copied = min(-(-(9 * max(recent, rise) // 8 + 1) // step) * step, self._room)
 

@@ -38,9 +38,6 @@ __all__ = ["EventCamera", "EventCameraConfig"]
 
 _log = logging.getLogger(__name__)
 
-_CUT_AHEAD_ON_CUDA = True
-_GRAPHS_ON_CUDA = True
-"""A scan is replayed as a graph where it comes again."""
 _PIXELS_PER_THREAD_MIN = 16_384
 _KEYS_PER_PIXEL = 4
 """Events of a scan for which there is room on CUDA before any have come."""
@@ -215,7 +212,7 @@ class EventCamera:
         self._drafts: Drafts | None = None
         self._draft: Draft | None = None  # the last that was launched
         self._carried: Draft | None = None  # it holds what is carried over; None: `_keys` do
-        wanted = self.device.is_cuda and _CUT_AHEAD_ON_CUDA if cut_ahead is None else cut_ahead
+        wanted = self.device.is_cuda if cut_ahead is None else cut_ahead
         if wanted and self._on_host and self._readout is None and len(self._chunk_bounds()) == 1:
             self._drafts = Drafts(
                 pixel_count=pixel_count,
@@ -677,7 +674,7 @@ class EventCamera:
             reset_ns = 0 if self._noise is None else self._noise.since_reset_ns(0)
             keys = (chunk.keys.ptr, chunk.keys.shape[0])
             key = (scan.number, before, scan.frames.ptr, len(scan.stamps_ns), keys, reset_ns)
-            if again and _GRAPHS_ON_CUDA:
+            if again:
                 self._graphs.run(key, lambda: launch(chunk))
             else:
                 launch(chunk)
