@@ -20,8 +20,11 @@ import warp as wp
 import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
-from neurosim_core.render.raycast import OUTPUTS, Terms, asking_kernel, raycast_kernel
-from neurosim_core.render.tile_walk import BLOCK, walk_kernel
+from neurosim_core.render.cast_terms import Terms
+from neurosim_core.render.film import OUTPUTS
+from neurosim_core.render.frustum_walk import walk_kernel
+from neurosim_core.render.raycast import asking_kernel, raycast_kernel
+from neurosim_core.render.walk_data import BLOCK
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import TERMS, make_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS

@@ -27,7 +27,8 @@ from neurosim_core.packets import EventArrays
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig, WalkConfig
 from neurosim_core.render.embree import EmbreeError
-from neurosim_core.render.tile_walk import ASK, WalkData, together_finder
+from neurosim_core.render.list_search import together_finder
+from neurosim_core.render.walk_data import ASK, WalkData
 from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.sensors.rig import EventSensorConfig

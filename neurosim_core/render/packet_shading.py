@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-call,no-untyped-def,empty-body,untyped-decorator,valid-type"
 """Shading of a packet of rays on a CPU, in loops over its lanes that become vector instructions.
 
-The same arithmetic in the same order as `raycast.shade` for baked light and mip-mapped textures, so the same
+The same arithmetic in the same order as `shading.py` for baked light and mip-mapped textures, so the same
 bytes. Ray by ray, shading took three times as long as Embree takes to find what the rays hit. Here lanes are
 gathered into arrays, one for each quantity, and each loop does one thing for all lanes without a branch, but
 for those that load from tables, and for the logarithm of the footprint, which is the library's. Where all

@@ -20,6 +20,7 @@ from neurosim_core.render.body_arrays import (
     upload_bodies,
 )
 from neurosim_core.render.camera import Lens
+from neurosim_core.render.cast_terms import Terms, group_of, with_walks
 from neurosim_core.render.config import RenderConfig, WalkConfig
 from neurosim_core.render.embree import PACKET, EmbreeError, EmbreeTree, packet_width
 from neurosim_core.render.launch import launch_split
@@ -31,16 +32,12 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.raycast import (
-    Terms,
-    WorldData,
-    asking_kernel,
-    group_of,
-    raycast_kernel,
-    with_walks,
-)
+from neurosim_core.render.pixel_order import WorldData
+from neurosim_core.render.ray_hit import face_normals
+from neurosim_core.render.raycast import asking_kernel, raycast_kernel
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData, face_normals, shared_walk
+from neurosim_core.render.tile_walk import TileWalk, shared_walk
+from neurosim_core.render.walk_data import TILE, WalkData
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
 from neurosim_core.scene.scene import Scene

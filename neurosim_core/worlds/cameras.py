@@ -11,11 +11,14 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.body_arrays import make_body_data, place_camera
+from neurosim_core.render.cast_terms import group_of, with_walks
 from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.raycast import WorldData, asking_kernel, group_of, raycast_kernel, with_walks
-from neurosim_core.render.tile_walk import TILE, TileWalk, WalkData, shared_walk
+from neurosim_core.render.pixel_order import WorldData
+from neurosim_core.render.raycast import asking_kernel, raycast_kernel
+from neurosim_core.render.tile_walk import TileWalk, shared_walk
+from neurosim_core.render.walk_data import TILE, WalkData
 from neurosim_core.render.warp_renderer import SceneArrays, ray_layers
 from neurosim_core.scene.bodies import BodyConfig, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig

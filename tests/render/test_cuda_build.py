@@ -5,8 +5,11 @@ from __future__ import annotations
 import warp as wp
 
 from neurosim_core.render import lighting
-from neurosim_core.render.raycast import OUTPUTS, Terms, raycast_kernel
-from neurosim_core.render.tile_walk import BLOCK, walk_kernel
+from neurosim_core.render.cast_terms import Terms
+from neurosim_core.render.film import OUTPUTS
+from neurosim_core.render.frustum_walk import walk_kernel
+from neurosim_core.render.raycast import raycast_kernel
+from neurosim_core.render.walk_data import BLOCK
 
 
 def test_kernels_build_for_sm_90(tmp_path):

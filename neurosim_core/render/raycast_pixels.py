@@ -1,0 +1,345 @@
+# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
+# mypy: disable-error-code="call-overload,no-untyped-def,return-value,empty-body"
+# mypy: allow-untyped-calls, allow-untyped-decorators
+# ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
+"""The ray caster whose threads are pixels: of an instant, or, where walks are shared, of a few.
+
+Blocks of 64 threads are tiles of 8 x 8 pixels, so that their rays walk the same nodes of the tree. With
+shared walks (`tile_walk.py`) a block finds together what its rays hit.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+import warp as wp
+
+from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.cast_terms import Terms, group_of
+from neurosim_core.render.film import geometry_writer, radiance_writer
+from neurosim_core.render.list_search import together_finder
+from neurosim_core.render.pixel_order import WorldData, tile_finder
+from neurosim_core.render.ray_hit import FAR_M, UNFUSED, meet_bodies, meet_listed, meet_scene
+from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.shading import pixel_shader
+from neurosim_core.render.walk_data import ASK, WalkData
+
+_BOUNDS = (64, 14)
+"""Threads and, on CUDA, blocks of a multiprocessor that registers must do for: as measured on an H200."""
+
+
+def pixel_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
+    """Return the kernel, made anew; see `raycast.raycast_kernel`."""
+    leaving = terms.walked > 0
+    look = _together_eye(outputs, terms) if leaving else _eye(outputs, terms)
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        module_options=UNFUSED,
+        launch_bounds=None if leaving else _BOUNDS,
+    )
+    def raycast(
+        first: int,
+        # Model:
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        # In:
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        bodies: BodyData,
+        world_data: WorldData,
+        walk_data: WalkData,
+        # Out:
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ) -> None:
+        begin = first + wp.tid()
+        end = begin + 1
+        step = int(1)
+        listed = bool(False)
+        if wp.static(terms.asking):
+            end = walk_data.left_count[0]
+            step = walk_data.left_threads
+            listed = end <= walk_data.left.shape[0]
+            if not listed:  # all pixels
+                end = instant_count * walk_data.bounds.shape[0] * 64
+                if wp.static(terms.worlds):
+                    end *= world_data.active.shape[0]
+        for place in range(begin, end, step):
+            index = place
+            if listed:
+                index = walk_data.left[place]
+            look(
+                index,
+                scene,
+                rays,
+                width,
+                height,
+                instant_count,
+                p_WC,
+                q_WC,
+                image_slot,
+                bodies,
+                world_data,
+                walk_data,
+                log_radiance_out,
+                rgb_out,
+                depth_out,
+                normal_out,
+                instance_out,
+            )
+
+    return raycast
+
+
+def _eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
+    """Return the function that looks at a pixel of an instant, by a ray that walks by itself."""
+    with_log = "log_radiance" in outputs
+    with_radiance = with_log or "rgb" in outputs
+    with_images = len(outputs) > int(with_log)
+    with_geometry = bool({"depth", "normal", "instance"} & set(outputs))
+    find_tile = tile_finder(terms)
+    radiance_of = pixel_shader(terms)
+    write_geometry = geometry_writer(outputs)
+    write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
+
+    @wp.func
+    def see(
+        index: int,
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        bodies: BodyData,
+        world_data: WorldData,
+        walk_data: WalkData,
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ):
+        # A pixel of an instant, of which `index` tells: of a tile all instants, then the next tile. Threads
+        # side by side should walk the same nodes: a block is a quarter of a tile at four instants, and
+        # what is left over the whole tile at one.
+        in_tile = index % 64
+        block = index // 64
+        instant = block % instant_count
+        tile = block // instant_count
+        if wp.static(not terms.asking):
+            if instant < instant_count // 4 * 4:
+                quarter = instant % 4
+                instant += in_tile // 16 - quarter
+                in_tile = 32 * (quarter // 2) + 4 * (quarter % 2) + 8 * ((in_tile % 16) // 4) + in_tile % 4
+        world, tile, left, top = find_tile(tile, width, height)
+        first_ray = int(0)
+        if wp.static(terms.worlds):
+            instant += world * world_data.stride
+            if world_data.active[world] == 0:
+                return
+        if wp.static(terms.world_scenes):
+            scene = world_data.scenes[world_data.scene[world]]
+        if wp.static(terms.world_lenses):
+            first_ray = world_data.lens[world] * width * height
+        col = left + in_tile % 8
+        row = top + in_tile // 8
+        if col >= width or row >= height:
+            return
+        slot = int(-1)
+        if wp.static(with_images):
+            slot = image_slot[instant]
+            if wp.static(not with_log):
+                if slot < 0:
+                    return
+        origin = p_WC[instant]
+        q = q_WC[instant]
+        pixel = first_ray + row * width + col
+        radiance = wp.vec3(0.0)
+        for layer in range(rays.shape[0]):
+            if wp.static(terms.supersampled):
+                # Layer 0 goes through the centre and is for geometry, the others are for radiance.
+                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
+                    continue
+            ray_C = rays[layer, pixel]
+            ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+            hit = meet_scene(scene, origin, ray)
+            body = int(-1)
+            if wp.static(terms.bodies):
+                hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
+            if wp.static(with_radiance):
+                if wp.static(not terms.supersampled) or layer > 0:
+                    radiance += radiance_of(scene, bodies, instant, body, q, ray, origin, ray_C[3], hit)
+            if wp.static(with_geometry):
+                if slot >= 0 and layer == 0:
+                    write_geometry(
+                        scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
+                    )
+        if wp.static(with_radiance):
+            write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
+
+    return see
+
+
+def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
+    """Return the function that looks at a pixel of a group of instants, by rays that share a walk."""
+    with_log = "log_radiance" in outputs
+    with_radiance = with_log or "rgb" in outputs
+    with_images = len(outputs) > int(with_log)
+    with_geometry = bool({"depth", "normal", "instance"} & set(outputs))
+    group = group_of(terms)
+    find_tile = tile_finder(terms)
+    find_together = together_finder(group)
+    radiance_of = pixel_shader(terms)
+    write_geometry = geometry_writer(outputs)
+    write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
+
+    @wp.func
+    def see_together(
+        index: int,
+        scene: SceneData,
+        rays: wp.array2d[wp.vec4],
+        width: int,
+        height: int,
+        instant_count: int,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        image_slot: wp.array[int],
+        bodies: BodyData,
+        world_data: WorldData,
+        walk_data: WalkData,
+        log_radiance_out: wp.array3d[float],
+        rgb_out: wp.array4d[wp.uint8],
+        depth_out: wp.array3d[float],
+        normal_out: wp.array3d[wp.vec3],
+        instance_out: wp.array3d[int],
+    ):
+        # A pixel of a group of instants, of which `index` tells; what blocks do together, all threads do.
+        in_tile = index % 64
+        block = index // 64
+        group_count = (instant_count + group - 1) // group
+        first = (block % group_count) * group
+        tile = block // group_count
+        instants = wp.min(instant_count - first, group)
+        block = tile * instant_count + first  # of the first instant, as `see` counts
+        world, tile, left_col, top = find_tile(tile, width, height)
+        if wp.static(terms.worlds):
+            first += world * world_data.stride
+            if world_data.active[world] == 0:
+                return
+        col = left_col + in_tile % 8
+        row = top + in_tile // 8
+        outside = col >= width or row >= height
+        pixel = wp.min(row, height - 1) * width + wp.min(col, width - 1)
+        walk = first // walk_data.instants
+        layer_count = rays.shape[0]
+        radiance = wp.vec3(0.0)
+        left = bool(False)
+        for layer in range(layer_count):
+            ray_C = rays[layer, pixel]
+            faces = find_together(
+                scene.mesh,
+                walk_data.faces,
+                (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
+                walk_data.count[walk, tile],
+                walk_data.reach[walk, tile],
+                FAR_M,
+                walk_data.bounds[tile],
+                p_WC,
+                q_WC,
+                first,
+                instants,
+                wp.vec3(ray_C[0], ray_C[1], ray_C[2]),
+            )
+            for member in range(instants):
+                instant = first + member
+                slot = int(-1)
+                if wp.static(with_images):
+                    slot = image_slot[instant]
+                seen = not outside and not left
+                if wp.static(with_images and not with_log):
+                    seen = seen and slot >= 0
+                if wp.static(terms.supersampled):
+                    seen = seen and (layer > 0 or (slot >= 0 and wp.static(with_geometry)))
+                if seen:
+                    origin = p_WC[instant]
+                    q = q_WC[instant]
+                    ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
+                    hit = meet_listed(scene, origin, ray, faces[member])
+                    left = hit.face == ASK
+                    if not left:
+                        body = int(-1)
+                        if wp.static(terms.bodies):
+                            hit, body = meet_bodies(
+                                bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
+                            )
+                        if wp.static(with_radiance):
+                            if wp.static(not terms.supersampled) or layer > 0:
+                                radiance += radiance_of(
+                                    scene, bodies, instant, body, q, ray, origin, ray_C[3], hit
+                                )
+                        if wp.static(with_geometry):
+                            if slot >= 0 and layer == 0:
+                                write_geometry(
+                                    scene,
+                                    ray,
+                                    ray_C[2],
+                                    hit,
+                                    slot,
+                                    row,
+                                    col,
+                                    depth_out,
+                                    normal_out,
+                                    instance_out,
+                                )
+                if layer == layer_count - 1:
+                    _leave(left, (block + member) * 64 + in_tile, walk_data.left, walk_data.left_count)
+                    if wp.static(with_radiance):
+                        if seen and not left:
+                            write_radiance(
+                                scene,
+                                radiance,
+                                layer_count,
+                                instant,
+                                slot,
+                                row,
+                                col,
+                                log_radiance_out,
+                                rgb_out,
+                            )
+                    radiance = wp.vec3(0.0)
+                    left = bool(False)
+
+    return see_together
+
+
+@wp.func_native("""
+    using namespace wp;
+#ifdef __CUDA_ARCH__
+    // one atomic for a warp, whose pixels stay side by side
+    const unsigned mask = __ballot_sync(0xffffffffu, is_left), lane = threadIdx.x & 31;
+    int place = 0;
+    if (mask && lane == 0)
+        place = atomicAdd(count.data, __popc(mask));
+    place = __shfl_sync(0xffffffffu, place, 0) + __popc(mask & ((1u << lane) - 1));
+#else
+    const int place = is_left ? __atomic_fetch_add(count.data, 1, __ATOMIC_RELAXED) : 0;
+#endif
+    if (is_left && place < left.shape[0])
+        left.data[place] = index;
+""")
+def _leave(is_left: wp.bool, index: int, left: wp.array[int], count: wp.array[int]):
+    """Note that the pixel of a thread is left, and count it, also where there is no room for it.
+
+    All threads of a block call it together.
+    """
+    ...

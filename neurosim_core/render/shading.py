@@ -1,0 +1,183 @@
+# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
+# mypy: disable-error-code="call-overload,no-untyped-def,return-value"
+# mypy: allow-untyped-calls, allow-untyped-decorators
+# ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
+"""The light that a pixel receives from what its ray hits, ray by ray. See `packet_shading.py` for packets."""
+
+# No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
+
+from functools import cache
+
+import warp as wp
+
+from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.cast_terms import Terms
+from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
+from neurosim_core.render.ray_hit import Hit
+from neurosim_core.render.scene_data import SceneData
+from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
+
+_COSINE_MIN = wp.constant(0.05)
+_OFFSET_M = wp.constant(1.0e-3)
+
+
+@cache
+def pixel_shader(terms: Terms) -> wp.Function:
+    """Return the function that says what light a pixel receives along a ray.
+
+    Its parameters: the scene and its bodies; the instant; the body that the ray hits, -1: none; orientation
+    of the camera; the ray, in W, and its origin; its spread [rad]; what it hits.
+    """
+    shade = _scene_shader(terms)
+    shade_body = _body_shader(terms) if terms.bodies else None
+
+    @wp.func
+    def radiance_of(
+        scene: SceneData,
+        bodies: BodyData,
+        instant: int,
+        body: int,
+        q_WC: wp.quat,
+        ray: wp.vec3,
+        origin: wp.vec3,
+        spread_rad: float,
+        hit: Hit,
+    ) -> wp.vec3:
+        if wp.static(terms.bodies):
+            if body >= 0:
+                return shade_body(scene, bodies, instant, body, q_WC, ray, origin, spread_rad, hit)
+        return shade(scene, ray, origin, spread_rad, hit)
+
+    return radiance_of
+
+
+@cache
+def _scene_shader(terms: Terms) -> wp.Function:
+    surface_albedo, emitted = _albedo(terms), _emission(terms)
+
+    @wp.func
+    def shade(scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit) -> wp.vec3:
+        if hit.face < 0:
+            return scene.sky
+        corner = 3 * hit.face
+        u = hit.u
+        v = hit.v
+        w = 1.0 - u - v
+        facing = wp.dot(ray, hit.normal)
+        albedo = surface_albedo(scene, spread_rad, facing, hit)
+        if wp.static(terms.baked):
+            side = wp.where(facing > 0.0, 1, 0)
+            light = (
+                u * scene.corner_light[side, corner]
+                + v * scene.corner_light[side, corner + 1]
+                + w * scene.corner_light[side, corner + 2]
+            )
+        else:
+            normal = wp.normalize(
+                u * scene.corner_normal[corner]
+                + v * scene.corner_normal[corner + 1]
+                + w * scene.corner_normal[corner + 2]
+            )
+            if facing > 0.0:
+                normal = -normal
+            point = origin + hit.t * ray
+            light = ambient_light(normal, scene.ambient_up, scene.ambient_down)
+            for lamp in range(scene.light_position.shape[0]):
+                light += point_light(
+                    point,
+                    normal,
+                    scene.light_position[lamp],
+                    scene.light_intensity[lamp],
+                    scene.light_radius_m,
+                )
+        return reflect_light(albedo, light, emitted(scene, hit))
+
+    return shade
+
+
+@cache
+def _body_shader(terms: Terms) -> wp.Function:
+    surface_albedo, emitted = _albedo(terms), _emission(terms)
+
+    @wp.func
+    def shade_body(
+        scene: SceneData,
+        bodies: BodyData,
+        instant: int,
+        body: int,
+        q_WC: wp.quat,
+        ray: wp.vec3,
+        origin: wp.vec3,
+        spread_rad: float,
+        hit: Hit,
+    ) -> wp.vec3:
+        # Bodies move under lights that stand still, so nothing is baked: light is found here, and shadows.
+        facing = wp.dot(ray, hit.normal)
+        corner = 3 * (hit.face - bodies.first_face[0])
+        normal_O = (
+            hit.u * bodies.corner_normal[corner]
+            + hit.v * bodies.corner_normal[corner + 1]
+            + (1.0 - hit.u - hit.v) * bodies.corner_normal[corner + 2]
+        )
+        normal_C = wp.quat_rotate_inv(bodies.q_OC[instant, body], normal_O)
+        normal = wp.normalize(wp.quat_rotate(q_WC, normal_C))
+        outwards = hit.normal
+        if facing > 0.0:
+            normal = -normal
+            outwards = -outwards
+        point = origin + hit.t * ray
+        light = ambient_light(normal, scene.ambient_up, scene.ambient_down)
+        for lamp in range(scene.light_position.shape[0]):
+            position = scene.light_position[lamp]
+            part = point_light(point, normal, position, scene.light_intensity[lamp], scene.light_radius_m)
+            if wp.static(terms.baked):
+                if wp.max(part) > 0.0:
+                    start = point + _OFFSET_M * outwards
+                    to_lamp = position - start
+                    distance = wp.length(to_lamp)
+                    if wp.mesh_query_ray_anyhit(bodies.shading, start, to_lamp / distance, distance):
+                        part = wp.vec3(0.0)
+            light += part
+        return reflect_light(surface_albedo(scene, spread_rad, facing, hit), light, emitted(scene, hit))
+
+    return shade_body
+
+
+@cache
+def _albedo(terms: Terms) -> wp.Function:
+    @wp.func
+    def surface_albedo(scene: SceneData, spread_rad: float, facing: float, hit: Hit) -> wp.vec3:
+        material = scene.face_material[hit.face]
+        albedo = scene.base_color[material]
+        if wp.static(terms.textured):
+            texture = scene.material_texture[material]
+            if texture[1] > 0:
+                corner = 3 * hit.face
+                uv = (
+                    hit.u * scene.corner_uv[corner]
+                    + hit.v * scene.corner_uv[corner + 1]
+                    + (1.0 - hit.u - hit.v) * scene.corner_uv[corner + 2]
+                )
+                if wp.static(terms.nearest_texel):
+                    albedo = wp.cw_mul(albedo, sample_nearest(scene.texels, scene.levels, texture, uv))
+                elif wp.static(terms.finest_level):
+                    albedo = wp.cw_mul(albedo, sample_finest(scene.texels, scene.levels, texture, uv))
+                else:
+                    footprint_m = spread_rad * hit.t / wp.max(wp.abs(facing), _COSINE_MIN)
+                    lod = wp.log2(footprint_m) + scene.face_lod[hit.face] + scene.mip_bias
+                    albedo = wp.cw_mul(albedo, sample_texture(scene.texels, scene.levels, texture, uv, lod))
+        return albedo
+
+    return surface_albedo
+
+
+@cache
+def _emission(terms: Terms) -> wp.Function:
+    @wp.func
+    def emitted(scene: SceneData, hit: Hit) -> wp.vec3:
+        emission = wp.vec3(0.0)
+        if wp.static(terms.emissive):
+            emission = scene.emission[scene.face_material[hit.face]]
+        return emission
+
+    return emitted
