@@ -38,6 +38,15 @@ class Loan:
         self._publish = publish
         self._drop = drop
 
+    @property
+    def memory(self) -> Any:
+        """The mapping in which the arrays of the draft lie; None if they are private, or the loan has ended.
+
+        For who has to tell a device about it. Whoever keeps it keeps it mapped.
+        """
+        slot = self._slot
+        return None if slot is None or slot.ring is None else slot.ring.memory
+
     def publish(self) -> bool:
         """Send the message.
 

@@ -155,6 +155,11 @@ class Ring:
         room: Room = Room((self.slot_bytes,), _U8, self._memory, self._first + slot * self.slot_bytes)
         return room
 
+    @property
+    def memory(self) -> Any:
+        """The whole mapping, None after `close`; whoever keeps it keeps it mapped, and must not write to it."""
+        return self._memory
+
     def commit(self, slot: int, sequence: int, body_size: int, mask: int) -> None:
         """Finish a slot and lease it to readers.
 

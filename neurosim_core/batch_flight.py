@@ -49,23 +49,40 @@ def set_command(model: Model, state: State, command: ArrayLike | None, mode: Com
     state.order = mode
 
 
-def plan_flight(
-    model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool
-) -> tuple[Batch, Hashable, Callable[[], object]]:
-    """Take the vehicle through a stretch: return the batch, and what launches it, with its key.
+def plan_batch(state: State, stretch: Sequence[Boundary], *, closed_loop: bool) -> Batch:
+    """Return the batch that takes the vehicle through a stretch; nothing changes until it is launched.
+
+    Args:
+        state: As of the end of what was launched.
+        stretch: What comes next.
+        closed_loop: Let the path controller command; otherwise the last command is held.
+    """
+    number = state.launched_count
+    stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in stretch)]
+    elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
+    return Batch(
+        boundaries=stretch,
+        elapsed_ns=elapsed_ns,
+        closed_loop=closed_loop,
+        step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
+        command_count=sum(closed_loop and boundary.control for boundary in stretch),
+        number=number,
+        slot=number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count),
+        wanted=state.wanted,
+        until_ns=stamps_ns[-1],
+    )
+
+
+def plan_flight(model: Model, state: State, batch: Batch) -> tuple[Hashable, Callable[[], object]]:
+    """Take the vehicle through a batch: return what launches that, with its key.
 
     A pilot may be replaced by another; a graph keeps the one that it was made with.
     """
-    number = state.launched_count
-    slot = number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count)
-    stamps_ns = [state.launched_ns, *(boundary.stamp_ns for boundary in stretch)]
-    elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
     order, state.order = state.order, None
     pattern = tuple(
         (span, boundary.control, boundary.samplers)
-        for span, boundary in zip(elapsed_ns, stretch, strict=True)
+        for span, boundary in zip(batch.elapsed_ns, batch.boundaries, strict=True)
     )
-
     pilot = None if order is None else state.pilots.get(order)
 
     def flight() -> Pilot | None:
@@ -74,21 +91,12 @@ def plan_flight(
             pilot.controller.update(state.vehicle.arrays)
         elif order is not None:
             state.rotor_speeds.upload()
-        _fly(model, state, stretch, elapsed_ns, slot=slot, closed_loop=closed_loop)
+        _fly(model, state, batch)
         return pilot
 
     state.launched_count += 1
-    state.launched_ns = stretch[-1].stamp_ns
-    batch = Batch(
-        boundaries=stretch,
-        step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
-        command_count=sum(closed_loop and boundary.control for boundary in stretch),
-        number=number,
-        slot=slot,
-        wanted=state.wanted,
-        until_ns=state.launched_ns,
-    )
-    return batch, (order, id(pilot), slot, closed_loop, pattern), flight
+    state.launched_ns = batch.until_ns
+    return (order, id(pilot), batch.slot, batch.closed_loop, pattern), flight
 
 
 def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], object]) -> None:
@@ -98,24 +106,17 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
         state.flown[batch.number % state.flight_lane_count].set()
 
 
-def _fly(
-    model: Model,
-    state: State,
-    stretch: Sequence[Boundary],
-    elapsed_ns: Sequence[int],
-    *,
-    slot: int,
-    closed_loop: bool,
-) -> None:
+def _fly(model: Model, state: State, batch: Batch) -> None:
     """Move the vehicle from boundary to boundary and do what is due there, on the device only."""
-    for place, (boundary, span_ns) in enumerate(zip(stretch, elapsed_ns, strict=True), slot):
+    stretch, slot = batch.boundaries, batch.slot
+    for place, (boundary, span_ns) in enumerate(zip(stretch, batch.elapsed_ns, strict=True), slot):
         if span_ns > 0:
             state.vehicle.advance(span_ns)
         state.trace.record(state.vehicle.arrays, place)
         for index in boundary.samplers:
             if (imu := state.imus.get(model.samplers[index])) is not None:
                 imu.measure(place)
-        if closed_loop and boundary.control:
+        if batch.closed_loop and boundary.control:
             state.controller.update(state.vehicle.arrays)
     ground = state.vehicle.config.ground
     state.trace.check_room(

@@ -21,6 +21,7 @@ from neurosim_core.sensors.cast import (
     CastState,
     Choice,
     Instants,
+    Look,
     MakeRoom,
     make_cast_state,
 )
@@ -53,6 +54,10 @@ class Batch:
     """A stretch of a run that was flown, and that cameras may have to look at."""
 
     boundaries: Sequence[Boundary]
+    elapsed_ns: Sequence[int]
+    """From each boundary's predecessor to it [ns]."""
+    closed_loop: bool
+    """The path controller commands."""
     step_count: int
     """Steps of the integration."""
     command_count: int
@@ -64,6 +69,8 @@ class Batch:
     """Cameras that look."""
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
+    looks: Sequence[Look] | None = None
+    """What casts render of it, if that was planned ahead."""
     seen: Sequence[tuple[CastState, Instants]] = ()
     choices: Sequence[Choice] = ()
     """What adaptive casts render of it."""
@@ -93,8 +100,8 @@ class State:
     """The most batches that may be flown and not looked at."""
     borrow_pictures: bool
     """Pictures are views that the next batch of their lane overwrites."""
-    make_room: MakeRoom | None
-    """Gives memory that pictures are copied to; None: they get their own."""
+    late_pictures: bool
+    """Pictures for which the caller has room are handed out before the device has finished them."""
     wanted: frozenset[str]
     """Cameras that look, from the next batch on."""
     flight_stream: wp.Stream | None
@@ -107,7 +114,7 @@ class State:
     """Where adaptive casts choose what to render, ahead of the renderers."""
     overlaps: bool
     """Parts of a batch are launched on their own; on a CUDA device with one lane, all as one graph, unless an
-    adaptive cast has to wait for the flight."""
+    adaptive cast or the host has to wait for the flight."""
     flown: Sequence[Milestone]
     """For each batch that may be flown and not looked at, its end on `flight_stream`."""
     rendered: Milestone
@@ -130,6 +137,8 @@ class State:
     order: CommandMode | None = None
     """Mode of the setpoint that the next batch begins with."""
     under_way: deque[Batch] = field(default_factory=deque)
+    ahead: Batch | None = None
+    """The next batch, if it was planned while the device was at work."""
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
     """The vehicle touched the scene at the last boundary."""
@@ -150,6 +159,7 @@ def make_state(
     lane_count: int | None = None,
     flight_lane_count: int | None = None,
     borrow_pictures: bool = False,
+    late_pictures: bool = False,
     make_room: MakeRoom | None = None,
     seed: int | None = None,
     start: StartState | None = None,
@@ -162,6 +172,8 @@ def make_state(
             launch returns when it has finished. It changes no packet.
         flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
         borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`.
+        late_pictures: Do not wait for pictures that a CUDA device copies to room of the caller's: they are
+            there after `settle`.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; called by the
             thread that reads the cameras.
         seed: Seed of the sensor noise and of turbulence; None: as configured.
@@ -208,7 +220,10 @@ def make_state(
     return State(
         vehicle=vehicle,
         rotor_speeds=HostInput(vehicle.arrays.rotor_speed_command),
-        overlaps=lane_count > 1 or wp.get_device(device).is_cpu or bool(model.schedule.sparse),
+        overlaps=lane_count > 1
+        or late_pictures
+        or wp.get_device(device).is_cpu
+        or bool(model.schedule.sparse),
         controller=make_controller(
             "path", model.airframe, config.control.gains, device=device, paths=model.path
         ),
@@ -228,6 +243,7 @@ def make_state(
                 device=device,
                 seed=config.seed if seed is None else seed,
                 bodies=config.bodies,
+                make_room=make_room,
             )
             for index, cast in enumerate(model.casts)
             if model.scene_on_device is not None
@@ -237,7 +253,7 @@ def make_state(
         lanes=[Milestone(device) for _ in range(lane_count)],
         flight_lane_count=flight_lane_count,
         borrow_pictures=borrow_pictures,
-        make_room=make_room,
+        late_pictures=late_pictures,
         wanted=frozenset(name for cast in model.casts for name in cast.names),
         flight_stream=make_stream(device, urgent=True) if lane_count > 1 else None,
         render_streams=[make_stream(device) if lane_count > 1 else None for _ in range(lane_count)],

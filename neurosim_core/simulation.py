@@ -10,7 +10,8 @@ On a CUDA device `run_model` launches the next batch before it reads one back, s
 Each batch under way has a lane: slots of the trace and buffers of the casts that no other batch writes to.
 What was launched beyond the end of a run is never read.
 
-Who commands from outside goes from one control period to the next: `step` flies one and returns its packets;
+Who commands from outside goes from one control period to the next: `step` flies one and returns its packets,
+or `begin_step` and `end_step` do, for who has something else to do while a CUDA device is at work;
 `fly_period` flies one and leaves the cameras to another thread, which calls `see` or `skip` for its batches.
 """
 
@@ -18,15 +19,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from neurosim_core.batch_cameras import choose, look_at, plan_looks, read_cameras, scan
+from neurosim_core.batch_cameras import choose, look_at, plan_ahead, plan_looks, read_cameras, scan
 from neurosim_core.batch_flight import (
     COLLISION,
     in_order,
     launch_flight,
+    plan_batch,
     plan_flight,
     read_flight,
     set_command,
@@ -39,6 +41,7 @@ from neurosim_core.phases import timed
 from neurosim_core.run_state import Batch, StartState, State, make_state
 from neurosim_core.schedule import Boundary, batch_end_ns, boundaries
 from neurosim_core.sensors.cast import (
+    bring_images,
     close_eyes,
     flush_events,
     is_due,
@@ -48,10 +51,13 @@ from neurosim_core.sensors.cast import (
 __all__ = [
     "COLLISION",
     "Batch",
+    "Begun",
     "Model",
     "StartState",
     "State",
     "advance",
+    "begin_step",
+    "end_step",
     "find_device",
     "finish",
     "fly_period",
@@ -63,12 +69,14 @@ __all__ = [
     "make_state",
     "observe",
     "plan_paths",
+    "prepare_step",
     "read",
     "refit",
     "run",
     "run_model",
     "see",
     "see_each",
+    "settle",
     "skip",
     "start",
     "step",
@@ -129,14 +137,57 @@ def step(
         ValueError: The command is of a wrong shape or not finite.
         DynamicsError: The integration has failed before; what was measured until then has been returned.
     """
+    return end_step(model, state, begin_step(model, state, command, mode=mode))
+
+
+class Begun(NamedTuple):
+    """A control period that has been launched as far as it can be."""
+
+    packets: list[Packet]
+    """What the sensors yield up to its beginning, if that has not been returned yet."""
+    end_ns: int
+    """Where it ends [ns]."""
+
+
+def begin_step(
+    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+) -> Begun:
+    """Begin a control period like `step`, without waiting for a CUDA device.
+
+    Returns:
+        What `end_step` needs, which has to come before anything else is done to the state. Arguments and
+        errors are those of `step`.
+    """
     if state.failure is not None:
         raise state.failure
+    _check_all_read(state)
     packets = start(model, state) if state.launched_count == 0 else []
     set_command(model, state, command, mode)
-    for end_ns in _parts_of_period(model, state):
-        packets += advance(model, state, end_ns, closed_loop=False)
-        if state.ended or state.failure is not None:
-            break
+    end_ns = _period_end_ns(model, state)
+    launch(model, state, batch_end_ns(model.schedule, state.launched_ns, end_ns), closed_loop=False)
+    return Begun(packets, end_ns)
+
+
+def prepare_step(model: Model, state: State) -> None:
+    """Plan the next control period, for `begin_step` to launch it sooner: while a CUDA device is at work."""
+    end_ns = batch_end_ns(model.schedule, state.launched_ns, _period_end_ns(model, state))
+    stretch = boundaries(model.schedule, state.launched_ns, end_ns)
+    state.ahead = plan_batch(state, stretch, closed_loop=False)
+    plan_ahead(model, state, state.ahead)
+
+
+def settle(state: State) -> None:
+    """Wait until the device has written all pictures that were handed out (`make_state`, `late_pictures`)."""
+    for lane in state.lanes:
+        lane.wait()
+
+
+def end_step(model: Model, state: State, begun: Begun) -> list[Packet]:
+    """Wait for a control period that was begun, and return what `step` returns."""
+    packets = begun.packets + read(model, state)
+    while state.launched_ns < begun.end_ns and not (state.ended or state.failure is not None):
+        part_ns = batch_end_ns(model.schedule, state.launched_ns, begun.end_ns)
+        packets += advance(model, state, part_ns, closed_loop=False)
     return packets
 
 
@@ -167,8 +218,8 @@ def fly_period(
     def fly(stretch: Sequence[Boundary]) -> None:
         if free_lanes(state) < 1:
             raise RuntimeError(f"{state.flight_lane_count} batches wait for see() or skip(): no lane is free")
-        batch, key, flight = plan_flight(model, state, stretch, closed_loop=False)
-        launch_flight(state, batch, key, flight)
+        batch = plan_batch(state, stretch, closed_loop=False)
+        launch_flight(state, batch, *plan_flight(model, state, batch))
         batches.append(batch)
         state.flown[batch.number % state.flight_lane_count].wait()
         packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
@@ -266,7 +317,7 @@ def observe(state: State) -> Odometry:
 
 def start(model: Model, state: State) -> list[Packet]:
     """Sample every sensor at stamp 0; event cameras take it as their reference."""
-    _launch(model, state, [_everything(model)], closed_loop=True)
+    _launch(model, state, plan_batch(state, [_everything(model)], closed_loop=True))
     return read(model, state)
 
 
@@ -283,8 +334,7 @@ def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True
     Raises:
         RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.
     """
-    if state.under_way:
-        raise RuntimeError("run_model() was broken off with batches under way: only it can go on")
+    _check_all_read(state)
     launch(model, state, end_ns, closed_loop=closed_loop)
     return read(model, state)
 
@@ -298,7 +348,15 @@ def launch(model: Model, state: State, end_ns: int, *, closed_loop: bool = True)
         end_ns: End of the batch [ns], after what was launched before.
         closed_loop: Let the path controller command; otherwise the last command is held.
     """
-    _launch(model, state, boundaries(model.schedule, state.launched_ns, end_ns), closed_loop=closed_loop)
+    batch, state.ahead = state.ahead, None
+    planned = batch is not None and (
+        (batch.number, batch.until_ns, batch.wanted, batch.closed_loop)
+        == (state.launched_count, end_ns, state.wanted, closed_loop)
+    )
+    if batch is None or not planned:
+        stretch = boundaries(model.schedule, state.launched_ns, end_ns)
+        batch = plan_batch(state, stretch, closed_loop=closed_loop)
+    _launch(model, state, batch)
 
 
 def read(model: Model, state: State) -> list[Packet]:
@@ -324,6 +382,13 @@ def finish(state: State) -> list[Packet]:
     return [packet for cast in state.casts for packet in flush_events(cast, until_ns=state.stamp_ns)]
 
 
+def _check_all_read(state: State) -> None:
+    if state.under_way:
+        raise RuntimeError(
+            "batches are under way: run_model() was broken off, and only it can go on, or end_step() is due"
+        )
+
+
 def _everything(model: Model) -> Boundary:
     """Return the boundary at stamp 0."""
     return Boundary(
@@ -336,23 +401,32 @@ def _everything(model: Model) -> Boundary:
 
 def _parts_of_period(model: Model, state: State) -> Iterator[int]:
     """Yield the ends of the batches that a control period is cut into, each when the one before was flown."""
-    control = model.schedule.control
-    end_ns = control.stamp_ns(control.first_tick(state.launched_ns + 1))
+    end_ns = _period_end_ns(model, state)
     while state.launched_ns < end_ns:
         yield batch_end_ns(model.schedule, state.launched_ns, end_ns)
 
 
-def _launch(model: Model, state: State, stretch: Sequence[Boundary], *, closed_loop: bool) -> None:
-    """Fly a stretch, let the cameras see it, and launch the copies to the host."""
-    batch, key, flight = plan_flight(model, state, stretch, closed_loop=closed_loop)
+def _period_end_ns(model: Model, state: State) -> int:
+    """Return the next tick of the control clock after what was launched [ns]."""
+    control = model.schedule.control
+    return control.stamp_ns(control.first_tick(state.launched_ns + 1))
+
+
+def _launch(model: Model, state: State, batch: Batch) -> None:
+    """Fly a batch, let the cameras see it, and launch the copies to the host."""
+    key, flight = plan_flight(model, state, batch)
     if state.overlaps:
         launch_flight(state, batch, key, flight)
         look_at(model, state, batch)
     else:  # all of it as one graph
-        looks = plan_looks(state, batch, choose(model, state, batch))
+        looks = batch.looks
+        if looks is None:
+            looks = plan_looks(state, batch, choose(model, state, batch))
         with timed(state.wall_s, "flight and render"):
             state.graphs.run(
                 (key, *(look.key for look in looks)), lambda: (flight(), *(look.render() for look in looks))
             )
+            for look in looks:
+                bring_images(look.cast, look.instants)
         scan(state, batch, looks)
     state.under_way.append(batch)

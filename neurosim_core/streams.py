@@ -25,6 +25,9 @@ _GRAPH_COUNT_MAX = 512
 in two states of the pixels; batches that are streamed take turns among slots: each combination is a graph.
 With fewer places than a cycle has, each would be given up before it comes again."""
 
+_PLACES_MAX = 64
+"""Most addresses that copies of one array go to and that are remembered."""
+
 _LENT_BYTES_MAX = 256 << 20
 """Most memory of one kind that is lent out: pages that are pinned are nobody else's."""
 
@@ -150,12 +153,30 @@ class HostCopy:
         self._host = wp.empty_like(array, device="cpu", pinned=True) if self._copied else array
         self._rows: NDArray[Any] = self._host.numpy()
         self._row_size = array.size // array.shape[0] if array.size else 0
+        self._places: dict[int, Any] = {}
+        """Memory of others by address: the same few come again and again."""
 
     def fetch(self, first: int, count: int) -> None:
         """Launch the copy of `count` rows of the array."""
         if self._copied and count > 0:
             offset, size = first * self._row_size, count * self._row_size
             wp.copy(self._host, self._array, dest_offset=offset, src_offset=offset, count=size)
+
+    def fetch_into(self, room: NDArray[Any], row: int) -> None:
+        """Launch the copy of one row into memory of the caller's; on a CPU it is done at once.
+
+        Args:
+            room: Contiguous, like a row; on CUDA pinned, and left alone until the device has come past this.
+            row: Which.
+        """
+        address = room.__array_interface__["data"][0]
+        place = self._places.get(address)
+        if place is None:
+            if len(self._places) >= _PLACES_MAX:
+                self._places.clear()
+            place = wp.array(ptr=address, dtype=self._array.dtype, shape=(self._row_size,), device="cpu")
+            self._places[address] = place
+        wp.copy(place, self._array, src_offset=row * self._row_size, count=self._row_size)
 
     def rows(self, first: int, count: int) -> NDArray[Any]:
         """Return rows that were fetched, in memory of their own; waits for nothing."""

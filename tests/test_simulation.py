@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 import trimesh
 
 import neurosim_core as ns
-from neurosim_core import simulation
+from neurosim_core import simulation, streams
 from neurosim_core.control import make_controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.render import launch
@@ -407,6 +408,92 @@ def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
     pictures = [packet for packet in packets if isinstance(packet, Image)]
     assert len(pictures) == len(asked) > 4
     assert sum(any(picture.data is room for room in rooms) for picture in pictures) == len(asked) // 2
+
+
+def fly_steps(model: simulation.Model, state: simulation.State, count: int, *, ahead: bool) -> list[Packet]:
+    """Packets of control periods in two parts, each planned ahead or not, with a camera off now and then."""
+    command = 1.01 * hover(model)
+    packets: list[Packet] = []
+    for number in range(count):
+        begun = simulation.begin_step(model, state, command)
+        with pytest.raises(RuntimeError, match="under way"):
+            simulation.begin_step(model, state, command)
+        packets += simulation.end_step(model, state, begun)
+        if ahead:
+            simulation.prepare_step(model, state)
+        if number % 7 == 3:
+            wanted = {"events", "rgb", "depth"} if number % 2 else {"rgb"}
+            simulation.want(model, state, wanted & set(model.config.sensors))
+    return packets
+
+
+@pytest.mark.parametrize("without", [(), ("events",), ("events", "rgb", "depth")])
+def test_steps_in_two_parts_are_the_same(settings, without):
+    """`begin_step` and `end_step` are `step`, planned ahead or not, whatever changes after the planning."""
+    sensors = {name: sensor for name, sensor in SENSORS.items() if name not in without}
+    model = simulation.make_model(ns.load_config({**settings, "sensors": sensors}))
+    found = [fly_steps(model, simulation.make_state(model), 30, ahead=ahead) for ahead in (False, True)]
+    assert content(found[0]) == content(found[1])
+    together = simulation.make_state(model)
+    expected = [p for _ in range(4) for p in simulation.step(model, together, 1.01 * hover(model))]
+    assert content(found[0][: len(expected)]) == content(expected)
+
+
+class LateCopies:
+    """Copies to the host are done when somebody waits for a milestone that was set after them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.waiting: list[Callable[[], None]] = []
+        due: dict[int, list[Callable[[], None]]] = {}
+
+        def late(copy: streams.HostCopy, room: np.ndarray, row: int) -> None:
+            self.waiting.append(functools.partial(np.copyto, room, copy.rows(row, 1)[0]))
+
+        def wait(milestone: streams.Milestone) -> None:
+            for operation in due.pop(id(milestone), ()):
+                if operation in self.waiting:
+                    operation()
+                    self.waiting.remove(operation)
+
+        monkeypatch.setattr(streams.HostCopy, "fetch_into", late)
+        monkeypatch.setattr(streams.Milestone, "set", lambda m: due.update({id(m): list(self.waiting)}))
+        monkeypatch.setattr(streams.Milestone, "wait", wait)
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("names", [("rgb",), ("rgb", "depth"), ("events", "rgb", "depth")])
+def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch, late, names):
+    """They are there at once, or after `settle` where the caller asks for that and there is nothing else."""
+    copies = LateCopies(monkeypatch)
+    sensors = {name: {**SENSORS[name], "rate_hz": 100.0} for name in names if name != "events"}
+    if "events" in names:
+        sensors["events"] = SENSORS["events"]
+    model = simulation.make_model(ns.load_config({**settings, "device": "cpu", "sensors": sensors}))
+    command = 1.01 * hover(model)
+    together = simulation.make_state(model)
+    expected = [p for _ in range(10) for p in simulation.step(model, together, command)]
+    rooms: list[np.ndarray] = []
+
+    def make_room(name: str, stamp_ns: int, picture: np.ndarray) -> np.ndarray | None:
+        rooms.append(np.full_like(picture, 77))
+        return rooms[-1]
+
+    state = simulation.make_state(model, late_pictures=late, make_room=make_room)
+    for cast in state.casts:
+        cast.brings_apart = True
+    packets = []
+    unfinished_count = 0
+    for _ in range(10):
+        some = simulation.step(model, state, command)
+        unfinished_count += bool(copies.waiting)
+        simulation.settle(state)
+        assert not copies.waiting
+        packets += some
+    assert content(packets) == content(expected)
+    pictures = [packet for packet in packets if isinstance(packet, Image)]
+    assert len(pictures) == len(rooms) > 5
+    assert all(picture.data is room for picture, room in zip(pictures, rooms, strict=True))
+    assert (unfinished_count > 4) == (late and "events" not in names)
 
 
 def test_the_fastest_camera_is_seen_first(settings):

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 from cortex import Node
 from neurosim_core.config import SimulationConfig
-from neurosim_core.nodes.cameras import Lanes, plan_lanes
+from neurosim_core.nodes.cameras import Lanes, plan_lanes, sees_inline
 from neurosim_core.nodes.helm import Command, Helm
 from neurosim_core.nodes.inbox import Inbox
 from neurosim_core.nodes.outlet import NO_LINK, Outlet
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.simulation import (
     Batch,
+    Begun,
     Model,
     StartState,
     State,
+    begin_step,
+    end_step,
     finish,
     fly_period,
     make_state,
     observe,
-    step,
+    prepare_step,
+    settle,
     want,
 )
 
@@ -78,6 +83,8 @@ class Craft:
         self._cameras = frozenset(name for cast in model.casts for name in cast.names)
         self._active: frozenset[str] = frozenset()
         self.lanes: Lanes = plan_lanes(model)
+        self._is_late = config.live.mode == "lockstep" and sees_inline(model.device)
+        """The device still writes pictures when they are offered."""
         self.state: State = self.make_state(seed=config.seed)
 
     def make_state(self, *, seed: int, start: StartState | None = None) -> State:
@@ -92,7 +99,9 @@ class Craft:
             lane_count=1,
             flight_lane_count=1 if live.mode == "lockstep" else self.lanes.count,
             borrow_pictures=live.mode == "lockstep",
-            make_room=None if live.mode == "lockstep" else self.outlet.make_room,
+            late_pictures=self._is_late,
+            # on a CPU, what is published at once is copied when it is published
+            make_room=self.outlet.make_room if live.mode == "streaming" or self._is_late else None,
             seed=seed,
             start=start,
         )
@@ -100,6 +109,8 @@ class Craft:
     def begin(self, state: State, *, seed: int) -> None:
         """Begin an episode: forget everything, and publish where the vehicle is."""
         self.state = state
+        if self._is_late:
+            self.outlet.settle_with(functools.partial(settle, state))
         before_ns = self.outlet.streams["odometry"].delivered_ns
         self._before_reset_ns = 0 if before_ns is None else before_ns
         self.helm.reset(seed=seed)
@@ -154,15 +165,24 @@ class Craft:
         self.has_newcomer = False
         self.outlet.deliver(self.helm.send(command, stamp_ns=stamp_ns), "command")
 
-    def step(self, stamp_ns: int) -> None:
-        """Fly the control period that begins at a tick [ns], cameras included.
+    def begin_step(self, stamp_ns: int) -> Begun:
+        """Begin to fly the control period from a tick [ns] on, cameras included; `end_step` has to follow.
 
         Raises:
-            DynamicsError: The integration failed.
+            DynamicsError: The integration has failed.
         """
         mode, setpoint = self.helm.command_at(stamp_ns, self.observe)
-        self.outlet.offer(step(self.model, self.state, setpoint, mode=mode))
+        return begin_step(self.model, self.state, setpoint, mode=mode)
+
+    def end_step(self, begun: Begun) -> None:
+        """Send on its way what a control period yields that was begun."""
+        self.outlet.offer(end_step(self.model, self.state, begun))
         self.outlet.offer_state(self.observe())
+
+    def prepare_step(self) -> None:
+        """Plan the next control period: while others read what this one has yielded."""
+        if not self.state.ended and self.state.failure is None:
+            prepare_step(self.model, self.state)
 
     def fly(self, stamp_ns: int) -> list[Batch]:
         """Fly the control period that begins at a tick [ns]; return what its cameras have to look at.

@@ -84,6 +84,7 @@ class Stream(Post):
         *,
         name: str,
         translate: Callable[[Any, Callable[[int], int] | None], Any],
+        device: str = "cpu",
     ) -> None:
         """Wrap a publisher.
 
@@ -92,12 +93,13 @@ class Stream(Post):
             channel: What is in their way.
             name: Of the sensor.
             translate: Makes the message of a packet, with the sensor's clock if that is not simulated time.
+            device: Where pictures are rendered.
         """
         super().__init__(publisher)
         self.name = name
         self.channel = channel
         self.late_times = Timings()
-        self.loan = PictureLoan(publisher)
+        self.loan = PictureLoan(publisher, device=device)
         self.subscriber_count = 0
         self.published_count = 0
         self.delivered_ns: int | None = None
@@ -180,6 +182,7 @@ class Outlet:
         self.lateness_ns: Callable[[int], int] | None = None
         self._node = node
         self._seed = model.config.seed
+        self._device = model.device
         self._delivery_posts: dict[str, Post] = {}
         self._odometry_count = 0
         self._odometry_ns = -1
@@ -215,9 +218,14 @@ class Outlet:
             post.reset()
 
     def drop_loans(self) -> None:
-        """Give back the room of pictures that are never published, on which closing topics would wait."""
+        """Give back the room of pictures, on which closing topics would wait, for good."""
         for stream in self.streams.values():
-            stream.loan.drop()
+            stream.loan.close()
+
+    def settle_with(self, settle: Callable[[], object]) -> None:
+        """Have something called before a picture is published that was lent room: it waits for the device."""
+        for stream in self.streams.values():
+            stream.loan.settle = settle
 
     def look(self) -> tuple[int, ...]:
         """See who listens, and return how many subscribers each topic has."""
@@ -225,6 +233,8 @@ class Outlet:
 
     def make_room(self, name: str, stamp_ns: int, picture: NDArray[Any]) -> NDArray[Any] | None:
         """Return where a picture can be written so that it is not copied again; None if that makes no sense.
+
+        A CUDA device can write there by itself.
 
         That is so where it is recorded or passes a link, where nobody listens, and where it is due already:
         then it is published at once, and to copy it takes less time than to prepare that it is not. May be
@@ -387,6 +397,7 @@ class Outlet:
             Channel(name, link, seed=self._seed),
             name=name,
             translate=convert or to_message,
+            device=self._device,
         )
         if not link.delivers_at_once:
             self.announce_link(name)

@@ -175,8 +175,7 @@ class Simulator:
             self._recorder.stop = stop
         while not stop.is_set() and self._exit is None:
             self._answer_requests()
-            self._audience.look()
-            self._tell()
+            self._mind()
             if self._ended or (self._paused and not self._steps):
                 if self._tick and not self._ended:
                     self._streaming.publish_seen(self.stamp_ns)
@@ -236,8 +235,10 @@ class Simulator:
         streaming = live.mode == "streaming"
         try:
             if not streaming:
-                for craft in self.crafts:
-                    craft.step(self.stamp_ns)
+                begun = [craft.begin_step(self.stamp_ns) for craft in self.crafts]
+                self._mind()  # a CUDA device is at work
+                for craft, step in zip(self.crafts, begun, strict=True):
+                    craft.end_step(step)
             elif not self._flown and not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
                 return
         except DynamicsError as error:
@@ -256,6 +257,9 @@ class Simulator:
             craft.answers_ns = craft.outlet.publish_due(end_ns)
         if streaming:
             self._streaming.let_readers_go_first(end_ns, end_ns - self.stamp_ns)
+        else:
+            for craft in self.crafts:
+                craft.prepare_step()
         self._end_period(end_ns)
 
     def _wait_for_end(self, end_ns: int) -> bool:
@@ -299,9 +303,8 @@ class Simulator:
         def wake() -> bool:
             if limited and time.monotonic() - begin_s > LATE_S:
                 self._reason = f"for the command of {craft.name} that answers {craft.answers_ns} ns"
-            self._audience.look()
+            self._mind()
             craft.greet()
-            self._tell()
             if self._tick == 0 and self._steps and time.monotonic() - begin_s > FIRST_STEP_S:
                 self._steps.stop(f"nobody has sent {craft.name} a command yet: time begins with the first")
                 return True
@@ -319,6 +322,11 @@ class Simulator:
                 f"at control period {self._tick}: {craft.describe_silence()}"
             )
         return command
+
+    def _mind(self) -> None:
+        """See who listens, and say how it is going, if it is time."""
+        self._audience.look()
+        self._tell()
 
     def _is_called(self) -> bool:
         """Whether something has to be done before what is waited for."""

@@ -37,6 +37,10 @@ _ENCODING: dict[str, ImageEncoding] = {"rgb": "rgb8", "depth": "32FC1"}
 
 _SLOT_LISTS_MAX = 256
 
+MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
+"""Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
+On a CUDA device it is pinned, and the picture is there when the device has finished with the batch."""
+
 
 @dataclass(kw_only=True, eq=False)
 class EventChannel:
@@ -91,6 +95,10 @@ class CastState:
     """Chooses the ticks that are rendered; None: all are."""
     chosen_slots: Sequence[HostInput] = ()
     """Slots of the ticks chosen, for each lane: they do not come again."""
+    make_room: MakeRoom | None = None
+    """Gives memory that pictures are copied to; None: they get their own."""
+    brings_apart: bool = False
+    """`bring_images` launches the copies of pictures to the host, as they go to other places each time."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,6 +112,8 @@ class Instants:
     """Stamp, image slot and camera of each picture."""
     events: tuple[str, ...]
     """Event cameras that see them."""
+    rooms: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
+    """Memory of the caller's that pictures are copied to, by camera and stamp."""
 
 
 def make_cast_state(
@@ -116,6 +126,7 @@ def make_cast_state(
     device: str,
     seed: int = 0,
     bodies: Mapping[str, BodyConfig] | None = None,
+    make_room: MakeRoom | None = None,
 ) -> CastState:
     """Allocate the buffers of a cast.
 
@@ -128,6 +139,7 @@ def make_cast_state(
         device: Where to compute.
         seed: Seed of the noise of event cameras.
         bodies: What moves in the scene.
+        make_room: Gives memory to copy a picture to, where the caller has a place for it.
 
     Raises:
         ValueError: The renderer cannot say what moves how far, and the cast is adaptive.
@@ -189,6 +201,8 @@ def make_cast_state(
         motions=upload_motions(bodies, device) if bodies else None,
         body_poses=[make_body_poses(capacity, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(cast, scene, p_BC, q_BC),
+        make_room=make_room,
+        brings_apart=make_room is not None and wp.get_device(device).is_cuda,
         chosen_slots=[HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(lane_count)]
         if cast.max_displacement_px is not None
         else (),
@@ -276,7 +290,8 @@ class Look(NamedTuple):
     key: Hashable | None
     """Same key, same launches; None: they do not come again."""
     render: Callable[[], Any]
-    """Launches the rendering and the copy of the pictures; returns what must be kept for a graph of it."""
+    """Launches the rendering and, unless that is done apart, the copy of the pictures; returns what must be
+    kept for a graph of it."""
 
 
 def plan_look(
@@ -323,8 +338,9 @@ def plan_look(
         if cast.motions is not None and body_poses is not None:
             pose_bodies(cast.motions, trace.stamps, from_slots, count=len(slots), poses=body_poses)
         cast.renderers[lane].render(p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses)
-        for copy in cast.picture_copies[lane].values():
-            copy.fetch(0, used)
+        if not cast.brings_apart:
+            for copy in cast.picture_copies[lane].values():
+                copy.fetch(0, used)
         return from_slots, to_slots
 
     instants = Instants(
@@ -404,26 +420,45 @@ def flush_events(cast: CastState, *, until_ns: int) -> list[Events]:
     return packets
 
 
-MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
-"""Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none."""
+def bring_images(cast: CastState, instants: Instants) -> None:
+    """Launch the copies of the pictures just rendered, unless that was part of the rendering.
+
+    The device copies a picture to where the caller has room for it, and there is nothing left to do.
+    """
+    if not cast.brings_apart:
+        return
+    for stamp_ns, slot, name in instants.pictures:
+        copy = cast.picture_copies[instants.lane][cast.images[name].output]
+        room = _room_for(cast, name, stamp_ns, copy.view(slot, 1)[0])
+        if room is None:
+            copy.fetch(slot, 1)
+        else:
+            copy.fetch_into(room, slot)
+            instants.rooms[name, stamp_ns] = room
 
 
-def read_images(
-    cast: CastState, instants: Instants, *, borrow: bool = False, make_room: MakeRoom | None = None
-) -> list[Packet]:
+def _room_for(cast: CastState, name: str, stamp_ns: int, picture: NDArray[Any]) -> NDArray[Any] | None:
+    return None if cast.make_room is None else cast.make_room(name, stamp_ns, picture)
+
+
+def read_images(cast: CastState, instants: Instants, *, borrow: bool = False) -> list[Packet]:
     """Return the pictures of a batch that the device has finished with.
 
     Args:
         cast: Which cameras.
         instants: What they have seen.
-        borrow: Return views that are valid until the lane's buffers are overwritten, not copies.
-        make_room: Gives memory that pictures are copied to; where it does not, they are as `borrow` says.
+        borrow: Return views that are valid until the lane's buffers are overwritten, not copies; of those for
+            which the caller has no room.
     """
     copies: dict[tuple[str, int], NDArray[Any]] = {}
 
     def copy_of(image: ImageChannel, slot: int, name: str, stamp_ns: int) -> NDArray[Any]:
+        room = instants.rooms.pop((name, stamp_ns), None)
+        if room is not None:
+            return room
         picture: NDArray[Any] = cast.picture_copies[instants.lane][image.output].view(slot, 1)[0]
-        room = None if make_room is None else make_room(name, stamp_ns, picture)
+        if not cast.brings_apart:
+            room = _room_for(cast, name, stamp_ns, picture)
         if room is not None:
             np.copyto(room, picture)
             return room

@@ -189,6 +189,7 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         self._array, self._copied, self._host = array, True, wp.empty_like(array)
         self._rows = self._host.numpy()
         self._row_size = array.size // array.shape[0] if array.size else 0
+        self._places = {}
 
     for name in ("reset", "_draw"):  # noise begins at once, from arrays that are ready
         monkeypatch.setattr(event_noise.PixelNoise, name, after_all(getattr(event_noise.PixelNoise, name)))

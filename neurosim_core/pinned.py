@@ -1,0 +1,71 @@
+"""Memory that somebody else has mapped, pinned, so that a CUDA device copies into it by itself.
+
+A copy to memory that is not pinned holds up the host until it is done, and goes through memory of the
+driver's. What Warp allocates can be pinned by Warp; shared memory, which others have mapped, only by CUDA.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+_PORTABLE = 1
+"""Pinned for every context: `CU_MEMHOSTREGISTER_PORTABLE`."""
+
+
+class PinError(RuntimeError):
+    """CUDA cannot pin this memory; the message has its error code."""
+
+
+class PinnedMapping:
+    """A mapping that is pinned until `close`, and is kept mapped until then."""
+
+    def __init__(self, memory: Any, device: Any) -> None:
+        """Pin it.
+
+        Args:
+            memory: All of the mapping, to read and write, such as an `mmap`; no part of it is pinned.
+            device: Who copies into it, a CUDA device.
+
+        Raises:
+            PinError: That is not possible.
+        """
+        self.memory = memory
+        """The mapping."""
+        self._device = wp.get_device(device)
+        self._bytes: Any = np.frombuffer(memory, np.uint8)
+        with wp.ScopedDevice(self._device):
+            code = _driver().cuMemHostRegister_v2(self._address, ctypes.c_size_t(self._bytes.size), _PORTABLE)
+        if code:
+            self._bytes = self.memory = None
+            raise PinError(f"CUDA error {code}")
+
+    @property
+    def _address(self) -> ctypes.c_void_p:
+        return ctypes.c_void_p(self._bytes.ctypes.data)
+
+    def close(self) -> None:
+        """Wait for copies that are under way, unpin the mapping, and let go of it; again: does nothing."""
+        if self.memory is None:
+            return
+        with wp.ScopedDevice(self._device):
+            wp.synchronize_device(self._device)
+            _driver().cuMemHostUnregister(self._address)
+        self._bytes = self.memory = None
+
+
+@functools.cache
+def _driver() -> Any:
+    """Return the library of CUDA's driver.
+
+    Raises:
+        PinError: There is none.
+    """
+    try:
+        return ctypes.CDLL("libcuda.so.1")
+    except OSError as error:
+        raise PinError(str(error)) from None
