@@ -9,14 +9,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import warp as wp
 from live_rig import RGB, LiveRig, count_free, drain, make_config, models_of
 from processes import SOON_S
 
 from cortex import Node, reliable
 from cortex.messages import Image, Odometry
 from neurosim_core import streams
+from neurosim_core.config import SimulationConfig
 from neurosim_core.nodes import craft, loans
+from neurosim_core.nodes.craft import Craft
 from neurosim_core.nodes.loans import PictureLoan
+from neurosim_core.packets import Image as ImagePacket
 from neurosim_core.pinned import PinError
 from neurosim_core.simulation import make_state, step
 
@@ -136,24 +140,42 @@ def late(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Callable[[], None]]]:
     due.clear()
 
 
-def test_a_flight_with_a_late_device_shows_the_same(runtime, late):
-    """Every picture is the one of its stamp, complete, in lockstep over Cortex as in one process."""
-    sensors = {"rgb": {**RGB, "rate_hz": 100.0, "lens": LENS}}
-    config = make_config(sensors=sensors, **{"live.mode": "lockstep", "control.rate_hz": 100.0})
+def check_flight(config: SimulationConfig, prepare: Callable[[Craft], None] = lambda craft: None) -> None:
+    """Fly over Cortex: every picture is the one of its stamp, complete, as in one process."""
     with LiveRig(config) as rig:
-        for cast in rig.simulator.crafts[0].state.casts:
-            cast.brings_apart = True
+        prepare(rig.simulator.crafts[0])
         pictures = rig.listen("/drone/rgb", Image)
         odometry = rig.listen("/drone/odometry", Odometry)
         tilt = np.array([1.02, 1.0, 1.0, 1.02])
         rig.fly(odometry, 12, lambda state: ("motor_speeds", rig.hover() * tilt))
         found = drain(pictures, least=13)
-        assert rig.simulator.crafts[0].outlet.streams["rgb"].published_count == 13
         model = models_of(config)["drone"]
-        state = make_state(model)
+        state = make_state(model, lane_count=1)
         packets = [packet for _ in range(12) for packet in step(model, state, rig.hover() * tilt)]
-        expected = [packet for packet in packets if packet.sensor == "rgb"]
+        expected = [packet for packet in packets if isinstance(packet, ImagePacket)]
         assert [picture.stamp_ns for picture in found] == [packet.stamp_ns for packet in expected]
         assert len({picture.data.tobytes() for picture in found}) == 13
         for picture, packet in zip(found, expected, strict=True):
             assert picture.data.tobytes() == packet.data.tobytes()
+
+
+def lockstep_config(**overrides: Any) -> SimulationConfig:
+    sensors = {"rgb": {**RGB, "rate_hz": 100.0, "lens": LENS}}
+    return make_config(sensors=sensors, **{"live.mode": "lockstep", "control.rate_hz": 100.0, **overrides})
+
+
+def test_a_flight_with_a_late_device_shows_the_same(runtime, late):
+    def write_late(craft: Craft) -> None:
+        for cast in craft.state.casts:
+            cast.brings_apart = True
+
+    check_flight(lockstep_config(), write_late)
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+def test_a_flight_on_a_cuda_device_shows_the_same(runtime):
+    def check_device(craft: Craft) -> None:
+        assert all(cast.brings_apart for cast in craft.state.casts)
+
+    config = lockstep_config(device="cuda:0", renderer="warp", **{"render.lighting.mode": "unshadowed"})
+    check_flight(config, check_device)
