@@ -6,7 +6,9 @@
 
 # No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
 
+from collections.abc import Collection
 from functools import cache
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -15,6 +17,53 @@ from neurosim_core.render.scene_data import SceneData
 
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
 """Everything that a cast can answer."""
+
+
+class Asked(NamedTuple):
+    """What some outputs have in common."""
+
+    log: bool
+    """Log radiance is asked for, which all instants have."""
+    images: bool
+    """Something else is asked for, which instants with an image slot have."""
+    radiance: bool
+    """Light is needed: for log radiance or for RGB."""
+    geometry: bool
+    """Depth, normal or instance is asked for."""
+
+
+def asked_for(outputs: Collection[str]) -> Asked:
+    """Return what kernels have to do for `outputs`."""
+    return Asked(
+        log="log_radiance" in outputs,
+        images=any(name != "log_radiance" for name in outputs),
+        radiance="log_radiance" in outputs or "rgb" in outputs,
+        geometry=any(name in outputs for name in ("depth", "normal", "instance")),
+    )
+
+
+@wp.struct
+class FilmData:
+    """The outputs of a cast; what is not asked for is empty. All but the first are of image slots."""
+
+    log_radiance: wp.array3d[float]
+    """log(Rec. 709 luma + dark floor) of each instant, shape [K, H, W]."""
+    rgb: wp.array4d[wp.uint8]
+    """sRGB of exposure times radiance, shape [M, H, W, 3]."""
+    depth: wp.array3d[float]
+    """Planar z [m], inf where nothing is hit, shape [M, H, W]."""
+    normal: wp.array3d[wp.vec3]
+    """Of the triangle, in W, towards the camera, zero where nothing is hit, shape [M, H, W]."""
+    instance: wp.array3d[int]
+    """-1 where nothing is hit, shape [M, H, W]."""
+
+
+def make_film(**outputs: Any) -> FilmData:
+    """Return the arrays of outputs, by name, as kernels take them; None: it is not asked for."""
+    film = FilmData()
+    for name, array in outputs.items():
+        setattr(film, name, array)
+    return film
 
 
 @wp.func
@@ -38,22 +87,20 @@ def geometry_writer(outputs: tuple[str, ...]) -> wp.Function:
         slot: int,
         row: int,
         col: int,
-        depth_out: wp.array3d[float],
-        normal_out: wp.array3d[wp.vec3],
-        instance_out: wp.array3d[int],
+        film: FilmData,
     ) -> None:
         if wp.static("depth" in outputs):
-            depth_out[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
+            film.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
         if wp.static("normal" in outputs):
             normal = wp.vec3(0.0)
             if hit.face >= 0:
                 normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
-            normal_out[slot, row, col] = normal
+            film.normal[slot, row, col] = normal
         if wp.static("instance" in outputs):
             name = int(-1)
             if hit.face >= 0:
                 name = scene.face_instance[hit.face]
-            instance_out[slot, row, col] = name
+            film.instance[slot, row, col] = name
 
     return write_geometry
 
@@ -74,19 +121,18 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
         slot: int,
         row: int,
         col: int,
-        log_radiance_out: wp.array3d[float],
-        rgb_out: wp.array4d[wp.uint8],
+        film: FilmData,
     ) -> None:
         radiance = total
         if wp.static(supersampled):
             radiance = (1.0 / float(layer_count - 1)) * radiance
         if wp.static("log_radiance" in outputs):
             luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
-            log_radiance_out[instant, row, col] = wp.log(luma + scene.dark_floor)
+            film.log_radiance[instant, row, col] = wp.log(luma + scene.dark_floor)
         if wp.static("rgb" in outputs):
             if slot >= 0:
-                rgb_out[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
-                rgb_out[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
-                rgb_out[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
+                film.rgb[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
+                film.rgb[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
+                film.rgb[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
 
     return write_radiance

@@ -6,11 +6,40 @@
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from neurosim_core.render.cast_terms import Terms
 from neurosim_core.render.scene_data import SceneData
+
+
+@wp.struct
+class ViewData:
+    """What a launch looks at: along the rays of a lens, from the poses of its instants."""
+
+    rays: wp.array2d[wp.vec4]
+    """Direction in C and spread [rad], shape [layer, H * W]: one layer, or that of the centres and then the
+    samples whose mean is the radiance."""
+    width: int
+    """Columns of a picture [px]."""
+    height: int
+    """Rows of a picture [px]."""
+    instant_count: int
+    """How many of the K instants are rendered, of each world."""
+    p_WC: wp.array[wp.vec3]
+    """Position of the camera [m], shape [K]."""
+    q_WC: wp.array[wp.quat]
+    """Orientation of the camera's optical frame, xyzw, shape [K]."""
+    image_slot: wp.array[int]
+    """Where the images of an instant go, shape [K]; -1: nowhere."""
+
+
+def make_view(rays: Any, width: int, height: int) -> ViewData:
+    """Return a view along rays, vec4, shape [layer, H * W]; without instants."""
+    view = ViewData()
+    view.rays, view.width, view.height = rays, width, height
+    return view
 
 
 @wp.struct

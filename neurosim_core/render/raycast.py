@@ -21,13 +21,8 @@ from neurosim_core.render.raycast_pixels import pixel_kernel
 def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     """Return the kernel that casts rays for `outputs` in a scene with `terms`; made once per combination.
 
-    Its outputs, all [.., H, W]: log_radiance, log(Rec. 709 luma + dark floor), of each instant; and of
-    instants with image_slot >= 0, in that slot: rgb, sRGB of exposure times radiance; depth, planar z [m],
-    inf where nothing is hit; normal, of the triangle, in W, towards the camera, zero where nothing is hit;
-    instance, -1 where nothing is hit.
-
-    Rays are [layer, H * W]: direction in C and spread [rad]. One layer, or the layer of the centres and then
-    the samples whose mean is the radiance.
+    Its parameters: the index of the first thread; `SceneData`, `ViewData`, `BodyData`, `WorldData` and
+    `WalkData`, of which it reads what the terms say. It writes `FilmData`.
 
     The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
     side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much

@@ -14,10 +14,10 @@ import warp as wp
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.cast_terms import Terms
 from neurosim_core.render.embree import packet_caster
-from neurosim_core.render.film import geometry_writer, radiance_writer
+from neurosim_core.render.film import FilmData, asked_for, geometry_writer, radiance_writer
 from neurosim_core.render.list_search import find_faces
 from neurosim_core.render.packet_shading import packet_eye, packet_shader
-from neurosim_core.render.pixel_order import WorldData, tile_finder
+from neurosim_core.render.pixel_order import ViewData, WorldData, tile_finder
 from neurosim_core.render.ray_hit import FAR_M, UNFUSED, Hit, meet_bodies, meet_listed, meet_scene
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
@@ -26,10 +26,7 @@ from neurosim_core.render.walk_data import ASK, TILE, WalkData
 
 def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     """Return the kernel, made anew; see `raycast.raycast_kernel`."""
-    with_log = "log_radiance" in outputs
-    with_radiance = with_log or "rgb" in outputs
-    with_images = len(outputs) > int(with_log)
-    with_geometry = bool({"depth", "normal", "instance"} & set(outputs))
+    asked = asked_for(outputs)
     walked = terms.walked > 0
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
@@ -40,10 +37,10 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     packets = (TILE // side) ** 2  # of a tile
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
-    together = with_radiance and terms.baked and not terms.bodies and not terms.finest_level
-    each_lane = with_geometry or walked or not together
+    together = asked.radiance and terms.baked and not terms.bodies and not terms.finest_level
+    each_lane = asked.geometry or walked or not together
     shade_packet = packet_shader(lanes, textured=terms.textured, emissive=terms.emissive, unit_normals=walked)
-    at_once = with_log and together and not walked  # where no picture is asked for
+    at_once = asked.log and together and not walked  # where no picture is asked for
     see_packet = (
         packet_eye(terms.embree, textured=terms.textured, emissive=terms.emissive) if at_once else None
     )
@@ -51,63 +48,52 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else UNFUSED)
     def raycast_packets(
         first: int,
-        # Model:
-        scene: SceneData,
-        rays: wp.array2d[wp.vec4],
-        width: int,
-        height: int,
         # In:
-        instant_count: int,
-        p_WC: wp.array[wp.vec3],
-        q_WC: wp.array[wp.quat],
-        image_slot: wp.array[int],
+        scene: SceneData,
+        view: ViewData,
         bodies: BodyData,
-        world_data: WorldData,
-        walk_data: WalkData,
+        worlds: WorldData,
+        walks: WalkData,
         # Out:
-        log_radiance_out: wp.array3d[float],
-        rgb_out: wp.array4d[wp.uint8],
-        depth_out: wp.array3d[float],
-        normal_out: wp.array3d[wp.vec3],
-        instance_out: wp.array3d[int],
+        film: FilmData,
     ) -> None:
         # A packet is the same pixels in every launch: the last bit of a hit may depend on the other rays.
         index = first + wp.tid()
         in_tile = index % packets
         block = index // packets
-        instant = block % instant_count
-        tile = block // instant_count
-        world, tile, left, top = find_tile(tile, width, height)
+        instant = block % view.instant_count
+        tile = block // view.instant_count
+        world, tile, left, top = find_tile(tile, view.width, view.height)
         first_ray = int(0)
         if wp.static(terms.worlds):
-            instant += world * world_data.stride
-            if world_data.active[world] == 0:
+            instant += world * worlds.stride
+            if worlds.active[world] == 0:
                 return
         if wp.static(terms.world_scenes):
-            scene = world_data.scenes[world_data.scene[world]]
+            scene = worlds.scenes[worlds.scene[world]]
         if wp.static(terms.world_lenses):
-            first_ray = world_data.lens[world] * width * height
+            first_ray = worlds.lens[world] * view.width * view.height
         left += (in_tile % 2) * side
         top += (in_tile // 2) * side
-        if left >= width or top >= height:
+        if left >= view.width or top >= view.height:
             return
         slot = int(-1)
-        if wp.static(with_images):
-            slot = image_slot[instant]
-            if wp.static(not with_log):
+        if wp.static(asked.images):
+            slot = view.image_slot[instant]
+            if wp.static(not asked.log):
                 if slot < 0:
                     return
-        origin = p_WC[instant]
-        q = q_WC[instant]
-        columns = wp.min(width - left, side)
-        rows = wp.min(height - top, side)
+        origin = view.p_WC[instant]
+        q = view.q_WC[instant]
+        columns = wp.min(view.width - left, side)
+        rows = wp.min(view.height - top, side)
         if wp.static(at_once):
             if slot < 0:
                 see_packet(
                     scene,
-                    rays,
-                    first_ray + top * width + left,
-                    width,
+                    view.rays,
+                    first_ray + top * view.width + left,
+                    view.width,
                     origin,
                     q,
                     FAR_M,
@@ -116,7 +102,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     left,
                     rows,
                     columns,
-                    log_radiance_out,
+                    film.log_radiance,
                 )
                 return
         ray = wp.zeros(shape=(lanes,), dtype=wp.vec3)
@@ -127,26 +113,26 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         normal = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         spread_rad = wp.zeros(shape=(lanes if together else 1,), dtype=float)
-        for layer in range(rays.shape[0]):
+        for layer in range(view.rays.shape[0]):
             if wp.static(terms.supersampled):
-                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
+                if layer == 0 and (slot < 0 or wp.static(not asked.geometry)):
                     continue
             for y in range(rows):
                 for x in range(columns):
-                    ray_C = rays[layer, first_ray + (top + y) * width + left + x]
+                    ray_C = view.rays[layer, first_ray + (top + y) * view.width + left + x]
                     ray[side * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
                     if wp.static(together):
                         spread_rad[side * y + x] = ray_C[3]
             if wp.static(walked):
-                walk = instant // walk_data.instants
+                walk = instant // walks.instants
                 find_faces(
                     scene.mesh,
-                    walk_data.faces,
-                    (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
-                    walk_data.count[walk, tile],
-                    walk_data.reach[walk, tile],
+                    walks.faces,
+                    (walk * walks.bounds.shape[0] + tile) * walks.limit,
+                    walks.count[walk, tile],
+                    walks.reach[walk, tile],
                     FAR_M,
-                    walk_data.bounds[tile],
+                    walks.bounds[tile],
                     q,
                     origin,
                     ray,
@@ -160,7 +146,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                 for y in range(rows):
                     for x in range(columns):
                         lane = side * y + x
-                        ray_C = rays[layer, first_ray + (top + y) * width + left + x]
+                        ray_C = view.rays[layer, first_ray + (top + y) * view.width + left + x]
                         if wp.static(walked):
                             hit = meet_listed(scene, origin, ray[lane], face[lane])
                             if hit.face == ASK:
@@ -183,12 +169,12 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                             u[lane] = hit.u
                             v[lane] = hit.v
                             normal[lane] = hit.normal
-                        if wp.static(with_radiance and not together):
+                        if wp.static(asked.radiance and not together):
                             if wp.static(not terms.supersampled) or layer > 0:
                                 radiance[lane] += radiance_of(
                                     scene, bodies, instant, body, q, ray[lane], origin, ray_C[3], hit
                                 )
-                        if wp.static(with_geometry):
+                        if wp.static(asked.geometry):
                             if slot >= 0 and layer == 0:
                                 write_geometry(
                                     scene,
@@ -198,9 +184,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                                     slot,
                                     top + y,
                                     left + x,
-                                    depth_out,
-                                    normal_out,
-                                    instance_out,
+                                    film,
                                 )
             if wp.static(together):
                 if wp.static(not terms.supersampled) or layer > 0:
@@ -215,19 +199,18 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                         normal,
                         radiance,
                     )
-        if wp.static(with_radiance):
+        if wp.static(asked.radiance):
             for y in range(rows):
                 for x in range(columns):
                     write_radiance(
                         scene,
                         radiance[side * y + x],
-                        rays.shape[0],
+                        view.rays.shape[0],
                         instant,
                         slot,
                         top + y,
                         left + x,
-                        log_radiance_out,
-                        rgb_out,
+                        film,
                     )
 
     return raycast_packets

@@ -14,9 +14,9 @@ import warp as wp
 
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.cast_terms import Terms, group_of
-from neurosim_core.render.film import geometry_writer, radiance_writer
+from neurosim_core.render.film import FilmData, asked_for, geometry_writer, radiance_writer
 from neurosim_core.render.list_search import together_finder
-from neurosim_core.render.pixel_order import WorldData, tile_finder
+from neurosim_core.render.pixel_order import ViewData, WorldData, tile_finder
 from neurosim_core.render.ray_hit import FAR_M, UNFUSED, meet_bodies, meet_listed, meet_scene
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
@@ -39,71 +39,46 @@ def pixel_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     )
     def raycast(
         first: int,
-        # Model:
-        scene: SceneData,
-        rays: wp.array2d[wp.vec4],
-        width: int,
-        height: int,
         # In:
-        instant_count: int,
-        p_WC: wp.array[wp.vec3],
-        q_WC: wp.array[wp.quat],
-        image_slot: wp.array[int],
+        scene: SceneData,
+        view: ViewData,
         bodies: BodyData,
-        world_data: WorldData,
-        walk_data: WalkData,
+        worlds: WorldData,
+        walks: WalkData,
         # Out:
-        log_radiance_out: wp.array3d[float],
-        rgb_out: wp.array4d[wp.uint8],
-        depth_out: wp.array3d[float],
-        normal_out: wp.array3d[wp.vec3],
-        instance_out: wp.array3d[int],
+        film: FilmData,
     ) -> None:
         begin = first + wp.tid()
-        end = begin + 1
-        step = int(1)
-        listed = bool(False)
         if wp.static(terms.asking):
-            end = walk_data.left_count[0]
-            step = walk_data.left_threads
-            listed = end <= walk_data.left.shape[0]
+            count = walks.left_count[0]
+            listed = count <= walks.left.shape[0]
             if not listed:  # all pixels
-                end = instant_count * walk_data.bounds.shape[0] * 64
+                count = view.instant_count * walks.bounds.shape[0] * 64
                 if wp.static(terms.worlds):
-                    end *= world_data.active.shape[0]
-        for place in range(begin, end, step):
-            index = place
-            if listed:
-                index = walk_data.left[place]
-            look(
-                index,
-                scene,
-                rays,
-                width,
-                height,
-                instant_count,
-                p_WC,
-                q_WC,
-                image_slot,
-                bodies,
-                world_data,
-                walk_data,
-                log_radiance_out,
-                rgb_out,
-                depth_out,
-                normal_out,
-                instance_out,
-            )
+                    count *= worlds.active.shape[0]
+            for turn in range(turn_count(begin, count, walks.left_threads)):
+                index = begin + turn * walks.left_threads
+                if listed:
+                    index = walks.left[index]
+                look(index, scene, view, bodies, worlds, walks, film)
+        else:
+            look(begin, scene, view, bodies, worlds, walks, film)
 
     return raycast
 
 
+@wp.func
+def turn_count(begin: int, end: int, step: int) -> int:
+    """Return how many numbers `range(begin, end, step)` has.
+
+    Counted, since the one after the last may be more than 32 bits hold.
+    """
+    return wp.where(begin < end, (end - 1 - begin) // step + 1, 0)
+
+
 def _eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
     """Return the function that looks at a pixel of an instant, by a ray that walks by itself."""
-    with_log = "log_radiance" in outputs
-    with_radiance = with_log or "rgb" in outputs
-    with_images = len(outputs) > int(with_log)
-    with_geometry = bool({"depth", "normal", "instance"} & set(outputs))
+    asked = asked_for(outputs)
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
     write_geometry = geometry_writer(outputs)
@@ -113,89 +88,74 @@ def _eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
     def see(
         index: int,
         scene: SceneData,
-        rays: wp.array2d[wp.vec4],
-        width: int,
-        height: int,
-        instant_count: int,
-        p_WC: wp.array[wp.vec3],
-        q_WC: wp.array[wp.quat],
-        image_slot: wp.array[int],
+        view: ViewData,
         bodies: BodyData,
-        world_data: WorldData,
-        walk_data: WalkData,
-        log_radiance_out: wp.array3d[float],
-        rgb_out: wp.array4d[wp.uint8],
-        depth_out: wp.array3d[float],
-        normal_out: wp.array3d[wp.vec3],
-        instance_out: wp.array3d[int],
+        worlds: WorldData,
+        walks: WalkData,
+        film: FilmData,
     ):
         # A pixel of an instant, of which `index` tells: of a tile all instants, then the next tile. Threads
         # side by side should walk the same nodes: a block is a quarter of a tile at four instants, and
         # what is left over the whole tile at one.
         in_tile = index % 64
         block = index // 64
-        instant = block % instant_count
-        tile = block // instant_count
+        instant = block % view.instant_count
+        tile = block // view.instant_count
         if wp.static(not terms.asking):
-            if instant < instant_count // 4 * 4:
+            if instant < view.instant_count // 4 * 4:
                 quarter = instant % 4
                 instant += in_tile // 16 - quarter
                 in_tile = 32 * (quarter // 2) + 4 * (quarter % 2) + 8 * ((in_tile % 16) // 4) + in_tile % 4
-        world, tile, left, top = find_tile(tile, width, height)
+        world, tile, left, top = find_tile(tile, view.width, view.height)
         first_ray = int(0)
         if wp.static(terms.worlds):
-            instant += world * world_data.stride
-            if world_data.active[world] == 0:
+            instant += world * worlds.stride
+            if worlds.active[world] == 0:
                 return
         if wp.static(terms.world_scenes):
-            scene = world_data.scenes[world_data.scene[world]]
+            scene = worlds.scenes[worlds.scene[world]]
         if wp.static(terms.world_lenses):
-            first_ray = world_data.lens[world] * width * height
+            first_ray = worlds.lens[world] * view.width * view.height
         col = left + in_tile % 8
         row = top + in_tile // 8
-        if col >= width or row >= height:
+        if col >= view.width or row >= view.height:
             return
         slot = int(-1)
-        if wp.static(with_images):
-            slot = image_slot[instant]
-            if wp.static(not with_log):
+        if wp.static(asked.images):
+            slot = view.image_slot[instant]
+            if wp.static(not asked.log):
                 if slot < 0:
                     return
-        origin = p_WC[instant]
-        q = q_WC[instant]
-        pixel = first_ray + row * width + col
+        origin = view.p_WC[instant]
+        q = view.q_WC[instant]
+        pixel = first_ray + row * view.width + col
         radiance = wp.vec3(0.0)
-        for layer in range(rays.shape[0]):
+        for layer in range(view.rays.shape[0]):
             if wp.static(terms.supersampled):
                 # Layer 0 goes through the centre and is for geometry, the others are for radiance.
-                if layer == 0 and (slot < 0 or wp.static(not with_geometry)):
+                if layer == 0 and (slot < 0 or wp.static(not asked.geometry)):
                     continue
-            ray_C = rays[layer, pixel]
+            ray_C = view.rays[layer, pixel]
             ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
             hit = meet_scene(scene, origin, ray)
             body = int(-1)
             if wp.static(terms.bodies):
                 hit, body = meet_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
-            if wp.static(with_radiance):
+            if wp.static(asked.radiance):
                 if wp.static(not terms.supersampled) or layer > 0:
                     radiance += radiance_of(scene, bodies, instant, body, q, ray, origin, ray_C[3], hit)
-            if wp.static(with_geometry):
+            if wp.static(asked.geometry):
                 if slot >= 0 and layer == 0:
-                    write_geometry(
-                        scene, ray, ray_C[2], hit, slot, row, col, depth_out, normal_out, instance_out
-                    )
-        if wp.static(with_radiance):
-            write_radiance(scene, radiance, rays.shape[0], instant, slot, row, col, log_radiance_out, rgb_out)
+                    write_geometry(scene, ray, ray_C[2], hit, slot, row, col, film)
+        if wp.static(asked.radiance):
+            write_radiance(scene, radiance, view.rays.shape[0], instant, slot, row, col, film)
 
     return see
 
 
 def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
     """Return the function that looks at a pixel of a group of instants, by rays that share a walk."""
-    with_log = "log_radiance" in outputs
-    with_radiance = with_log or "rgb" in outputs
-    with_images = len(outputs) > int(with_log)
-    with_geometry = bool({"depth", "normal", "instance"} & set(outputs))
+    asked = asked_for(outputs)
     group = group_of(terms)
     find_tile = tile_finder(terms)
     find_together = together_finder(group)
@@ -207,55 +167,45 @@ def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
     def see_together(
         index: int,
         scene: SceneData,
-        rays: wp.array2d[wp.vec4],
-        width: int,
-        height: int,
-        instant_count: int,
-        p_WC: wp.array[wp.vec3],
-        q_WC: wp.array[wp.quat],
-        image_slot: wp.array[int],
+        view: ViewData,
         bodies: BodyData,
-        world_data: WorldData,
-        walk_data: WalkData,
-        log_radiance_out: wp.array3d[float],
-        rgb_out: wp.array4d[wp.uint8],
-        depth_out: wp.array3d[float],
-        normal_out: wp.array3d[wp.vec3],
-        instance_out: wp.array3d[int],
+        worlds: WorldData,
+        walks: WalkData,
+        film: FilmData,
     ):
         # A pixel of a group of instants, of which `index` tells; what blocks do together, all threads do.
         in_tile = index % 64
         block = index // 64
-        group_count = (instant_count + group - 1) // group
+        group_count = (view.instant_count + group - 1) // group
         first = (block % group_count) * group
         tile = block // group_count
-        instants = wp.min(instant_count - first, group)
-        block = tile * instant_count + first  # of the first instant, as `see` counts
-        world, tile, left_col, top = find_tile(tile, width, height)
+        instants = wp.min(view.instant_count - first, group)
+        block = tile * view.instant_count + first  # of the first instant, as `see` counts
+        world, tile, left_col, top = find_tile(tile, view.width, view.height)
         if wp.static(terms.worlds):
-            first += world * world_data.stride
-            if world_data.active[world] == 0:
+            first += world * worlds.stride
+            if worlds.active[world] == 0:
                 return
         col = left_col + in_tile % 8
         row = top + in_tile // 8
-        outside = col >= width or row >= height
-        pixel = wp.min(row, height - 1) * width + wp.min(col, width - 1)
-        walk = first // walk_data.instants
-        layer_count = rays.shape[0]
+        outside = col >= view.width or row >= view.height
+        pixel = wp.min(row, view.height - 1) * view.width + wp.min(col, view.width - 1)
+        walk = first // walks.instants
+        layer_count = view.rays.shape[0]
         radiance = wp.vec3(0.0)
         left = bool(False)
         for layer in range(layer_count):
-            ray_C = rays[layer, pixel]
+            ray_C = view.rays[layer, pixel]
             faces = find_together(
                 scene.mesh,
-                walk_data.faces,
-                (walk * walk_data.bounds.shape[0] + tile) * walk_data.limit,
-                walk_data.count[walk, tile],
-                walk_data.reach[walk, tile],
+                walks.faces,
+                (walk * walks.bounds.shape[0] + tile) * walks.limit,
+                walks.count[walk, tile],
+                walks.reach[walk, tile],
                 FAR_M,
-                walk_data.bounds[tile],
-                p_WC,
-                q_WC,
+                walks.bounds[tile],
+                view.p_WC,
+                view.q_WC,
                 first,
                 instants,
                 wp.vec3(ray_C[0], ray_C[1], ray_C[2]),
@@ -263,16 +213,16 @@ def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
             for member in range(instants):
                 instant = first + member
                 slot = int(-1)
-                if wp.static(with_images):
-                    slot = image_slot[instant]
+                if wp.static(asked.images):
+                    slot = view.image_slot[instant]
                 seen = not outside and not left
-                if wp.static(with_images and not with_log):
+                if wp.static(asked.images and not asked.log):
                     seen = seen and slot >= 0
                 if wp.static(terms.supersampled):
-                    seen = seen and (layer > 0 or (slot >= 0 and wp.static(with_geometry)))
+                    seen = seen and (layer > 0 or (slot >= 0 and wp.static(asked.geometry)))
                 if seen:
-                    origin = p_WC[instant]
-                    q = q_WC[instant]
+                    origin = view.p_WC[instant]
+                    q = view.q_WC[instant]
                     ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
                     hit = meet_listed(scene, origin, ray, faces[member])
                     left = hit.face == ASK
@@ -282,12 +232,12 @@ def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
                             hit, body = meet_bodies(
                                 bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
                             )
-                        if wp.static(with_radiance):
+                        if wp.static(asked.radiance):
                             if wp.static(not terms.supersampled) or layer > 0:
                                 radiance += radiance_of(
                                     scene, bodies, instant, body, q, ray, origin, ray_C[3], hit
                                 )
-                        if wp.static(with_geometry):
+                        if wp.static(asked.geometry):
                             if slot >= 0 and layer == 0:
                                 write_geometry(
                                     scene,
@@ -297,13 +247,11 @@ def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
                                     slot,
                                     row,
                                     col,
-                                    depth_out,
-                                    normal_out,
-                                    instance_out,
+                                    film,
                                 )
                 if layer == layer_count - 1:
-                    _leave(left, (block + member) * 64 + in_tile, walk_data.left, walk_data.left_count)
-                    if wp.static(with_radiance):
+                    _leave(left, (block + member) * 64 + in_tile, walks.left, walks.left_count)
+                    if wp.static(asked.radiance):
                         if seen and not left:
                             write_radiance(
                                 scene,
@@ -313,8 +261,7 @@ def _together_eye(outputs: tuple[str, ...], terms: Terms) -> wp.Function:
                                 slot,
                                 row,
                                 col,
-                                log_radiance_out,
-                                rgb_out,
+                                film,
                             )
                     radiance = wp.vec3(0.0)
                     left = bool(False)

@@ -23,6 +23,7 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.cast_terms import Terms, group_of, with_walks
 from neurosim_core.render.config import RenderConfig, WalkConfig
 from neurosim_core.render.embree import PACKET, EmbreeError, EmbreeTree, packet_width
+from neurosim_core.render.film import OUTPUTS, make_film
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import (
     RefinedMesh,
@@ -32,7 +33,7 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.pixel_order import WorldData
+from neurosim_core.render.pixel_order import WorldData, make_view
 from neurosim_core.render.ray_hit import face_normals
 from neurosim_core.render.raycast import asking_kernel, raycast_kernel
 from neurosim_core.render.scene_data import SceneData
@@ -270,7 +271,7 @@ def ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
 class WarpRenderer:
     """Renders K instants of one lens per launch. `render` neither allocates nor waits for a CUDA device.
 
-    Outputs that were not asked for are None. See `raycast.raycast_kernel` for what they are.
+    Outputs that were not asked for are None. See `film.FilmData` for what they are.
 
     Attributes:
         log_radiance: float32, shape [K, H, W].
@@ -315,7 +316,6 @@ class WarpRenderer:
         self._asking = asking_kernel(outputs, terms)
         self._group = group_of(terms)
         self._arrays = arrays
-        self._width, self._height = lens.width, lens.height
         self._thread_count = thread_count
         tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
         most = _THREAD_COUNT_MAX // (tiles * TILE * TILE)
@@ -328,6 +328,7 @@ class WarpRenderer:
         self._instant_threads = tiles * TILE * TILE // rays_together
         device = arrays.device
         self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
+        self._view = make_view(self.rays, lens.width, lens.height)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
         self._world_data = WorldData()
         self.walk = None
@@ -343,6 +344,7 @@ class WarpRenderer:
                 leaves=self._asking is not None,
                 thread_count=thread_count,
             )
+        self._walk_data = WalkData() if self.walk is None else self.walk.data
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
@@ -353,6 +355,7 @@ class WarpRenderer:
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
+        self._film = make_film(**{name: getattr(self, name) for name in OUTPUTS})
 
     def render(
         self,
@@ -384,20 +387,10 @@ class WarpRenderer:
             )
         if self.walk is not None:
             self.walk.launch(self.rays, p_WC, q_WC, instant_count=instant_count)
-        inputs = [
-            self._arrays.data,
-            self.rays,
-            self._width,
-            self._height,
-            instant_count,
-            p_WC,
-            q_WC,
-            image_slot,
-            self._body_data,
-            self._world_data,
-            WalkData() if self.walk is None else self.walk.data,
-        ]
-        outputs = [self.log_radiance, self.rgb, self.depth, self.normal, self.instance]
+        view = self._view
+        view.instant_count, view.p_WC, view.q_WC, view.image_slot = instant_count, p_WC, q_WC, image_slot
+        inputs = [self._arrays.data, view, self._body_data, self._world_data, self._walk_data]
+        outputs = [self._film]
         device = self._arrays.device
         launch_split(
             self._kernel,

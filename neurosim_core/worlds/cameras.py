@@ -14,8 +14,9 @@ from neurosim_core.render.body_arrays import make_body_data, place_camera
 from neurosim_core.render.cast_terms import group_of, with_walks
 from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.embree import PACKET
+from neurosim_core.render.film import make_film
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.pixel_order import WorldData
+from neurosim_core.render.pixel_order import WorldData, make_view
 from neurosim_core.render.raycast import asking_kernel, raycast_kernel
 from neurosim_core.render.tile_walk import TileWalk, shared_walk
 from neurosim_core.render.walk_data import TILE, WalkData
@@ -111,11 +112,14 @@ class WorldCast:
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
         self._scene = arrays.data
         self._walk = None if walk is None else self._make_walk(arrays, rays, walk)
+        self._walk_data = WalkData() if self._walk is None else self._walk.data
         self._worlds = self._make_worlds(scenes, chosen if len(lenses) > 1 else None)
         self._p_BC = wp.vec3d(*cast.mount.position_m)
         self._q_BC = wp.quatd(*cast.mount.optical_quaternion())
         self._p_WC = wp.zeros(world_count * instant_count, dtype=wp.vec3, device=device)
         self._q_WC = wp.zeros(world_count * instant_count, dtype=wp.quat, device=device)
+        self._view = make_view(self._rays, *self._size)
+        self._view.p_WC, self._view.q_WC = self._p_WC, self._q_WC
         self._bodies = arrays.bodies
         self._make_bodies(bodies)
         self.parity = 0
@@ -131,6 +135,7 @@ class WorldCast:
             name: wp.zeros(size, dtype=dtype, device=device) if name in cast.outputs else None
             for name, (size, dtype) in made.items()
         }
+        self._film = make_film(**self._outputs)
         self.pictures: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
         """Of image cameras that look less often than another of their kind in the cast, or than the cast."""
@@ -203,19 +208,10 @@ class WorldCast:
         if self._walk is not None:
             self._walk.launch(self._rays, self._p_WC, self._q_WC, instant_count=self._count * self._stride)
         self._worlds.active = active
-        inputs = [
-            self._scene,
-            self._rays,
-            *self._size,
-            instant_count,
-            self._p_WC,
-            self._q_WC,
-            self._slots_of(instant_count, bool(names)),
-            self._body_data,
-            self._worlds,
-            WalkData() if self._walk is None else self._walk.data,
-        ]
-        outputs = [self._outputs["log_radiance"], self._outputs["rgb"], self._outputs["depth"], None, None]
+        self._view.instant_count = instant_count
+        self._view.image_slot = self._slots_of(instant_count, bool(names))
+        inputs = [self._scene, self._view, self._body_data, self._worlds, self._walk_data]
+        outputs = [self._film]
         dim = self._count * -(-instant_count // self._group) * self._instant_threads
         launch_split(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
         if self._asking is not None and self._walk is not None:
