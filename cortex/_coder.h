@@ -30,6 +30,7 @@ typedef struct {
     char *out;        /* NULL: it is only measured */
     Py_ssize_t end;   /* where the next item of the tail may begin */
     Py_ssize_t limit; /* where the body must end */
+    const char *place; /* where it goes, if arrays may lie there already; NULL: they do not */
     int64_t stamp_ns;
     int defers; /* whether large arrays are left to `copy_deferred` */
     int deferred_count;
@@ -38,6 +39,10 @@ typedef struct {
 
 /* Size of a message's body; -1 without error if it is not as usual. */
 Py_ssize_t measure_body(const Coder *coder, PyObject *message);
+
+/* As `measure_body`, where arrays may lie already in the `room` bytes to which the body goes: -1, too, if one of them
+   is not where it belongs. */
+Py_ssize_t measure_in_place(const Coder *coder, PyObject *message, const char *place, Py_ssize_t room);
 
 /* Write a body of the size that was measured; 0 without error if the message is not as usual. */
 int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_ssize_t size, int defers);

@@ -249,6 +249,44 @@ static PyObject *gate_call(PyObject *self, PyObject *const *arguments, size_t fl
     return result != NULL ? result : PyObject_CallOneArg(gate->slowly, arguments[0]);
 }
 
+/* Send a message whose large arrays lie in a slot already; NULL without error if it has to go the long way. */
+static PyObject *gate_send_lent(Gate *gate, Ledger *ledger, PyObject *message, Py_ssize_t slot) {
+    const int64_t now_ns = monotonic_ns();
+    if (now_ns >= gate->refresh_ns || (PyObject *)ledger != gate->ledger || gate->records != NULL) return NULL;
+    if (gate->sends == NULL || !PyTuple_CheckExact(gate->sends) || !PyTuple_GET_SIZE(gate->sends)) return NULL;
+    if (!ledger_is_writing(ledger, slot) || !ledger_has_room(ledger)) return NULL;
+    char *memory = ledger_memory(ledger, slot);
+    const Py_ssize_t size = measure_in_place(gate->coder, message, memory, ledger_slot_bytes(ledger));
+    if (size <= gate->limit) return NULL;
+    Pack pack;
+    if (!write_body(gate->coder, message, &pack, memory, size, 1)) return NULL;
+    copy_deferred(&pack);
+    return gate_commit(gate, ledger, slot, size, pack.stamp_ns, now_ns);
+}
+
+PyDoc_STRVAR(gate_send_slot_doc,
+"send_slot($self, message, ledger, slot, /)\n--\n\n"
+"Send a message whose large arrays lie where they belong in a slot that is being written, with the lock held.\n\n"
+"Returns:\n"
+"    As a call; None if it has to go the long way: then the arrays are as they were, and the slot is not given up.\n");
+
+static PyObject *gate_send_slot_method(Gate *gate, PyObject *const *arguments, Py_ssize_t count) {
+    if (count != 3) {
+        PyErr_Format(PyExc_TypeError, "send_slot() takes 3 arguments, got %zd", count);
+        return NULL;
+    }
+    Ledger *ledger = ledger_of(arguments[1]);
+    const Py_ssize_t slot = PyLong_AsSsize_t(arguments[2]);
+    if (slot == -1 && PyErr_Occurred()) return NULL;
+    PyObject *sent = ledger == NULL ? NULL : gate_send_lent(gate, ledger, arguments[0], slot);
+    return sent != NULL || PyErr_Occurred() ? sent : Py_NewRef(Py_None);
+}
+
+static PyMethodDef gate_methods[] = {
+    {"send_slot", (PyCFunction)(void (*)(void))gate_send_slot_method, METH_FASTCALL, gate_send_slot_doc},
+    {NULL, NULL, 0, NULL},
+};
+
 static PyObject *gate_new(PyTypeObject *type, PyObject *arguments, PyObject *keywords) {
     static char *names[] = {"coder", "acquire", "release", "slowly", "retry", "again", "limit", "flush", NULL};
     PyObject *coder, *acquire, *release, *slowly, *retry, *again, *flush;
@@ -345,6 +383,7 @@ static PyTypeObject GateType = {
     .tp_clear = (inquiry)gate_clear,
     .tp_dealloc = (destructor)gate_dealloc,
     .tp_members = gate_members,
+    .tp_methods = gate_methods,
 };
 
 int add_gate(PyObject *module) {

@@ -159,9 +159,17 @@ static Py_ssize_t find_dtype(const Array *known, PyObject *value, npy_intp *dime
     return -1;
 }
 
+/* Whether an array does not lie where the body goes, or just where it belongs. */
+static int is_placed(const Pack *pack, PyArrayObject *array, Py_ssize_t start) {
+    const char *data = PyArray_BYTES(array);
+    if (data == pack->place + start) return 1;
+    return data + PyArray_NBYTES(array) <= pack->place || data >= pack->place + pack->limit;
+}
+
 /* Copy the items of an array to where they belong, or leave that for later. */
 static void put_items(Pack *pack, PyArrayObject *array, Py_ssize_t start) {
     const Py_ssize_t size = PyArray_NBYTES(array);
+    if (PyArray_BYTES(array) == pack->out + start) return;
     if (pack->defers && size >= DEFERRED_BYTES && pack->deferred_count < DEFERRED_MAX) {
         pack->deferred[pack->deferred_count++] = (Deferred){(PyObject *)array, PyArray_BYTES(array), start, size};
     } else if (size) {
@@ -176,7 +184,7 @@ static int pack_variable(Pack *pack, const Array *known, PyObject *value, Py_ssi
     const Py_ssize_t size = PyArray_NBYTES(array);
     const Py_ssize_t start = claim(pack, size, size >= LARGE_ARRAY_BYTES ? 64 : 8);
     if (start < 0) return 0;
-    if (pack->out == NULL) return 1;
+    if (pack->out == NULL) return pack->place == NULL || is_placed(pack, array, start);
     describe(pack, at, start, known->head + dtype);
     for (int axis = 0; axis < known->rank; ++axis) {
         const uint32_t length = (uint32_t)PyArray_DIM(array, axis);
@@ -266,7 +274,18 @@ Py_ssize_t measure_body(const Coder *coder, PyObject *message) {
     pack.out = NULL;
     pack.end = block->size;
     pack.limit = BODY_LIMIT - 1;
+    pack.place = NULL;
     return pack_message(&pack, block, message, 0) ? pack.end : -1;
+}
+
+Py_ssize_t measure_in_place(const Coder *coder, PyObject *message, const char *place, Py_ssize_t room) {
+    const Block *block = &coder->block;
+    Pack pack;
+    pack.out = NULL;
+    pack.end = block->size;
+    pack.limit = room;
+    pack.place = place;
+    return block->has_tail && block->size <= room && pack_message(&pack, block, message, 0) ? pack.end : -1;
 }
 
 int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_ssize_t size, int defers) {
@@ -274,6 +293,7 @@ int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_
     pack->out = out;
     pack->end = block->size;
     pack->limit = size;
+    pack->place = NULL;
     pack->stamp_ns = 0;
     pack->defers = defers;
     pack->deferred_count = 0;

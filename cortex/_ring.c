@@ -139,6 +139,12 @@ Py_ssize_t ledger_acquire(Ledger *ledger, Py_ssize_t size) {
 
 char *ledger_memory(Ledger *ledger, Py_ssize_t slot) { return ledger->first + slot * ledger->slot_bytes; }
 
+int ledger_is_writing(const Ledger *ledger, Py_ssize_t slot) {
+    return !ledger->closed && slot >= 0 && slot < ledger->slots && ledger->state[slot] & 1;
+}
+
+Py_ssize_t ledger_slot_bytes(const Ledger *ledger) { return ledger->slot_bytes; }
+
 int ledger_has_room(Ledger *ledger) {
     if (ledger->closed) return 0;
     for (uint64_t rest = ledger->mask; rest; rest &= rest - 1) {

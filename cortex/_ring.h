@@ -19,6 +19,10 @@ Ledger *ledger_of(PyObject *object);
 Py_ssize_t ledger_acquire(Ledger *ledger, Py_ssize_t size);
 char *ledger_memory(Ledger *ledger, Py_ssize_t slot);
 
+/* Whether a slot of this number is being written, and how much there is room for. */
+int ledger_is_writing(const Ledger *ledger, Py_ssize_t slot);
+Py_ssize_t ledger_slot_bytes(const Ledger *ledger);
+
 /* Whether all readers with a column have room for one more message. */
 int ledger_has_room(Ledger *ledger);
 

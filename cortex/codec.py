@@ -160,6 +160,27 @@ class Codec:
         """
         return self._drafter.draft(buffer, dims, dtypes)
 
+    @property
+    def drafts_by_tail(self) -> bool:
+        """Whether all views of a draft lie where `encode` would copy them, behind the block of the body."""
+        return not self._drafter.has_fixed_arrays
+
+    def fill(self, draft: Draft, message: Any) -> None:
+        """Set every field of a draft as in a message.
+
+        Args:
+            draft: What arrays of the message lie in it already are not copied.
+            message: Of the codec's type.
+
+        Raises:
+            ValueError: An array does not fit.
+        """
+        self._drafter.fill(draft, message)
+
+    def seal(self, draft: Draft) -> None:
+        """Make the views of a draft read-only: it is sent as it is."""
+        self._drafter.seal(draft)
+
     def finish(self, draft: Draft) -> int:
         """Complete a draft in its buffer and return the size of the body [bytes]. Its views become read-only.
 

@@ -10,7 +10,7 @@ import logging
 import os
 from typing import Any
 
-INTERFACE = 7
+INTERFACE = 8
 """What `_native.c` must say of itself: counts up with each change of what it offers."""
 
 

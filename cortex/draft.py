@@ -134,9 +134,26 @@ class Drafter:
             )
         in_place = {id(view) for view in views.values()}
         write([part.nbytes if id(part) in in_place else part for part in parts], buffer)
-        for view in views.values():
-            view.flags.writeable = False
+        self.seal(draft)
         return end
+
+    @property
+    def has_fixed_arrays(self) -> bool:
+        """Whether some views of a draft lie in the block with which a body begins."""
+        return bool(self._fixed)
+
+    def fill(self, draft: Draft, message: Any) -> None:
+        """Set every field as in a message; what lies in its place already is not copied."""
+        views = draft._Draft__views
+        for name in self._names:
+            value = getattr(message, name)
+            if name not in views or not _is_same(views[name], value):
+                setattr(draft, name, value)
+
+    def seal(self, draft: Draft) -> None:
+        """Let nobody write to the views of a draft any more."""
+        for view in draft._Draft__views.values():
+            view.flags.writeable = False
 
     def _layout(self, message: Any, places: dict[str, _Place]) -> tuple[list[Any], int]:
         values: list[Any] = []
@@ -218,6 +235,14 @@ class Drafter:
                 raise ValueError(f"{self._schema.name} has no array {name} of open dtype")
             if np.dtype(dtype) not in DTYPES:
                 raise ValueError(f"{name}: dtype {dtype} is none of {', '.join(DTYPE_CODES)}")
+
+
+def _is_same(view: NDArray[Any], value: Any) -> bool:
+    """Return whether an array is the same memory, seen in the same way."""
+    return isinstance(value, np.ndarray) and all(
+        view.__array_interface__[key] == value.__array_interface__[key]
+        for key in ("data", "shape", "strides", "typestr")
+    )
 
 
 def _reserve(tail: Tail, shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:

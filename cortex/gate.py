@@ -54,6 +54,14 @@ class Gate(Protocol):
         """Send a message; False if a reliable subscriber lost it."""
         ...
 
+    def send_slot(self, message: Any, ledger: Any, slot: int, /) -> bool | None:
+        """Send a message whose large arrays lie in a slot that is being written; the lock is held.
+
+        Returns:
+            As `__call__`; None if it has to go the long way: then its arrays are as they were.
+        """
+        ...
+
 
 class LongGate:
     """Where a message cannot be sent at once: each goes the long way, whatever `sends` are."""
@@ -77,6 +85,9 @@ class LongGate:
     def __call__(self, message: Any, /) -> bool:
         """Send a message; False if a reliable subscriber lost it."""
         return self._slowly(message)
+
+    def send_slot(self, message: Any, ledger: Any, slot: int, /) -> None:
+        """Leave it to the long way."""
 
 
 def make_gate(

@@ -29,7 +29,7 @@ class Loan:
         slot: Slot,
         room: Room | None,
         *,
-        publish: Callable[[Any, Slot], bool],
+        publish: Callable[[Any, Slot, Any], bool],
         drop: Callable[[Slot], object],
     ) -> None:
         self.draft = draft
@@ -47,14 +47,19 @@ class Loan:
         slot = self._slot
         return None if slot is None or slot.ring is None else slot.ring.memory
 
-    def publish(self) -> bool:
+    def publish(self, message: Any = None) -> bool:
         """Send the message.
+
+        Args:
+            message: What to send in place of the draft, in half the time: one whose large arrays are those of
+                the draft, where they are.
 
         Returns:
             As `Publisher.publish`; False, too, if its slot was given up for larger ones meanwhile, and there
             is no other: every subscriber loses it.
 
         Raises:
+            TypeError: The message is of another type; the loan is dropped.
             ValueError: A field is not set, or does not fit; the loan is dropped.
             RuntimeError: It was published or dropped before.
             Closed: The publisher was closed; the loan is dropped.
@@ -62,7 +67,7 @@ class Loan:
         slot = self._end()
         if slot is None:
             raise RuntimeError("this loan was published or dropped before")
-        return self._publish(self.draft, slot)
+        return self._publish(self.draft, slot, message)
 
     def drop(self) -> None:
         """Give the slot back unpublished; does nothing after `publish`."""
@@ -80,7 +85,7 @@ class Loan:
 def lend(
     slot: Slot,
     make_draft: Callable[[np.ndarray], Any],
-    publish: Callable[[Any, Slot], bool],
+    publish: Callable[[Any, Slot, Any], bool],
     large: LargeSender,
     warn: Callable[[], object],
 ) -> Loan:
@@ -89,7 +94,7 @@ def lend(
     Args:
         slot: Where it is written.
         make_draft: Makes the draft in the slot's memory.
-        publish: Sends the draft, which lies in the slot.
+        publish: Sends the draft, which lies in the slot, or the message in its place.
         large: Takes the slot back.
         warn: Called when the loan was forgotten, by the garbage collector.
     """

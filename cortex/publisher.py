@@ -62,6 +62,7 @@ class Publisher(Generic[T]):
         latch: bool = False,
         coalesce: bool = False,
         inline_max: int = INLINE_MAX,
+        expected_bytes: int = 0,
         on_batch: Callable[[], None] | None = None,
         on_close: Callable[[Publisher[T]], None] | None = None,
     ) -> None:
@@ -101,7 +102,12 @@ class Publisher(Generic[T]):
             self._gate.records = self._batch.records
         self._patience = Patience(outlets, self._gate, self._check_open)
         self._large = LargeSender(
-            self.source, codec.fingerprint, stamped=stamped, topic=topic, outlets=outlets
+            self.source,
+            codec.fingerprint,
+            stamped=stamped,
+            topic=topic,
+            outlets=outlets,
+            expected_bytes=expected_bytes if expected_bytes > inline_max else 0,
         )
         self._fanout = Fanout(
             topic,
@@ -243,18 +249,23 @@ class Publisher(Generic[T]):
             text = f"{self.topic}: a loan was forgotten, neither published nor dropped"
             warnings.warn(text, ResourceWarning, stacklevel=2)
 
-    def _publish_inline_loan(self, draft: Any, slot: Slot) -> bool:
+    def _publish_inline_loan(self, draft: Any, slot: Slot, message: Any) -> bool:
         """Send a small message that was written on loan; returns and raises as `Loan.publish`."""
-        size, stamp_ns = self._finish_draft(draft)
+        size, stamp_ns = self._finish_draft(draft, message)
         with self._lock:
             now_ns = monotonic_ns()
             self._prepare(now_ns)
             return self._publish_inline(slot.buffer[:size].tobytes(), stamp_ns, now_ns)
 
-    def _publish_loan(self, draft: Any, slot: Slot) -> bool:
+    def _publish_loan(self, draft: Any, slot: Slot, message: Any) -> bool:
         """As `_publish_inline_loan` for a large message."""
+        if message is not None and slot.ring is not None and self.codec.drafts_by_tail:
+            sent = self._send_lent(slot, slot.ring.ledger, message)
+            if sent is not None:
+                self.codec.seal(draft)
+                return sent
         try:
-            size, stamp_ns = self._finish_draft(draft)
+            size, stamp_ns = self._finish_draft(draft, message)
         except BaseException:
             self._large.give_back(slot)
             raise
@@ -270,8 +281,27 @@ class Publisher(Generic[T]):
                 return self._skip()
             return self._publish_slot(renewed, size, stamp_ns, now_ns)
 
-    def _finish_draft(self, draft: Any) -> tuple[int, int]:
+    def _send_lent(self, slot: Slot, ledger: Any, message: Any) -> bool | None:
+        """Send a message that lies in a slot, if nothing special is to be done; None if something is."""
+        handed_over = False
+        try:
+            with self._lock:
+                now_ns = monotonic_ns()
+                if now_ns >= self._gate.refresh_ns:
+                    self._prepare(now_ns)
+                handed_over = True
+                return self._gate.send_slot(message, ledger, slot.number)
+        except BaseException:
+            if not handed_over:
+                self._large.give_back(slot)
+            raise
+
+    def _finish_draft(self, draft: Any, message: Any) -> tuple[int, int]:
         """Write what is not in its place yet; the size of the body, and its stamp [ns]."""
+        if message is not None:
+            if type(message) is not self._type:
+                raise TypeError(f"{self.topic} carries {self._type.__name__}, got {type(message).__name__}")
+            self.codec.fill(draft, message)
         size = self.codec.finish(draft)
         return size, 0 if self._stamp_of is None else int(draft.stamp_ns)
 

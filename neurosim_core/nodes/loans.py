@@ -23,7 +23,6 @@ from neurosim_core.pinned import PinError, PinnedMapping
 _logger = logging.getLogger(__name__)
 _BYTES_MIN = 1 << 16
 """Smaller pictures are copied: that takes less time than to write in place."""
-_FIELDS = ("stamp_ns", "encoding", "frame_id", "sequence")
 
 
 class PictureLoan:
@@ -103,7 +102,7 @@ class PictureLoan:
         """Publish the picture that was lent room for.
 
         Args:
-            message: Its image; of its data only the place is used.
+            message: Its image, with the room as data.
 
         Returns:
             As `Loan.publish`.
@@ -114,11 +113,9 @@ class PictureLoan:
         with self._lock:
             loan, self._loan, self._room = self._loan, None, None
             assert loan is not None
-            for name in _FIELDS:
-                setattr(loan.draft, name, getattr(message, name))
             if self.settle is not None:
                 self.settle()
-            return loan.publish()
+            return loan.publish(message)
 
     def _pin(self, memory: Any) -> bool:
         """Have the device know the ring that is lent from; return whether it does. The lock is held."""

@@ -126,7 +126,7 @@ def test_no_room_while_a_picture_waits_for_its_reader():
     """Who renders does not wait with it: the next picture is copied."""
     begun, read = threading.Event(), threading.Event()
 
-    def publish():
+    def publish(message):
         begun.set()
         return read.wait(600.0)
 

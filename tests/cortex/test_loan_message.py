@@ -1,0 +1,179 @@
+"""A message whose large arrays lie in a slot that was lent: sent as it is, or written anew, never wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from peer import Scan, make_block
+from processes import SOON_S, wait_for
+from test_large import connected, slots_held
+
+from cortex import Array, Closed, Publisher, keep_last, message, reliable
+from cortex.compiled import native
+from cortex.messages import Image
+
+SHAPE = (60, 480, 3)
+DIMS = dict(zip(("height", "width", "channels"), SHAPE, strict=True))
+
+
+@message
+class Framed:
+    """An array in the block with which a body begins, and one behind it."""
+
+    stamp_ns: int
+    matrix: Array["f8", 3, 3]
+    data: Array["u1", "n"]
+
+
+@pytest.fixture
+def node(make_node):
+    return make_node(registry="off")
+
+
+@pytest.fixture(params=["as it is", "the long way"])
+def way(request, monkeypatch):
+    """Without the C module there is only the long way."""
+    if request.param == "the long way":
+        monkeypatch.setattr(Publisher, "_send_lent", lambda *_: None)
+    elif native is None:
+        pytest.skip("without the C module there is no short cut")
+    else:
+        send, taken = Publisher._send_lent, []
+        monkeypatch.setattr(Publisher, "_send_lent", lambda *args: taken.append(send(*args)) or taken[-1])
+        yield taken
+        return
+    yield []
+
+
+def image(data: np.ndarray, number: int = 0, frame_id: str = "camera") -> Image:
+    return Image(stamp_ns=7 + number, data=data, encoding="rgb8", frame_id=frame_id, sequence=number)
+
+
+def pixels(number: int) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 256, SHAPE).astype(np.uint8)
+
+
+def test_the_same_bytes_as_a_message_that_is_copied(node, way):
+    """Whatever else is in it; and who has it sees the memory that was lent."""
+    publisher, subscriber = connected(node, Image, reliable(64, SOON_S))
+    for number, frame_id in enumerate(["camera", "", "ä" * 700, "camera"]):
+        expected = image(pixels(number), number, frame_id)
+        publisher.publish(expected)
+        info, body, _ = subscriber.recv_raw(SOON_S)
+        loan = publisher.try_loan({"data": "u1"}, **DIMS)
+        room = loan.draft.data
+        room[:] = expected.data
+        assert loan.publish(dataclasses.replace(expected, data=room))
+        lent_info, lent_body, _ = subscriber.recv_raw(SOON_S)
+        assert bytes(lent_body) == bytes(body)
+        assert (lent_info.sequence, lent_info.stamp_ns) == (info.sequence + 1, info.stamp_ns)
+        with pytest.raises(ValueError, match="read-only"):
+            room[:] = 0
+        with pytest.raises(RuntimeError, match="before"):
+            loan.publish(expected)
+        del room, body, lent_body, loan
+    assert not way or way.count(True) >= 3  # now and then the gate looks who has come
+    wait_for(lambda: slots_held(publisher) == 0)
+    assert not any(ring.in_writing for ring in publisher._large._rings)
+
+
+def test_arrays_that_lie_elsewhere_are_copied(node, way):
+    """Of other memory, at another place in the slot, in another order: readers get what the message says."""
+    publisher, subscriber = connected(node, Image, reliable(64, SOON_S))
+    picture = pixels(1)
+    flipped = np.ascontiguousarray(picture[::-1])
+
+    def of_the_slot(room: np.ndarray) -> np.ndarray:
+        """The same bytes, 64 further on than they belong."""
+        memory = room.base if isinstance(room.base, np.ndarray) else room
+        while isinstance(memory.base, np.ndarray):
+            memory = memory.base
+        begin = room.ctypes.data - memory.ctypes.data + 64
+        moved = memory.view(np.ndarray)[begin : begin + room.size].reshape(SHAPE)
+        moved[:] = picture
+        return moved
+
+    for data_of, expected in [
+        (lambda room: picture, picture),
+        (lambda room: room[::-1], flipped),
+        (of_the_slot, picture),
+        (lambda room: room, picture),
+    ]:
+        loan = publisher.try_loan({"data": "u1"}, **DIMS)
+        loan.draft.data[:] = picture
+        loan.publish(image(data_of(loan.draft.data), 3))
+        received = subscriber.recv(SOON_S)
+        assert (received.data == expected).all()
+        assert (received.stamp_ns, received.sequence, received.frame_id) == (10, 3, "camera")
+        del received, loan
+    wait_for(lambda: slots_held(publisher) == 0)
+
+
+def test_an_array_in_the_block_is_kept(node, way):
+    publisher, subscriber = connected(node, Framed, reliable(64, SOON_S))
+    for number in range(3):
+        loan = publisher.try_loan(n=50_000)
+        loan.draft.matrix[:] = np.arange(9).reshape(3, 3) + number
+        loan.draft.data[:] = number
+        loan.publish(Framed(stamp_ns=number, matrix=loan.draft.matrix, data=loan.draft.data))
+        received = subscriber.recv(SOON_S)
+        assert (received.matrix == np.arange(9).reshape(3, 3) + number).all()
+        assert (received.data == number).all()
+
+
+def test_what_does_not_fit_leaves_no_slot_behind(node, way):
+    publisher, subscriber = connected(node, Image, reliable(64, SOON_S))
+    wrong = [
+        (make_block(0, 100), TypeError),
+        (image(np.zeros((1, 2, 3), np.uint8)), ValueError),
+        (dataclasses.replace(image(pixels(0)), stamp_ns="soon"), (TypeError, ValueError)),
+    ]
+    for number in range(30):
+        for bad, error in wrong:
+            loan = publisher.try_loan({"data": "u1"}, **DIMS)
+            assert loan is not None, number
+            with pytest.raises(error):
+                loan.publish(bad)
+    publisher.publish(image(pixels(5)))
+    assert (subscriber.recv(SOON_S).data == pixels(5)).all()
+    assert not any(ring.in_writing for ring in publisher._large._rings)
+
+
+def test_a_small_one(node, way):
+    publisher, subscriber = connected(node, Scan, reliable(64, SOON_S))
+    loan = publisher.try_loan(n=100)
+    loan.draft.ranges[:] = 3.0
+    assert loan.publish(Scan(5, loan.draft.ranges))
+    received = subscriber.recv(SOON_S)
+    assert received.stamp_ns == 5
+    assert (received.ranges == 3.0).all()
+
+
+def test_a_reader_without_room(node, way):
+    """Who keeps two gets the newest, and whoever is slow is counted: nothing is overwritten that is held."""
+    publisher, subscriber = connected(node, Image, keep_last(2))
+    held = []
+    for number in range(40):
+        loan = publisher.try_loan({"data": "u1"}, **DIMS)
+        if loan is None:
+            publisher.publish(image(pixels(number), number))
+            continue
+        loan.draft.data[:] = pixels(number)
+        loan.publish(image(loan.draft.data, number))
+        del loan
+        if number % 13 == 5:
+            held.append(subscriber.recv(SOON_S))
+    for received in held:
+        assert (received.data == pixels(received.sequence)).all()
+
+
+def test_after_the_end(node, way):
+    publisher, _ = connected(node, Image, reliable(64, SOON_S))
+    loan = publisher.try_loan({"data": "u1"}, **DIMS)
+    lent = image(loan.draft.data)
+    publisher.close()
+    with pytest.raises(Closed):
+        loan.publish(lent)
+    assert not publisher._large._rings
