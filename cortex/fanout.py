@@ -92,6 +92,7 @@ class Fanout:
         reader = self._large.admit(key, request, outlet)
         self.readers[key] = reader
         sequence = self._next_sequence()
+        self._large.reserve(reader, sequence)
         if reader.pipe is not None:
             reader.pipe.offer(self._news(sequence))  # this tells the reader that all else comes there
             self.pipes.admit(reader)

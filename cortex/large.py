@@ -112,8 +112,18 @@ class LargeSender:
     Everything that touches readers or sockets runs under the outlets' lock.
     """
 
-    def __init__(self, source: int, fingerprint: int, *, stamped: bool, topic: str, outlets: Outlets) -> None:
+    def __init__(
+        self,
+        source: int,
+        fingerprint: int,
+        *,
+        stamped: bool,
+        topic: str,
+        outlets: Outlets,
+        expected_bytes: int = 0,
+    ) -> None:
         self._source = source
+        self._expected_bytes = expected_bytes
         self._topic = topic
         self._outlets = outlets
         self._slot_head = message_head(SLOT, source, fingerprint, stamped=stamped)
@@ -187,6 +197,16 @@ class LargeSender:
             self._columns[column] = reader
         self._plan()
         return reader
+
+    def reserve(self, newcomer: Reader, sequence: int) -> None:
+        """Make room for messages that are expected, before the first is sent to a reader.
+
+        Args:
+            newcomer: The reader, admitted; its answer will tell it of the rings.
+            sequence: What the next message will have.
+        """
+        if self._expected_bytes and newcomer.column is not None:
+            self._ring_for(self._expected_bytes, sequence, exact=True, newcomer=newcomer)
 
     def dismiss(self, reader: Reader) -> None:
         """A reader has left: whatever it held is free."""
@@ -483,7 +503,9 @@ class LargeSender:
         """Whether a reliable reader holds slots of a ring, messages on their way to it included."""
         return any(strict and ring.outstanding(column) for column, _, _, strict in self._grants)
 
-    def _ring_for(self, size: int, sequence: int, *, exact: bool) -> Ring | None:
+    def _ring_for(
+        self, size: int, sequence: int, *, exact: bool, newcomer: Reader | None = None
+    ) -> Ring | None:
         current, page = self._ring, mmap.PAGESIZE
         crowded = len(self._rings) >= RINGS_KEPT and self._is_awaited(self._rings[0])
         if crowded or time.monotonic() < self._unavailable_until_s:
@@ -518,6 +540,8 @@ class LargeSender:
                 old.close()
         self._plan()
         for reader in self._columns.values():
+            if reader is newcomer:
+                continue
             frame = self.answer(reader, sequence, b"")
             if not reader.outlet.strict:
                 reader.outlet.send(frame, DONTWAIT)

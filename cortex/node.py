@@ -146,6 +146,7 @@ class Node:
         latch: bool = False,
         coalesce: bool = False,
         inline_max: int = INLINE_MAX,
+        expected_bytes: int = 0,
     ) -> Publisher[T]:
         """Publish messages of a type on a topic.
 
@@ -156,6 +157,9 @@ class Node:
             coalesce: Send messages that follow each other within 15 us together: more of them per second,
                 each up to a millisecond later.
             inline_max: Bodies over this size go through shared memory where that is possible [bytes].
+            expected_bytes: Bodies will hardly be larger than this: shared memory for them is made when the
+                first local subscriber comes, and not while messages grow, which takes milliseconds then
+                [bytes]. 0: not known.
         """
         return self._add_publisher(
             Publisher(
@@ -165,6 +169,7 @@ class Node:
                 latch=latch,
                 coalesce=coalesce,
                 inline_max=inline_max,
+                expected_bytes=expected_bytes,
                 on_batch=self._flusher.wake,
                 on_close=self._drop_publisher,
             ),
