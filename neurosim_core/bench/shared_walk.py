@@ -28,13 +28,13 @@ from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig, WalkConfig
 from neurosim_core.render.embree import EmbreeError
 from neurosim_core.render.list_search import together_finder
+from neurosim_core.render.ray_hit import FAR_M
 from neurosim_core.render.walk_data import ASK, WalkData
 from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.sensors.rig import EventSensorConfig
 
 _K = 16
-_FAR_M = 1.0e9
 _FAST_SHARE = SLOW_SHARE + 0.03
 _PARTS = {"slow": 0.3, "fast": _FAST_SHARE}
 """Parts of the flight, and the share of it at which each begins."""
@@ -120,7 +120,7 @@ def _count_asked(
         (walk * data.bounds.shape[0] + tile) * data.limit,
         data.count[walk, tile],
         data.reach[walk, tile],
-        float(_FAR_M),
+        FAR_M,
         data.bounds[tile],
         p_WC,
         q_WC,

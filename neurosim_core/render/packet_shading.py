@@ -308,7 +308,7 @@ def packet_eye(width: int, *, textured: bool, emissive: bool) -> Any:
     the rays hit is passed on in arrays by quantity, which are neither cleared nor transposed on the way. Of
     several layers of rays the first is left out, and the mean of the others taken.
 
-    Its parameters: the scene; rays of pixels, as `raycast_kernel` has them, contiguous; the first of the
+    Its parameters: the scene; rays of pixels, as `ViewData` has them, contiguous; the first of the
     packet, and the columns of the picture; position and orientation of the camera; the distance beyond which
     hits do not count [m]; instant, top row and left column of the packet; its rows and columns, at most 4.
     The last is the log radiance, of which these pixels are written.

@@ -83,7 +83,11 @@ def meet_listed(scene: SceneData, origin: wp.vec3, ray: wp.vec3, face: int) -> H
 
 @wp.func
 def meet_bodies(bodies: BodyData, instant: int, ray_C: wp.vec3, q_WC: wp.quat, hit: Hit):
-    """Return what a ray hits first, `hit` or a point of a body, and which body, -1: none."""
+    """Return what a ray hits first, `hit` or a point of a body, and which body, -1: none.
+
+    Of each body whose sphere the ray passes, the tree is asked in the frame of the body, no further than the
+    nearest hit so far.
+    """
     nearest = Hit()
     nearest.face = hit.face
     nearest.t = wp.where(hit.face >= 0, hit.t, FAR_M)

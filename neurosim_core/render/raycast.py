@@ -24,15 +24,6 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     Its parameters: the index of the first thread; `SceneData`, `ViewData`, `BodyData`, `WorldData` and
     `WalkData`, of which it reads what the terms say. It writes `FilmData`.
 
-    The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
-    side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much
-    as along. The short side or the geometric mean would keep more detail there, but alias along the surface,
-    and aliasing makes events that no sensor sees. |cos| counts as at least 0.05.
-
-    Bodies are met after the scene: of each whose sphere the ray passes, the tree is asked in the frame of the
-    body, no further than the nearest hit so far. Their light is found for each pixel: ambient, and the lamps
-    that no part of the scene hides from it (all lamps, where the scene itself is unshadowed).
-
     Raises:
         ValueError: If an output is unknown or none is asked for, or unlike worlds are to share walks.
     """

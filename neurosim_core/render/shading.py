@@ -53,6 +53,7 @@ def pixel_shader(terms: Terms) -> wp.Function:
 
 @cache
 def _scene_shader(terms: Terms) -> wp.Function:
+    """Return the function that says what light comes from what stands still, or from the sky."""
     surface_albedo, emitted = _albedo(terms), _emission(terms)
 
     @wp.func
@@ -97,6 +98,11 @@ def _scene_shader(terms: Terms) -> wp.Function:
 
 @cache
 def _body_shader(terms: Terms) -> wp.Function:
+    """Return the function that finds the light of a body for each pixel.
+
+    It is ambient light, and that of the lamps that no part of the scene hides (all lamps, where the scene
+    itself is unshadowed). Bodies move under lights that stand still, so nothing is baked.
+    """
     surface_albedo, emitted = _albedo(terms), _emission(terms)
 
     @wp.func
@@ -111,7 +117,6 @@ def _body_shader(terms: Terms) -> wp.Function:
         spread_rad: float,
         hit: Hit,
     ) -> wp.vec3:
-        # Bodies move under lights that stand still, so nothing is baked: light is found here, and shadows.
         facing = wp.dot(ray, hit.normal)
         corner = 3 * (hit.face - bodies.first_face[0])
         normal_O = (
@@ -145,6 +150,14 @@ def _body_shader(terms: Terms) -> wp.Function:
 
 @cache
 def _albedo(terms: Terms) -> wp.Function:
+    """Return the function that reads the base colour and the texture of what is hit.
+
+    The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
+    side on the surface. The filter is isotropic: a surface seen at a grazing angle is blurred across as much
+    as along. The short side or the geometric mean would keep more detail there, but alias along the surface,
+    and aliasing makes events that no sensor sees. |cos| counts as at least 0.05.
+    """
+
     @wp.func
     def surface_albedo(scene: SceneData, spread_rad: float, facing: float, hit: Hit) -> wp.vec3:
         material = scene.face_material[hit.face]

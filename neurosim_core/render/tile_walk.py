@@ -8,18 +8,16 @@ camera. One walk lists the triangles that reach into it, and each ray is tested 
    lies behind the walls of a room is not in it.
 2. The tree is walked with the swept frustum, cut off at the reach. On CUDA the threads of a block take nodes
    from one stack. What is listed is every triangle that one of the rays can hit within the reach.
-3. A ray is tested against the list: three edge functions, normalised such that their sum is one over the
-   distance. If one triangle is nearer than all others by more than rounding, hit inside its edges by more
-   than rounding, and within the reach, it is what the ray hits first; where exactly, the tree's own
-   intersection says. A ray of which that is not sure asks the tree, as do all of a tile with too long a list.
+3. A ray is tested against the list. Where by more than rounding one triangle is what it hits first, the
+   tree's own intersection says where exactly. A ray of which that is not sure asks the tree, as do all of a
+   tile with too long a list.
 
 So nothing is approximated: the answers are those of `wp.mesh_query_ray` to the last bit, as far as a compiler
 makes the same code of the same intersection in two places. Neither the number of instants per launch, nor how
 many share a walk, nor the order in which threads find triangles, changes them.
 
-What is within rounding is in `list_search.py` and `tile_bounds.py`.
-
-Reference: Reshetov, Soupikov, Hurley (2005), Multi-Level Ray Tracing Algorithm.
+The walk of 1 and 2 is in `frustum_walk.py`; the test of 3 and its rounding in `list_search.py`; what the
+sides of tiles have to spare in `tile_bounds.py`.
 """
 
 from __future__ import annotations
