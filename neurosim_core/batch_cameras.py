@@ -11,10 +11,12 @@ from neurosim_core.phases import timed
 from neurosim_core.run_state import Batch, State
 from neurosim_core.sensors.cast import (
     Look,
+    ask_for_room,
     bring_images,
     choose_ticks,
     close_eyes,
     is_due,
+    launch_key,
     plan_look,
     read_events,
     read_images,
@@ -39,10 +41,11 @@ def look_at(model: Model, state: State, batch: Batch, casts: Collection[int] | N
         if looks is None:
             looks = plan_looks(state, batch, due)
         for look in looks:
+            ask_for_room(look)
             if look.key is None:
                 look.render()
             else:
-                state.graphs.run(look.key, look.render)
+                state.graphs.run(launch_key(look), look.render)
             bring_images(look.cast, look.instants)
         state.rendered.set()
     with on(state.event_stream):

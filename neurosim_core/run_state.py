@@ -172,8 +172,8 @@ def make_state(
             launch returns when it has finished. It changes no packet.
         flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
         borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`.
-        late_pictures: Do not wait for pictures that a CUDA device copies to room of the caller's: they are
-            there after `settle`.
+        late_pictures: Ask for room before pictures are rendered, and do not wait for those that a device
+            copies there: they are there after `settle`.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; called by the
             thread that reads the cameras.
         seed: Seed of the sensor noise and of turbulence; None: as configured.
@@ -244,6 +244,7 @@ def make_state(
                 seed=config.seed if seed is None else seed,
                 bodies=config.bodies,
                 make_room=make_room,
+                late=late_pictures,
             )
             for index, cast in enumerate(model.casts)
             if model.scene_on_device is not None

@@ -41,10 +41,12 @@ from neurosim_core.phases import timed
 from neurosim_core.run_state import Batch, StartState, State, make_state
 from neurosim_core.schedule import Boundary, batch_end_ns, boundaries
 from neurosim_core.sensors.cast import (
+    ask_for_room,
     bring_images,
     close_eyes,
     flush_events,
     is_due,
+    launch_key,
     leave_out,
 )
 
@@ -63,6 +65,7 @@ __all__ = [
     "fly_period",
     "free_lanes",
     "launch",
+    "lend_rooms",
     "load_scene",
     "make_fleet",
     "make_model",
@@ -169,11 +172,18 @@ def begin_step(
 
 
 def prepare_step(model: Model, state: State) -> None:
-    """Plan the next control period, for `begin_step` to launch it sooner: while a CUDA device is at work."""
+    """Plan the next control period, for `begin_step` to launch it sooner; while a CUDA device is at work."""
     end_ns = batch_end_ns(model.schedule, state.launched_ns, _period_end_ns(model, state))
     stretch = boundaries(model.schedule, state.launched_ns, end_ns)
     state.ahead = plan_batch(state, stretch, closed_loop=False)
     plan_ahead(model, state, state.ahead)
+
+
+def lend_rooms(state: State) -> None:
+    """Ask for room for the pictures of a control period that was prepared: `begin_step` is sooner then."""
+    if state.ahead is not None:
+        for look in state.ahead.looks or ():
+            ask_for_room(look)
 
 
 def settle(state: State) -> None:
@@ -422,9 +432,11 @@ def _launch(model: Model, state: State, batch: Batch) -> None:
         looks = batch.looks
         if looks is None:
             looks = plan_looks(state, batch, choose(model, state, batch))
+        for look in looks:
+            ask_for_room(look)
         with timed(state.wall_s, "flight and render"):
             state.graphs.run(
-                (key, *(look.key for look in looks)), lambda: (flight(), *(look.render() for look in looks))
+                (key, *map(launch_key, looks)), lambda: (flight(), *(look.render() for look in looks))
             )
             for look in looks:
                 bring_images(look.cast, look.instants)

@@ -480,7 +480,7 @@ def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch,
 
     state = simulation.make_state(model, late_pictures=late, make_room=make_room)
     for cast in state.casts:
-        cast.brings_apart = True
+        cast.brings_apart = not cast.lends
     packets = []
     unfinished_count = 0
     for _ in range(10):

@@ -23,6 +23,7 @@ from neurosim_core.simulation import (
     end_step,
     finish,
     fly_period,
+    lend_rooms,
     make_state,
     observe,
     prepare_step,
@@ -180,9 +181,18 @@ class Craft:
         self.outlet.offer_state(self.observe())
 
     def prepare_step(self) -> None:
-        """Plan the next control period: while others read what this one has yielded."""
+        """Plan the next control period: while a CUDA device is at work."""
         if not self.state.ended and self.state.failure is None:
             prepare_step(self.model, self.state)
+
+    def lend_rooms(self) -> None:
+        """Lend room for the pictures of the next control period."""
+        lend_rooms(self.state)
+
+    def drop_loans(self) -> None:
+        """Take back the room of pictures that never come, on which closing topics would wait, for good."""
+        self.state.ahead = None
+        self.outlet.drop_loans()
 
     def fly(self, stamp_ns: int) -> list[Batch]:
         """Fly the control period that begins at a tick [ns]; return what its cameras have to look at.

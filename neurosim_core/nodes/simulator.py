@@ -239,6 +239,7 @@ class Simulator:
                 self._mind()  # a CUDA device is at work
                 for craft, step in zip(self.crafts, begun, strict=True):
                     craft.end_step(step)
+                    craft.prepare_step()
             elif not self._flown and not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
                 return
         except DynamicsError as error:
@@ -258,8 +259,8 @@ class Simulator:
         if streaming:
             self._streaming.let_readers_go_first(end_ns, end_ns - self.stamp_ns)
         else:
-            for craft in self.crafts:
-                craft.prepare_step()
+            for craft in self.crafts:  # while others read what has been published
+                craft.lend_rooms()
         self._end_period(end_ns)
 
     def _wait_for_end(self, end_ns: int) -> bool:
@@ -389,7 +390,7 @@ class Simulator:
 
     def _drop_loans(self) -> None:
         for craft in self.crafts:
-            craft.outlet.drop_loans()
+            craft.drop_loans()
 
     def _culprit(self, error: DynamicsError) -> str:
         return next(craft.name for craft in self.crafts if craft.state.failure is error)

@@ -99,6 +99,8 @@ class CastState:
     """Gives memory that pictures are copied to; None: they get their own."""
     brings_apart: bool = False
     """`bring_images` launches the copies of pictures to the host, as they go to other places each time."""
+    lends: bool = False
+    """They are part of the rendering, and go to the few places that `ask_for_room` is given in turn."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,6 +129,7 @@ def make_cast_state(
     seed: int = 0,
     bodies: Mapping[str, BodyConfig] | None = None,
     make_room: MakeRoom | None = None,
+    late: bool = False,
 ) -> CastState:
     """Allocate the buffers of a cast.
 
@@ -140,6 +143,7 @@ def make_cast_state(
         seed: Seed of the noise of event cameras.
         bodies: What moves in the scene.
         make_room: Gives memory to copy a picture to, where the caller has a place for it.
+        late: It is asked for, by `ask_for_room`, before pictures are rendered, not when they are read.
 
     Raises:
         ValueError: The renderer cannot say what moves how far, and the cast is adaptive.
@@ -202,7 +206,8 @@ def make_cast_state(
         body_poses=[make_body_poses(capacity, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(cast, scene, p_BC, q_BC),
         make_room=make_room,
-        brings_apart=make_room is not None and wp.get_device(device).is_cuda,
+        brings_apart=make_room is not None and not late and wp.get_device(device).is_cuda,
+        lends=make_room is not None and late,
         chosen_slots=[HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(lane_count)]
         if cast.max_displacement_px is not None
         else (),
@@ -338,7 +343,9 @@ def plan_look(
         if cast.motions is not None and body_poses is not None:
             pose_bodies(cast.motions, trace.stamps, from_slots, count=len(slots), poses=body_poses)
         cast.renderers[lane].render(p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses)
-        if not cast.brings_apart:
+        if cast.lends:
+            _bring(cast, instants)
+        elif not cast.brings_apart:
             for copy in cast.picture_copies[lane].values():
                 copy.fetch(0, used)
         return from_slots, to_slots
@@ -350,6 +357,28 @@ def plan_look(
         events=tuple(name for name in cast.events if name in wanted),
     )
     return Look(cast, instants, key, render)
+
+
+def ask_for_room(look: Look) -> None:
+    """Ask for memory for the pictures of a look that have none yet, if a device copies them there."""
+    cast, instants = look.cast, look.instants
+    if not cast.lends:
+        return
+    for stamp_ns, slot, name in instants.pictures:
+        if (name, stamp_ns) not in instants.rooms:
+            picture = cast.picture_copies[instants.lane][cast.images[name].output].view(slot, 1)[0]
+            room = _room_for(cast, name, stamp_ns, picture)
+            if room is not None:
+                instants.rooms[name, stamp_ns] = room
+
+
+def launch_key(look: Look) -> Hashable | None:
+    """Return the key of the launches of a look: they copy pictures to where there is room now."""
+    if look.key is None or not look.cast.lends:
+        return look.key
+    rooms = look.instants.rooms
+    places = (rooms.get((name, stamp_ns)) for stamp_ns, _, name in look.instants.pictures)
+    return look.key, *(0 if room is None else room.__array_interface__["data"][0] for room in places)
 
 
 def close_eyes(cast: CastState, wanted: Collection[str]) -> None:
@@ -383,7 +412,6 @@ def scan_events(cast: CastState, instants: Instants) -> None:
             channel.camera.feed_device(
                 log_radiance[first:] if first else log_radiance,
                 stamps_ns,
-                ends_ns=_window_ends(channel, stamps_ns),
             )
 
 
@@ -430,11 +458,20 @@ def bring_images(cast: CastState, instants: Instants) -> None:
     for stamp_ns, slot, name in instants.pictures:
         copy = cast.picture_copies[instants.lane][cast.images[name].output]
         room = _room_for(cast, name, stamp_ns, copy.view(slot, 1)[0])
+        if room is not None:
+            instants.rooms[name, stamp_ns] = room
+    _bring(cast, instants)
+
+
+def _bring(cast: CastState, instants: Instants) -> None:
+    """Launch the copies of pictures to the host: to the room that there is, or as usual."""
+    for stamp_ns, slot, name in instants.pictures:
+        copy = cast.picture_copies[instants.lane][cast.images[name].output]
+        room = instants.rooms.get((name, stamp_ns))
         if room is None:
             copy.fetch(slot, 1)
         else:
             copy.fetch_into(room, slot)
-            instants.rooms[name, stamp_ns] = room
 
 
 def _room_for(cast: CastState, name: str, stamp_ns: int, picture: NDArray[Any]) -> NDArray[Any] | None:
@@ -457,7 +494,7 @@ def read_images(cast: CastState, instants: Instants, *, borrow: bool = False) ->
         if room is not None:
             return room
         picture: NDArray[Any] = cast.picture_copies[instants.lane][image.output].view(slot, 1)[0]
-        if not cast.brings_apart:
+        if not (cast.brings_apart or cast.lends):
             room = _room_for(cast, name, stamp_ns, picture)
         if room is not None:
             np.copyto(room, picture)

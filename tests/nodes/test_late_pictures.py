@@ -18,7 +18,6 @@ from cortex.messages import Image, Odometry
 from neurosim_core import streams
 from neurosim_core.config import SimulationConfig
 from neurosim_core.nodes import craft, loans
-from neurosim_core.nodes.craft import Craft
 from neurosim_core.nodes.loans import PictureLoan
 from neurosim_core.packets import Image as ImagePacket
 from neurosim_core.pinned import PinError
@@ -140,10 +139,10 @@ def late(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Callable[[], None]]]:
     due.clear()
 
 
-def check_flight(config: SimulationConfig, prepare: Callable[[Craft], None] = lambda craft: None) -> None:
+def check_flight(config: SimulationConfig) -> None:
     """Fly over Cortex: every picture is the one of its stamp, complete, as in one process."""
     with LiveRig(config) as rig:
-        prepare(rig.simulator.crafts[0])
+        assert all(cast.lends for cast in rig.simulator.crafts[0].state.casts)
         pictures = rig.listen("/drone/rgb", Image)
         odometry = rig.listen("/drone/odometry", Odometry)
         tilt = np.array([1.02, 1.0, 1.0, 1.02])
@@ -165,17 +164,10 @@ def lockstep_config(**overrides: Any) -> SimulationConfig:
 
 
 def test_a_flight_with_a_late_device_shows_the_same(runtime, late):
-    def write_late(craft: Craft) -> None:
-        for cast in craft.state.casts:
-            cast.brings_apart = True
-
-    check_flight(lockstep_config(), write_late)
+    check_flight(lockstep_config())
 
 
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 def test_a_flight_on_a_cuda_device_shows_the_same(runtime):
-    def check_device(craft: Craft) -> None:
-        assert all(cast.brings_apart for cast in craft.state.casts)
-
     config = lockstep_config(device="cuda:0", renderer="warp", **{"render.lighting.mode": "unshadowed"})
-    check_flight(config, check_device)
+    check_flight(config)
