@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
-# mypy: disable-error-code="call-overload,no-untyped-def,return-value"
+# mypy: disable-error-code="index,assignment,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """What is kept of a pixel: the outputs of a cast, and how they are written."""

@@ -1,6 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
-# mypy: disable-error-code="call-overload,empty-body,no-untyped-call,untyped-decorator,valid-type"
-# mypy: disable-error-code="no-untyped-def,union-attr"
+# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,assignment,empty-body"
+# mypy: disable-error-code="no-untyped-call,untyped-decorator"
 # ruff: noqa: UP018  (typed literals have a meaning in kernels)
 """The walk through the tree with the frustum of a tile, swept by the motion of the camera.
 

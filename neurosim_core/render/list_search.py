@@ -1,6 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
-# mypy: disable-error-code="call-overload,empty-body,no-untyped-call,untyped-decorator,valid-type"
-# mypy: disable-error-code="no-untyped-def,union-attr"
+# mypy: disable-error-code="no-any-return,untyped-decorator,valid-type,no-untyped-def"
 """What rays hit, found in the list of their tile alone, where that is sure.
 
 A ray is tested against the list: three edge functions, normalised such that their sum is one over the

@@ -1,5 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
-# mypy: disable-error-code="call-overload,no-untyped-def,empty-body"
+# mypy: disable-error-code="index,attr-defined,no-any-return,arg-type,assignment,call-overload"
+# mypy: disable-error-code="no-untyped-def,empty-body"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
 """What a ray hits first: of the scene, of the triangles of a list, of the bodies that move through it."""

@@ -1,5 +1,5 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
-# mypy: disable-error-code="call-overload,no-untyped-def,return-value,empty-body"
+# mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def"
+# mypy: disable-error-code="return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """The ray caster whose threads are pixels: of an instant, or, where walks are shared, of a few.

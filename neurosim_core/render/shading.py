@@ -1,5 +1,4 @@
-# mypy: disable-error-code="index,attr-defined,misc,no-any-return,operator,arg-type,assignment"
-# mypy: disable-error-code="call-overload,no-untyped-def,return-value"
+# mypy: disable-error-code="index,misc,no-any-return,operator,arg-type,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
 """The light that a pixel receives from what its ray hits, ray by ray. See `packet_shading.py` for packets."""
