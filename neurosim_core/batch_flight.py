@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -63,6 +63,10 @@ def plan_batch(state: State, stretch: Sequence[Boundary], *, closed_loop: bool) 
     return Batch(
         boundaries=stretch,
         elapsed_ns=elapsed_ns,
+        pattern=tuple(
+            (span_ns, boundary.control, boundary.samplers)
+            for span_ns, boundary in zip(elapsed_ns, stretch, strict=True)
+        ),
         closed_loop=closed_loop,
         step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
         command_count=sum(closed_loop and boundary.control for boundary in stretch),
@@ -79,10 +83,6 @@ def plan_flight(model: Model, state: State, batch: Batch) -> tuple[Hashable, Cal
     A pilot may be replaced by another; a graph keeps the one that it was made with.
     """
     order, state.order = state.order, None
-    pattern = tuple(
-        (span, boundary.control, boundary.samplers)
-        for span, boundary in zip(batch.elapsed_ns, batch.boundaries, strict=True)
-    )
     pilot = None if order is None else state.pilots.get(order)
 
     def flight() -> Pilot | None:
@@ -96,7 +96,7 @@ def plan_flight(model: Model, state: State, batch: Batch) -> tuple[Hashable, Cal
 
     state.launched_count += 1
     state.launched_ns = batch.until_ns
-    return (order, id(pilot), batch.slot, batch.closed_loop, pattern), flight
+    return (order, id(pilot), batch.slot, batch.closed_loop, batch.pattern), flight
 
 
 def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], object]) -> None:
@@ -149,8 +149,8 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
         packets += _read_samplers(model, state, batch, rows)
     reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
     if reached:
-        header = {"stamp_ns": reached[-1], "sequence": 0, "sensor": "odometry"}
-        state.last = _odometry(rows.states[len(reached) - 1, 0], header)
+        row = rows.states[len(reached) - 1, 0]
+        state.last = _odometry(row, stamp_ns=reached[-1], sequence=0, sensor="odometry")
     return packets
 
 
@@ -172,9 +172,11 @@ def _failure(vehicle: Multirotor) -> DynamicsError:
     raise AssertionError("the status of a vehicle that is held does not change")
 
 
-def _odometry(row: Any, header: Mapping[str, Any]) -> Odometry:
+def _odometry(row: Any, *, stamp_ns: int, sequence: int, sensor: str) -> Odometry:
     return Odometry(
-        **header,
+        stamp_ns=stamp_ns,
+        sequence=sequence,
+        sensor=sensor,
         position=row[POSITION],
         orientation=row[ORIENTATION],
         velocity=row[VELOCITY],
@@ -207,13 +209,16 @@ def _read_samplers(model: Model, state: State, batch: Batch, rows: TraceRows) ->
                     )
                 )
             else:
-                packets.append(_odometry(rows.states[place, 0], header))
+                packets.append(_odometry(rows.states[place, 0], **header))
     return packets
 
 
 def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
     """Report each beginning of a touch; end the run at the first one if so configured."""
     packets: list[Packet] = []
+    if not any(margin_m <= 0.0 for margin_m in rows.clearance.tolist()):
+        state.touching = False
+        return packets
     for boundary, row, margin_m in zip(batch.boundaries, rows.states[:, 0], rows.clearance, strict=True):
         touching = bool(margin_m <= 0.0)
         if touching and not state.touching:
@@ -238,6 +243,8 @@ def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[
 
 def in_order(model: Model, packets: list[Packet], until_ns: int) -> list[Packet]:
     """Return packets up to a stamp in the order of time, those of one stamp in that of the rig."""
-    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
     kept = [packet for packet in packets if packet.stamp_ns <= until_ns]
+    if len(kept) < 2:
+        return kept
+    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
     return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))

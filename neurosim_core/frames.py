@@ -90,6 +90,8 @@ def as_rows(value: Any, *, name: str, count: int, width: int) -> NDArray[np.floa
         ValueError: If the shape does not fit or an element is not finite.
     """
     rows = np.asarray(value, dtype=np.float64)
+    if count == 1 and rows.shape == (width,) and width <= _FEW and all(map(math.isfinite, rows.tolist())):
+        return np.ascontiguousarray(rows).reshape(1, width)  # a command, in every control period
     if rows.shape not in ((width,), (1, width), (count, width)):
         raise ValueError(f"{name} must have shape [{count}, {width}] or [{width}], got {list(rows.shape)}")
     few = rows.size <= _FEW

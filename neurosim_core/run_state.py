@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -56,6 +56,8 @@ class Batch:
     boundaries: Sequence[Boundary]
     elapsed_ns: Sequence[int]
     """From each boundary's predecessor to it [ns]."""
+    pattern: Hashable
+    """Same pattern, same flight: spans, and what is due at their ends."""
     closed_loop: bool
     """The path controller commands."""
     step_count: int
@@ -74,6 +76,15 @@ class Batch:
     seen: Sequence[tuple[CastState, Instants]] = ()
     choices: Sequence[Choice] = ()
     """What adaptive casts render of it."""
+
+
+class Ahead(NamedTuple):
+    """A control period that was planned."""
+
+    batch: Batch
+    """The first of it."""
+    end_ns: int
+    """Where it ends [ns]."""
 
 
 class Pilot(NamedTuple):
@@ -137,8 +148,8 @@ class State:
     order: CommandMode | None = None
     """Mode of the setpoint that the next batch begins with."""
     under_way: deque[Batch] = field(default_factory=deque)
-    ahead: Batch | None = None
-    """The next batch, if it was planned while the device was at work."""
+    ahead: Ahead | None = None
+    """The next control period, if it was planned while the device was at work."""
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
     """The vehicle touched the scene at the last boundary."""

@@ -38,7 +38,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.model import Model, find_device, load_scene, make_fleet, make_model, plan_paths, refit
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.phases import timed
-from neurosim_core.run_state import Batch, StartState, State, make_state
+from neurosim_core.run_state import Ahead, Batch, StartState, State, make_state
 from neurosim_core.schedule import Boundary, batch_end_ns, boundaries
 from neurosim_core.sensors.cast import (
     ask_for_room,
@@ -166,23 +166,23 @@ def begin_step(
     _check_all_read(state)
     packets = start(model, state) if state.launched_count == 0 else []
     set_command(model, state, command, mode)
-    end_ns = _period_end_ns(model, state)
-    launch(model, state, batch_end_ns(model.schedule, state.launched_ns, end_ns), closed_loop=False)
-    return Begun(packets, end_ns)
+    ahead, state.ahead = state.ahead, None
+    if ahead is None or (ahead.batch.number, ahead.batch.wanted) != (state.launched_count, state.wanted):
+        ahead = _plan_period(model, state)
+    _launch(model, state, ahead.batch)
+    return Begun(packets, ahead.end_ns)
 
 
 def prepare_step(model: Model, state: State) -> None:
     """Plan the next control period, for `begin_step` to launch it sooner; while a CUDA device is at work."""
-    end_ns = batch_end_ns(model.schedule, state.launched_ns, _period_end_ns(model, state))
-    stretch = boundaries(model.schedule, state.launched_ns, end_ns)
-    state.ahead = plan_batch(state, stretch, closed_loop=False)
-    plan_ahead(model, state, state.ahead)
+    state.ahead = _plan_period(model, state)
+    plan_ahead(model, state, state.ahead.batch)
 
 
 def lend_rooms(state: State) -> None:
     """Ask for room for the pictures of a control period that was prepared: `begin_step` is sooner then."""
     if state.ahead is not None:
-        for look in state.ahead.looks or ():
+        for look in state.ahead.batch.looks or ():
             ask_for_room(look)
 
 
@@ -358,15 +358,8 @@ def launch(model: Model, state: State, end_ns: int, *, closed_loop: bool = True)
         end_ns: End of the batch [ns], after what was launched before.
         closed_loop: Let the path controller command; otherwise the last command is held.
     """
-    batch, state.ahead = state.ahead, None
-    planned = batch is not None and (
-        (batch.number, batch.until_ns, batch.wanted, batch.closed_loop)
-        == (state.launched_count, end_ns, state.wanted, closed_loop)
-    )
-    if batch is None or not planned:
-        stretch = boundaries(model.schedule, state.launched_ns, end_ns)
-        batch = plan_batch(state, stretch, closed_loop=closed_loop)
-    _launch(model, state, batch)
+    stretch = boundaries(model.schedule, state.launched_ns, end_ns)
+    _launch(model, state, plan_batch(state, stretch, closed_loop=closed_loop))
 
 
 def read(model: Model, state: State) -> list[Packet]:
@@ -414,6 +407,14 @@ def _parts_of_period(model: Model, state: State) -> Iterator[int]:
     end_ns = _period_end_ns(model, state)
     while state.launched_ns < end_ns:
         yield batch_end_ns(model.schedule, state.launched_ns, end_ns)
+
+
+def _plan_period(model: Model, state: State) -> Ahead:
+    """Plan the first batch of the next control period."""
+    end_ns = _period_end_ns(model, state)
+    part_ns = batch_end_ns(model.schedule, state.launched_ns, end_ns)
+    stretch = boundaries(model.schedule, state.launched_ns, part_ns)
+    return Ahead(plan_batch(state, stretch, closed_loop=False), end_ns)
 
 
 def _period_end_ns(model: Model, state: State) -> int:

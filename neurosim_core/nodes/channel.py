@@ -32,6 +32,7 @@ class Channel:
         """
         self.config = config
         self._link = Link(config, seed=seed, name=name)
+        self._is_direct = config.delivers_at_once
         self._direct: deque[tuple[int, Any]] = deque()
 
     def send(self, item: Any, *, stamp_ns: int, size_bytes: int) -> Delivery | None:
@@ -47,6 +48,8 @@ class Channel:
 
     def due(self, stamp_ns: int) -> list[tuple[int, Any]]:
         """Take what has arrived by a time [ns]: pairs of arrival [ns] and message, in order."""
+        if not (self._direct or len(self._link)):
+            return []
         arrived: list[tuple[int, Any]] = []
         while self._direct and self._direct[0][0] <= stamp_ns:
             arrived.append(self._direct.popleft())
@@ -57,7 +60,7 @@ class Channel:
     @property
     def delivers_at_once(self) -> bool:
         """Whether nothing is in the way of the next message."""
-        return self.config.delivers_at_once and not len(self._link)
+        return self._is_direct and not len(self._link)
 
     @property
     def next_due_ns(self) -> int | None:
@@ -72,6 +75,7 @@ class Channel:
     def configure(self, config: LinkConfig) -> None:
         """Change the link for what is sent from now on."""
         self.config = config
+        self._is_direct = config.delivers_at_once
         self._link.configure(config)
 
     def reset(self, *, seed: int) -> None:
