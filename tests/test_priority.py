@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import platform
 import sys
 import threading
 from collections.abc import Callable
@@ -46,6 +48,47 @@ def test_a_thread_gives_way_with_those_that_it_starts_and_no_other():
     expected = min(before + priority._STEPS, 19)
     assert found == [expected, expected]
     assert niceness() == before
+
+
+def turn_ns() -> int:
+    """How long turns of the calling thread are [ns]; 0: the kernel does not know of such, before 6.12."""
+    attributes = priority._Attributes()
+    call = priority._SET_ATTRIBUTES[platform.machine()] + 1  # sched_getattr
+    size = ctypes.sizeof(attributes)
+    assert ctypes.CDLL(None).syscall(call, 0, ctypes.byref(attributes), size, 0) == 0
+    return int(attributes.runtime_ns)
+
+
+@on_linux
+@pytest.mark.skipif(platform.machine() not in priority._SET_ATTRIBUTES, reason="no number of the system call")
+def test_who_gives_way_has_longer_turns_than_usual_and_who_is_punctual_shorter_ones():
+    usual_ns, found = 1_400_000, []
+
+    def usual() -> None:
+        priority._take_turns(usual_ns)  # whatever those of the thread that tests are
+        in_thread(lambda: (give_way(), found.append(turn_ns()), in_thread(lambda: found.append(turn_ns()))))
+        in_thread(lambda: (be_punctual(), found.append(turn_ns())))
+        found.append(turn_ns())
+
+    in_thread(usual)
+    long_ns, short_ns = priority._LONG_TURN_NS, priority._SHORT_TURN_NS
+    assert short_ns < usual_ns < long_ns
+    assert found == ([long_ns, long_ns, short_ns, usual_ns] if turn_ns() else [0, 0, 0, 0])
+
+
+@on_linux
+def test_a_thread_that_was_given_another_policy_keeps_it():
+    """Such as by `chrt`; to set turns would set a policy as well."""
+    found = []
+
+    def work() -> None:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        give_way()
+        be_punctual()
+        found.append(os.sched_getscheduler(0))
+
+    in_thread(work)
+    assert found == [os.SCHED_BATCH]
 
 
 @on_linux

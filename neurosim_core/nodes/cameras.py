@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import warp as wp
 
+from neurosim_core.cores import OwnCore
 from neurosim_core.packets import Packet
 from neurosim_core.priority import give_way, sparing
 from neurosim_core.schedule import batch_end_ns
@@ -68,6 +69,8 @@ class Cameras:
         self._closed = False
         self._failure: Exception | None = None
         self._changed = threading.Condition()
+        self._flier = 0
+        """The thread that flies, as the system counts it."""
         self._thread = None
         if not inline:
             self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
@@ -97,6 +100,7 @@ class Cameras:
                 if here:
                     job.left_out = late and shows
                 else:
+                    self._flier = threading.get_native_id()
                     self._jobs.append(job)
                     self._changed.notify_all()
             if here:
@@ -205,18 +209,34 @@ class Cameras:
 
     def _run(self) -> None:
         give_way()
-        while True:
-            with self._changed:
-                self._work = None
-                self._changed.notify_all()
-                while not self._jobs and not self._closed:
-                    self._changed.wait()
-                if self._closed or self._failure is not None:
-                    return
-                job = self._work = self._jobs.popleft()
-                behind = any(map(_shows_anything, self._jobs))
+        core = OwnCore()
+        while (job := self._next(core)) is not None:
+            behind = self._is_behind()
+            if behind:
+                core.take_back()
+            else:
+                core.give(self._flier)
             with sparing(0 if behind else _SPARED_CORES):
                 self._try(job)
+        core.take_back()
+
+    def _next(self, core: OwnCore) -> Job | None:
+        """Wait for the next job, with all cores for everybody; None if there is to be none."""
+        with self._changed:
+            self._work = None
+            self._changed.notify_all()
+            while not self._jobs and not self._closed:
+                core.take_back()
+                self._changed.wait()
+            if self._closed or self._failure is not None:
+                return None
+            self._work = self._jobs.popleft()
+            return self._work
+
+    def _is_behind(self) -> bool:
+        """Return whether a picture waits for the one in work."""
+        with self._changed:
+            return any(map(_shows_anything, self._jobs))
 
     def _try(self, job: Job) -> None:
         try:

@@ -7,7 +7,6 @@ parameter.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -15,6 +14,7 @@ from typing import Any
 
 import warp as wp
 
+from neurosim_core.cores import all_cores, following
 from neurosim_core.priority import niceness, spared_count
 
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
@@ -22,9 +22,7 @@ _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Pyt
 
 def core_count() -> int:
     """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(all_cores())
 
 
 @cache
@@ -68,5 +66,5 @@ def launch_split(
             kernel, dim=size, inputs=[first, *inputs], outputs=list(outputs), device=device, block_dim=64
         )
 
-    for _ in _pool(threads, niceness()).map(run, range(0, dim, slice_size)):
+    for _ in _pool(threads, niceness()).map(following(run), range(0, dim, slice_size)):
         pass

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -134,6 +136,34 @@ def test_a_core_is_left_to_others_as_long_as_no_picture_waits(model: Model, gate
     assert len(spared) == PERIODS + 1
     assert set(spared[1:-1]) == {0}
     assert spared[-1] == 1
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="needs Linux and two cores"
+)
+def test_who_flies_has_a_core_of_its_own_as_long_as_no_picture_waits(model: Model, gate: Gate):
+    places = []
+    held = module.see_each
+
+    def look(*job: Any) -> Any:
+        places.append((spared_count(), os.sched_getaffinity(0), os.sched_getaffinity(flier)))
+        return held(*job)
+
+    flier = threading.get_native_id()
+    before = os.sched_getaffinity(flier)
+    module.see_each = look  # the gate puts it back
+    eyes = Cameras(inline=False, on_packets=lambda: None)
+    fly(model, eyes)
+    assert gate.reached.wait(SOON_S)
+    gate.open.set()
+    eyes.finish(lambda: False)
+    eyes.close()
+    assert len(places) == PERIODS + 1
+    for spared, renderer, own in places:
+        assert (renderer, own) == (before - own if spared else before, own if spared else before)
+        assert len(own) == 1 or not spared
+    assert places[-1][0] == 1
+    wait_for(lambda: os.sched_getaffinity(flier) == before)
 
 
 def test_a_request_does_not_keep_the_loop_awake():

@@ -1,0 +1,122 @@
+"""Which thread runs on which core: a core of its own for one that must be in time, while another computes.
+
+A scheduler may wake a thread on the core that is busiest with its work instead of one that idles: that of
+who woke it, or the only one that is awake in a virtual machine. There it waits for whoever computes until the
+scheduler's clock ticks, up to 4 ms, unless the two may not use the same core.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+_PROCESSOR = 36
+"""Where the core is in `/proc/self/task/*/stat`, counted from what follows the name."""
+
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
+_own = threading.local()
+
+
+@cache
+def all_cores() -> frozenset[int]:
+    """Return the cores that this process may use, as of the first call; threads may keep to some since."""
+    if hasattr(os, "sched_getaffinity"):
+        return frozenset(os.sched_getaffinity(0))
+    return frozenset(range(os.cpu_count() or 1))
+
+
+class OwnCore:
+    """A core for a thread that must be in time; a thread that computes much keeps to the others.
+
+    To be used by the thread that computes. Without effect where there is one core only, or not Linux.
+    """
+
+    def __init__(self) -> None:
+        """Leave everything as it is."""
+        all_cores()  # before anybody is kept to some of them
+        self._thread_id: int | None = None
+        self._core: int | None = None
+        self._before: set[int] = set()
+        self._threads: set[str] = set()
+
+    def give(self, thread_id: int) -> None:
+        """Let a thread run where it ran last and nowhere else, and the calling one on all other cores.
+
+        Args:
+            thread_id: Of this process, as the system counts it (`threading.get_native_id`).
+        """
+        if thread_id == self._thread_id:
+            return
+        self.take_back()
+        core = _last_core(thread_id)
+        others = all_cores() - {core}
+        if core is None or not others:
+            return
+        try:
+            self._before = os.sched_getaffinity(thread_id)
+            os.sched_setaffinity(thread_id, {core})
+        except OSError:  # it has ended, or the system says no
+            return
+        self._thread_id, self._core, self._threads = thread_id, core, _threads()
+        _keep_to(others)
+
+    def take_back(self) -> None:
+        """Let both run where they could before, and threads that were started on the core meanwhile."""
+        thread_id, self._thread_id = self._thread_id, None
+        if thread_id is None:
+            return
+        _keep_to(all_cores())
+        if _last_core(thread_id) is not None:  # the number may be another process's by now
+            _set(thread_id, self._before)
+        for number in map(int, _threads() - self._threads):
+            with contextlib.suppress(OSError):  # it has ended
+                if os.sched_getaffinity(number) == {self._core}:
+                    os.sched_setaffinity(number, self._before)
+
+
+def following(work: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """Return work for a thread of a pool that keeps to the cores to which the calling thread keeps now."""
+    cores: frozenset[int] | None = getattr(_own, "cores", None)
+
+    def run(*arguments: _Parameters.args, **named: _Parameters.kwargs) -> _Result:
+        if cores is not None or hasattr(_own, "cores"):
+            _keep_to(cores or all_cores())
+        return work(*arguments, **named)
+
+    return run
+
+
+def _keep_to(cores: frozenset[int]) -> None:
+    """Let the calling thread run on these cores only."""
+    if getattr(_own, "cores", None) != cores:
+        _set(0, cores)
+        _own.cores = cores
+
+
+def _set(thread_id: int, cores: set[int] | frozenset[int]) -> None:
+    """Say where a thread may run; 0: the calling one. Where the system says no, it is as it was."""
+    with contextlib.suppress(OSError):
+        os.sched_setaffinity(thread_id, cores)
+
+
+def _threads() -> set[str]:
+    """Return the numbers of the threads of this process."""
+    return set(os.listdir("/proc/self/task"))
+
+
+def _last_core(thread_id: int) -> int | None:
+    """Return the core on which a thread of this process ran last; None if it has ended, or is not Linux's."""
+    if sys.platform != "linux":
+        return None
+    try:
+        stat = Path(f"/proc/self/task/{thread_id}/stat").read_text()
+    except OSError:
+        return None
+    return int(stat.rpartition(")")[2].split()[_PROCESSOR])
