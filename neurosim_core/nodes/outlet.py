@@ -192,7 +192,13 @@ class Outlet:
         for sensor in sensors:
             if sensor.name != "odometry":
                 frame = topics.sensor_frame(vehicle, sensor.name, sensor.kind)
-                self._add(sensor.name, translate.message_type(sensor.kind), config.links, frame_id=frame)
+                self._add(
+                    sensor.name,
+                    translate.message_type(sensor.kind),
+                    config.links,
+                    frame_id=frame,
+                    expected_bytes=translate.expected_bytes(config.sensors[sensor.name]),
+                )
         self._add(COLLISION, msg.Collision, {})
         self._add(
             "rotor_speeds",
@@ -372,7 +378,7 @@ class Outlet:
 
     def _send(self, stream: Stream, packet: Packet) -> None:
         channel = stream.channel
-        size_bytes = 0 if channel.config.delivers_at_once else payload_bytes(packet)
+        size_bytes = 0 if channel.delivers_at_once else payload_bytes(packet)
         delivery = channel.send(packet, stamp_ns=packet.stamp_ns, size_bytes=size_bytes)
         if delivery is not None:
             self.deliver(delivery, stream.name)
@@ -385,13 +391,16 @@ class Outlet:
         *,
         frame_id: str = "",
         latch: bool = False,
+        expected_bytes: int = 0,
         convert: Callable[[Any, Callable[[int], int] | None], Any] | None = None,
     ) -> None:
         def to_message(packet: Packet, clock_ns: Callable[[int], int] | None) -> Any:
             return translate.to_message(packet, frame_id=frame_id, clock_ns=clock_ns)
 
         link = links.get(name, NO_LINK)
-        publisher = self._node.publisher(topics.stream_topic(self.vehicle, name), message, latch=latch)
+        publisher = self._node.publisher(
+            topics.stream_topic(self.vehicle, name), message, latch=latch, expected_bytes=expected_bytes
+        )
         self.streams[name] = Stream(
             publisher,
             Channel(name, link, seed=self._seed),

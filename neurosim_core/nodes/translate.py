@@ -12,7 +12,17 @@ from cortex import messages as msg
 from neurosim_core import packets as pkt
 from neurosim_core.nodes.topics import COMMANDS, WORLD_FRAME, body_frame, sensor_frame
 from neurosim_core.record.header import SensorDescription
+from neurosim_core.sensors.rig import EventSensorConfig
 from neurosim_core.trajectory import Path
+
+_PIXEL_EVENTS_HZ = 100.0
+"""How often a pixel of an event camera may fire, on the average of all, in fast flight [Hz]: 80 were seen."""
+_EVENT_BYTES = 13
+"""Of one event in a message: x, y, t and polarity [bytes]."""
+_OTHER_BYTES = 4096
+"""More than all else in a message of events [bytes]."""
+_RESERVE_MAX_BYTES = 8 << 20
+"""The largest message that memory is reserved for [bytes]: a ring holds at least four."""
 
 
 def message_type(kind: str) -> type[Any]:
@@ -28,6 +38,18 @@ def message_type(kind: str) -> type[Any]:
         "imu": msg.Imu,
         "odometry": msg.Odometry,
     }[kind]
+
+
+def expected_bytes(sensor: object) -> int:
+    """Return what the messages of a sensor will hardly be larger than [bytes]; 0 if that is not known.
+
+    Known of event cameras: on the average of all, pixels hardly fire more than a hundred times a second.
+    """
+    if not isinstance(sensor, EventSensorConfig):
+        return 0
+    window_s = sensor.packets.stamp_ns(1) * 1e-9
+    count = _PIXEL_EVENTS_HZ * window_s * sensor.lens.width * sensor.lens.height
+    return min(round(count) * _EVENT_BYTES + _OTHER_BYTES, _RESERVE_MAX_BYTES)
 
 
 def to_message(
