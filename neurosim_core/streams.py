@@ -156,6 +156,13 @@ class HostCopy:
         self._places: dict[int, Any] = {}
         """Memory of others by address: the same few come again and again."""
 
+    def mapped(self) -> Any:
+        """Return the memory of the host as an array that kernels on the device write; on a CPU the array."""
+        if not self._copied:
+            return self._array
+        host = self._host
+        return wp.array(ptr=host.ptr, dtype=host.dtype, shape=host.shape, device=self._array.device)
+
     def fetch(self, first: int, count: int) -> None:
         """Launch the copy of `count` rows of the array."""
         if self._copied and count > 0:

@@ -2,6 +2,7 @@
 """The states of the vehicles at the boundaries of batches, on the device until a batch is read back."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +81,30 @@ def _camera_poses(
     q_WC_out[instant] = wp.quat(q_WC)
 
 
+@wp.kernel
+def _copy_rows(
+    # In:
+    first: int,
+    states: wp.array3d[wp.float64],
+    status: wp.array2d[wp.int32],
+    clearance: wp.array[wp.float32],
+    redone: wp.array2d[wp.int64],
+    # Out:
+    states_out: wp.array3d[wp.float64],
+    status_out: wp.array2d[wp.int32],
+    clearance_out: wp.array[wp.float32],
+    redone_out: wp.array2d[wp.int64],
+) -> None:
+    place, vehicle, part = wp.tid()
+    slot = first + place
+    states_out[slot, vehicle, part] = states[slot, vehicle, part]
+    if part == 0:
+        status_out[slot, vehicle] = status[slot, vehicle]
+        redone_out[slot, vehicle] = redone[slot, vehicle]
+        if vehicle == 0:
+            clearance_out[slot] = clearance[slot]
+
+
 class TraceRows(NamedTuple):
     """Slots of a `Trace` on the host."""
 
@@ -110,7 +135,9 @@ class Trace:
         self.stamps: Any = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
         self.redone = wp.zeros((capacity, vehicle_count), dtype=wp.int64, device=device)
         self.clearance = wp.zeros(capacity, dtype=wp.float32, device=device)
-        self._copies = [HostCopy(array) for array in (self.states, self.status, self.clearance, self.redone)]
+        self._rows = (self.states, self.status, self.clearance, self.redone)
+        self._copies = [HostCopy(array) for array in self._rows]
+        self._mapped = [copy.mapped() for copy in self._copies]
         self._recording: tuple[Any, Any] = (None, None)
         self._room_checks: dict[tuple[int, int, float, float], tuple[DistanceField, wp.Launch]] = {}
         self._pose_launches: dict[tuple[int, int, int, int], tuple[Any, wp.Launch]] = {}
@@ -222,10 +249,29 @@ class Trace:
         self._pose_launches[key][1].launch()
 
     def fetch(self, first: int, count: int) -> None:
-        """Launch the copy of some slots to the host."""
-        for copy in self._copies:
-            copy.fetch(first, count)
+        """Launch the copy of some slots to the host: by one kernel, as four copies take three times as long."""
+        if self.states.device.is_cuda:
+            copy_rows(self._rows, self._mapped, first, count)
 
     def numpy(self, first: int, count: int) -> TraceRows:
         """Return some slots that were fetched, and that the device has finished with."""
         return TraceRows(*(copy.rows(first, count) for copy in self._copies))
+
+
+def copy_rows(rows: Sequence[Any], rows_out: Sequence[Any], first: int, count: int) -> None:
+    """Launch the copy of some slots to other arrays.
+
+    Args:
+        rows: States, status, clearance and redone intervals, as in `Trace`.
+        rows_out: Where to, likewise; for a CUDA device, memory of the host may be among it that is pinned.
+        first: First slot.
+        count: Number of slots.
+    """
+    states = rows[0]
+    wp.launch(
+        _copy_rows,
+        dim=(count, *states.shape[1:]),
+        inputs=[first, *rows],
+        outputs=list(rows_out),
+        device=states.device,
+    )

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Mount
 from neurosim_core.scene.freespace import DistanceField
-from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace
+from neurosim_core.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, Trace, copy_rows
 
 
 def test_camera_pose_is_body_pose_times_mount(device):
@@ -66,6 +66,22 @@ def test_camera_pose_is_body_pose_times_mount(device):
         p_WC.numpy()[0], position[0] + R_WB.apply(mount.position_m), atol=1e-6
     )  # float32
     np.testing.assert_allclose(Rotation.from_quat(q_WC.numpy()[0]).as_matrix(), R_WC.as_matrix(), atol=1e-6)
+
+
+def test_rows_are_copied_and_no_others(device):
+    """The kernel that takes them to the host, which a CPU does without."""
+    rng = np.random.default_rng(0)
+    shapes = [((4, 2, 17), np.float64), ((4, 2), np.int32), ((4,), np.float32), ((4, 2), np.int64)]
+    values = [rng.integers(1, 2**20, size=shape).astype(dtype) for shape, dtype in shapes]
+    rows, others = (
+        [wp.array(value, device=device) for value in group]
+        for group in (values, [np.zeros_like(value) for value in values])
+    )
+    copy_rows(rows, others, 1, 2)
+    wp.synchronize_device(device)
+    for value, other in zip(values, others, strict=True):
+        np.testing.assert_array_equal(other.numpy()[1:3], value[1:3])
+        assert not other.numpy()[[0, 3]].any()
 
 
 def test_optical_frame_looks_forward():
