@@ -249,7 +249,7 @@ class Trace:
         self._pose_launches[key][1].launch()
 
     def fetch(self, first: int, count: int) -> None:
-        """Launch the copy of some slots to the host: by one kernel, as four copies take three times as long."""
+        """Launch the copy of some slots to the host: by one kernel, three times as fast as four copies."""
         if self.states.device.is_cuda:
             copy_rows(self._rows, self._mapped, first, count)
 
