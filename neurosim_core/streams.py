@@ -236,13 +236,16 @@ class LentBlocks:
             free.append(self._make(size))
 
     def take(self, size: int) -> LentBlock:
-        """Return a block of at least so many bytes that nobody reads: the least that has come back."""
+        """Return a block of at least so many bytes that nobody reads: the least that has come back.
+
+        A new one is for twice as many.
+        """
         for known in sorted(self._free):
             if known >= size and self._free[known]:
                 block = self._free[known].popleft()  # the one that came back first
                 break
         else:
-            block = self._make(size_class(size))
+            block = self._make(size_class(2 * size))
         self._taken_bytes += block.size
         return block
 

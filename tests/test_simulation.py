@@ -19,7 +19,6 @@ from neurosim_core.control import make_controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.render import launch
 from neurosim_core.sensors import cast as cast_module
-from neurosim_core.sensors.events import EventCamera
 from neurosim_core.vehicle import DynamicsError
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
@@ -126,12 +125,6 @@ def test_packets_do_not_depend_on_the_size_of_a_launch(settings, instants):
     assert content(fly(settings, instants_per_launch=instants)) == content(fly(settings))
 
 
-@pytest.fixture(params=[False, True], ids=["asked", "ahead"])
-def cut_ahead(request, monkeypatch):
-    """Cut windows of events when they are asked for, or ahead, as on a GPU."""
-    monkeypatch.setattr(cast_module, "EventCamera", functools.partial(EventCamera, cut_ahead=request.param))
-
-
 def test_terms_are_those_that_the_kernels_have(settings):
     """Walks are shared or not by the lens, the launch and the device, not by the scene alone."""
     found = {}
@@ -164,7 +157,6 @@ def test_lanes_share_no_list_of_slots(settings):
 
 @pytest.mark.parametrize("lane_count", [1, 2, 3])
 @pytest.mark.parametrize("instants", [4, 64])
-@pytest.mark.usefixtures("cut_ahead")
 def test_packets_do_not_depend_on_the_batches_under_way(settings, lane_count, instants):
     """Also where events are many: the buffers for them grow, and scans are done again."""
     events = {**SENSORS["events"], "pixel": {"threshold_on": 0.01, "threshold_off": 0.01}}
@@ -266,7 +258,6 @@ def test_a_collision_ends_the_run_or_is_reported(settings):
     assert content([p for p in reported if p.stamp_ns <= hit.stamp_ns]) == content(ended)
 
 
-@pytest.mark.usefixtures("cut_ahead")
 def test_where_a_collision_ends_does_not_depend_on_the_size_of_a_launch(settings):
     settings = {**settings, "path": THROUGH_THE_WALL, "duration_s": 1.5}
     ended = content(fly(settings))

@@ -95,7 +95,7 @@ def test_a_block_comes_back_when_its_last_view_is_gone(device):
 
 
 def test_who_keeps_too_much_gets_copies(device, monkeypatch):
-    monkeypatch.setattr(streams, "_LENT_BYTES_MAX", 400)
+    monkeypatch.setattr(streams, "_LENT_BYTES_MAX", 800)
     blocks = LentBlocks(device)
     kept = []
     for number in range(6):

@@ -457,7 +457,7 @@ def events_to_host_per_s(views: Views, *, seconds: float) -> float:
     def feed() -> None:
         nonlocal fed
         seen = stamps + fed * stamps[-1]
-        camera.feed_device(stacks[fed % 2], seen, ends_ns=seen[-1:])
+        camera.feed_device(stacks[fed % 2], seen)
         fed += 1
 
     def read() -> int:

@@ -409,10 +409,7 @@ def scan_events(cast: CastState, instants: Instants) -> None:
             first = 1
         stamps_ns = instants.stamps_ns[first:]
         if stamps_ns:
-            channel.camera.feed_device(
-                log_radiance[first:] if first else log_radiance,
-                stamps_ns,
-            )
+            channel.camera.feed_device(log_radiance[first:] if first else log_radiance, stamps_ns)
 
 
 def _window_ends(channel: EventChannel, stamps_ns: Sequence[int]) -> list[int]:

@@ -14,7 +14,7 @@ from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import SUB_BITS
-from neurosim_core.streams import HostCopy, HostInput, Milestone
+from neurosim_core.streams import HostCopy, HostInput, LentBlock, LentBlocks, Milestone, size_class
 
 ROOM_PER_PIXEL = 16
 """Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
@@ -23,6 +23,16 @@ TOUCHED_COUNT_MAX = 1 << 18
 """Keys of that room that are written to at once: the first busy moment of a run needs no new pages."""
 _COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
 """Types of the times, columns, rows and polarities that are handed out."""
+_OFFSETS = (0, 8, 10, 12)
+"""Where each of them begins in a block with room for one event."""
+_EVENT_BYTES = 13
+_EVENTS_PER_SAMPLE = 1 / 8
+"""Events of a pixel in a frame for which memory of the host is pinned from the start: four times as many as a
+tour of a house yields at 1 kHz. To pin takes 1 ms a MB, in which a device stands still."""
+_PINNED_BLOCKS = 3
+"""What a reader holds, what it reads next, and what is copied to."""
+_PINNED_BYTES_MAX = 144 << 20
+"""Most memory that is pinned for events that have not come."""
 
 
 def roomy_keys(count: int, touched_count: int) -> wp.array[wp.int64]:
@@ -61,7 +71,11 @@ class EventKeys:
         self._read_count = 0
         self._spare = self._buffer(0)
         self._order = self._empty(0, wp.int32)
-        self._columns: list[tuple[Any, HostCopy]] = []
+        self._blocks = LentBlocks(device) if on_host and device.is_cuda else None
+        """Where events go that are copied to the host."""
+        self._columns: list[Any] = []
+        """What is copied to them: one block of memory, as each type that is in it."""
+        self._frame_count = 0
         self._read = Milestone(device)
         self._make_window_buffers(16)
 
@@ -69,6 +83,14 @@ class EventKeys:
         """Forget all keys; those that come have their time from an origin [us]."""
         self.count = self._read_count = 0
         self.origin_us = origin_us
+
+    def expect(self, frame_count: int) -> None:
+        """Pin memory of the host for what a stack of so many frames may yield, if events are copied there."""
+        if self._blocks is None or frame_count <= self._frame_count:
+            return
+        self._frame_count = size_class(frame_count)
+        events = int(_EVENTS_PER_SAMPLE * self._frame_count * self._pixel_count)
+        self._blocks.reserve(min(_EVENT_BYTES * events, _PINNED_BYTES_MAX // _PINNED_BLOCKS), _PINNED_BLOCKS)
 
     def append(self, keys: wp.array[wp.int64], first: int, count: int, origin_us: int) -> None:
         """Add `count` keys from `first` on, whose time has its own origin [us]."""
@@ -122,22 +144,44 @@ class EventKeys:
             [self._found],
         )
         self._found_on_host.fetch(0, len(ends_ns))
-        copied = self._on_host and self._device.is_cuda
-        columns = [c for c, _ in self._columns] if copied else [self._empty(count, d) for d in _COLUMN_TYPES]
-        self._launch(
-            event_scan.decode, count, [self.keys, self.origin_us, self._row_shift, self._time_shift], columns
-        )
-        if copied:
-            for _, copy in self._columns:
-                copy.fetch(0, count)
+        columns, block = [], None
+        if self._blocks is not None:
+            block = self._copy_to_host(self._blocks, count)
+        else:
+            columns = [self._empty(count, dtype) for dtype in _COLUMN_TYPES]
+            decoded = [self.keys, self.origin_us, self._row_shift, self._time_shift]
+            self._launch(event_scan.decode, count, decoded, columns)
         self._read.set()
         self._read.wait()
         cuts: list[int] = self._found_on_host.rows(0, len(ends_ns)).tolist()
-        if copied:
-            columns = [copy.rows(0, cuts[-1]) for _, copy in self._columns]
+        if self._blocks is not None and block is not None:
+            columns = self._lend(self._blocks, block, count)
         elif self._on_host:
             columns = [column.numpy() for column in columns]
         return columns, cuts
+
+    def _copy_to_host(self, blocks: LentBlocks, count: int) -> LentBlock:
+        """Launch the copy of all events to the host, one column after the other."""
+        room = _room_of(count)
+        self._launch(
+            event_scan.decode_block,
+            count,
+            [self.keys, room, self.origin_us, self._row_shift, self._time_shift],
+            self._columns,
+        )
+        block = blocks.take(_EVENT_BYTES * room)
+        wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * room)
+        return block
+
+    def _lend(self, blocks: LentBlocks, block: LentBlock, count: int) -> list[Any]:
+        """Return the columns of events that were copied to a block; who reads them has them to himself."""
+        room = _room_of(count)
+        rows = blocks.lend(block, _EVENT_BYTES * room)
+        columns = []
+        for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
+            size = np.dtype(dtype).itemsize
+            columns.append(rows[offset * room : (offset + size) * room].view(dtype))
+        return columns
 
     def no_events(self) -> list[Any]:
         """Return columns without an event."""
@@ -193,8 +237,12 @@ class EventKeys:
         if self._device.is_cuda:
             self._order = self._empty(2 * room, wp.int32)
             if self._on_host:
-                columns = [self._empty(room, dtype) for dtype in _COLUMN_TYPES]
-                self._columns = [(column, HostCopy(column)) for column in columns]
+                block = self._empty(_EVENT_BYTES * room, wp.uint8)
+                self._columns = [
+                    wp.array(ptr=block.ptr, dtype=dtype, shape=block.shape[0] // size, device=self._device)
+                    for dtype, size in ((wp.int64, 8), (wp.uint16, 2))
+                ]
+                self._columns.append(block)
 
     def _make_window_buffers(self, window_count: int) -> None:
         self._bounds = HostInput(self._empty(window_count, wp.int64))
@@ -206,3 +254,8 @@ class EventKeys:
 
     def _empty(self, count: int, dtype: Any) -> Any:
         return wp.empty(count, dtype=dtype, device=self._device)
+
+
+def _room_of(count: int) -> int:
+    """Return for how many events the columns have room: an even number, so that each begins where it may."""
+    return count + count % 2

@@ -2,8 +2,8 @@
 # mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
 """Kernels of the event camera: the pixels' scan over a stack of frames, and the 64-bit keys it writes.
 
-The law is in `walk`, once. A pixel holds the log radiance it was reset to (`base`), its last sample, and how
-many levels it crossed upwards and downwards since. The reference level is a function of these counts,
+The law is in `scan_pixel`, once. A pixel holds the log radiance it was reset to (`base`), its last sample,
+and how many levels it crossed upwards and downwards since. The reference level is a function of these counts,
 
     L_ref = base + up * threshold_on - down * threshold_off     (float64)
 
@@ -41,8 +41,7 @@ OPEN = wp.constant(0)
 PUT = wp.constant(1)
 CLOSE = wp.constant(2)
 READ = wp.constant(3)
-_BLOCKS_SHARE = wp.constant(True)
-"""Whether the threads of a block on CUDA share the work of turning crossings into keys."""
+START = wp.constant(4)
 
 _HALF_ULP = wp.constant(wp.float64(2.0**-24))
 """Of a float32 in [1, 2)."""
@@ -54,22 +53,6 @@ LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
 _TICKS_PER_NS = wp.constant(wp.float64(1024.0))
 COLUMN_SHIFT = wp.constant(wp.int64(SUB_BITS))
 _US = wp.constant(wp.int64(1000))
-
-
-@wp.struct
-class Pixel:
-    """What a pixel remembers, and what one walk over a stack found."""
-
-    last: wp.float32
-    """Last sample."""
-    up: wp.int32
-    """Levels crossed upwards since the reset."""
-    down: wp.int32
-    """Levels crossed downwards since the reset."""
-    invalid_count: wp.int32
-    """Samples that are no log radiance; the sample before was held."""
-    invalid_first: wp.int32
-    """Frame of the first of them."""
 
 
 @wp.func_native("""
@@ -119,30 +102,29 @@ def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    constexpr int SIZE = 1024;
-    __shared__ int words[6][SIZE];
-    __shared__ unsigned kept_count;
+    constexpr int SIZE = 2048;  // a crossing for each thread and each of 8 frames
+    __shared__ int words[5][SIZE];
+    __shared__ unsigned kept_count, total;  // of 64 bits together they would be added in a loop
+    __shared__ unsigned long long start;
     if (step == 1) {
-        const unsigned slot = atomicAdd(&kept_count, 1u);
-        if (slot >= SIZE) return 0;
-        words[0][slot] = frame;
-        words[1][slot] = __float_as_int(last);
-        words[2][slot] = __float_as_int(sample);
-        words[3][slot] = up;
-        words[4][slot] = down;
-        words[5][slot] = 2 * (int)threadIdx.x + polarity;
+        const unsigned index = atomicAdd(&kept_count, 1u);
+        words[0][index] = (event_count << 11) | ((frame & 7) << 8) | threadIdx.x;
+        words[1][index] = __float_as_int(last);
+        words[2][index] = up;
+        words[3][index] = down;
+        words[4][index] = (int)atomicAdd(&total, (unsigned)event_count);
         return 1;
     }
+    if (step == 3) return words[place][index];
+    if (step == 4) return (int64_t)start;
+    __syncthreads();
     if (step == 0) {
-        if (threadIdx.x == 0) kept_count = 0;
-        __syncthreads();
-        return 0;
+        if (threadIdx.x == 0) kept_count = total = 0;
+    } else if (threadIdx.x == 0 && total > 0) {
+        start = atomicAdd((unsigned long long*)counters.data, (unsigned long long)total);
     }
-    if (step == 2) {
-        __syncthreads();
-        return kept_count < SIZE ? (int)kept_count : SIZE;
-    }
-    return words[place][index];
+    __syncthreads();
+    return (int64_t)kept_count;
 #else
     return 0;
 #endif
@@ -150,26 +132,30 @@ def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters:
 def keep_crossing(
     step: wp.int32,
     frame: wp.int32,
+    event_count: wp.int32,
     last: wp.float32,
-    sample: wp.float32,
     up: wp.int32,
     down: wp.int32,
-    polarity: wp.int32,
     place: wp.int32,
     index: wp.int32,
-) -> wp.int32:
-    """Keep crossings (step PUT) for the whole block to turn into keys, on CUDA: few lanes find one together.
+    counters: wp.array[wp.int64],
+) -> wp.int64:
+    """Keep what a pixel crosses in a frame (step PUT), for its whole block to turn into keys; only on CUDA.
 
-    Every thread of a block comes here once before with OPEN. Returns for PUT whether there was room; for
-    CLOSE, to which all threads come, how many are kept; and for READ a word of one, in the order of the
-    parameters, where the last is twice the thread that kept it plus the polarity. On a CPU there is no room.
+    Few threads cross levels, some many in each frame, and the others would wait for them. At most 2^21 - 1
+    levels are crossed in a frame, and 8 frames that begin at a multiple of 8 are kept together.
+
+    Every thread of a block comes here before with OPEN, and after with CLOSE, which counts the events and
+    returns how many crossings are kept. Then READ returns a word of one: its levels, the last bits of the
+    frame and the thread; and `last`, `up` and `down` as they were before, and the number of its first event.
+    START returns the place of event 0. On a CPU, PUT returns 0 and nothing is kept.
     """
     ...
 
 
 @wp.func
-def _read_crossing(word: wp.int32, index: wp.int32) -> wp.int32:
-    return keep_crossing(READ, 0, wp.float32(0.0), wp.float32(0.0), 0, 0, 0, word, index)
+def _read_word(place: wp.int32, index: wp.int32, counters: wp.array[wp.int64]) -> wp.int32:
+    return wp.int32(keep_crossing(READ, 0, 0, wp.float32(0.0), 0, 0, place, index, counters))
 
 
 @wp.func_native("""
@@ -339,30 +325,39 @@ def _count_lead(
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // the loads of 16 frames are under way together, and threads that ask from different frames of the 16 on
-    // read the same lines; beyond the end the last frame stands in, which is no louder than itself
-    constexpr int SIZE = 16;
-    const float* sample = log_radiance.data + pixel;
-    const size_t stride = log_radiance.shape[1];
-    for (int begin = first / SIZE * SIZE; begin < frame_count; begin += SIZE) {
-        float value[SIZE];
-#pragma unroll
-        for (int i = 0; i < SIZE; ++i) {
-            const int frame = begin + i < frame_count ? begin + i : frame_count - 1;
-            value[i] = sample[frame * stride];
-        }
-        unsigned loud = 0;
-#pragma unroll
-        for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
-        if (begin < first) loud &= ~0u << (first - begin);
-        if (loud != 0) return begin + __ffs(loud) - 1 < frame_count ? begin + __ffs(loud) - 1 : frame_count;
-    }
-    return frame_count;
+    return first + 8 < frame_count ? first + 8 : frame_count;
 #else
+    return frame_count;
+#endif
+""")
+def _end_of_round(first: wp.int32, frame_count: wp.int32) -> wp.int32:
+    """Return where the frames end that a block scans before it writes their events; 8 on CUDA."""
+    ...
+
+
+@wp.func_native("""
     const float* sample = log_radiance.data + pixel;
     const size_t stride = log_radiance.shape[1];
+#if defined(__CUDA_ARCH__)
+    // the loads of all frames of a round are under way together; beyond the end the last frame stands in
+    constexpr int SIZE = 8;
+    if (first >= end) return end;
+    const int begin = first / SIZE * SIZE;
+    float value[SIZE];
+    const float* at = sample + begin * stride;
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) {
+        value[i] = *at;
+        if (begin + i + 1 < end) at += stride;
+    }
+    unsigned loud = 0;
+#pragma unroll
+    for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
+    loud &= ~0u << (first - begin);
+    return loud != 0 && begin + __ffs(loud) - 1 < end ? begin + __ffs(loud) - 1 : end;
+#else
     int frame = first;
-    while (frame < frame_count && sample[frame * stride] > low && sample[frame * stride] < high) ++frame;
+    while (frame < end && sample[frame * stride] > low && sample[frame * stride] < high) ++frame;
     return frame;
 #endif
 """)
@@ -370,11 +365,11 @@ def _next_loud(
     log_radiance: wp.array2d[wp.float32],
     pixel: wp.int32,
     first: wp.int32,
-    frame_count: wp.int32,
+    end: wp.int32,
     low: wp.float32,
     high: wp.float32,
 ) -> wp.int32:
-    """Return the first frame from `first` on whose sample leaves (low, high), or the number of frames."""
+    """Return the first frame of a round from `first` on whose sample leaves (low, high), or its end."""
     ...
 
 
@@ -398,97 +393,120 @@ def _place(pixel: wp.int32, row: wp.int32, width: wp.int32, row_shift: wp.int32)
 
 
 @wp.func
-def walk(
-    tabulate: wp.bool,
-    kept: wp.bool,
-    pixel: wp.int32,
-    row: wp.int32,
-    place: wp.int64,
-    base_32: wp.float32,
-    state: Pixel,
+def _rise(
+    sample: wp.float32,
+    base: wp.float64,
+    up: wp.int32,
+    down: wp.int32,
     threshold_on: wp.float64,
     threshold_off: wp.float64,
+) -> wp.int32:
+    """Return `up` when a sample that has reached the level above has crossed all that it reaches."""
+    least = up + 1
+    if sample < _upper(base, least, down, threshold_on, threshold_off):
+        return least
+    level = level_at(base, least, down, threshold_on, threshold_off)
+    found = least + wp.int32((wp.float64(sample) - level) / threshold_on)  # but for rounding
+    while sample >= _upper(base, found, down, threshold_on, threshold_off):
+        found += 1
+    while found > least and sample < _upper(base, found - 1, down, threshold_on, threshold_off):
+        found -= 1
+    return found
+
+
+@wp.func
+def _fall(
+    sample: wp.float32,
+    base: wp.float64,
+    up: wp.int32,
+    down: wp.int32,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+) -> wp.int32:
+    """Return `down` when a sample that has reached the level below has crossed all that it reaches."""
+    least = down + 1
+    if sample > _lower(base, up, least, threshold_on, threshold_off):
+        return least
+    level = level_at(base, up, least, threshold_on, threshold_off)
+    found = least + wp.int32((level - wp.float64(sample)) / threshold_off)
+    while sample <= _lower(base, up, found, threshold_on, threshold_off):
+        found += 1
+    while found > least and sample > _lower(base, up, found - 1, threshold_on, threshold_off):
+        found -= 1
+    return found
+
+
+@wp.func
+def _key_of_level(
+    event: wp.int32,
+    base: wp.float64,
+    up: wp.int32,
+    down: wp.int32,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    last: wp.float32,
+    sample: wp.float32,
+    start_ns: wp.int64,
+    end_ns: wp.int64,
+    place: wp.int64,
     time_shift: wp.int32,
+) -> wp.int64:
+    """Return the key of one of the events between two samples, from `up` and `down` at the first of them."""
+    polarity = wp.where(sample > last, 1, 0)
+    level = level_at(
+        base,
+        up + (event + 1) * polarity,
+        down + (event + 1) * (1 - polarity),
+        threshold_on,
+        threshold_off,
+    )
+    return _key(level, wp.float64(last), wp.float64(sample), start_ns, end_ns, place, time_shift, polarity)
+
+
+@wp.func
+def _write_kept(
+    index: wp.int32,
+    threshold_on: wp.float64,
+    threshold_off: wp.float64,
+    width: wp.int32,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    first_pixel: wp.int32,
+    first_frame: wp.int32,
     log_radiance: wp.array2d[wp.float32],
     stamps: wp.array[wp.int64],
-    frame_count: wp.int32,
-    lead: wp.int32,
-    row_limit: wp.array[wp.int32],
-    table: wp.array2d[wp.int32],
-    keys: wp.array[wp.int64],
-    counters: wp.array[wp.int64],
-) -> Pixel:
-    """Take one pixel over a stack of frames, and write its events, or enter their number in the table.
-
-    The first `lead` frames are known to be quiet. With `kept`, events are left to the block.
-    """
-    base = wp.float64(base_32)
-    up = state.up
-    down = state.down
-    low = _lower(base, up, down, threshold_on, threshold_off)
-    high = _upper(base, up, down, threshold_on, threshold_off)
-    last = state.last
-    invalid_count = wp.int32(0)
-    invalid_first = wp.int32(0)
-    after = wp.int32(0)  # the first frame that comes after those that `last` knows of
-
-    frame = _next_loud(log_radiance, pixel, lead, frame_count, low, high)
-    while frame < frame_count:
-        if frame > after:
-            last = log_radiance[frame - 1, pixel]
-        sample = log_radiance[frame, pixel]
-        if wp.abs(sample) <= LIMIT:
-            up_before = up
-            down_before = down
-            while sample >= high:
-                up += 1
-                high = _upper(base, up, down, threshold_on, threshold_off)
-            if up > up_before:
-                low = _lower(base, up, down, threshold_on, threshold_off)
-            while sample <= low:
-                down += 1
-                low = _lower(base, up, down, threshold_on, threshold_off)
-            if down > down_before:
-                high = _upper(base, up, down, threshold_on, threshold_off)
-            found = up - up_before + down - down_before
-            if tabulate:
-                wp.atomic_add(table, frame, row, found)
-            elif row < row_limit[frame]:
-                polarity = wp.where(up > up_before, 1, 0)
-                for event in range(found):
-                    up_then = up_before + (event + 1) * polarity
-                    down_then = down_before + (event + 1) * (1 - polarity)
-                    if kept:  # noqa: SIM102, one of them is for the compiler
-                        if keep_crossing(PUT, frame, last, sample, up_then, down_then, polarity, 0, 0) == 1:
-                            continue
-                    level = level_at(base, up_then, down_then, threshold_on, threshold_off)
-                    key = _key(
-                        level,
-                        wp.float64(last),
-                        wp.float64(sample),
-                        stamps[frame],
-                        stamps[frame + 1],
-                        place,
-                        time_shift,
-                        polarity,
-                    )
-                    write_key(PUT, key, keys, counters)
-            last = sample
-        else:
-            if invalid_count == 0:
-                invalid_first = frame
-            invalid_count += 1
-        after = frame + 1
-        frame = _next_loud(log_radiance, pixel, after, frame_count, low, high)
-    if after < frame_count:
-        last = log_radiance[frame_count - 1, pixel]
-
-    state.last = last
-    state.up = up
-    state.down = down
-    state.invalid_count = invalid_count
-    state.invalid_first = invalid_first
-    return state
+    base: wp.array[wp.float32],
+    keys_out: wp.array[wp.int64],
+    counters_out: wp.array[wp.int64],
+) -> None:
+    """Write the keys of what a pixel of the block has crossed in a frame, as far as there is room."""
+    word = _read_word(0, index, counters_out)
+    pixel = first_pixel + (word & 255)
+    frame = first_frame + ((word >> 8) & 7)
+    last = wp.cast(_read_word(1, index, counters_out), wp.float32)
+    up = _read_word(2, index, counters_out)
+    down = _read_word(3, index, counters_out)
+    offset = wp.int64(_read_word(4, index, counters_out)) & wp.int64(0xFFFFFFFF)
+    slot = keep_crossing(START, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out) + offset
+    sample = log_radiance[frame, pixel]
+    level_0 = wp.float64(base[pixel])
+    place = _place(pixel, pixel // width, width, row_shift)
+    for event in range((word >> 11) & 0x1FFFFF):
+        if slot + wp.int64(event) < wp.int64(keys_out.shape[0]):
+            keys_out[wp.int32(slot) + event] = _key_of_level(
+                event,
+                level_0,
+                up,
+                down,
+                threshold_on,
+                threshold_off,
+                last,
+                sample,
+                stamps[frame],
+                stamps[frame + 1],
+                place,
+                time_shift,
+            )
 
 
 @wp.func
@@ -499,6 +517,8 @@ def scan_pixel(
     row_shift: wp.int32,
     time_shift: wp.int32,
     pixel: wp.int32,
+    end_pixel: wp.int32,
+    lane: wp.int32,
     log_radiance: wp.array2d[wp.float32],
     stamps: wp.array[wp.int64],
     frame_count: wp.int32,
@@ -514,94 +534,115 @@ def scan_pixel(
     counters_out: wp.array[wp.int64],
     table_out: wp.array2d[wp.int32],
 ) -> None:
-    """Take one pixel from its state before a stack to that after it; parameters as for `scan`."""
-    scan_pixel_keeping(
-        False,
-        threshold_on,
-        threshold_off,
-        width,
-        row_shift,
-        time_shift,
-        pixel,
-        log_radiance,
-        stamps,
-        frame_count,
-        lead,
-        row_limit,
-        base,
-        last,
-        crossed,
-        tabulate,
-        last_out,
-        crossed_out,
-        keys_out,
-        counters_out,
-        table_out,
-    )
+    """Take one pixel from its state before a stack to that after it; parameters as for `scan`.
 
+    All threads of a block come here together, also those whose pixel is past the end. `lane` is their number.
+    """
+    alive = pixel < end_pixel
+    base_32 = wp.float32(0.0)
+    row = wp.int32(0)
+    up = wp.int32(0)
+    down = wp.int32(0)
+    low = wp.float32(0.0)
+    high = wp.float32(0.0)
+    sample_before = wp.float32(0.0)
+    seen = wp.int32(0)  # the frames that `sample_before` knows of
+    frame = wp.int32(0)
+    invalid_count = wp.int32(0)
+    invalid_first = wp.int32(0)
+    if alive:
+        before = crossed[pixel]
+        up = before[0]
+        down = before[1]
+        frame = lead[pixel]
+        if frame < frame_count:
+            base_32 = base[pixel]
+            sample_before = last[pixel]
+            row = pixel // width
+            low = _lower(wp.float64(base_32), up, down, threshold_on, threshold_off)
+            high = _upper(wp.float64(base_32), up, down, threshold_on, threshold_off)
 
-@wp.func
-def scan_pixel_keeping(
-    kept: wp.bool,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    width: wp.int32,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    pixel: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    stamps: wp.array[wp.int64],
-    frame_count: wp.int32,
-    lead: wp.array[wp.int32],
-    row_limit: wp.array[wp.int32],
-    base: wp.array[wp.float32],
-    last: wp.array[wp.float32],
-    crossed: wp.array[wp.vec2i],
-    tabulate: wp.bool,
-    last_out: wp.array[wp.float32],
-    crossed_out: wp.array[wp.vec2i],
-    keys_out: wp.array[wp.int64],
-    counters_out: wp.array[wp.int64],
-    table_out: wp.array2d[wp.int32],
-) -> None:
-    """Do what `scan_pixel` does; with `kept`, events are left to the block where it has room for them."""
-    state = Pixel()
-    before = crossed[pixel]
-    state.up = before[0]
-    state.down = before[1]
-    if lead[pixel] == frame_count:
-        state.last = log_radiance[frame_count - 1, pixel]
-    else:
-        state.last = last[pixel]
-        row = pixel // width
-        place = _place(pixel, row, width, row_shift)
-        state = walk(
-            tabulate,
-            kept,
-            pixel,
-            row,
-            place,
-            base[pixel],
-            state,
-            threshold_on,
-            threshold_off,
-            time_shift,
-            log_radiance,
-            stamps,
-            frame_count,
-            lead[pixel],
-            row_limit,
-            table_out,
-            keys_out,
-            counters_out,
-        )
-    if not tabulate:
-        last_out[pixel] = state.last
-        crossed_out[pixel] = wp.vec2i(state.up, state.down)
-        if state.invalid_count > 0:
+    begin = wp.int32(0)
+    while begin < frame_count:
+        end = _end_of_round(begin, frame_count)
+        keep_crossing(OPEN, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out)
+        if alive:
+            frame = _next_loud(log_radiance, pixel, wp.max(frame, begin), end, low, high)
+            while frame < end:
+                if frame > seen:
+                    sample_before = log_radiance[frame - 1, pixel]
+                sample = log_radiance[frame, pixel]
+                if wp.abs(sample) <= LIMIT:
+                    level_0 = wp.float64(base_32)
+                    up_before = up
+                    down_before = down
+                    if sample >= high:
+                        up = _rise(sample, level_0, up, down, threshold_on, threshold_off)
+                    else:
+                        down = _fall(sample, level_0, up, down, threshold_on, threshold_off)
+                    low = _lower(level_0, up, down, threshold_on, threshold_off)
+                    high = _upper(level_0, up, down, threshold_on, threshold_off)
+                    found = up - up_before + down - down_before
+                    if tabulate:
+                        wp.atomic_add(table_out, frame, row, found)
+                    elif row < row_limit[frame]:
+                        kept = keep_crossing(
+                            PUT, frame, found, sample_before, up_before, down_before, 0, 0, counters_out
+                        )
+                        if kept == wp.int64(0):
+                            place = _place(pixel, row, width, row_shift)
+                            for event in range(found):
+                                key = _key_of_level(
+                                    event,
+                                    level_0,
+                                    up_before,
+                                    down_before,
+                                    threshold_on,
+                                    threshold_off,
+                                    sample_before,
+                                    sample,
+                                    stamps[frame],
+                                    stamps[frame + 1],
+                                    place,
+                                    time_shift,
+                                )
+                                write_key(PUT, key, keys_out, counters_out)
+                    sample_before = sample
+                else:
+                    if invalid_count == 0:
+                        invalid_first = frame
+                    invalid_count += 1
+                seen = frame + 1
+                frame = _next_loud(log_radiance, pixel, seen, end, low, high)
+        kept_count = wp.int32(keep_crossing(CLOSE, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out))
+        for index in range(lane, kept_count, BLOCK_SIZE):
+            _write_kept(
+                index,
+                threshold_on,
+                threshold_off,
+                width,
+                row_shift,
+                time_shift,
+                pixel - lane,
+                begin,
+                log_radiance,
+                stamps,
+                base,
+                keys_out,
+                counters_out,
+            )
+        if alive and seen < end:
+            sample_before = log_radiance[end - 1, pixel]
+            seen = end
+        begin = end
+
+    if alive and not tabulate:
+        last_out[pixel] = sample_before
+        crossed_out[pixel] = wp.vec2i(up, down)
+        if invalid_count > 0:
             pixel_count = base.shape[0]
-            flat = wp.int64(state.invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
-            wp.atomic_add(counters_out, 1, wp.int64(state.invalid_count))
+            flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
+            wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
             wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
 
 
@@ -679,7 +720,7 @@ def screen(
     )
 
 
-@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))  # as many blocks as need no register spilled
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 3))  # as many blocks as need no register spilled
 def scan(
     # Model:
     threshold_on: wp.float64,
@@ -715,7 +756,7 @@ def scan(
         row_shift: Bits of a key below its row.
         time_shift: Bits of a key below its microseconds.
         first_pixel: Pixel of thread 0.
-        end_pixel: Threads at or past it (they fill the last CUDA block) do nothing.
+        end_pixel: Threads at or past it (they fill the last CUDA block) have no pixel.
         log_radiance: Frames, shape [frame, pixel].
         stamps: Stamp of the state, then of each frame, from the keys' time origin [ns], shape [frame + 1].
         frame_count: Frames to scan.
@@ -733,59 +774,30 @@ def scan(
         table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
     """
     thread = wp.tid()
-    pixel = first_pixel + thread
-    write_key(OPEN, wp.int64(0), keys_out, counters_out)
-    keep_crossing(OPEN, 0, wp.float32(0.0), wp.float32(0.0), 0, 0, 0, 0, 0)
-    if pixel < end_pixel:
-        scan_pixel_keeping(
-            _BLOCKS_SHARE,
-            threshold_on,
-            threshold_off,
-            width,
-            row_shift,
-            time_shift,
-            pixel,
-            log_radiance,
-            stamps,
-            frame_count,
-            lead,
-            row_limit,
-            base,
-            last,
-            crossed,
-            tabulate,
-            last_out,
-            crossed_out,
-            keys_out,
-            counters_out,
-            table_out,
-        )
-    lane = thread % BLOCK_SIZE
-    kept_count = keep_crossing(CLOSE, 0, wp.float32(0.0), wp.float32(0.0), 0, 0, 0, 0, 0)
-    for index in range(lane, kept_count, BLOCK_SIZE):
-        frame = _read_crossing(0, index)
-        who = _read_crossing(5, index)
-        polarity = who & 1
-        kept_pixel = pixel - lane + (who >> 1)
-        level = level_at(
-            wp.float64(base[kept_pixel]),
-            _read_crossing(3, index),
-            _read_crossing(4, index),
-            threshold_on,
-            threshold_off,
-        )
-        key = _key(
-            level,
-            wp.float64(wp.cast(_read_crossing(1, index), wp.float32)),
-            wp.float64(wp.cast(_read_crossing(2, index), wp.float32)),
-            stamps[frame],
-            stamps[frame + 1],
-            _place(kept_pixel, kept_pixel // width, width, row_shift),
-            time_shift,
-            polarity,
-        )
-        write_key(PUT, key, keys_out, counters_out)
-    write_key(CLOSE, wp.int64(0), keys_out, counters_out)
+    scan_pixel(
+        threshold_on,
+        threshold_off,
+        width,
+        row_shift,
+        time_shift,
+        first_pixel + thread,
+        end_pixel,
+        thread % BLOCK_SIZE,
+        log_radiance,
+        stamps,
+        frame_count,
+        lead,
+        row_limit,
+        base,
+        last,
+        crossed,
+        tabulate,
+        last_out,
+        crossed_out,
+        keys_out,
+        counters_out,
+        table_out,
+    )
 
 
 @wp.func
@@ -947,3 +959,28 @@ def decode(
     x_out[event] = found.x
     y_out[event] = found.y
     polarity_out[event] = found.polarity
+
+
+@wp.kernel
+def decode_block(
+    # In:
+    keys: wp.array[wp.int64],
+    room: wp.int32,
+    time_origin_us: wp.int64,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    # Out:
+    columns_8: wp.array[wp.int64],
+    columns_2: wp.array[wp.uint16],
+    columns_1: wp.array[wp.uint8],
+) -> None:
+    """Take keys apart like `decode`, into one block of memory that is given as three types.
+
+    The columns are in it one after the other, each with room for `room` events, an even number.
+    """
+    event = wp.tid()
+    found = take_apart(keys[event], row_shift, time_shift)
+    columns_8[event] = time_origin_us + found.time_us
+    columns_2[4 * room + event] = found.x
+    columns_2[5 * room + event] = found.y
+    columns_1[12 * room + event] = found.polarity

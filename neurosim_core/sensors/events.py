@@ -22,11 +22,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
+from neurosim_core.cores import following
 from neurosim_core.packets import Events
 from neurosim_core.priority import spared_count
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_scan
-from neurosim_core.sensors.event_ahead import WINDOW_COUNT_MAX, Draft, Drafts
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, EventKeys, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise, terms_of
@@ -75,10 +75,6 @@ class _Scan:
     """Origin of its keys' time."""
     state: int = 0
     """Where in the ring the state before it is; the state after it comes next."""
-    ends_ns: tuple[int, ...] | None = None
-    """Where windows will end in it [ns]; None: nobody has said."""
-    draft: Draft | None = None
-    """These windows, cut ahead."""
 
 
 class EventCamera:
@@ -119,12 +115,9 @@ class EventCamera:
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
         terms: What is compiled in beyond ideal pixels, some of `event_noise.TERMS`; by default what the
             configuration asks for.
-        cut_ahead: Cut windows before they are asked for, if `feed_device` was told where they end; they are
-            the same. By default on a CUDA device that hands events out on the host.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise.TERMS`, and "readout".
-        ahead_count: Stacks whose windows were cut before they were asked for.
 
     Raises:
         ValueError: If width, height or seed is out of range.
@@ -142,7 +135,6 @@ class EventCamera:
         scan_count_max: int = 1,
         on_host: bool = False,
         terms: Sequence[str] | None = None,
-        cut_ahead: bool | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -209,25 +201,12 @@ class EventCamera:
                 time_shift=self._time_shift,
                 device=self.device,
             )
-        self._drafts: Drafts | None = None
-        self._draft: Draft | None = None  # the last that was launched
-        self._carried: Draft | None = None  # it holds what is carried over; None: `_keys` do
-        wanted = self.device.is_cuda if cut_ahead is None else cut_ahead
-        if wanted and self._on_host and self._readout is None and len(self._chunk_bounds()) == 1:
-            self._drafts = Drafts(
-                pixel_count=pixel_count,
-                row_shift=self._row_shift,
-                time_shift=self._time_shift,
-                under_way_max=scan_count_max,
-                device=self.device,
-            )
         self._feeder: Any = None
-        self.ahead_count = 0
         wp.load_module(event_scan, device=self.device)
 
         self._now_ns: int | None = None
         self._fed_ns = 0
-        self._window_start_ns = self._drafted_ns = 0
+        self._window_start_ns = 0
         self._state = 0
         self._forget()
 
@@ -299,12 +278,10 @@ class EventCamera:
         stamps = _as_stamps(stamps_ns)
         frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
         if len(stamps) > 0:
-            self._feed(frames, stamps, None, again=False)
+            self._feed(frames, stamps, again=False)
         return self.collect()
 
-    def feed_device(
-        self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any, *, ends_ns: Sequence[int] | None = None
-    ) -> None:
+    def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
         """Launch the scan of a stack of frames, without waiting for it.
 
         Nothing is allocated unless the stack is longer than any before. After `scan_count_max` calls
@@ -315,21 +292,18 @@ class EventCamera:
             log_radiance: Frames on the camera's device, float32, contiguous, shape [K_max, H, W].
             stamps_ns: Times of the first K frames [ns], integers on the host, shape [K], 1 <= K <= K_max;
                 strictly increasing, later than what the camera has seen. The frames after K are not read.
-            ends_ns: Where `collect_windows` will be asked to end windows when this stack is the last that it
-                waits for [ns], so that they can be cut before; a guess that proves wrong changes no packet.
 
         Raises:
             RuntimeError: If the camera was not reset, or a stack before must be collected.
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
-        self._feed(log_radiance, _as_stamps(stamps_ns), ends_ns, again=True)
+        self._feed(log_radiance, _as_stamps(stamps_ns), again=True)
 
     def _feed(
         self,
         log_radiance: wp.array3d[wp.float32],
         stamps: NDArray[np.int64],
-        ends_ns: Sequence[int] | None,
         *,
         again: bool,
     ) -> None:
@@ -344,9 +318,8 @@ class EventCamera:
             scan.chunks[0].keys = self._empty(self._key_room, wp.int64)
         scan.frames = log_radiance
         scan.stamps_ns = stamps
-        scan.ends_ns = None if ends_ns is None else tuple(int(end) for end in ends_ns)
-        ahead = self._can_cut_ahead(scan)
-        scan.origin_us = self._drafted_ns // NS_PER_US if ahead else self._keys.origin_us
+        self._keys.expect(count)
+        scan.origin_us = self._keys.origin_us
         scan.state = self._state
         origin_ns = scan.origin_us * NS_PER_US
         times = scan.times.rows
@@ -356,8 +329,6 @@ class EventCamera:
         self._state = (self._state + 1) % len(self._last)
         self._fed_ns = int(stamps[-1])
         self._launch(scan, tabulate=False, again=again)
-        if ahead:
-            self._cut_ahead(scan)
         self._under_way.append(scan)
         if self.device.is_cuda:
             self._feeder = self.device.stream
@@ -397,11 +368,9 @@ class EventCamera:
         """
         with on(self._reader):
             self._taken.hold()
-            self._leave_drafts()
             while self._under_way:
                 self._take_over()
             packets = self._cut([self._require_reset()])
-            self._drafted_ns = self._window_start_ns
             self._taken.set()
             return packets[0]
 
@@ -426,14 +395,11 @@ class EventCamera:
         ends = [int(end) for end in ends_ns]
         if scan_count is None:
             scan_count = len(self._under_way)
-        if scan_count == 1 and self._is_foreseen(self._under_way[0], ends):
-            return self._hand_out_draft()
         if scan_count == 1 and not ends and self._is_alone():
             self._take_over()
             return []
         with on(self._reader):
             self._taken.hold()
-            self._leave_drafts()
             for _ in range(scan_count):
                 self._take_over()
             now_ns = self._require_reset()
@@ -444,111 +410,22 @@ class EventCamera:
                 )
             packets = self._cut(ends)
             self._taken.set()
-            self._take_up_drafts()
             return packets
 
     def _is_alone(self) -> bool:
         """Return whether one scan is under way, and taking it over on this stream holds up no other."""
         stream = self.device.stream if self.device.is_cuda else None
-        return len(self._under_way) == 1 and self._draft is None and stream is self._feeder
-
-    def _can_cut_ahead(self, scan: _Scan) -> bool:
-        """Return whether the windows of the next scan can be cut: those of all under way before it were."""
-        ends = scan.ends_ns
-        return (
-            self._drafts is not None
-            and self._drafts.ready
-            and ends is not None
-            and len(ends) <= WINDOW_COUNT_MAX
-            and all(before.draft is not None for before in self._under_way)
-            and _are_ends(ends, self._drafted_ns, int(scan.stamps_ns[-1]))
-        )
-
-    def _cut_ahead(self, scan: _Scan) -> None:
-        """Cut the windows of a scan that was launched on this stream after the one cut before."""
-        assert self._drafts is not None
-        assert scan.ends_ns is not None
-        if self._draft is None:
-            self._drafts.seed(self._keys.keys, self._keys.count, self._keys.origin_us)
-        (chunk,) = scan.chunks
-        scan.draft = self._draft = self._drafts.launch(
-            chunk.keys,
-            chunk.counters,
-            ends_ns=scan.ends_ns,
-            origin_us=scan.origin_us,
-            now_ns=int(scan.stamps_ns[-1]),
-        )
-        if scan.ends_ns:
-            self._drafted_ns = scan.ends_ns[-1]
-
-    def _is_foreseen(self, scan: _Scan, ends: list[int]) -> bool:
-        """Wait for the draft of a scan; return whether it holds what is wanted now."""
-        draft = scan.draft
-        if draft is None or draft.ends_ns != tuple(ends):
-            return False
-        draft.done.wait()
-        (chunk,) = scan.chunks
-        found, invalid, _ = chunk.counters_on_host.view(0, 3).tolist()
-        room = min(chunk.keys.shape[0], self.config.event_count_max)
-        return invalid == 0 and found <= room and draft.total() <= draft.room
-
-    def _hand_out_draft(self) -> list[Events]:
-        """Return the windows of the oldest scan, which were cut ahead."""
-        scan = self._under_way.popleft()
-        draft, scan.draft = scan.draft, None
-        assert self._drafts is not None
-        assert draft is not None
-        self.ahead_count += 1
-        self._drafts.note(draft.total())
-        if self.device.is_cuda:
-            self._expect_keys(scan.chunks[0].counters_on_host.view(0, 1).item())
-        cuts = draft.cuts()
-        columns = self._drafts.take(draft)
-        self._carried = draft
-        self._finish(scan)
-        packets = self._packets(list(draft.ends_ns), columns, cuts)
-        self._keys.clear(self._window_start_ns // NS_PER_US)
-        return packets
-
-    def _leave_drafts(self) -> None:
-        """Let the keys be those that the host has counted, and forget what was cut ahead."""
-        if self._drafts is None or self._draft is None:
-            return
-        for scan in self._under_way:
-            if scan.draft is not None:
-                self._drafts.drop(scan.draft)
-                scan.draft = None
-        carried, self._carried, self._draft = self._carried, None, None
-        if carried is not None:
-            self._drafts.grown.hold()
-            first, count = carried.carried()
-            self._keys.append(carried.keys, first, count, carried.origin_us)
-
-    def _take_up_drafts(self) -> None:
-        """Cut the windows of the scans under way ahead again, from the keys that there are now."""
-        self._drafted_ns = self._window_start_ns
-        scans = list(self._under_way)
-        self._under_way.clear()
-        with on(self._feeder if scans else None):
-            for scan in scans:
-                if self._can_cut_ahead(scan) and scan.origin_us <= self._drafted_ns // NS_PER_US:
-                    self._cut_ahead(scan)
-                self._under_way.append(scan)
+        return len(self._under_way) == 1 and stream is self._feeder
 
     def _forget(self) -> None:
         scans = [*self._idle, *self._under_way]
         self._idle = deque(sorted(scans, key=lambda scan: scan.number))  # as at the first time: same graphs
         self._under_way.clear()
-        for scan in scans:
-            if self._drafts is not None and scan.draft is not None:
-                self._drafts.drop(scan.draft)
-                scan.draft = None
-        self._draft = self._carried = None
         self._state = 0
         self._dropped: list[tuple[int, int]] = []
         self._drop_reported = False
         self._sequence = 0
-        self._window_start_ns = self._drafted_ns = self._now_ns or 0
+        self._window_start_ns = self._now_ns or 0
         self._keys.clear(self._window_start_ns // NS_PER_US)
 
     def _require_reset(self) -> int:
@@ -687,7 +564,7 @@ class EventCamera:
         if len(chunks) > 1 and self._pool is None:
             self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
         own = 1 + spared_count()  # chunks that this thread does one after the other
-        futures = [self._pool.submit(launch, chunk) for chunk in chunks[own:]] if self._pool else []
+        futures = [self._pool.submit(following(launch), c) for c in chunks[own:]] if self._pool else []
         for chunk in chunks[:own]:
             launch(chunk)
         for future in futures:
@@ -714,8 +591,6 @@ class EventCamera:
         for count, chunk in zip(counts, scan.chunks, strict=True):
             self._keys.append(chunk.keys, 0, count, scan.origin_us)
         self._taken.set()
-        if self._drafts is not None:
-            self._drafts.note(self._keys.count)
         self._finish(self._under_way.popleft())
 
     def _expect_keys(self, count: int) -> None:

@@ -17,6 +17,7 @@ import warp as wp
 
 from neurosim_core.sensors.event_noise import Memory, PixelModel, begin_pixel, make_pixel_scan
 from neurosim_core.sensors.event_scan import (
+    BLOCK_SIZE,
     CLOSE,
     COLUMN_SHIFT,
     OPEN,
@@ -170,33 +171,30 @@ def scan(
     world = first_world + index
     if part != ALL and stack.overflow[world] == 0:
         return
-    keys = stack.keys[world]
-    counters = stack.counters[world]
-    write_key(OPEN, wp.int64(0), keys, counters)
-    if pixel < base.shape[1]:
-        scan_pixel(
-            thresholds[world][0],
-            thresholds[world][1],
-            width,
-            row_shift,
-            time_shift,
-            pixel,
-            stack.log_radiance[world],
-            stack.stamps[world],
-            frame_count,
-            lead[world],
-            stack.row_limit[world],
-            base[world],
-            last[world],
-            crossed[world],
-            part == COUNT,
-            last_out[world],
-            crossed_out[world],
-            keys,
-            counters,
-            stack.table[world],
-        )
-    write_key(CLOSE, wp.int64(0), keys, counters)
+    scan_pixel(
+        thresholds[world][0],
+        thresholds[world][1],
+        width,
+        row_shift,
+        time_shift,
+        pixel,
+        base.shape[1],
+        pixel % BLOCK_SIZE,
+        stack.log_radiance[world],
+        stack.stamps[world],
+        frame_count,
+        lead[world],
+        stack.row_limit[world],
+        base[world],
+        last[world],
+        crossed[world],
+        part == COUNT,
+        last_out[world],
+        crossed_out[world],
+        stack.keys[world],
+        stack.counters[world],
+        stack.table[world],
+    )
 
 
 @functools.cache

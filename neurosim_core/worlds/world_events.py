@@ -15,11 +15,10 @@ import warp as wp
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_noise import Memory, PixelModel, PixelNoise, terms_of
-from neurosim_core.sensors.event_scan import SUB_BITS, TILE_SIZE
+from neurosim_core.sensors.event_scan import BLOCK_SIZE, SUB_BITS, TILE_SIZE
 from neurosim_core.worlds import scan
 from neurosim_core.worlds.timetable import PATTERN_COUNT_MAX
 
-_BLOCK_SIZE = 256
 _SORT_BLOCK_SIZE = 1024
 """Threads that sort the events of a world, where there may be many."""
 _MANY_EVENTS = 8192
@@ -244,7 +243,7 @@ class WorldEventCamera:
 
     def _hand_out(self) -> None:
         events, world_count = self.events, self._base.shape[0]
-        lanes = _BLOCK_SIZE if self.device.is_cuda else 1
+        lanes = BLOCK_SIZE if self.device.is_cuda else 1
         if self._ordered:
             self._sort()
         counters, sections = self._stack.counters, self._sections
@@ -253,7 +252,7 @@ class WorldEventCamera:
         wp.launch(
             scan.decode,
             dim=(world_count, lanes),
-            block_dim=_BLOCK_SIZE,
+            block_dim=BLOCK_SIZE,
             inputs=[self._row_shift, self._time_shift, lanes, self._stack, events.offsets],
             outputs=[events.t, events.x, events.y, events.polarity],
             device=self.device,
@@ -262,7 +261,7 @@ class WorldEventCamera:
     def _sort(self) -> None:
         world_count = self._base.shape[0]
         if self.device.is_cuda:
-            block = _SORT_BLOCK_SIZE if self._capacity > _MANY_EVENTS else _BLOCK_SIZE
+            block = _SORT_BLOCK_SIZE if self._capacity > _MANY_EVENTS else BLOCK_SIZE
             wp.launch(
                 scan.sort_keys,
                 dim=(world_count, block),
@@ -299,14 +298,14 @@ class WorldEventCamera:
                     outputs=[*self._quiet_range, self._lead],
                     device=self.device,
                 )
-            block = _BLOCK_SIZE if self.device.is_cuda else 1
+            block = BLOCK_SIZE if self.device.is_cuda else 1
             own = [self._models] if self.terms else [self._thresholds]
             lead = [] if self.terms else [self._lead]
             memory = [[self._memories[slot]] if self.terms else [] for slot in (parity, 1 - parity)]
             wp.launch(
                 self._scan,
                 dim=(end - first, -(-self._base.shape[1] // block) * block),  # whole blocks to a world
-                block_dim=_BLOCK_SIZE,
+                block_dim=BLOCK_SIZE,
                 inputs=[
                     *own,
                     self._width,

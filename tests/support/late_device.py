@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core import streams
-from neurosim_core.sensors import event_ahead, event_keys, event_noise, events
+from neurosim_core.sensors import event_keys, event_noise, events
 
-_MODULES = (streams, events, event_ahead, event_keys)
+_MODULES = (streams, events, event_keys)
 
 
 class LateStream:
@@ -205,9 +205,8 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         if module is not streams:
             monkeypatch.setattr(module, "Milestone", lambda _: _LateMilestone(device), raising=False)
             monkeypatch.setattr(module, "Graphs", lambda _: _LateGraphs(device), raising=False)
-    for module in (events, event_ahead):
-        monkeypatch.setattr(module, "on", device.on)
-        monkeypatch.setattr(module, "make_stream", device.make_stream)
+    monkeypatch.setattr(events, "on", device.on)
+    monkeypatch.setattr(events, "make_stream", device.make_stream)
     monkeypatch.setattr(streams.HostInput, "__init__", host_input)
     monkeypatch.setattr(streams.HostCopy, "__init__", host_copy)
     monkeypatch.setattr(wp.array, "numpy", late_numpy)

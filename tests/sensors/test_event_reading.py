@@ -1,4 +1,4 @@
-"""Windows cut before they are asked for are those that are cut when they are, whatever was guessed wrong."""
+"""Events are the same however far what is fed is ahead of what is read, and stay as they were handed out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from late_device import LateDevice, install
 
 from neurosim_core import streams
 from neurosim_core.packets import Events
-from neurosim_core.sensors import event_ahead
 from neurosim_core.sensors.event_config import ShotNoiseConfig
 from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
@@ -23,7 +22,7 @@ WIDTH, HEIGHT = 9, 7
 FRAME_NS = 1_700
 WINDOW_NS = 5_005
 
-# neither the device nor the size of the smallest guess changes between examples
+# the device does not change between examples
 relaxed = settings(
     max_examples=150,
     deadline=None,
@@ -31,14 +30,7 @@ relaxed = settings(
 )
 
 
-@pytest.fixture
-def tight_guesses(monkeypatch):
-    """Let guesses be as tight for a few events as they are for many: some prove too small."""
-    monkeypatch.setattr(event_ahead, "_ROOM_MIN", 8)
-    monkeypatch.setattr(event_ahead, "_ROOM_PER_PIXEL", 0)
-
-
-def make_camera(device: str, *, cut_ahead: bool, lanes: int = 1, **config: Any) -> EventCamera:
+def make_camera(device: str, *, lanes: int = 1, **config: Any) -> EventCamera:
     return EventCamera(
         EventCameraConfig(**config),
         width=WIDTH,
@@ -46,7 +38,6 @@ def make_camera(device: str, *, cut_ahead: bool, lanes: int = 1, **config: Any) 
         device=device,
         scan_count_max=lanes,
         on_host=True,
-        cut_ahead=cut_ahead,
     )
 
 
@@ -74,10 +65,9 @@ def fly(
     stacks: list[np.ndarray],
     *,
     lanes: int,
-    guesses: list[str],
     reads: list[str],
 ) -> list[Events]:
-    """Feed stacks ahead of what is read; say for each where windows end, as guessed, and read it somehow."""
+    """Feed stacks ahead of what is read, and read each somehow."""
     device, packets = camera.device, []
     fed_ns, read_ns = camera.stamp_ns, camera.stamp_ns
     under_way: deque[int] = deque()
@@ -102,23 +92,16 @@ def fly(
             packets.extend(camera.collect_windows(ends_until(read_ns, end_ns), scan_count=1))
         read_ns = end_ns
 
-    waiting = deque(zip(stacks, guesses, strict=True))
+    waiting = deque(stacks)
     longest = max(len(stack) for stack in stacks)
     lane_frames = [wp.empty((longest, HEIGHT, WIDTH), dtype=float, device=device) for _ in range(lanes)]
     while waiting:
-        stack, guess = waiting.popleft()
+        stack = waiting.popleft()
         stamps = fed_ns + FRAME_NS * np.arange(1, len(stack) + 1)
-        ends: list[int] | None = ends_until(fed_ns, int(stamps[-1]))
         fed_ns = int(stamps[-1])
-        if guess == "none":
-            ends = None
-        elif guess == "more":
-            ends = sorted({*ends_until(int(stamps[0]) - FRAME_NS, fed_ns), int(stamps[0]), fed_ns})
-        elif guess == "fewer":
-            ends = []
         frames = lane_frames[len(waiting) % lanes]  # the stack that was in them has been read
         wp.copy(frames, wp.array(stack, device=device))
-        camera.feed_device(frames, stamps, ends_ns=ends)
+        camera.feed_device(frames, stamps)
         under_way.append(fed_ns)
         if len(under_way) == lanes:
             read()
@@ -127,9 +110,9 @@ def fly(
     return [*packets, camera.collect()]
 
 
-def assert_same(ahead: list[Events], plain: list[Events]) -> None:
-    assert len(ahead) == len(plain)
-    for a, b in zip(ahead, plain, strict=True):
+def assert_same(found: list[Events], plain: list[Events]) -> None:
+    assert len(found) == len(plain)
+    for a, b in zip(found, plain, strict=True):
         assert (a.start_ns, a.stamp_ns, a.sequence, a.dropped_count) == (
             b.start_ns, b.stamp_ns, b.sequence, b.dropped_count,
         )  # fmt: skip
@@ -138,24 +121,10 @@ def assert_same(ahead: list[Events], plain: list[Events]) -> None:
             np.testing.assert_array_equal(first, second)
 
 
-def fly_both(
-    device: str, first: np.ndarray, stacks: list[np.ndarray], *, lanes: int, config: Any, **how: Any
-) -> EventCamera:
-    """Compare the packets of a camera that cuts ahead with those of one that does not; return the first."""
-    cameras = [make_camera(device, cut_ahead=ahead, lanes=lanes, **config) for ahead in (True, False)]
-    flown = []
-    for camera in cameras:
-        camera.reset(first)
-        flown.append(fly(camera, stacks, lanes=lanes, **how))
-    assert_same(*flown)
-    assert cameras[1].ahead_count == 0
-    return cameras[0]
-
-
 @relaxed
 @given(data=st.data(), lanes=st.integers(1, 3), seed=st.integers(0, 2**32 - 1))
-def test_packets_are_the_same_whatever_was_guessed(data, lanes, seed, device, tight_guesses):
-    """Wrong ends, none, bursts of events, too many of them, reads in any order: nothing of it shows."""
+def test_packets_are_the_same_however_they_are_read(data, lanes, seed, device):
+    """Bursts of events, too many of them, reads in any order: they are those of stacks that are fed whole."""
     count = data.draw(st.integers(2, 12))
 
     def lists(values: Any) -> Any:
@@ -163,62 +132,32 @@ def test_packets_are_the_same_whatever_was_guessed(data, lanes, seed, device, ti
 
     lengths = lists(st.integers(1, 6))
     loudness = lists(st.sampled_from([0.0, 0.1, 0.3, 0.3, 2.0]))
-    guesses = lists(st.sampled_from(["right", "right", "right", "none", "more", "fewer"]))
     reads = lists(st.sampled_from(["one", "one", "one", "all", "collect", "early"]))
     config = data.draw(
         st.sampled_from([{}, {"event_count_max": 60}, {"shot_noise": ShotNoiseConfig(rate_hz=2e4)}])
     )
     first, stacks = draw_stacks(np.random.default_rng(seed), lengths, loudness)
-    fly_both(device, first, stacks, lanes=lanes, config=config, guesses=guesses, reads=reads)
-
-
-@pytest.mark.parametrize("lanes", [1, 2, 3])
-def test_a_steady_run_is_cut_ahead_from_the_second_stack_on(device, lanes):
-    count = 24
-    first, stacks = draw_stacks(np.random.default_rng(3), [4] * count, [0.3] * count)
-    camera = fly_both(
-        device,
-        first,
-        stacks,
-        lanes=lanes,
-        config={},
-        guesses=["right"] * count,
-        reads=["one"] * count,
-    )
-    # on CUDA each scan may once have had too little room for keys
-    assert count - 2 - lanes <= camera.ahead_count < count
-
-
-@pytest.mark.parametrize(
-    "case",
-    ["ends", "burst", "limit"],
-)
-def test_what_was_guessed_wrong_is_done_again_and_the_rest_is_kept(device, case):
-    """One stack in the middle is foreseen wrongly: only that one, and no more."""
-    count, wrong = 12, 6
-    loudness, guesses = [0.3] * count, ["right"] * count
-    config: dict[str, Any] = {}
-    if case == "ends":
-        guesses[wrong] = "fewer"
-    elif case == "burst":
-        loudness[wrong] = 3.0
-    else:
-        loudness[wrong] = 3.0
-        config["event_count_max"] = 400
-    first, stacks = draw_stacks(np.random.default_rng(5), [4] * count, loudness)
-    camera = fly_both(device, first, stacks, lanes=3, config=config, guesses=guesses, reads=["one"] * count)
-    assert count - 2 - 4 <= camera.ahead_count <= count - 2
+    camera, whole = make_camera(device, lanes=lanes, **config), make_camera("cpu", **config)
+    camera.reset(first)
+    whole.reset(first)
+    packets = fly(camera, stacks, lanes=lanes, reads=reads)
+    stamps = FRAME_NS * np.arange(1, sum(lengths) + 1)
+    expected = whole.feed(np.concatenate(stacks), stamps)
+    found = [np.concatenate(columns) for columns in zip(*(packet.numpy() for packet in packets), strict=True)]
+    t, x, y, polarity = found
+    order = np.lexsort((polarity, x, y, t))  # a window may end within a microsecond
+    for column, expected_column in zip(found, expected.numpy(), strict=True):
+        np.testing.assert_array_equal(column[order], expected_column)
+    assert sum(packet.dropped_count for packet in packets) == expected.dropped_count
 
 
 def test_values_that_are_no_log_radiance_are_named(device):
-    camera = make_camera(device, cut_ahead=True)
+    camera = make_camera(device)
     frames = np.zeros((2, HEIGHT, WIDTH), np.float32)
     camera.reset(frames[0])
     for turn in range(2):
         start_ns = camera.stamp_ns
-        camera.feed_device(
-            wp.array(frames, device=device), [start_ns + 1000, start_ns + 2000], ends_ns=[start_ns + 2000]
-        )
+        camera.feed_device(wp.array(frames, device=device), [start_ns + 1000, start_ns + 2000])
         if turn == 0:
             camera.collect_windows([start_ns + 2000], scan_count=1)
             frames[1, 2, 3] = np.nan
@@ -226,7 +165,7 @@ def test_values_that_are_no_log_radiance_are_named(device):
         camera.collect_windows([4000], scan_count=1)
     camera.reset(np.zeros((HEIGHT, WIDTH), np.float32), 5000, sequence=7)
     frames[1] = 1.0
-    camera.feed_device(wp.array(frames, device=device), [6000, 7000], ends_ns=[7000])
+    camera.feed_device(wp.array(frames, device=device), [6000, 7000])
     (packet,) = camera.collect_windows([7000], scan_count=1)
     assert (packet.sequence, packet.start_ns) == (7, 5000)
     assert len(packet.t) > 0
@@ -236,16 +175,15 @@ def test_events_stay_as_they_are_while_the_camera_goes_on(device):
     """What was handed out is not overwritten, however many packets are kept."""
     count = 40
     first, stacks = draw_stacks(np.random.default_rng(8), [3] * count, [0.3] * count)
-    camera = make_camera(device, cut_ahead=True)
+    camera = make_camera(device)
     camera.reset(first)
     kept, copies = [], []
     for stack in stacks:
         stamps = camera.stamp_ns + FRAME_NS * np.arange(1, 4)
-        camera.feed_device(wp.array(stack, device=device), stamps, ends_ns=[stamps[-1]])
+        camera.feed_device(wp.array(stack, device=device), stamps)
         (packet,) = camera.collect_windows([int(stamps[-1])], scan_count=1)
         kept.append(packet.numpy())
         copies.append([np.array(column) for column in packet.numpy()])
-    assert camera.ahead_count > count - 5
     for columns, copied in zip(kept, copies, strict=True):
         for a, b in zip(columns, copied, strict=True):
             np.testing.assert_array_equal(a, b)
@@ -254,28 +192,26 @@ def test_events_stay_as_they_are_while_the_camera_goes_on(device):
 @pytest.mark.parametrize("eagerness", [0.0, 0.7])
 @pytest.mark.parametrize("lanes", [1, 2, 3])
 @pytest.mark.parametrize("config", [{}, {"event_count_max": 300}, {"shot_noise": {"rate_hz": 2e4}}])
-def test_a_device_that_is_late_gives_the_same(monkeypatch, tight_guesses, eagerness, lanes, config):
+def test_a_device_that_is_late_gives_the_same(monkeypatch, eagerness, lanes, config):
     """As on a GPU, streams run behind the host and beside each other: nobody reads what is not ready."""
     count = 48
     rng = np.random.default_rng([lanes, int(10 * eagerness)])
     lengths = [4] * count
     # the same few sizes come again, so that most of it is replayed
     loudness = rng.choice([0.3, 0.3, 0.3, 1.0], size=count).tolist()
-    guesses = rng.choice(["right"] * 9 + ["none", "more", "fewer"], size=count).tolist()
     reads = rng.choice(["one"] * 12 + ["all", "collect", "early"], size=count).tolist()
     first, stacks = draw_stacks(rng, lengths, loudness)
-    plain_camera = make_camera("cpu", cut_ahead=False, lanes=lanes, **config)
+    plain_camera = make_camera("cpu", lanes=lanes, **config)
     plain_camera.reset(first)
-    plain = fly(plain_camera, stacks, lanes=lanes, guesses=guesses, reads=reads)
+    plain = fly(plain_camera, stacks, lanes=lanes, reads=reads)
     late = LateDevice(rng, eagerness)
     with monkeypatch.context() as patch:
         install(patch, late)
-        camera = make_camera("cpu", cut_ahead=True, lanes=lanes, **config)
+        camera = make_camera("cpu", lanes=lanes, **config)
         camera.reset(first)
-        packets = fly(camera, stacks, lanes=lanes, guesses=guesses, reads=reads)
+        packets = fly(camera, stacks, lanes=lanes, reads=reads)
     assert_same(packets, plain)
     assert late.replayed_count > count / 6
-    assert camera.ahead_count > count / 6
 
 
 def test_frames_are_the_callers_again_when_they_have_been_read(monkeypatch):
@@ -285,7 +221,7 @@ def test_frames_are_the_callers_again_when_they_have_been_read(monkeypatch):
         with monkeypatch.context() as patch:
             if late:
                 install(patch, LateDevice(np.random.default_rng(2), 0.0))
-            camera = make_camera("cpu", cut_ahead=False, threshold_on=0.25)
+            camera = make_camera("cpu", threshold_on=0.25)
             camera.reset(np.zeros((HEIGHT, WIDTH), np.float32))
             # three events a pixel fit; the five after them do not, where all of them do
             for number, levels in enumerate((3.1, 8.1), 1):
@@ -299,7 +235,7 @@ def test_frames_are_the_callers_again_when_they_have_been_read(monkeypatch):
     assert_same(*([packet] for packet in packets))
 
 
-def test_a_flight_of_changing_views_needs_no_memory_and_few_second_looks(monkeypatch):
+def test_a_flight_of_changing_views_needs_no_memory(monkeypatch):
     """The number of events varies more than tenfold, by jumps of five: soon there is room for all."""
     warm, count, lanes = 24, 160, 2
     rng = np.random.default_rng(11)
@@ -315,38 +251,33 @@ def test_a_flight_of_changing_views_needs_no_memory_and_few_second_looks(monkeyp
 
         return call
 
-    monkeypatch.setattr(event_ahead, "_ROOM_MIN", 64)
     install(monkeypatch, LateDevice(rng, 0.5))
-    camera = make_camera("cpu", cut_ahead=True, lanes=lanes)
+    camera = make_camera("cpu", lanes=lanes)
     for owner, name in (
-        (EventCamera, "_empty"), (EventKeys, "_empty"), (event_ahead.Drafts, "_empty"),
+        (EventCamera, "_empty"), (EventKeys, "_empty"),
         (streams.LentBlock, "__init__"), (streams.HostCopy, "__init__"),
     ):  # fmt: skip
         monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
     camera.reset(first)
-    ahead_count = 0
     frames = [wp.empty((16, HEIGHT, WIDTH), dtype=float, device="cpu") for _ in range(lanes)]
     fed: deque[int] = deque()
     for number, stack in enumerate(stacks):
         stamps = FRAME_NS * (16 * number + np.arange(1, 17))
         frames[number % lanes].numpy()[:] = stack
-        camera.feed_device(frames[number % lanes], stamps, ends_ns=[stamps[-1]])
+        camera.feed_device(frames[number % lanes], stamps)
         fed.append(int(stamps[-1]))
         if len(fed) == lanes:
             (packet,) = camera.collect_windows([fed.popleft()], scan_count=1)
             found.append(len(packet.t))
         if number == warm:
             made.clear()
-            ahead_count = camera.ahead_count
     ordered = sorted(found[warm:])
     assert ordered[-count // 10] > 10 * ordered[count // 10]
     assert made == []
-    assert camera.ahead_count - ahead_count >= 0.85 * count  # one of several jumps at a time is a second look
 
 
 @pytest.mark.parametrize("eagerness", [0.0, 0.5])
-@pytest.mark.parametrize("cut_ahead", [False, True])
-def test_frames_that_are_counted_one_by_one_on_a_late_device_give_the_same(monkeypatch, eagerness, cut_ahead):
+def test_frames_that_are_counted_one_by_one_on_a_late_device_give_the_same(monkeypatch, eagerness):
     """The host reads each count and takes windows now and then."""
     rng = np.random.default_rng(21)
     first, stacks = draw_stacks(rng, [1] * 40, rng.choice([0.0, 0.3, 3.0], size=40).tolist())
@@ -355,7 +286,7 @@ def test_frames_that_are_counted_one_by_one_on_a_late_device_give_the_same(monke
         with monkeypatch.context() as patch:
             if late:
                 install(patch, LateDevice(rng, eagerness))
-            camera = make_camera("cpu", cut_ahead=late and cut_ahead)
+            camera = make_camera("cpu")
             camera.reset(first)
             found = []
             for number, stack in enumerate(stacks, 1):
