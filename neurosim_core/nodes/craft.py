@@ -179,15 +179,19 @@ class Craft:
         """Send on its way what a control period yields that was begun."""
         self.outlet.offer(end_step(self.model, self.state, begun))
         self.outlet.offer_state(self.observe())
+        if self._is_late:  # the device is still at work
+            self._plan()
 
-    def prepare_step(self) -> None:
-        """Plan the next control period: while a CUDA device is at work."""
+    def get_ready(self) -> None:
+        """Do what can be done for the next control period while others read what this one has yielded."""
+        if not self._is_late:
+            self._plan()
+        lend_rooms(self.state)
+
+    def _plan(self) -> None:
+        """Plan the next control period."""
         if not self.state.ended and self.state.failure is None:
             prepare_step(self.model, self.state)
-
-    def lend_rooms(self) -> None:
-        """Lend room for the pictures of the next control period."""
-        lend_rooms(self.state)
 
     def drop_loans(self) -> None:
         """Take back the room of pictures that never come, on which closing topics would wait, for good."""

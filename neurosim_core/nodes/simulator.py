@@ -239,7 +239,6 @@ class Simulator:
                 self._mind()  # a CUDA device is at work
                 for craft, step in zip(self.crafts, begun, strict=True):
                     craft.end_step(step)
-                    craft.prepare_step()
             elif not self._flown and not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
                 return
         except DynamicsError as error:
@@ -259,8 +258,8 @@ class Simulator:
         if streaming:
             self._streaming.let_readers_go_first(end_ns, end_ns - self.stamp_ns)
         else:
-            for craft in self.crafts:  # while others read what has been published
-                craft.lend_rooms()
+            for craft in self.crafts:
+                craft.get_ready()
         self._end_period(end_ns)
 
     def _wait_for_end(self, end_ns: int) -> bool:
