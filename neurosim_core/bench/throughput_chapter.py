@@ -354,7 +354,8 @@ def _comparison_table(result: ThroughputResult) -> Table:
         note="Naive: one frame per call, at most one event per pixel and frame, stamped at the frame, an "
         "atomic per event, and the host reads the count each time. Ours: the exact law, crossing times "
         f"interpolated, alone {result.roofline.instants} frames per launch, and in the loop sorted and "
-        "handed out each 16 frames. Events reach the host, sorted, at "
+        "handed out each 16 frames; there a call reads the count of the frame before, while its own renders. "
+        "Events reach the host, sorted, at "
         + (
             f"{1e-6 * result.events_per_s:,.1f} M/s (each pixel fires in each frame)."
             if result.events_per_s is not None

@@ -186,6 +186,8 @@ class Views:
         self.lens = model.casts[0].lens
         self.count = model.config.instants_per_launch
         self.p_WC, self.q_WC = seeing.p_WC[0], seeing.q_WC[0]
+        self._chosen: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
+        """Poses and image slots of renders, by their first view and number."""
         renderer = self.renderer("log_radiance")
         self.render(renderer)
         self.frames = renderer.log_radiance
@@ -200,17 +202,11 @@ class Views:
     def render(self, renderer: WarpRenderer, *, first: int = 0, count: int | None = None) -> None:
         """Launch the render of some views, into image slots from 0 on."""
         count = self.count if count is None else count
-        slots = self._slots(count)
-        renderer.render(
-            self.p_WC[first : first + count], self.q_WC[first : first + count], slots, instant_count=count
-        )
-
-    def _slots(self, count: int) -> wp.array:
-        if not hasattr(self, "_slot_lists"):
-            self._slot_lists: dict[int, wp.array] = {}
-        if count not in self._slot_lists:
-            self._slot_lists[count] = wp.array(np.arange(count, dtype=np.int32), device=self.device)
-        return self._slot_lists[count]
+        if (first, count) not in self._chosen:
+            seen = slice(first, first + count)
+            slots = wp.array(np.arange(count, dtype=np.int32), device=self.device)
+            self._chosen[first, count] = self.p_WC[seen], self.q_WC[seen], slots
+        renderer.render(*self._chosen[first, count], instant_count=count)
 
 
 def seconds_per_call(call: Callable[[], object], device: Any, *, seconds: float) -> float:
@@ -382,17 +378,19 @@ def compare_scans(views: Views, ours_per_s: float, ours_events: float, *, second
 
 
 def compare_loops(views: Views, *, seconds: float) -> Comparison:
-    """Return frames a second where every call renders one frame, scans it and has the host read the count.
+    """Return frames a second where every call renders one frame, scans it and has the host read a count.
 
-    Ours is sorted and handed out each 16 frames as well; the naive events stay where they are, unsorted.
+    The naive camera has the count of its frame read at once. Ours lets the next frame render meanwhile: the
+    count that a call reads is that of the frame before. Each 16 frames ours are sorted and handed out as
+    well; the naive events stay where they are, unsorted.
     """
-    renderer = views.renderer("log_radiance", instants=1)
-    camera, naive = _camera(views, scan_count_max=1), _naive(views)
+    renderers = [views.renderer("log_radiance", instants=1) for _ in range(2)]
+    camera, naive = _camera(views, scan_count_max=2), _naive(views)
     camera.reset(views.frames[0], 0)
     order = [*range(views.count), *reversed(range(views.count))]
     shown, ours, theirs = 0, 0, 0
 
-    def render() -> int:
+    def render(renderer: WarpRenderer) -> int:
         nonlocal shown
         views.render(renderer, first=order[shown % len(order)], count=1)
         shown += 1
@@ -400,17 +398,19 @@ def compare_loops(views: Views, *, seconds: float) -> Comparison:
 
     def call_ours() -> None:
         nonlocal ours
-        stamp_us = render()
-        camera.feed_device(renderer.log_radiance, [stamp_us * NS_PER_US])
-        camera.collect_windows([], scan_count=1)
-        if shown % 16 == 0:
+        if shown > 0 and shown % 16 == 0:
             ours += len(camera.collect().numpy().t)
+        renderer = renderers[shown % 2]
+        stamp_us = render(renderer)
+        camera.feed_device(renderer.log_radiance, [stamp_us * NS_PER_US])
+        if shown % 16 != 1:
+            camera.collect_windows([], scan_count=1)
 
     def call_naive() -> None:
         nonlocal theirs
-        stamp_us = render()
-        assert renderer.log_radiance is not None
-        theirs += naive.feed(renderer.log_radiance[0], stamp_us)
+        stamp_us = render(renderers[0])
+        assert renderers[0].log_radiance is not None
+        theirs += naive.feed(renderers[0].log_radiance[0], stamp_us)
 
     ours_s = seconds_per_call(call_ours, views.device, seconds=seconds)
     ours += len(camera.collect().numpy().t)
