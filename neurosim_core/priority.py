@@ -21,8 +21,6 @@ _STEPS = 5
 _LONG_TURN_NS = 3_000_000
 """Longer than the usual turn, 2.8 ms on machines of 8 cores or more and less on others [ns]. Not much longer:
 with turns of 20 ms half of the pictures were late beside busy programs of others."""
-_SHORT_TURN_NS = 300_000
-"""Shorter than the usual turn, and than that of who gives way [ns]."""
 _SLACK_NS = 1_000
 """How much later than asked for a thread that is punctual may be woken by a timer [ns]; usually 50,000."""
 _SET_TIMER_SLACK = 29  # PR_SET_TIMERSLACK of `prctl`
@@ -46,11 +44,10 @@ def give_way() -> None:
 def be_punctual() -> None:
     """Let sleeps and timed waits of the calling thread, and of those that it starts, end when they are to.
 
-    For good, and only on Linux. Others are woken up to 50 us later, so that a core can sleep on, and then do
-    not go before who runs.
+    For good, and only on Linux. Others are woken up to 50 us later, so that a core can sleep on. Turns are as
+    usual: with shorter ones it would go before who reads what it has just sent.
     """
     if sys.platform == "linux":
-        _take_turns(_SHORT_TURN_NS)
         ctypes.CDLL(None).prctl(_SET_TIMER_SLACK, ctypes.c_ulong(_SLACK_NS), 0, 0, 0)
 
 

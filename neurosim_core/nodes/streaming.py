@@ -18,10 +18,10 @@ ANSWER_NS = 50_000_000
 """A request waits for the end of a control period that is this near [ns]."""
 BEHIND_MAX_NS = 500_000_000
 """How far the machine may be behind where camera frames give way [ns]."""
-READERS_S = 50e-6
-"""What readers are left of a control period before the next one is flown [s]."""
-READERS_SHARE = 0.025
-"""The largest share of a period that this may be."""
+READERS_SHARE = 0.04
+"""What readers are left of a control period before the next one is flown."""
+READERS_S = (50e-6, 250e-6)
+"""The least that this is worth, and the most that they need: to take a picture and to answer it [s]."""
 BEHIND_SHARE = 0.25
 """Share of a period that the machine may be behind, and leave readers this time."""
 
@@ -166,11 +166,10 @@ class Streaming:
         if not factor:
             return
         wall_ns = period_ns / factor
-        if (
-            READERS_SHARE * wall_ns >= READERS_S * 1e9
-            and self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns
-        ):
-            time.sleep(READERS_S)
+        least_s, most_s = READERS_S
+        left_s = min(READERS_SHARE * wall_ns * 1e-9, most_s)
+        if left_s >= least_s and self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
+            time.sleep(left_s)
 
     def offer_seen(self) -> None:
         """Send on their way what the cameras have seen."""

@@ -17,7 +17,7 @@ from neurosim_core.live import LiveConfig
 from neurosim_core.nodes import cameras as module
 from neurosim_core.nodes.cameras import Cameras
 from neurosim_core.nodes.status import Meter
-from neurosim_core.nodes.streaming import READERS_S, Streaming
+from neurosim_core.nodes.streaming import Streaming
 from neurosim_core.pacing import Pacer
 from neurosim_core.priority import spared_count
 from neurosim_core.simulation import Batch, Model, State, finish, fly_period, free_lanes, make_state
@@ -186,20 +186,21 @@ def test_a_request_does_not_keep_the_loop_awake():
 
 
 @pytest.mark.parametrize(
-    ("factor", "period_ms", "late_ms", "pauses"),
+    ("factor", "period_ms", "late_ms", "pauses_us"),
     [
-        (1.0, 10, 0.0, 1),
-        (1.0, 10, 2.0, 1),
-        (1.0, 10, 3.0, 0),  # behind by more than a quarter of a period
-        (1.0, 2, 0.0, 1),
-        (1.0, 1, 0.0, 0),  # a twentieth of a period is too much
-        (2.0, 2, 0.0, 0),
-        (0.5, 1, 0.0, 1),
-        (0.0, 10, 0.0, 0),  # as fast as it can
+        (1.0, 10, 0.0, [250]),  # the most that readers need
+        (1.0, 10, 2.0, [250]),
+        (1.0, 10, 3.0, []),  # behind by more than a quarter of a period
+        (1.0, 5, 0.0, [200]),  # a twenty-fifth
+        (1.0, 2, 0.0, [80]),
+        (1.0, 1, 0.0, []),  # of that it would be too little
+        (2.0, 2, 0.0, []),
+        (0.5, 1, 0.0, [80]),
+        (0.0, 10, 0.0, []),  # as fast as it can
     ],
 )
 def test_readers_go_first_where_there_is_time(
-    monkeypatch: pytest.MonkeyPatch, factor: float, period_ms: float, late_ms: float, pauses: int
+    monkeypatch: pytest.MonkeyPatch, factor: float, period_ms: float, late_ms: float, pauses_us: list[int]
 ):
     slept_s: list[float] = []
     monkeypatch.setattr("neurosim_core.nodes.streaming.time.sleep", slept_s.append)
@@ -210,4 +211,4 @@ def test_readers_go_first_where_there_is_time(
     streaming = Streaming([], Cameras(inline=True, on_packets=bell.set), pacer, Meter(), bell=bell)
     now_ns = pacer.wall_ns(period_ns) + round(late_ms * MS)
     streaming.let_readers_go_first(period_ns, period_ns)
-    assert slept_s == [READERS_S] * pauses
+    assert slept_s == pytest.approx([pause * 1e-6 for pause in pauses_us])
