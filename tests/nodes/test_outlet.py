@@ -13,15 +13,17 @@ from live_rig import count_free, make_config, models_of
 from processes import SOON_S, wait_for
 
 from cortex import Node, Subscriber, reliable
-from cortex.messages import CameraInfo, Collision, Image, Imu, Odometry, RotorSpeeds, Transform
+from cortex.messages import CameraInfo, Collision, Events, Image, Imu, Odometry, RotorSpeeds, Transform
 from cortex.messages import Delivery as DeliveryMessage
 from cortex.messages import Path as PathMessage
 from neurosim_core.nodes import outlet as outlet_module
 from neurosim_core.nodes.outlet import Outlet
+from neurosim_core.nodes.translate import expected_bytes
 from neurosim_core.packets import Collision as CollisionPacket
 from neurosim_core.packets import Delivery, ImuSample, Packet
 from neurosim_core.packets import Image as ImagePacket
 from neurosim_core.packets import Odometry as OdometryPacket
+from neurosim_core.sensors.rig import EventSensorConfig, RgbSensorConfig
 
 MS = 1_000_000
 
@@ -409,3 +411,29 @@ def test_reset_begins_again(make_stand: Callable[..., Stand]):
     assert stand.outlet.next_due_ns is None
     stand.outlet.offer_state(odometry(0))
     assert [(m.stamp_ns, m.sequence) for m in take(states, 3)] == [(0, 0), (5 * MS, 1), (0, 0)]
+
+
+def test_memory_for_events_is_there_before_they_come(make_stand: Callable[..., Stand]):
+    """To make it takes milliseconds, and in the flight messages would be late meanwhile."""
+    stand = make_stand(**{"sensors.events.lens": {"width": 128, "height": 96, "horizontal_fov_rad": 1.5}})
+    events = stand.model.config.sensors["events"]
+    sent = stand.outlet.streams["events"].publisher
+    stand.listen("/drone/events", Events)
+    with sent._outlets.lock:
+        (ring,) = sent._large._rings
+    assert ring.slot_bytes >= expected_bytes(events) > 128 * 96 * 100 * 13 / events.packets.rate_hz
+
+
+def test_what_is_expected_of_an_event_camera():
+    """A hundred events of 13 bytes per pixel and second, and a little more, up to a limit."""
+
+    def camera(width: int, height: int, packet_rate_hz: float) -> EventSensorConfig:
+        lens = {"width": width, "height": height, "horizontal_fov_rad": 1.5}
+        return EventSensorConfig.model_validate(
+            {"lens": lens, "sampling_rate_hz": 1000.0, "packet_rate_hz": packet_rate_hz}
+        )
+
+    assert expected_bytes(camera(346, 260, 25.0)) == 346 * 260 * 4 * 13 + 4096
+    assert expected_bytes(camera(346, 260, 1000.0)) == 346 * 26 * 13 + 4096
+    assert expected_bytes(camera(1280, 720, 25.0)) == 8 << 20
+    assert expected_bytes(RgbSensorConfig()) == expected_bytes(None) == 0
