@@ -21,7 +21,7 @@ from neurosim_core.nodes import craft, loans
 from neurosim_core.nodes.loans import PictureLoan
 from neurosim_core.packets import Image as ImagePacket
 from neurosim_core.pinned import PinError
-from neurosim_core.simulation import make_state, step
+from neurosim_core.simulation import make_state, observe, step
 
 SHAPE = (150, 160, 3)
 LENS = {"width": 160, "height": 150, "horizontal_fov_rad": 1.5}
@@ -140,17 +140,21 @@ def late(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Callable[[], None]]]:
 
 
 def check_flight(config: SimulationConfig) -> None:
-    """Fly over Cortex: every picture is the one of its stamp, complete, as in one process."""
+    """Fly over Cortex: every state and picture is that of its stamp, complete, as in one process."""
     with LiveRig(config) as rig:
         assert all(cast.lends for cast in rig.simulator.crafts[0].state.casts)
         pictures = rig.listen("/drone/rgb", Image)
         odometry = rig.listen("/drone/odometry", Odometry)
         tilt = np.array([1.02, 1.0, 1.0, 1.02])
-        rig.fly(odometry, 12, lambda state: ("motor_speeds", rig.hover() * tilt))
+        states = rig.fly(odometry, 12, lambda state: ("motor_speeds", rig.hover() * tilt))
         found = drain(pictures, least=13)
         model = models_of(config)["drone"]
         state = make_state(model, lane_count=1)
-        packets = [packet for _ in range(12) for packet in step(model, state, rig.hover() * tilt)]
+        packets, positions = [], [observe(state).position]
+        for _ in range(12):
+            packets += step(model, state, rig.hover() * tilt)
+            positions.append(observe(state).position)
+        assert [each.position.tobytes() for each in states] == [each.tobytes() for each in positions]
         expected = [packet for packet in packets if isinstance(packet, ImagePacket)]
         assert [picture.stamp_ns for picture in found] == [packet.stamp_ns for packet in expected]
         assert len({picture.data.tobytes() for picture in found}) == 13
