@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-call,attr-defined"
 """Keys of events that the host has counted: gathered, sorted, cut into windows and taken apart.
 
-Keys are as in `event_scan`. What no window has taken yet stays, and its time goes on from the last cut.
+Keys are as in `event_levels`. What no window has taken yet stays, and its time goes on from the last cut.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.sensors import event_scan
+from neurosim_core.sensors import event_cut
+from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.sensors.event_scan import SUB_BITS
 from neurosim_core.streams import HostCopy, HostInput, LentBlock, LentBlocks, Milestone, size_class
 
 ROOM_PER_PIXEL = 16
@@ -135,10 +135,10 @@ class EventKeys:
         bounds = self._bounds.array
         self._bounds.rows[: len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
         self._bounds.upload()
-        self._launch(event_scan.mark_late, count, [bounds, len(ends_ns), self._time_shift], [self.keys])
+        self._launch(event_cut.mark_late, count, [bounds, len(ends_ns), self._time_shift], [self.keys])
         self._sort(end_bit)
         self._launch(
-            event_scan.find_ends,
+            event_cut.find_ends,
             len(ends_ns),
             [self.keys, count, bounds, self._time_shift],
             [self._found],
@@ -150,7 +150,7 @@ class EventKeys:
         else:
             columns = [self._empty(count, dtype) for dtype in _COLUMN_TYPES]
             decoded = [self.keys, self.origin_us, self._row_shift, self._time_shift]
-            self._launch(event_scan.decode, count, decoded, columns)
+            self._launch(event_cut.decode, count, decoded, columns)
         self._read.set()
         self._read.wait()
         cuts: list[int] = self._found_on_host.rows(0, len(ends_ns)).tolist()
@@ -164,7 +164,7 @@ class EventKeys:
         """Launch the copy of all events to the host, one column after the other."""
         room = _room_of(count)
         self._launch(
-            event_scan.decode_block,
+            event_cut.decode_block,
             count,
             [self.keys, room, self.origin_us, self._row_shift, self._time_shift],
             self._columns,
@@ -202,7 +202,7 @@ class EventKeys:
         self, keys: Any, first: int, count: int, keys_out: Any, first_out: int, origin_step_us: int
     ) -> None:
         self._launch(
-            event_scan.carry_over,
+            event_cut.carry_over,
             count,
             [keys, first, origin_step_us, self._time_shift],
             [keys_out, first_out],

@@ -47,18 +47,8 @@ import warp as wp
 
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_scan import (
-    CLOSE,
-    COLUMN_SHIFT,
-    LIMIT,
-    OPEN,
-    PUT,
-    call_up,
-    key_after,
-    level_at,
-    quiet_range,
-    write_key,
-)
+from neurosim_core.sensors.event_levels import COLUMN_SHIFT, key_after, level_at, quiet_range
+from neurosim_core.sensors.event_scan import CLOSE, LIMIT, OPEN, PUT, call_up, write_key
 from neurosim_core.sensors.event_signal import (
     Crossing,
     Signal,

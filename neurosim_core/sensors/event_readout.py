@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors.event_config import ReadoutConfig
-from neurosim_core.sensors.event_scan import SUB_BITS
+from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.streams import Milestone
 
 wp.set_module_options({"enable_backward": False})

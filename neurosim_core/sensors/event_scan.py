@@ -1,58 +1,40 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
 # mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
-"""Kernels of the event camera: the pixels' scan over a stack of frames, and the 64-bit keys it writes.
+"""Kernels of the event camera: the pixels' scan over a stack of frames, which writes the keys of events.
 
-The law is in `scan_pixel`, once. A pixel holds the log radiance it was reset to (`base`), its last sample,
-and how many levels it crossed upwards and downwards since. The reference level is a function of these counts,
+What a pixel does with its samples is in `scan_pixel`, once; levels, the tie rule and keys are in
+`event_levels`. Between stacks a pixel holds its last sample and how many levels it has crossed.
 
-    L_ref = base + up * threshold_on - down * threshold_off     (float64)
-
-so nothing accumulates: after any number of events it has the rounding of one evaluation. Where both sums
-agree within that rounding, the level is the base itself.
-
-The tie rule (stated in `EventCamera`) is in `_bound`: the float32 that a sample must reach, for each level.
-
-Crossing times are rounded to 2^-10 ns, then written as a key that sorts in the order of the packets:
-
-    time [us] | late | row | col | polarity | nanoseconds after the microsecond, rounded up (0 .. 1000)
-
-Rounded down to the microsecond, a crossing gets its time; rounded up to the nanosecond, it is compared
-exactly with the stamps of windows. `mark_late` sets `late` on events that share the microsecond of a window's
-end but come after it, so that windows are contiguous in the sorted keys.
-
-Pixels that are not ideal have a scan of their own, made to measure, in `event_noise`; levels, the tie rule
-and keys are those of this module.
+Pixels that are not ideal have a scan of their own, made to measure, in `event_noise`.
 """
 
 import warp as wp
 
+from neurosim_core.sensors.event_levels import (
+    fall,
+    key_of_level,
+    place_of,
+    quiet_range,
+    reach_down,
+    reach_up,
+    rise,
+)
+
 wp.set_module_options({"enable_backward": False})
 
-SUB_BITS = 11
-"""Bits of a key below the column: polarity and nanoseconds."""
 BLOCK_SIZE = wp.constant(256)
 """Threads of a block on CUDA."""
 TILE_SIZE = wp.constant(256)
 """Pixels that a thread of `screen` takes."""
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
+LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
 
 OPEN = wp.constant(0)
 PUT = wp.constant(1)
 CLOSE = wp.constant(2)
 READ = wp.constant(3)
 START = wp.constant(4)
-
-_HALF_ULP = wp.constant(wp.float64(2.0**-24))
-"""Of a float32 in [1, 2)."""
-_ROUNDING = wp.constant(wp.float64(2.0**-50))
-"""Bound of the relative error of the sums in a level."""
-_STEP_ROUNDING = wp.constant(wp.float64(2.0**-23))
-"""Relative error of k C computed in float32: half an ulp for C, and half an ulp for the product."""
-LIMIT = wp.constant(wp.float32(LOG_RADIANCE_MAX))
-_TICKS_PER_NS = wp.constant(wp.float64(1024.0))
-COLUMN_SHIFT = wp.constant(wp.int64(SUB_BITS))
-_US = wp.constant(wp.int64(1000))
 
 
 @wp.func_native("""
@@ -156,124 +138,6 @@ def keep_crossing(
 @wp.func
 def _read_word(place: wp.int32, index: wp.int32, counters: wp.array[wp.int64]) -> wp.int32:
     return wp.int32(keep_crossing(READ, 0, 0, wp.float32(0.0), 0, 0, place, index, counters))
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __dmul_rn(a, b);
-#else
-    return a * b;
-#endif
-""")
-def _product(a: wp.float64, b: wp.float64) -> wp.float64:
-    """Return a product, on CUDA not joined with a sum: a level has the same bits wherever it is asked."""
-    ...
-
-
-@wp.func
-def level_at(
-    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
-) -> wp.float64:
-    """Return the level after so many crossings, from the log radiance of the reset."""
-    rise = _product(wp.float64(up), threshold_on)
-    fall = _product(wp.float64(down), threshold_off)
-    step = rise - fall
-    if wp.abs(step) <= _ROUNDING * (rise + fall):
-        return base
-    return base + step
-
-
-@wp.func
-def _half_ulp(base: wp.float32) -> wp.float64:
-    """Return half the distance from a float32 to the next larger in magnitude; 0 below 2^-126."""
-    return wp.float64(wp.cast(wp.cast(base, wp.int32) & 0x7F800000, wp.float32)) * _HALF_ULP
-
-
-@wp.func
-def _bound(level: wp.float64, base: wp.float64, half_ulp: wp.float64, direction: wp.float64) -> wp.float32:
-    """Return the float32 at which a sample reaches a level from below (direction 1) or above (-1)."""
-    if level == base:
-        return wp.float32(base)
-    slack = wp.max(half_ulp, _STEP_ROUNDING * wp.abs(level - base))
-    return wp.float32(level - direction * slack)
-
-
-@wp.func
-def _lower(
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.float32:
-    """Return the largest sample that reaches the level below."""
-    level = level_at(base, up, down + 1, threshold_on, threshold_off)
-    return _bound(level, base, _half_ulp(wp.float32(base)), wp.float64(-1.0))
-
-
-@wp.func
-def _upper(
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.float32:
-    """Return the least sample that reaches the level above."""
-    level = level_at(base, up + 1, down, threshold_on, threshold_off)
-    return _bound(level, base, _half_ulp(wp.float32(base)), wp.float64(1.0))
-
-
-@wp.func
-def quiet_range(
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.vec2:
-    """Return the samples that reach the level below and the level above; between them a pixel is quiet."""
-    return wp.vec2(
-        _lower(base, up, down, threshold_on, threshold_off),
-        _upper(base, up, down, threshold_on, threshold_off),
-    )
-
-
-@wp.func
-def key_after(
-    elapsed_ns: wp.float64,
-    start_ns: wp.int64,
-    place: wp.int64,
-    time_shift: wp.int32,
-    polarity: wp.int32,
-) -> wp.int64:
-    """Return the key of an event some time, rounded to 2^-10 ns, after a stamp."""
-    ticks = wp.int64(wp.rint(elapsed_ns * _TICKS_PER_NS))
-    ticks = wp.max(ticks, wp.int64(1))  # an interval does not hold its start: that is the window before
-    whole_ns = ticks >> wp.int64(10)
-    down_ns = start_ns + whole_ns
-    up_ns = down_ns
-    if ticks > (whole_ns << wp.int64(10)):
-        up_ns += wp.int64(1)
-    time_us = down_ns // _US
-    sub_ns = up_ns - time_us * _US
-    return (time_us << wp.int64(time_shift)) | place | wp.int64(polarity << 10) | sub_ns
-
-
-@wp.func
-def _key(
-    level: wp.float64,
-    last: wp.float64,
-    sample: wp.float64,
-    start_ns: wp.int64,
-    end_ns: wp.int64,
-    place: wp.int64,
-    time_shift: wp.int32,
-    polarity: wp.int32,
-) -> wp.int64:
-    """Return the key of the crossing of a level on the line from (start_ns, last) to (end_ns, sample)."""
-    fraction = wp.min((level - last) / (sample - last), wp.float64(1.0))
-    return key_after(wp.float64(end_ns - start_ns) * fraction, start_ns, place, time_shift, polarity)
 
 
 @wp.func_native("""
@@ -387,83 +251,6 @@ def call_up(log_radiance: wp.array2d[wp.float32], pixel: wp.int32, frame_count: 
 
 
 @wp.func
-def _place(pixel: wp.int32, row: wp.int32, width: wp.int32, row_shift: wp.int32) -> wp.int64:
-    """Return the bits of a key that say which pixel it is."""
-    return (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
-
-
-@wp.func
-def _rise(
-    sample: wp.float32,
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.int32:
-    """Return `up` when a sample that has reached the level above has crossed all that it reaches."""
-    least = up + 1
-    if sample < _upper(base, least, down, threshold_on, threshold_off):
-        return least
-    level = level_at(base, least, down, threshold_on, threshold_off)
-    found = least + wp.int32((wp.float64(sample) - level) / threshold_on)  # but for rounding
-    while sample >= _upper(base, found, down, threshold_on, threshold_off):
-        found += 1
-    while found > least and sample < _upper(base, found - 1, down, threshold_on, threshold_off):
-        found -= 1
-    return found
-
-
-@wp.func
-def _fall(
-    sample: wp.float32,
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.int32:
-    """Return `down` when a sample that has reached the level below has crossed all that it reaches."""
-    least = down + 1
-    if sample > _lower(base, up, least, threshold_on, threshold_off):
-        return least
-    level = level_at(base, up, least, threshold_on, threshold_off)
-    found = least + wp.int32((level - wp.float64(sample)) / threshold_off)
-    while sample <= _lower(base, up, found, threshold_on, threshold_off):
-        found += 1
-    while found > least and sample > _lower(base, up, found - 1, threshold_on, threshold_off):
-        found -= 1
-    return found
-
-
-@wp.func
-def _key_of_level(
-    event: wp.int32,
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    last: wp.float32,
-    sample: wp.float32,
-    start_ns: wp.int64,
-    end_ns: wp.int64,
-    place: wp.int64,
-    time_shift: wp.int32,
-) -> wp.int64:
-    """Return the key of one of the events between two samples, from `up` and `down` at the first of them."""
-    polarity = wp.where(sample > last, 1, 0)
-    level = level_at(
-        base,
-        up + (event + 1) * polarity,
-        down + (event + 1) * (1 - polarity),
-        threshold_on,
-        threshold_off,
-    )
-    return _key(level, wp.float64(last), wp.float64(sample), start_ns, end_ns, place, time_shift, polarity)
-
-
-@wp.func
 def _write_kept(
     index: wp.int32,
     threshold_on: wp.float64,
@@ -490,10 +277,10 @@ def _write_kept(
     slot = keep_crossing(START, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out) + offset
     sample = log_radiance[frame, pixel]
     level_0 = wp.float64(base[pixel])
-    place = _place(pixel, pixel // width, width, row_shift)
+    place = place_of(pixel, pixel // width, width, row_shift)
     for event in range((word >> 11) & 0x1FFFFF):
         if slot + wp.int64(event) < wp.int64(keys_out.shape[0]):
-            keys_out[wp.int32(slot) + event] = _key_of_level(
+            keys_out[wp.int32(slot) + event] = key_of_level(
                 event,
                 level_0,
                 up,
@@ -559,8 +346,8 @@ def scan_pixel(
             base_32 = base[pixel]
             sample_before = last[pixel]
             row = pixel // width
-            low = _lower(wp.float64(base_32), up, down, threshold_on, threshold_off)
-            high = _upper(wp.float64(base_32), up, down, threshold_on, threshold_off)
+            low = reach_down(wp.float64(base_32), up, down, threshold_on, threshold_off)
+            high = reach_up(wp.float64(base_32), up, down, threshold_on, threshold_off)
 
     begin = wp.int32(0)
     while begin < frame_count:
@@ -577,11 +364,11 @@ def scan_pixel(
                     up_before = up
                     down_before = down
                     if sample >= high:
-                        up = _rise(sample, level_0, up, down, threshold_on, threshold_off)
+                        up = rise(sample, level_0, up, down, threshold_on, threshold_off)
                     else:
-                        down = _fall(sample, level_0, up, down, threshold_on, threshold_off)
-                    low = _lower(level_0, up, down, threshold_on, threshold_off)
-                    high = _upper(level_0, up, down, threshold_on, threshold_off)
+                        down = fall(sample, level_0, up, down, threshold_on, threshold_off)
+                    low = reach_down(level_0, up, down, threshold_on, threshold_off)
+                    high = reach_up(level_0, up, down, threshold_on, threshold_off)
                     found = up - up_before + down - down_before
                     if tabulate:
                         wp.atomic_add(table_out, frame, row, found)
@@ -590,9 +377,9 @@ def scan_pixel(
                             PUT, frame, found, sample_before, up_before, down_before, 0, 0, counters_out
                         )
                         if kept == wp.int64(0):
-                            place = _place(pixel, row, width, row_shift)
+                            place = place_of(pixel, row, width, row_shift)
                             for event in range(found):
-                                key = _key_of_level(
+                                key = key_of_level(
                                     event,
                                     level_0,
                                     up_before,
@@ -720,7 +507,7 @@ def screen(
     )
 
 
-@wp.kernel(launch_bounds=(BLOCK_SIZE, 3))  # as many blocks as need no register spilled
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 3))  # blocks of a multiprocessor: fastest on an H200
 def scan(
     # Model:
     threshold_on: wp.float64,
@@ -798,189 +585,3 @@ def scan(
         counters_out,
         table_out,
     )
-
-
-@wp.func
-def mark(key: wp.int64, stamps: wp.array[wp.int64], stamp_count: wp.int32, time_shift: wp.int32) -> wp.int64:
-    """Return a key with `late` set if it comes after a stamp within its microsecond; see `mark_late`."""
-    time_us = key >> wp.int64(time_shift)
-    low = wp.int32(0)
-    high = stamp_count
-    while low < high:
-        middle = (low + high) // 2
-        if stamps[middle] // _US < time_us:
-            low = middle + 1
-        else:
-            high = middle
-    if low < stamp_count:
-        end_ns = stamps[low]
-        sub_ns = key & wp.int64(1023)
-        if end_ns // _US == time_us and sub_ns > end_ns - time_us * _US:
-            return key | (wp.int64(1) << wp.int64(time_shift - 1))
-    return key
-
-
-@wp.kernel
-def mark_late(
-    # In:
-    stamps: wp.array[wp.int64],
-    stamp_count: wp.int32,
-    time_shift: wp.int32,
-    # In/out:
-    keys: wp.array[wp.int64],
-) -> None:
-    """Set `late` on the keys that come after a stamp within its microsecond.
-
-    Args:
-        stamps: Ends of windows from the keys' time origin [ns], at least 1 us apart, increasing.
-        stamp_count: How many there are.
-        time_shift: Bits of a key below its microseconds.
-        keys: Keys, in any order; overwritten.
-    """
-    event = wp.tid()
-    keys[event] = mark(keys[event], stamps, stamp_count, time_shift)
-
-
-@wp.func
-def move_origin(key: wp.int64, step_us: wp.int64, time_shift: wp.int32) -> wp.int64:
-    """Return a key with a time origin that is later, and without `late`."""
-    return (key & ~(wp.int64(1) << wp.int64(time_shift - 1))) - (step_us << wp.int64(time_shift))
-
-
-@wp.kernel
-def carry_over(
-    # In:
-    keys: wp.array[wp.int64],
-    first: wp.int32,
-    origin_step_us: wp.int64,
-    time_shift: wp.int32,
-    # Out:
-    keys_out: wp.array[wp.int64],
-    first_out: wp.int32,
-) -> None:
-    """Copy keys, from and to a position, with a time origin that is later, and clear `late`."""
-    event = wp.tid()
-    keys_out[first_out + event] = move_origin(keys[first + event], origin_step_us, time_shift)
-
-
-@wp.func
-def count_until(
-    end_ns: wp.int64, keys: wp.array[wp.int64], key_count: wp.int32, time_shift: wp.int32
-) -> wp.int32:
-    """Return how many of the sorted keys are in a window that ends then, or before it; see `find_ends`."""
-    bound = ((end_ns // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
-    low = wp.int32(0)
-    high = key_count
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < bound:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@wp.kernel
-def find_ends(
-    # In:
-    keys: wp.array[wp.int64],
-    key_count: wp.int32,
-    stamps: wp.array[wp.int64],
-    time_shift: wp.int32,
-    # Out:
-    end_out: wp.array[wp.int32],
-) -> None:
-    """Find where each window ends in the sorted keys.
-
-    Args:
-        keys: Keys after `mark_late`, sorted.
-        key_count: Number of keys.
-        stamps: Ends of windows from the keys' time origin [ns], shape [window].
-        time_shift: Bits of a key below its microseconds.
-        end_out: Index of the first key after each window, shape [window].
-    """
-    window = wp.tid()
-    end_out[window] = count_until(stamps[window], keys, key_count, time_shift)
-
-
-@wp.struct
-class Event:
-    """What a key says."""
-
-    time_us: wp.int64
-    """From the keys' time origin."""
-    x: wp.uint16
-    y: wp.uint16
-    polarity: wp.uint8
-
-
-@wp.func
-def take_apart(key: wp.int64, row_shift: wp.int32, time_shift: wp.int32) -> Event:
-    """Return what a key says; parameters as for `decode`."""
-    one = wp.int64(1)
-    row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
-    column_mask = (one << (wp.int64(row_shift) - COLUMN_SHIFT)) - one
-    found = Event()
-    found.time_us = key >> wp.int64(time_shift)
-    found.x = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
-    found.y = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
-    found.polarity = wp.uint8((key >> wp.int64(10)) & one)
-    return found
-
-
-@wp.kernel
-def decode(
-    # In:
-    keys: wp.array[wp.int64],
-    time_origin_us: wp.int64,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    # Out:
-    t_out: wp.array[wp.int64],
-    x_out: wp.array[wp.uint16],
-    y_out: wp.array[wp.uint16],
-    polarity_out: wp.array[wp.uint8],
-) -> None:
-    """Take keys apart into time [us], column, row and polarity, arrays of shape [event].
-
-    Args:
-        keys: Keys.
-        time_origin_us: Origin of the keys' time [us].
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        t_out: Time [us].
-        x_out: Column.
-        y_out: Row.
-        polarity_out: 1: brighter, 0: darker.
-    """
-    event = wp.tid()
-    found = take_apart(keys[event], row_shift, time_shift)
-    t_out[event] = time_origin_us + found.time_us
-    x_out[event] = found.x
-    y_out[event] = found.y
-    polarity_out[event] = found.polarity
-
-
-@wp.kernel
-def decode_block(
-    # In:
-    keys: wp.array[wp.int64],
-    room: wp.int32,
-    time_origin_us: wp.int64,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    # Out:
-    columns_8: wp.array[wp.int64],
-    columns_2: wp.array[wp.uint16],
-    columns_1: wp.array[wp.uint8],
-) -> None:
-    """Take keys apart like `decode`, into one block of memory that is given as three types.
-
-    The columns are in it one after the other, each with room for `room` events, an even number.
-    """
-    event = wp.tid()
-    found = take_apart(keys[event], row_shift, time_shift)
-    columns_8[event] = time_origin_us + found.time_us
-    columns_2[4 * room + event] = found.x
-    columns_2[5 * room + event] = found.y
-    columns_1[12 * room + event] = found.polarity

@@ -26,12 +26,13 @@ from neurosim_core.cores import following
 from neurosim_core.packets import Events
 from neurosim_core.priority import spared_count
 from neurosim_core.render.launch import core_count
-from neurosim_core.sensors import event_scan
+from neurosim_core.sensors import event_cut, event_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, EventKeys, roomy_keys
+from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise import PixelNoise, terms_of
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, SUB_BITS, TILE_SIZE
+from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, TILE_SIZE
 from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_stream, on
 
 __all__ = ["EventCamera", "EventCameraConfig"]
@@ -202,7 +203,8 @@ class EventCamera:
                 device=self.device,
             )
         self._feeder: Any = None
-        wp.load_module(event_scan, device=self.device)
+        for kernels in (event_scan, event_cut):
+            wp.load_module(kernels, device=self.device)
 
         self._now_ns: int | None = None
         self._fed_ns = 0

@@ -15,11 +15,11 @@ from typing import Any
 
 import warp as wp
 
+from neurosim_core.sensors.event_levels import COLUMN_SHIFT
 from neurosim_core.sensors.event_noise import Memory, PixelModel, begin_pixel, make_pixel_scan
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
     CLOSE,
-    COLUMN_SHIFT,
     OPEN,
     TILE_SIZE,
     scan_pixel,

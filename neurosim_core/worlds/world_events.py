@@ -14,8 +14,9 @@ import warp as wp
 
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise import Memory, PixelModel, PixelNoise, terms_of
-from neurosim_core.sensors.event_scan import BLOCK_SIZE, SUB_BITS, TILE_SIZE
+from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 from neurosim_core.worlds import scan
 from neurosim_core.worlds.timetable import PATTERN_COUNT_MAX
 
