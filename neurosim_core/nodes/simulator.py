@@ -38,7 +38,7 @@ from neurosim_core.pacing import Pacer
 from neurosim_core.packets import Packet
 from neurosim_core.priority import be_punctual
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.simulation import Model, make_fleet, warm_up
+from neurosim_core.simulation import Begun, Model, make_fleet, warm_up
 from neurosim_core.vehicle import DynamicsError
 
 _SWITCH_S = 2e-4
@@ -235,10 +235,7 @@ class Simulator:
         streaming = live.mode == "streaming"
         try:
             if not streaming:
-                begun = [craft.begin_step(self.stamp_ns) for craft in self.crafts]
-                self._mind()  # a CUDA device is at work
-                for craft, step in zip(self.crafts, begun, strict=True):
-                    craft.end_step(step)
+                self._step()
             elif not self._flown and not self._streaming.fly(self.stamp_ns, live, self._stop.is_set):
                 return
         except DynamicsError as error:
@@ -261,6 +258,17 @@ class Simulator:
             for craft in self.crafts:
                 craft.get_ready()
         self._end_period(end_ns)
+
+    def _step(self) -> None:
+        """Fly a control period in lockstep; on a CUDA device, all vehicles at the same time."""
+        begun: list[tuple[Craft, Begun]] = []
+        try:
+            for craft in self.crafts:
+                begun.append((craft, craft.begin_step(self.stamp_ns)))
+            self._mind()  # while the device is at work
+        finally:
+            for craft, step in begun:
+                craft.end_step(step)
 
     def _wait_for_end(self, end_ns: int) -> bool:
         """Publish until the end of a control period [ns]; False if something else has to be done first."""
