@@ -35,12 +35,13 @@ def all_cores() -> frozenset[int]:
 class OwnCore:
     """A core for a thread that must be in time; a thread that computes much keeps to the others.
 
-    To be used by the thread that computes. Without effect where there is one core only, or not Linux.
+    To be used by the thread that computes, but for `leave`. It does nothing where there is one core, or no Linux.
     """
 
     def __init__(self) -> None:
         """Leave everything as it is."""
         all_cores()  # before anybody is kept to some of them
+        self._lock = threading.Lock()
         self._thread_id: int | None = None
         self._core: int | None = None
         self._before: set[int] = set()
@@ -59,26 +60,33 @@ class OwnCore:
         others = all_cores() - {core}
         if core is None or not others:
             return
-        try:
-            self._before = os.sched_getaffinity(thread_id)
-            os.sched_setaffinity(thread_id, {core})
-        except OSError:  # it has ended, or the system says no
-            return
-        self._thread_id, self._core, self._threads = thread_id, core, _threads()
+        with self._lock:
+            try:
+                self._before = os.sched_getaffinity(thread_id)
+                os.sched_setaffinity(thread_id, {core})
+            except OSError:  # it has ended, or the system says no
+                return
+            self._thread_id, self._core, self._threads = thread_id, core, _threads()
         _keep_to(others)
 
     def take_back(self) -> None:
         """Let both run where they could before, and threads that were started on the core meanwhile."""
-        thread_id, self._thread_id = self._thread_id, None
-        if thread_id is None:
-            return
-        _keep_to(all_cores())
-        if _last_core(thread_id) is not None:  # the number may be another process's by now
-            _set(thread_id, self._before)
-        for number in map(int, _threads() - self._threads):
-            with contextlib.suppress(OSError):  # it has ended
-                if os.sched_getaffinity(number) == {self._core}:
-                    os.sched_setaffinity(number, self._before)
+        self.leave()
+        if hasattr(_own, "cores"):
+            _keep_to(all_cores())
+
+    def leave(self) -> None:
+        """Let only the thread that has the core run where it could before. Any thread may say so."""
+        with self._lock:
+            thread_id, self._thread_id = self._thread_id, None
+            if thread_id is None:
+                return
+            if _last_core(thread_id) is not None:  # the number may be another process's by now
+                _set(thread_id, self._before)
+            for number in map(int, _threads() - self._threads):
+                with contextlib.suppress(OSError):  # it has ended
+                    if os.sched_getaffinity(number) == {self._core}:
+                        os.sched_setaffinity(number, self._before)
 
 
 def following(work: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:

@@ -73,6 +73,26 @@ def test_two_threads_are_kept_apart_and_let_go():
     assert own() == all_cores()
 
 
+def test_who_has_the_core_may_leave_it_at_once():
+    """While the other thread computes on; that one goes back to all cores when it says so."""
+
+    def compute() -> None:
+        core = OwnCore()
+        with sleeper() as punctual:
+            core.give(punctual)
+            kept = own()
+            in_thread(core.leave)
+            assert frozenset(os.sched_getaffinity(punctual)) == all_cores()
+            assert own() == kept < all_cores()
+            core.take_back()
+            assert own() == all_cores()
+            core.give(punctual)
+            assert len(os.sched_getaffinity(punctual)) == 1
+            core.take_back()
+
+    in_thread(compute)
+
+
 def test_another_thread_gets_the_core_instead():
     def compute() -> None:
         core = OwnCore()

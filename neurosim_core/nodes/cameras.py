@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ _SPARE_PERIODS = 32
 """Further periods that are flown while one picture takes too long, where frames are left out."""
 _SPARED_CORES = 1
 """Left to the threads that must be in time, as long as no picture waits for the one before it."""
+CROWDED_S = 2.0
+"""Where others want the core of the thread that flies, it does not keep to it for so long [s]."""
 GIVE_UP_S = 0.5
 """How long the batch in work may take when nobody waits for more [s]."""
 
@@ -71,6 +74,8 @@ class Cameras:
         self._changed = threading.Condition()
         self._flier = 0
         """The thread that flies, as the system counts it."""
+        self._core = OwnCore()
+        self._crowded_until_s = 0.0
         self._thread = None
         if not inline:
             self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
@@ -207,26 +212,30 @@ class Cameras:
         """Wait until the thread does nothing, with the lock held; return whether that is so."""
         return self._changed.wait_for(lambda: self._work is None, timeout_s)
 
+    def leave_core(self) -> None:
+        """Let the thread that flies run on any core for a while: on its own it was late."""
+        self._crowded_until_s = time.monotonic() + CROWDED_S
+        self._core.leave()
+
     def _run(self) -> None:
         give_way()
-        core = OwnCore()
-        while (job := self._next(core)) is not None:
+        while (job := self._next()) is not None:
             behind = self._is_behind()
-            if behind:
-                core.take_back()
+            if behind or time.monotonic() < self._crowded_until_s:
+                self._core.take_back()
             else:
-                core.give(self._flier)
+                self._core.give(self._flier)
             with sparing(0 if behind else _SPARED_CORES):
                 self._try(job)
-        core.take_back()
+        self._core.take_back()
 
-    def _next(self, core: OwnCore) -> Job | None:
+    def _next(self) -> Job | None:
         """Wait for the next job, with all cores for everybody; None if there is to be none."""
         with self._changed:
             self._work = None
             self._changed.notify_all()
             while not self._jobs and not self._closed:
-                core.take_back()
+                self._core.take_back()
                 self._changed.wait()
             if self._closed or self._failure is not None:
                 return None

@@ -18,6 +18,8 @@ ANSWER_NS = 50_000_000
 """A request waits for the end of a control period that is this near [ns]."""
 BEHIND_MAX_NS = 500_000_000
 """How far the machine may be behind where camera frames give way [ns]."""
+CROWDED_NS = 5_000_000
+"""So late is who does not get the core that it keeps to [ns]: a scheduler looks at least every 4 ms."""
 READERS_SHARE = 0.04
 """What readers are left of a control period before the next one is flown."""
 READERS_S = (50e-6, 250e-6)
@@ -144,6 +146,8 @@ class Streaming:
             late_ns = self._pacer.wait_until(due_ns, interrupted)
             if late_ns < 0:
                 continue
+            if late_ns > CROWDED_NS:
+                self._cameras.leave_core()
             if due_ns == end_ns:
                 self._meter.late_times.add(late_ns)
                 return True

@@ -166,6 +166,41 @@ def test_who_flies_has_a_core_of_its_own_as_long_as_no_picture_waits(model: Mode
     wait_for(lambda: os.sched_getaffinity(flier) == before)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no cores of their own")
+def test_who_was_late_on_its_core_leaves_it_for_a_while(
+    model: Model, gate: Gate, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(module, "CROWDED_S", 10 * SOON_S)
+    places = []
+    held = module.see_each
+    flier = threading.get_native_id()
+    before = os.sched_getaffinity(flier)
+    module.see_each = lambda *job: places.append(os.sched_getaffinity(flier)) or held(*job)
+    eyes = Cameras(inline=False, on_packets=lambda: None)
+    eyes.leave_core()
+    fly(model, eyes)
+    assert gate.reached.wait(SOON_S)
+    gate.open.set()
+    eyes.finish(lambda: False)
+    eyes.close()
+    assert places == [before] * (PERIODS + 1)
+
+
+@pytest.mark.parametrize(("late_ms", "leaves"), [(0, False), (4, False), (6, True)])
+def test_a_core_is_left_by_who_was_later_than_a_scheduler_is(late_ms: int, leaves: bool):
+    now_ns = 0
+    pacer = Pacer(1.0, clock_ns=lambda: now_ns)
+    bell = threading.Event()
+    eyes = Cameras(inline=True, on_packets=bell.set)
+    left: list[bool] = []
+    eyes.leave_core = lambda: left.append(True)
+    streaming = Streaming([], eyes, pacer, Meter(), bell=bell)
+    now_ns = pacer.wall_ns(10 * MS) + late_ms * MS
+    live = LiveConfig()
+    assert streaming.publish_until(10 * MS, 10 * MS, live, lambda: False, called=lambda: False)
+    assert bool(left) is leaves
+
+
 def test_a_request_does_not_keep_the_loop_awake():
     """It is answered at the end of a control period that is near; until then the loop sleeps as before."""
     bell = threading.Event()
