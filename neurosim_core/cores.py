@@ -35,7 +35,7 @@ def all_cores() -> frozenset[int]:
 class OwnCore:
     """A core for a thread that must be in time; a thread that computes much keeps to the others.
 
-    To be used by the thread that computes, but for `leave`. It does nothing where there is one core, or no Linux.
+    To be used by the thread that computes, but for `leave`. Without effect on one core, or where no Linux is.
     """
 
     def __init__(self) -> None:
