@@ -8,7 +8,14 @@ from neurosim_core.sensors.event_levels import COLUMN_SHIFT
 
 wp.set_module_options({"enable_backward": False})
 
+# what `decode_windows` is told
+COUNT = wp.constant(0)
+ROOM = wp.constant(1)
+ORIGIN_US = wp.constant(2)
+
 _US = wp.constant(wp.int64(1000))
+_NOTHING = wp.constant(wp.int64((1 << 63) - 1))
+"""Key that sorts behind all others."""
 
 
 @wp.func
@@ -75,11 +82,17 @@ def carry_over(
 
 
 @wp.func
+def _bound_of(end_ns: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return the least key that may come after a window which ends then."""
+    return ((end_ns // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
+
+
+@wp.func
 def count_until(
     end_ns: wp.int64, keys: wp.array[wp.int64], key_count: wp.int32, time_shift: wp.int32
 ) -> wp.int32:
     """Return how many of the sorted keys are in a window that ends then, or before it; see `find_ends`."""
-    bound = ((end_ns // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
+    bound = _bound_of(end_ns, time_shift)
     low = wp.int32(0)
     high = key_count
     while low < high:
@@ -173,25 +186,74 @@ def decode(
 
 
 @wp.kernel
-def decode_block(
+def prepare(
     # In:
+    told: wp.array[wp.int64],
+    bounds: wp.array[wp.int64],
+    window_count: wp.int32,
+    time_shift: wp.int32,
+    # In/out:
     keys: wp.array[wp.int64],
-    room: wp.int32,
-    time_origin_us: wp.int64,
+) -> None:
+    """Do what `mark_late` does, and let keys beyond the count sort behind all others; threads are the room.
+
+    Args:
+        told: How many keys there are, and what else `decode_windows` is told.
+        bounds: Ends of windows from the keys' time origin [ns].
+        window_count: How many there are.
+        time_shift: Bits of a key below its microseconds.
+        keys: Keys, in any order; overwritten.
+    """
+    event = wp.tid()
+    if wp.int64(event) < told[COUNT]:
+        keys[event] = mark(keys[event], bounds, window_count, time_shift)
+    else:
+        keys[event] = _NOTHING
+
+
+@wp.kernel
+def decode_windows(
+    # In:
+    told: wp.array[wp.int64],
+    bounds: wp.array[wp.int64],
+    window_count: wp.int32,
+    keys: wp.array[wp.int64],
     row_shift: wp.int32,
     time_shift: wp.int32,
     # Out:
     columns_8: wp.array[wp.int64],
     columns_2: wp.array[wp.uint16],
     columns_1: wp.array[wp.uint8],
+    end_out: wp.array[wp.int32],
 ) -> None:
-    """Take keys apart like `decode`, into one block of memory that is given as three types.
+    """Do what `find_ends` and `decode` do, for at least one key; threads are the room.
 
-    The columns are in it one after the other, each with room for `room` events, an even number.
+    Args:
+        told: How many keys there are; for how many the columns have room, an even number; and the origin of
+            their time [us].
+        bounds: Ends of windows from there [ns].
+        window_count: How many there are.
+        keys: Keys after `prepare`, sorted.
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        columns_8: One block of memory, given as three types: in it are the columns, one after the other.
+        columns_2: The same block.
+        columns_1: The same block.
+        end_out: Index of the first key after each window, shape [window].
     """
     event = wp.tid()
-    found = take_apart(keys[event], row_shift, time_shift)
-    columns_8[event] = time_origin_us + found.time_us
-    columns_2[4 * room + event] = found.x
-    columns_2[5 * room + event] = found.y
-    columns_1[12 * room + event] = found.polarity
+    count = wp.int32(told[COUNT])
+    if event < count:
+        room = wp.int32(told[ROOM])
+        found = take_apart(keys[event], row_shift, time_shift)
+        columns_8[event] = told[ORIGIN_US] + found.time_us
+        columns_2[4 * room + event] = found.x
+        columns_2[5 * room + event] = found.y
+        columns_1[12 * room + event] = found.polarity
+        for window in range(window_count):
+            bound = _bound_of(bounds[window], time_shift)
+            inside = keys[event] < bound
+            if inside and (event == count - 1 or keys[event + 1] >= bound):
+                end_out[window] = event + 1
+            if event == 0 and not inside:
+                end_out[window] = 0

@@ -14,7 +14,7 @@ from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.streams import HostCopy, HostInput, LentBlock, LentBlocks, Milestone, size_class
+from neurosim_core.streams import Graphs, HostCopy, HostInput, LentBlocks, Milestone, size_class
 
 ROOM_PER_PIXEL = 16
 """Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
@@ -31,6 +31,11 @@ _EVENTS_PER_SAMPLE = 1 / 8
 tour of a house yields at 1 kHz. To pin takes 1 ms a MB, in which a device stands still."""
 _PINNED_BLOCKS = 3
 """What a reader holds, what it reads next, and what is copied to."""
+_REPLAYED_COUNT_MAX = 1 << 16
+"""So many keys or less are cut by a graph, which sorts up to twice as many: launches would take longer."""
+_ROOM_MIN = 1024
+_TOLD = 3
+"""Numbers that a cut is told besides the ends of its windows."""
 _PINNED_BYTES_MAX = 144 << 20
 """Most memory that is pinned for events that have not come."""
 
@@ -132,56 +137,63 @@ class EventKeys:
             return [], [0] * len(ends_ns)
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
-        bounds = self._bounds.array
-        self._bounds.rows[: len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
-        self._bounds.upload()
-        self._launch(event_cut.mark_late, count, [bounds, len(ends_ns), self._time_shift], [self.keys])
-        self._sort(end_bit)
+        told = self._told.rows
+        told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
+        if self._blocks is not None:
+            return self._cut_to_host(self._blocks, len(ends_ns), end_bit)
+        self._told.upload()
+        self._launch(event_cut.mark_late, count, [self._bounds, len(ends_ns), self._time_shift], [self.keys])
+        self._sort(count, end_bit)
         self._launch(
             event_cut.find_ends,
             len(ends_ns),
-            [self.keys, count, bounds, self._time_shift],
+            [self.keys, count, self._bounds, self._time_shift],
             [self._found],
         )
         self._found_on_host.fetch(0, len(ends_ns))
-        columns, block = [], None
-        if self._blocks is not None:
-            block = self._copy_to_host(self._blocks, count)
-        else:
-            columns = [self._empty(count, dtype) for dtype in _COLUMN_TYPES]
-            decoded = [self.keys, self.origin_us, self._row_shift, self._time_shift]
-            self._launch(event_cut.decode, count, decoded, columns)
+        columns = [self._empty(count, dtype) for dtype in _COLUMN_TYPES]
+        decoded = [self.keys, self.origin_us, self._row_shift, self._time_shift]
+        self._launch(event_cut.decode, count, decoded, columns)
         self._read.set()
         self._read.wait()
-        cuts: list[int] = self._found_on_host.rows(0, len(ends_ns)).tolist()
-        if self._blocks is not None and block is not None:
-            columns = self._lend(self._blocks, block, count)
-        elif self._on_host:
+        if self._on_host:
             columns = [column.numpy() for column in columns]
-        return columns, cuts
+        return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
-    def _copy_to_host(self, blocks: LentBlocks, count: int) -> LentBlock:
-        """Launch the copy of all events to the host, one column after the other."""
-        room = _room_of(count)
-        self._launch(
-            event_cut.decode_block,
-            count,
-            [self.keys, room, self.origin_us, self._row_shift, self._time_shift],
-            self._columns,
-        )
-        block = blocks.take(_EVENT_BYTES * room)
-        wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * room)
-        return block
+    def _cut_to_host(
+        self, blocks: LentBlocks, window_count: int, end_bit: int
+    ) -> tuple[list[Any], list[int]]:
+        """Do the same on CUDA with a copy of all events to the host, one column after the other."""
+        count, shifts = self.count, [self._row_shift, self._time_shift]
+        room = count
+        if count <= _REPLAYED_COUNT_MAX:
+            room = max(_ROOM_MIN, 1 << (count - 1).bit_length())
+        copied = _room_of(count)
+        self._told.rows[:_TOLD] = count, copied, self.origin_us
 
-    def _lend(self, blocks: LentBlocks, block: LentBlock, count: int) -> list[Any]:
-        """Return the columns of events that were copied to a block; who reads them has them to himself."""
-        room = _room_of(count)
-        rows = blocks.lend(block, _EVENT_BYTES * room)
+        def launch() -> None:
+            self._told.upload()
+            told = [self._told.array, self._bounds, window_count]
+            self._launch(event_cut.prepare, room, [*told, self._time_shift], [self.keys])
+            self._sort(room, end_bit)
+            outputs = [*self._columns, self._found]
+            self._launch(event_cut.decode_windows, room, [*told, self.keys, *shifts], outputs)
+            self._found_on_host.fetch(0, window_count)
+
+        if count <= _REPLAYED_COUNT_MAX:
+            self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
+        else:
+            launch()
+        block = blocks.take(_EVENT_BYTES * copied)
+        wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
+        self._read.set()
+        self._read.wait()
+        rows = blocks.lend(block, _EVENT_BYTES * copied)
         columns = []
         for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
             size = np.dtype(dtype).itemsize
-            columns.append(rows[offset * room : (offset + size) * room].view(dtype))
-        return columns
+            columns.append(rows[offset * copied : (offset + size) * copied].view(dtype))
+        return columns, self._found_on_host.rows(0, window_count).tolist()
 
     def no_events(self) -> list[Any]:
         """Return columns without an event."""
@@ -208,11 +220,11 @@ class EventKeys:
             [keys_out, first_out],
         )
 
-    def _sort(self, end_bit: int) -> None:
+    def _sort(self, count: int, end_bit: int) -> None:
         if self._device.is_cpu:
-            self.keys.numpy()[: self.count].sort()  # ten times as fast as Warp's radix sort on a CPU
+            self.keys.numpy()[:count].sort()  # ten times as fast as Warp's radix sort on a CPU
             return
-        wp.utils.radix_sort_pairs(self.keys, self._order, self.count, begin_bit=SUB_BITS - 1, end_bit=end_bit)
+        wp.utils.radix_sort_pairs(self.keys, self._order, count, begin_bit=SUB_BITS - 1, end_bit=end_bit)
 
     def _buffer(self, count: int) -> wp.array[wp.int64]:
         """Return a buffer for keys that are to be sorted: the radix sort on CUDA wants twice the room."""
@@ -228,11 +240,12 @@ class EventKeys:
             room = max(room, ROOM_PER_PIXEL * self._pixel_count)
             keys = roomy_keys(room, TOUCHED_COUNT_MAX)
         else:
-            room = max(2 * room, 4 * self._pixel_count)  # pinned memory takes long to come by
+            room = max(2 * room, 4 * self._pixel_count, _ROOM_MIN)
             keys = self._buffer(room)
         if kept > 0:
             wp.copy(keys, self.keys, count=kept)
         self.keys = keys
+        self._graphs = Graphs(self._device)
         self._spare = self._buffer(room)
         if self._device.is_cuda:
             self._order = self._empty(2 * room, wp.int32)
@@ -245,7 +258,9 @@ class EventKeys:
                 self._columns.append(block)
 
     def _make_window_buffers(self, window_count: int) -> None:
-        self._bounds = HostInput(self._empty(window_count, wp.int64))
+        self._graphs = Graphs(self._device)  # they name the buffers
+        self._told = HostInput(wp.zeros(_TOLD + window_count, dtype=wp.int64, device=self._device))
+        self._bounds = self._told.array[_TOLD:]
         self._found = wp.zeros(window_count, dtype=wp.int32, device=self._device)
         self._found_on_host = HostCopy(self._found)
 

@@ -656,7 +656,7 @@ class EventCamera:
             self._keys.read_out(self._readout, self._require_reset())
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
         # with a readout events may be read later than now
-        end_bit = self._time_shift + span_us.bit_length() if self._readout is None else 63
+        end_bit = self._time_shift + (span_us + 1).bit_length() if self._readout is None else 63
         columns, cuts = self._keys.cut(ends, end_bit)
         packets = self._packets(ends, columns, cuts)
         self._keys.carry_over(cuts[-1], self._window_start_ns // NS_PER_US)
