@@ -226,7 +226,6 @@ class LentBlocks:
         """By size."""
         self.made_count = 0
         self._made_bytes = 0
-        self._taken_bytes = 0
 
     def reserve(self, size: int, count: int) -> None:
         """Have so many blocks of at least so many bytes that nobody reads."""
@@ -246,20 +245,13 @@ class LentBlocks:
                 break
         else:
             block = self._make(size_class(2 * size))
-        self._taken_bytes += block.size
         return block
-
-    def give_back(self, block: LentBlock) -> None:
-        """Let a block be taken again: its content is not wanted."""
-        self._taken_bytes -= block.size
-        self._free[block.size].append(block)
 
     def lend(self, block: LentBlock, size: int) -> NDArray[np.uint8]:
         """Return the first bytes of a block for the caller to keep, or a copy; the block is not theirs."""
-        self._taken_bytes -= block.size
         free = self._free[block.size]
         free_bytes = sum(known * len(blocks) for known, blocks in self._free.items())
-        if self._made_bytes - free_bytes - self._taken_bytes > _LENT_BYTES_MAX:  # with this one
+        if self._made_bytes - free_bytes > _LENT_BYTES_MAX:  # with this one
             rows = np.array(block.rows()[:size])
             free.append(block)
             return rows

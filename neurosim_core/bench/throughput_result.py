@@ -114,7 +114,7 @@ PHYSICS_ALONE = "physics"
 READ_ALONE = "sort, decode, copy"
 
 SCAN = "event scan alone"
-LOOP = "one render and one scan per call, count read by the host"
+LOOP = "one render and one scan per call, a count read by the host (ours of the frame before)"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,6 +34,8 @@ _PINNED_BLOCKS = 3
 _REPLAYED_COUNT_MAX = 1 << 16
 """So many keys or less are cut by a graph, which sorts up to twice as many: launches would take longer."""
 _ROOM_MIN = 1024
+_BLOCK_COUNT_MAX = 1 << 26
+"""Most events in one block of memory: Warp counts its bytes in 31 bits."""
 _TOLD = 3
 """Numbers that a cut is told besides the ends of its windows."""
 _PINNED_BYTES_MAX = 144 << 20
@@ -139,7 +141,7 @@ class EventKeys:
             self._make_window_buffers(len(ends_ns))
         told = self._told.rows
         told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
-        if self._blocks is not None:
+        if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
             return self._cut_to_host(self._blocks, len(ends_ns), end_bit)
         self._told.upload()
         self._launch(event_cut.mark_late, count, [self._bounds, len(ends_ns), self._time_shift], [self.keys])
@@ -250,7 +252,7 @@ class EventKeys:
         if self._device.is_cuda:
             self._order = self._empty(2 * room, wp.int32)
             if self._on_host:
-                block = self._empty(_EVENT_BYTES * room, wp.uint8)
+                block = self._empty(_EVENT_BYTES * min(room, _BLOCK_COUNT_MAX), wp.uint8)
                 self._columns = [
                     wp.array(ptr=block.ptr, dtype=dtype, shape=block.shape[0] // size, device=self._device)
                     for dtype, size in ((wp.int64, 8), (wp.uint16, 2))

@@ -83,6 +83,17 @@ def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters:
 
 
 @wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const int64_t slot = counters.data[0]++;
+    if (slot < (int64_t)keys.shape[0]) keys.data[slot] = key;
+#endif
+""")
+def _append(key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
+    """Append a key and count it, on a CPU, where a thread has keys for itself."""
+    ...
+
+
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
     constexpr int SIZE = 2048;  // a crossing for each thread and each of 8 frames
     __shared__ int words[5][SIZE];
@@ -365,7 +376,7 @@ def scan_pixel(
                     down_before = down
                     if sample >= high:
                         up = rise(sample, level_0, up, down, threshold_on, threshold_off)
-                    else:
+                    elif sample <= low:
                         down = fall(sample, level_0, up, down, threshold_on, threshold_off)
                     low = reach_down(level_0, up, down, threshold_on, threshold_off)
                     high = reach_up(level_0, up, down, threshold_on, threshold_off)
@@ -393,7 +404,7 @@ def scan_pixel(
                                     place,
                                     time_shift,
                                 )
-                                write_key(PUT, key, keys_out, counters_out)
+                                _append(key, keys_out, counters_out)
                     sample_before = sample
                 else:
                     if invalid_count == 0:

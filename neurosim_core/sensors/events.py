@@ -398,6 +398,7 @@ class EventCamera:
         if scan_count is None:
             scan_count = len(self._under_way)
         if scan_count == 1 and not ends and self._is_alone():
+            self._taken.hold()
             self._take_over()
             return []
         with on(self._reader):

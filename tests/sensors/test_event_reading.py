@@ -276,29 +276,67 @@ def test_a_flight_of_changing_views_needs_no_memory(monkeypatch):
     assert made == []
 
 
-@pytest.mark.parametrize("eagerness", [0.0, 0.5])
-def test_frames_that_are_counted_one_by_one_on_a_late_device_give_the_same(monkeypatch, eagerness):
-    """The host reads each count and takes windows now and then."""
-    rng = np.random.default_rng(21)
-    first, stacks = draw_stacks(rng, [1] * 40, rng.choice([0.0, 0.3, 3.0], size=40).tolist())
+@pytest.mark.parametrize("lanes", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(6))
+def test_frames_that_are_counted_one_by_one_on_a_late_device_give_the_same(monkeypatch, seed, lanes):
+    """The host reads each count, with so many frames under way, and takes windows now and then."""
+    count, eagerness = 60, 0.1 * seed
+    rng = np.random.default_rng([seed, lanes])
+    first, stacks = draw_stacks(rng, [1] * count, rng.choice([0.0, 0.3, 3.0], size=count).tolist())
     packets: list[list[Events]] = []
     for late in (False, True):
         with monkeypatch.context() as patch:
             if late:
                 install(patch, LateDevice(rng, eagerness))
-            camera = make_camera("cpu")
+            camera = make_camera("cpu", lanes=lanes)
             camera.reset(first)
-            found = []
+            found: list[Events] = []
+            fed: deque[np.ndarray] = deque()
+
+            def read(camera: EventCamera = camera, fed: deque[np.ndarray] = fed) -> None:
+                camera.collect_windows([], scan_count=1)
+                fed.popleft().fill(0.0)  # the frame is the caller's again
+
             for number, stack in enumerate(stacks, 1):
                 rows = np.array(stack)
                 frames = wp.array(rows, dtype=wp.float32, device="cpu", copy=False)
                 camera.feed_device(frames, [FRAME_NS * number])
-                found += camera.collect_windows([], scan_count=1)
-                rows.fill(0.0)
+                fed.append(rows)
+                if len(fed) == lanes:
+                    read()
                 if number % 7 == 0:
                     found.append(camera.collect())
-                elif number % 5 == 0:
-                    found += camera.collect_windows([FRAME_NS * number], scan_count=0)
+                    fed.clear()
+                elif number % 5 == 0 and camera.stamp_ns > camera.window_start_ns:  # some events stay
+                    found += camera.collect_windows([camera.stamp_ns - 600], scan_count=0)
             packets.append([*found, camera.collect()])
     assert len(packets[0]) > 10
     assert_same(*packets)
+
+
+def test_keys_that_are_carried_over_are_there_before_the_next_are_added(monkeypatch):
+    """A count is read, and the buffers grow, when the device has not yet moved what the cut before left."""
+
+    def frames(*levels: float) -> wp.array:
+        rows = [np.full((HEIGHT, WIDTH), 0.25 * level + 0.05, np.float32) for level in levels]
+        return wp.array(np.stack(rows), dtype=wp.float32, device="cpu")
+
+    for seed in range(20):
+        packets: list[list[Events]] = []
+        for late in (False, True):
+            with monkeypatch.context() as patch:
+                if late:
+                    install(patch, LateDevice(np.random.default_rng(seed), 0.0))
+                camera = make_camera("cpu", lanes=2, threshold_on=0.25, threshold_off=0.25)
+                camera.reset(np.zeros((HEIGHT, WIDTH), np.float32))
+                found = []
+                for number, level in enumerate((5, 0, 5, 0), 1):
+                    camera.feed_device(frames(level), [1000 * number])
+                    found.append(camera.collect())
+                two, one = frames(0, 8), frames(18)
+                camera.feed_device(two, [6000, 8000])
+                camera.feed_device(one, [10_000])
+                found += camera.collect_windows([6000], scan_count=1)
+                found += camera.collect_windows([], scan_count=1)
+                packets.append([*found, camera.collect()])
+        assert_same(*packets)
