@@ -269,7 +269,7 @@ class _Study:
             lambda: time_steps(
                 make(),
                 warm_up_count=plan.warm_up_batches * instants,
-                step_count=steps_left // plan.repetitions - instants,
+                step_count=steps_left // plan.repetitions - 8 * instants,  # adaptive batches are longer
                 repetitions=plan.repetitions,
                 repetition_s=plan.repetition_s,
                 begin_s=_BEGIN_S,

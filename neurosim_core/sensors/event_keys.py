@@ -169,7 +169,7 @@ class EventKeys:
         count, shifts = self.count, [self._row_shift, self._time_shift]
         room = count
         if count <= _REPLAYED_COUNT_MAX:
-            room = max(_ROOM_MIN, 1 << (count - 1).bit_length())
+            room = min(max(_ROOM_MIN, 1 << (count - 1).bit_length()), self._order.shape[0] // 2)
         copied = _room_of(count)
         self._told.rows[:_TOLD] = count, copied, self.origin_us
 

@@ -340,3 +340,32 @@ def test_keys_that_are_carried_over_are_there_before_the_next_are_added(monkeypa
                 found += camera.collect_windows([], scan_count=1)
                 packets.append([*found, camera.collect()])
         assert_same(*packets)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_more_events_than_a_power_of_two_fit_into_what_there_is(monkeypatch, device, late):
+    """There is room for four a pixel from the start, and for sorting no more than that."""
+    width, height = 40, 30
+    levels = np.full((1, height, width), 4.1, np.float32)
+    levels[0, : height // 4] = 3.1
+    found = []
+    if late:
+        install(monkeypatch, LateDevice(np.random.default_rng(0), 0.0))
+    camera = EventCamera(
+        EventCameraConfig(threshold_on=0.25, threshold_off=0.25),
+        width=width,
+        height=height,
+        device="cpu" if late else device,
+        on_host=True,
+    )
+    camera.reset(np.zeros((height, width), np.float32))
+    one = np.zeros_like(levels)
+    one[0, 3, 4] = 1.1
+    for number, rows in enumerate((one, 0.0 * one, *(levels, 0.0 * levels) * 2), 1):
+        rows = (0.25 * rows).astype(np.float32)
+        camera.feed_device(wp.array(rows, dtype=wp.float32, device=camera.device), [FRAME_NS * number])
+        found += camera.collect_windows([FRAME_NS * number], scan_count=1)
+    count = int(np.floor(levels).sum())
+    assert 4096 < count < 4 * width * height
+    assert [len(packet.t) for packet in found] == [1, 1] + [count] * 4
+    assert [int(packet.polarity.sum()) for packet in found] == [1, 0] + [count, 0] * 2

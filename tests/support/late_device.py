@@ -124,8 +124,10 @@ class _LateWarp:
     def launch(self, *args: Any, **kwargs: Any) -> None:
         self._device.add(lambda: wp.launch(*args, **kwargs))
 
-    def radix_sort_pairs(self, *args: Any, **kwargs: Any) -> None:
-        self._device.add(lambda: wp.utils.radix_sort_pairs(*args, **kwargs))
+    def radix_sort_pairs(self, keys: Any, values: Any, count: int, **kwargs: Any) -> None:
+        if min(keys.size, values.size) < 2 * count:  # which only a CUDA device minds
+            raise RuntimeError(f"{keys.size} keys and {values.size} values are not twice {count}")
+        self._device.add(lambda: wp.utils.radix_sort_pairs(keys, values, count, **kwargs))
 
 
 class _LateMilestone:
