@@ -157,7 +157,7 @@ class Ring:
 
     @property
     def memory(self) -> Any:
-        """The whole mapping, None after `close`; whoever keeps it keeps it mapped, and must not write to it."""
+        """The whole mapping, None after `close`: who keeps it keeps it mapped, and must not write to it."""
         return self._memory
 
     def commit(self, slot: int, sequence: int, body_size: int, mask: int) -> None:

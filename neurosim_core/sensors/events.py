@@ -87,7 +87,7 @@ class EventCamera:
     - `feed` takes a stack of frames and returns its events.
     - `feed_device` launches the scan of a stack without waiting for it, and later `collect` or
       `collect_windows` reads back the number of events and hands them out, sorted. They do so on a stream of
-      their own: on another stream than `feed_device`, they wait for one scan, not for what was launched since.
+      their own: on another stream than `feed_device`, they wait for one scan and not for later launches.
 
     A pixel's levels are base + m threshold_on - n threshold_off, where base is its log radiance at the reset.
     Tie rule: a sample rises to a level if it may have been that level, or more, before it was rounded,
