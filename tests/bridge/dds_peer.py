@@ -135,7 +135,7 @@ def _until(condition: Any, timeout_s: float = SOON_S) -> Any:
 
 
 def _matched(ask: Any) -> Any:
-    """Return the matches that CycloneDDS lists; where one comes while it does, its list is too short for it."""
+    """Return the matches that CycloneDDS lists; its list is too short where one comes while it is made."""
     try:
         return ask()
     except IndexError:
