@@ -128,8 +128,14 @@ def _is_late(batch: Batch) -> bool:
     )
 
 
-def read_cameras(state: State, batch: Batch) -> list[Packet]:
-    """Wait until the cameras have seen a batch, and return what they yield."""
+def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
+    """Wait until the cameras have seen a batch, and return what they yield.
+
+    Args:
+        state: Where it is under way.
+        batch: What was flown.
+        borrow: Pictures are views of the lane's buffers.
+    """
     packets: list[Packet] = []
     with timed(state.wall_s, "camera read-back"):
         if not (state.late_pictures and _is_late(batch)):
@@ -145,5 +151,5 @@ def read_cameras(state: State, batch: Batch) -> list[Packet]:
             packets += events
     with timed(state.wall_s, "camera read-back"):
         for cast, instants in batch.seen:
-            packets += read_images(cast, instants, borrow=state.borrow_pictures)
+            packets += read_images(cast, instants, borrow=borrow)
     return packets

@@ -45,6 +45,7 @@ class OwnCore:
         self._thread_id: int | None = None
         self._core: int | None = None
         self._before: set[int] = set()
+        self._mine: frozenset[int] = frozenset()
         self._threads: set[str] = set()
 
     def give(self, thread_id: int) -> None:
@@ -57,8 +58,11 @@ class OwnCore:
             return
         self.take_back()
         core = _last_core(thread_id)
-        others = all_cores() - {core}
-        if core is None or not others:
+        if core is None:
+            return
+        self._mine = frozenset(os.sched_getaffinity(0))
+        others = self._mine - {core}
+        if not others:
             return
         with self._lock:
             try:
@@ -73,7 +77,8 @@ class OwnCore:
         """Let both run where they could before, and threads that were started on the core meanwhile."""
         self.leave()
         if hasattr(_own, "cores"):
-            _keep_to(all_cores())
+            _keep_to(self._mine)
+            del _own.cores  # where it may run is the system's matter again
 
     def leave(self) -> None:
         """Let only the thread that has the core run where it could before. Any thread may say so."""
@@ -81,11 +86,14 @@ class OwnCore:
             thread_id, self._thread_id = self._thread_id, None
             if thread_id is None:
                 return
-            if _last_core(thread_id) is not None:  # the number may be another process's by now
-                _set(thread_id, self._before)
-            for number in map(int, _threads() - self._threads):
+            started = _threads() - self._threads
+            if os.path.exists(
+                f"/proc/self/task/{thread_id}"
+            ):  # or the number may be another process's by now
+                started.add(str(thread_id))
+            for number in map(int, started):
                 with contextlib.suppress(OSError):  # it has ended
-                    if os.sched_getaffinity(number) == {self._core}:
+                    if os.sched_getaffinity(number) == {self._core}:  # and nobody has said otherwise since
                         os.sched_setaffinity(number, self._before)
 
 
@@ -115,8 +123,11 @@ def _set(thread_id: int, cores: set[int] | frozenset[int]) -> None:
 
 
 def _threads() -> set[str]:
-    """Return the numbers of the threads of this process."""
-    return set(os.listdir("/proc/self/task"))
+    """Return the numbers of the threads of this process; none where they cannot be read."""
+    try:
+        return set(os.listdir("/proc/self/task"))
+    except OSError:
+        return set()
 
 
 def _last_core(thread_id: int) -> int | None:

@@ -194,10 +194,11 @@ def settle(state: State) -> None:
 
 def end_step(model: Model, state: State, begun: Begun) -> list[Packet]:
     """Wait for a control period that was begun, and return what `step` returns."""
-    packets = begun.packets + read(model, state)
+    packets = begun.packets + read(model, state, last=state.launched_ns >= begun.end_ns)
     while state.launched_ns < begun.end_ns and not (state.ended or state.failure is not None):
         part_ns = batch_end_ns(model.schedule, state.launched_ns, begun.end_ns)
-        packets += advance(model, state, part_ns, closed_loop=False)
+        launch(model, state, part_ns, closed_loop=False)
+        packets += read(model, state, last=part_ns >= begun.end_ns)
     return packets
 
 
@@ -258,7 +259,7 @@ def see(model: Model, state: State, batch: Batch) -> list[Packet]:
         batch: The oldest that was flown and not looked at.
     """
     look_at(model, state, batch)
-    packets = read_cameras(state, batch)
+    packets = read_cameras(state, batch, borrow=state.borrow_pictures)
     state.looked_count += 1
     return in_order(model, packets, batch.until_ns)
 
@@ -271,7 +272,7 @@ def see_each(model: Model, state: State, batch: Batch) -> Iterator[tuple[int, li
     """
     for index in sorted(range(len(state.casts)), key=lambda index: -state.casts[index].rate.rate_hz):
         look_at(model, state, batch, {index})
-        yield index, in_order(model, read_cameras(state, batch), batch.until_ns)
+        yield index, in_order(model, read_cameras(state, batch, borrow=state.borrow_pictures), batch.until_ns)
     state.looked_count += 1
 
 
@@ -362,20 +363,21 @@ def launch(model: Model, state: State, end_ns: int, *, closed_loop: bool = True)
     _launch(model, state, plan_batch(state, stretch, closed_loop=closed_loop))
 
 
-def read(model: Model, state: State) -> list[Packet]:
+def read(model: Model, state: State, *, last: bool = False) -> list[Packet]:
     """Wait for the oldest batch under way and return what the sensors yield in it, in the order of time.
 
     Args:
         model: What does not change.
         state: `stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or
             the integration failed (`failure`).
+        last: Nothing is launched before the pictures have been used: they may be borrowed, if that is wanted.
     """
     batch = state.under_way.popleft()
     with timed(state.wall_s, "read-back"):
         flown = state.flown if state.overlaps else state.lanes  # one graph has one end
         flown[batch.number % len(flown)].wait()
     packets = read_flight(model, state, batch)  # may end the run before the end of the batch
-    packets += read_cameras(state, batch)
+    packets += read_cameras(state, batch, borrow=last and state.borrow_pictures)
     state.looked_count += 1
     return in_order(model, packets, batch.until_ns)
 

@@ -430,6 +430,21 @@ def test_steps_in_two_parts_are_the_same(settings, without):
     assert content(found[0][: len(expected)]) == content(expected)
 
 
+@pytest.mark.parametrize("instants", [1, 4])
+def test_borrowed_pictures_are_those_of_the_step(settings, instants):
+    """Of stamp 0, and of all batches of a control period: none is overwritten before the next step."""
+    sensors = {**SENSORS, "rgb": {**SENSORS["rgb"], "rate_hz": 400}}
+    model = simulation.make_model(
+        ns.load_config({**settings, "sensors": sensors, "instants_per_launch": instants})
+    )
+    states = [simulation.make_state(model, lane_count=1, borrow_pictures=borrow) for borrow in (False, True)]
+    for number in range(4):
+        command = (1.0 + 0.1 * number) * hover(model)
+        own, borrowed = (simulation.step(model, state, command) for state in states)
+        assert content(borrowed) == content(own)
+        assert sum(packet.sensor == "rgb" for packet in own) == (3 if number == 0 else 2)
+
+
 class LateCopies:
     """Copies to the host are done when somebody waits for a milestone that was set after them."""
 

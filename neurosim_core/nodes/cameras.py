@@ -207,6 +207,7 @@ class Cameras:
             self._changed.notify_all()
         if self._thread is not None:
             self._thread.join(GIVE_UP_S)
+        self._core.leave()  # it may still be at a picture
 
     def _wait_for_work(self, timeout_s: float) -> bool:
         """Wait until the thread does nothing, with the lock held; return whether that is so."""
@@ -221,7 +222,7 @@ class Cameras:
         give_way()
         while (job := self._next()) is not None:
             behind = self._is_behind()
-            if behind or time.monotonic() < self._crowded_until_s:
+            if self._closed or behind or time.monotonic() < self._crowded_until_s:
                 self._core.take_back()
             else:
                 self._core.give(self._flier)

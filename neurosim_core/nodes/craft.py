@@ -232,5 +232,6 @@ class Craft:
         for name, channel in (channels | {"command": self.helm.channel}).items():
             link = config.links.get(name, NO_LINK)
             if link != channel.config:
+                self.state.ahead = None  # where its pictures go was planned for the link before
                 channel.configure(link)
                 self.outlet.announce_link(name)

@@ -98,6 +98,11 @@ class PictureLoan:
         """Return whether that is the room that was lent last, and not published yet."""
         return self._loan is not None and self._room is not None and self._room() is data
 
+    def wait_for(self, data: NDArray[Any]) -> None:
+        """Let the device write the picture, if that is in the room that was lent last."""
+        if self.settle is not None and self.holds(data):
+            self.settle()
+
     def publish(self, message: Any) -> bool:
         """Publish the picture that was lent room for.
 

@@ -275,6 +275,7 @@ class Outlet:
                 continue
             stream = self.streams[packet.sensor]
             if isinstance(packet, Image) and (self.record is not None or not stream.channel.delivers_at_once):
+                stream.loan.wait_for(packet.data)
                 packet = dataclasses.replace(packet, data=np.array(packet.data))  # the view is short-lived
             self._send(stream, packet)
             if self.record is not None:
