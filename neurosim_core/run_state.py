@@ -182,8 +182,8 @@ def make_state(
         lane_count: How many batches `run_model` keeps under way. By default 3 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
         flight_lane_count: How many batches of `fly_period` may wait for `see`; by default `lane_count`.
-        borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`; those that a step
-            itself would overwrite are copied.
+        borrow_pictures: Do not copy pictures: with one lane, each is valid until the next `step` or `see`;
+            those that a step would overwrite itself are copied.
         late_pictures: Ask for room before pictures are rendered, and do not wait for those that a device
             copies there: they are there after `settle`.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; called by the
