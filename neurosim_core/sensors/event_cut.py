@@ -20,7 +20,7 @@ _NOTHING = wp.constant(wp.int64((1 << 63) - 1))
 
 @wp.func
 def mark(key: wp.int64, stamps: wp.array[wp.int64], stamp_count: wp.int32, time_shift: wp.int32) -> wp.int64:
-    """Return a key with `late` set if it comes after a stamp within its microsecond; see `mark_late`."""
+    """Return a key with `late` set if it comes after a stamp within its microsecond; see `prepare`."""
     time_us = key >> wp.int64(time_shift)
     low = wp.int32(0)
     high = stamp_count
@@ -39,24 +39,31 @@ def mark(key: wp.int64, stamps: wp.array[wp.int64], stamp_count: wp.int32, time_
 
 
 @wp.kernel
-def mark_late(
+def prepare(
     # In:
-    stamps: wp.array[wp.int64],
-    stamp_count: wp.int32,
+    told: wp.array[wp.int64],
+    bounds: wp.array[wp.int64],
+    window_count: wp.int32,
     time_shift: wp.int32,
     # In/out:
     keys: wp.array[wp.int64],
 ) -> None:
-    """Set `late` on the keys that come after a stamp within its microsecond.
+    """Set `late` on keys that come after the end of a window within its microsecond; threads are the room.
+
+    Keys beyond the count get to sort behind all others.
 
     Args:
-        stamps: Ends of windows from the keys' time origin [ns], at least 1 us apart, increasing.
-        stamp_count: How many there are.
+        told: How many keys there are, and what else `decode_windows` is told.
+        bounds: Ends of windows from the keys' time origin [ns], at least 1 us apart, increasing.
+        window_count: How many there are.
         time_shift: Bits of a key below its microseconds.
         keys: Keys, in any order; overwritten.
     """
     event = wp.tid()
-    keys[event] = mark(keys[event], stamps, stamp_count, time_shift)
+    if wp.int64(event) < told[COUNT]:
+        keys[event] = mark(keys[event], bounds, window_count, time_shift)
+    else:
+        keys[event] = _NOTHING
 
 
 @wp.func
@@ -117,7 +124,7 @@ def find_ends(
     """Find where each window ends in the sorted keys.
 
     Args:
-        keys: Keys after `mark_late`, sorted.
+        keys: Keys after `prepare`, sorted.
         key_count: Number of keys.
         stamps: Ends of windows from the keys' time origin [ns], shape [window].
         time_shift: Bits of a key below its microseconds.
@@ -183,32 +190,6 @@ def decode(
     x_out[event] = found.x
     y_out[event] = found.y
     polarity_out[event] = found.polarity
-
-
-@wp.kernel
-def prepare(
-    # In:
-    told: wp.array[wp.int64],
-    bounds: wp.array[wp.int64],
-    window_count: wp.int32,
-    time_shift: wp.int32,
-    # In/out:
-    keys: wp.array[wp.int64],
-) -> None:
-    """Do what `mark_late` does, and let keys beyond the count sort behind all others; threads are the room.
-
-    Args:
-        told: How many keys there are, and what else `decode_windows` is told.
-        bounds: Ends of windows from the keys' time origin [ns].
-        window_count: How many there are.
-        time_shift: Bits of a key below its microseconds.
-        keys: Keys, in any order; overwritten.
-    """
-    event = wp.tid()
-    if wp.int64(event) < told[COUNT]:
-        keys[event] = mark(keys[event], bounds, window_count, time_shift)
-    else:
-        keys[event] = _NOTHING
 
 
 @wp.kernel

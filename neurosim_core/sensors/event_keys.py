@@ -139,12 +139,15 @@ class EventKeys:
             return [], [0] * len(ends_ns)
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
+        copied = count + count % 2  # columns in a block begin where they may
         told = self._told.rows
+        told[:_TOLD] = count, copied, self.origin_us
         told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
         if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
-            return self._cut_to_host(self._blocks, len(ends_ns), end_bit)
+            return self._cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
         self._told.upload()
-        self._launch(event_cut.mark_late, count, [self._bounds, len(ends_ns), self._time_shift], [self.keys])
+        prepared = [self._told.array, self._bounds, len(ends_ns), self._time_shift]
+        self._launch(event_cut.prepare, count, prepared, [self.keys])
         self._sort(count, end_bit)
         self._launch(
             event_cut.find_ends,
@@ -163,15 +166,13 @@ class EventKeys:
         return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
     def _cut_to_host(
-        self, blocks: LentBlocks, window_count: int, end_bit: int
+        self, blocks: LentBlocks, copied: int, window_count: int, end_bit: int
     ) -> tuple[list[Any], list[int]]:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
         count, shifts = self.count, [self._row_shift, self._time_shift]
         room = count
         if count <= _REPLAYED_COUNT_MAX:
             room = min(max(_ROOM_MIN, 1 << (count - 1).bit_length()), self._order.shape[0] // 2)
-        copied = _room_of(count)
-        self._told.rows[:_TOLD] = count, copied, self.origin_us
 
         def launch() -> None:
             self._told.upload()
@@ -271,8 +272,3 @@ class EventKeys:
 
     def _empty(self, count: int, dtype: Any) -> Any:
         return wp.empty(count, dtype=dtype, device=self._device)
-
-
-def _room_of(count: int) -> int:
-    """Return for how many events the columns have room: an even number, so that each begins where it may."""
-    return count + count % 2

@@ -17,7 +17,7 @@ Crossing times are rounded to 2^-10 ns, then written as a key that sorts in the 
     time [us] | late | row | col | polarity | nanoseconds after the microsecond, rounded up (0 .. 1000)
 
 Rounded down to the microsecond, a crossing gets its time; rounded up to the nanosecond, it is compared
-exactly with the stamps of windows. `event_cut.mark_late` sets `late` on events that share the microsecond of
+exactly with the stamps of windows. `event_cut.prepare` sets `late` on events that share the microsecond of
 a window's end but come after it, so that windows are contiguous in the sorted keys.
 """
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.sensors.event_levels import COLUMN_SHIFT
+from neurosim_core.sensors.event_cut import take_apart
 from neurosim_core.sensors.event_noise import Memory, PixelModel, begin_pixel, make_pixel_scan
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
@@ -474,13 +474,10 @@ def decode(
     """Take the keys of all worlds apart, world after world; threads are [world, lane]."""
     world, lane = wp.tid()
     count = wp.int32(stack.counters[world, 0])
-    one = wp.int64(1)
-    row_mask = (one << wp.int64(time_shift - 1 - row_shift)) - one
-    column_mask = (one << (wp.int64(row_shift) - COLUMN_SHIFT)) - one
     for index in range(lane, count, lane_count):
-        key = stack.keys[world, index]
         event = offsets[world] + index
-        t_out[event] = stack.origin_us[world] + (key >> wp.int64(time_shift))
-        x_out[event] = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
-        y_out[event] = wp.uint16((key >> wp.int64(row_shift)) & row_mask)
-        polarity_out[event] = wp.uint8((key >> wp.int64(10)) & one)
+        found = take_apart(stack.keys[world, index], row_shift, time_shift)
+        t_out[event] = stack.origin_us[world] + found.time_us
+        x_out[event] = found.x
+        y_out[event] = found.y
+        polarity_out[event] = found.polarity
