@@ -143,10 +143,11 @@ class Streaming:
         while not leave():
             self.offer_seen()
             due_ns = min([end_ns, *(d for c in self._crafts if (d := c.outlet.next_due_ns) is not None)])
+            is_early = self._pacer.lateness_ns(due_ns) < 0
             late_ns = self._pacer.wait_until(due_ns, interrupted)
             if late_ns < 0:
                 continue
-            if late_ns > CROWDED_NS:
+            if late_ns > CROWDED_NS and (is_early or due_ns == end_ns):  # else a picture that took its time
                 self._cameras.leave_core()
             if due_ns == end_ns:
                 self._meter.late_times.add(late_ns)

@@ -201,6 +201,52 @@ def test_a_core_is_left_by_who_was_later_than_a_scheduler_is(late_ms: int, leave
     assert bool(left) is leaves
 
 
+class Queue:
+    """What a vehicle has to publish: stamps, in order, each in front of the next [ns]."""
+
+    def __init__(self, *stamps_ns: int) -> None:
+        self.outlet = self
+        self.model = models_of(make_config())["drone"]
+        self.lateness_ns: Any = None
+        self._stamps_ns = list(stamps_ns)
+
+    @property
+    def next_due_ns(self) -> int | None:
+        return self._stamps_ns[0] if self._stamps_ns else None
+
+    def publish_due(self, stamp_ns: int) -> None:
+        while self._stamps_ns and self._stamps_ns[0] <= stamp_ns:
+            self._stamps_ns.pop(0)
+
+
+@pytest.mark.parametrize(
+    ("due_ms", "oversleeps_ms", "leaves"),
+    [
+        (2, 0, False),  # a picture that took 18 ms: the core was not at fault
+        (22, 0, False),
+        (22, 4, False),
+        (22, 6, True),  # it was not woken when it should have been
+    ],
+)
+def test_a_core_is_not_left_for_pictures_that_take_long(due_ms: int, oversleeps_ms: int, leaves: bool):
+    now_ns = 0
+
+    def sleep(seconds: float) -> None:
+        nonlocal now_ns
+        now_ns += round(seconds * 1e9) + (oversleeps_ms * MS if now_ns < due_ms * MS else 0)
+
+    pacer = Pacer(1.0, clock_ns=lambda: now_ns, sleep=sleep)
+    bell = threading.Event()
+    eyes = Cameras(inline=True, on_packets=bell.set)
+    left: list[bool] = []
+    eyes.leave_core = lambda: left.append(True)
+    craft: Any = Queue(due_ms * MS)
+    streaming = Streaming([craft], eyes, pacer, Meter(), bell=bell)
+    now_ns = 20 * MS
+    assert streaming.publish_until(40 * MS, 40 * MS, LiveConfig(), lambda: False, called=lambda: False)
+    assert bool(left) is leaves
+
+
 def test_a_request_does_not_keep_the_loop_awake():
     """It is answered at the end of a control period that is near; until then the loop sleeps as before."""
     bell = threading.Event()
