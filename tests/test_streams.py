@@ -9,7 +9,16 @@ import pytest
 import warp as wp
 
 from neurosim_core import streams
-from neurosim_core.streams import Graphs, HostCopy, LentBlocks, Milestone, make_stream, on, size_class
+from neurosim_core.streams import (
+    Graphs,
+    HostCopy,
+    LentBlocks,
+    Milestone,
+    Relaunch,
+    make_stream,
+    on,
+    size_class,
+)
 
 
 @wp.kernel
@@ -39,6 +48,17 @@ def test_replays_do_what_the_launches_do(device, monkeypatch, capacity):
         assert calls == steps
     elif capacity > 2:
         assert calls == [1.0, 2.0, 1.0, 4.0, 2.0]  # once to launch and once to record
+
+
+def test_a_relaunch_takes_other_arguments_each_time(device):
+    """Numbers, arrays and threads: what was launched before keeps what it was launched with."""
+    values = [wp.zeros(count, dtype=float, device=device) for count in (3, 5)]
+    add = Relaunch(_add, device)
+    with on(make_stream(device)):
+        for dim, step, index in [(3, 1.0, 0), (2, 4.0, 0), (5, 2.0, 1), (1, 8.0, 1), (3, 16.0, 0)]:
+            add.launch(dim, [step, values[index]])
+        np.testing.assert_array_equal(values[0].numpy(), [21.0, 21.0, 17.0])
+        np.testing.assert_array_equal(values[1].numpy(), [10.0, 2.0, 2.0, 2.0, 2.0])
 
 
 def test_a_copy_holds_the_rows_that_were_fetched(device):

@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.bench import frame_loops
 from neurosim_core.bench import throughput_stages as stages
 from neurosim_core.bench.machine import processor
 from neurosim_core.bench.step import flight_settings, fly_blind, time_steps
@@ -214,7 +215,7 @@ class _Study:
         roofline, scan = self._roofline(*views[plan.launch_size], rows)
         self._tell("one render and one scan per call")
         loop, loop_failure = self._with(
-            views[plan.launch_size], lambda seen: stages.compare_loops(seen, seconds=plan.alone_s)
+            views[plan.launch_size], lambda seen: frame_loops.compare_loops(seen, seconds=plan.alone_s)
         )
         self._tell("events to the host")
         events_per_s, events_failure = self._with(

@@ -22,7 +22,6 @@ from neurosim_core.bench.naive_events import NaiveEventCamera
 from neurosim_core.bench.step import fly_blind
 from neurosim_core.bench.throughput_result import (
     BARE_CAST,
-    LOOP,
     PHYSICS_ALONE,
     READ_ALONE,
     RENDER_ALONE,
@@ -38,7 +37,7 @@ from neurosim_core.schedule import batch_end_ns
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.simulation import Model, advance, make_state, run_model, start, want
 
-_FRAME_US = 1000
+FRAME_US = 1000
 _SORT_PASSES = 5
 """Of a radix sort with 8 bits a pass: the microseconds of a window and the pixel have about 40."""
 _COLUMN_BYTES = 13
@@ -287,7 +286,7 @@ class _Show:
         self._views = views
         self._camera = camera
         camera.reset(views.frames[0], 0)
-        self._stamps = np.arange(1, views.count + 1, dtype=np.int64) * _FRAME_US * NS_PER_US
+        self._stamps = np.arange(1, views.count + 1, dtype=np.int64) * FRAME_US * NS_PER_US
         self._shown = 0
 
     def feed(self) -> None:
@@ -296,7 +295,8 @@ class _Show:
         self._shown += 1
 
 
-def _camera(views: Views, *, scan_count_max: int, on_host: bool = True) -> EventCamera:
+def make_camera(views: Views, *, scan_count_max: int, on_host: bool = True) -> EventCamera:
+    """Return an event camera for views, as configured by default."""
     return EventCamera(
         EventCameraConfig(),
         width=views.lens.width,
@@ -314,7 +314,7 @@ def scan_alone(views: Views, *, seconds: float) -> tuple[Part, float]:
     A burst of scans is launched and waited for; their events are then thrown away, off the clock.
     """
     burst = 16
-    camera = _camera(views, scan_count_max=burst)
+    camera = make_camera(views, scan_count_max=burst)
     times_s: list[float] = []
     show = _Show(views, camera)
     show.feed()
@@ -337,7 +337,7 @@ def scan_alone(views: Views, *, seconds: float) -> tuple[Part, float]:
 
 def read_alone(views: Views, *, seconds: float) -> Part:
     """Return what sorting, decoding and copying the events of a step take, waiting included."""
-    camera = _camera(views, scan_count_max=1)
+    camera = make_camera(views, scan_count_max=1)
     show = _Show(views, camera)
     times_s: list[float] = []
     counts: list[float] = []
@@ -358,13 +358,13 @@ def read_alone(views: Views, *, seconds: float) -> Part:
 
 def compare_scans(views: Views, ours_per_s: float, ours_events: float, *, seconds: float) -> Comparison:
     """Return frames a second of our scan and of the naive camera, which has the host read each count."""
-    naive = _naive(views)
+    naive = make_naive(views)
     frames = [*(views.frames[k] for k in range(views.count)), *(views.back[k] for k in range(views.count))]
     shown, counts = 0, 0
 
     def show() -> None:
         nonlocal shown, counts
-        counts += naive.feed(frames[shown % len(frames)], shown * _FRAME_US)
+        counts += naive.feed(frames[shown % len(frames)], shown * FRAME_US)
         shown += 1
 
     frame_s = seconds_per_call(show, views.device, seconds=seconds)
@@ -377,55 +377,8 @@ def compare_scans(views: Views, ours_per_s: float, ours_events: float, *, second
     )
 
 
-def compare_loops(views: Views, *, seconds: float) -> Comparison:
-    """Return frames a second where every call renders one frame, scans it and has the host read a count.
-
-    The naive camera has the count of its frame read at once. Ours lets the next frame render meanwhile: the
-    count that a call reads is that of the frame before. Each 16 frames ours are sorted and handed out as
-    well; the naive events stay where they are, unsorted.
-    """
-    renderers = [views.renderer("log_radiance", instants=1) for _ in range(2)]
-    camera, naive = _camera(views, scan_count_max=2), _naive(views)
-    camera.reset(views.frames[0], 0)
-    order = [*range(views.count), *reversed(range(views.count))]
-    shown, ours, theirs = 0, 0, 0
-
-    def render(renderer: WarpRenderer) -> int:
-        nonlocal shown
-        views.render(renderer, first=order[shown % len(order)], count=1)
-        shown += 1
-        return shown * _FRAME_US
-
-    def call_ours() -> None:
-        nonlocal ours
-        if shown > 0 and shown % 16 == 0:
-            ours += len(camera.collect().numpy().t)
-        renderer = renderers[shown % 2]
-        stamp_us = render(renderer)
-        camera.feed_device(renderer.log_radiance, [stamp_us * NS_PER_US])
-        if shown % 16 != 1:
-            camera.collect_windows([], scan_count=1)
-
-    def call_naive() -> None:
-        nonlocal theirs
-        stamp_us = render(renderers[0])
-        assert renderers[0].log_radiance is not None
-        theirs += naive.feed(renderers[0].log_radiance[0], stamp_us)
-
-    ours_s = seconds_per_call(call_ours, views.device, seconds=seconds)
-    ours += len(camera.collect().numpy().t)
-    ours_shown, shown = shown, 0
-    naive_s = seconds_per_call(call_naive, views.device, seconds=seconds)
-    return Comparison(
-        name=LOOP,
-        ours_per_s=1.0 / ours_s,
-        naive_per_s=1.0 / naive_s,
-        ours_events=ours / ours_shown,
-        naive_events=theirs / shown,
-    )
-
-
-def _naive(views: Views) -> NaiveEventCamera:
+def make_naive(views: Views) -> NaiveEventCamera:
+    """Return a naive camera with the same thresholds, that has seen the first frame."""
     config = EventCameraConfig()
     naive = NaiveEventCamera(
         width=views.lens.width,
@@ -443,7 +396,7 @@ def events_to_host_per_s(views: Views, *, seconds: float) -> float:
 
     Two stacks are under way: while the events of one are read, the next is scanned.
     """
-    camera = _camera(views, scan_count_max=2)
+    camera = make_camera(views, scan_count_max=2)
     base = views.frames.numpy()[0]
     count_of_frames = min(views.count, _LOUD_FRAMES)
     steps = np.arange(1, count_of_frames + 1, dtype=np.float32)[:, None, None] * np.float32(_LOUD)
@@ -451,7 +404,7 @@ def events_to_host_per_s(views: Views, *, seconds: float) -> float:
     down = up[-1] - steps
     stacks = [wp.array(stack, dtype=float, device=views.device) for stack in (up, down)]
     camera.reset(views.frames[0], 0)
-    stamps: NDArray[np.int64] = np.arange(1, count_of_frames + 1, dtype=np.int64) * _FRAME_US * NS_PER_US
+    stamps: NDArray[np.int64] = np.arange(1, count_of_frames + 1, dtype=np.int64) * FRAME_US * NS_PER_US
     fed = 0
 
     def feed() -> None:

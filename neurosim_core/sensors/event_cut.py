@@ -77,15 +77,27 @@ def carry_over(
     # In:
     keys: wp.array[wp.int64],
     first: wp.int32,
+    count: wp.int32,
     origin_step_us: wp.int64,
     time_shift: wp.int32,
     # Out:
     keys_out: wp.array[wp.int64],
     first_out: wp.int32,
 ) -> None:
-    """Copy keys, from and to a position, with a time origin that is later, and clear `late`."""
+    """Copy keys, from and to a position, with a time origin that is later, and clear `late`.
+
+    Args:
+        keys: Where they are.
+        first: The first of them.
+        count: How many; at most the threads.
+        origin_step_us: How much later the origin is [us].
+        time_shift: Bits of a key below its microseconds.
+        keys_out: Where they go.
+        first_out: Where the first of them goes.
+    """
     event = wp.tid()
-    keys_out[first_out + event] = move_origin(keys[first + event], origin_step_us, time_shift)
+    if event < count:
+        keys_out[first_out + event] = move_origin(keys[first + event], origin_step_us, time_shift)
 
 
 @wp.func

@@ -14,7 +14,7 @@ from neurosim_core.clock import NS_PER_US
 from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.streams import Graphs, HostCopy, HostInput, LentBlocks, Milestone, size_class
+from neurosim_core.streams import Graphs, HostCopy, HostInput, LentBlocks, Milestone, Relaunch, size_class
 
 ROOM_PER_PIXEL = 16
 """Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
@@ -84,6 +84,7 @@ class EventKeys:
         """What is copied to them: one block of memory, as each type that is in it."""
         self._frame_count = 0
         self._read = Milestone(device)
+        self._carry_over = Relaunch(event_cut.carry_over, device)
         self._make_window_buffers(16)
 
     def clear(self, origin_us: int) -> None:
@@ -104,7 +105,7 @@ class EventKeys:
         start = self.count
         self.count += count
         self._reserve(kept=start)
-        if count > 0 and origin_us == self.origin_us:
+        if count > 0 and origin_us == self.origin_us and self._device.is_cpu:
             wp.copy(self.keys, keys, src_offset=first, dest_offset=start, count=count)
         elif count > 0:
             self._move(keys, first, count, self.keys, start, self.origin_us - origin_us)
@@ -139,12 +140,12 @@ class EventKeys:
             return [], [0] * len(ends_ns)
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
-        copied = count + count % 2  # columns in a block begin where they may
+        room = self._room_of_cut()
         told = self._told.rows
-        told[:_TOLD] = count, copied, self.origin_us
+        told[:_TOLD] = count, room + room % 2, self.origin_us  # columns in a block begin where they may
         told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
         if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
-            return self._cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
+            return self._cut_to_host(self._blocks, room, len(ends_ns), end_bit)
         self._told.upload()
         prepared = [self._told.array, self._bounds, len(ends_ns), self._time_shift]
         self._launch(event_cut.prepare, count, prepared, [self.keys])
@@ -165,14 +166,20 @@ class EventKeys:
             columns = [column.numpy() for column in columns]
         return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
+    def _room_of_cut(self) -> int:
+        """Return for how many keys a cut is launched: few numbers serve for all graphs that are replayed."""
+        if self._blocks is None or self.count > _REPLAYED_COUNT_MAX:
+            return self.count
+        room: int = self._order.shape[0] // 2
+        return min(max(_ROOM_MIN, 1 << (self.count - 1).bit_length()), room)
+
     def _cut_to_host(
-        self, blocks: LentBlocks, copied: int, window_count: int, end_bit: int
+        self, blocks: LentBlocks, room: int, window_count: int, end_bit: int
     ) -> tuple[list[Any], list[int]]:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
-        count, shifts = self.count, [self._row_shift, self._time_shift]
-        room = count
-        if count <= _REPLAYED_COUNT_MAX:
-            room = min(max(_ROOM_MIN, 1 << (count - 1).bit_length()), self._order.shape[0] // 2)
+        shifts = [self._row_shift, self._time_shift]
+        copied = room + room % 2
+        block = blocks.take(_EVENT_BYTES * copied)
 
         def launch() -> None:
             self._told.upload()
@@ -182,13 +189,12 @@ class EventKeys:
             outputs = [*self._columns, self._found]
             self._launch(event_cut.decode_windows, room, [*told, self.keys, *shifts], outputs)
             self._found_on_host.fetch(0, window_count)
+            wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
 
-        if count <= _REPLAYED_COUNT_MAX:
-            self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
+        if self.count <= _REPLAYED_COUNT_MAX:
+            self._graphs.run((room, window_count, end_bit, self.keys.ptr, block.array.ptr), launch)
         else:
             launch()
-        block = blocks.take(_EVENT_BYTES * copied)
-        wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()
         self._read.wait()
         rows = blocks.lend(block, _EVENT_BYTES * copied)
@@ -216,12 +222,9 @@ class EventKeys:
     def _move(
         self, keys: Any, first: int, count: int, keys_out: Any, first_out: int, origin_step_us: int
     ) -> None:
-        self._launch(
-            event_cut.carry_over,
-            count,
-            [keys, first, origin_step_us, self._time_shift],
-            [keys_out, first_out],
-        )
+        dim = count if self._device.is_cpu else max(_ROOM_MIN, size_class(count))
+        arguments = [keys, first, count, origin_step_us, self._time_shift, keys_out, first_out]
+        self._carry_over.launch(dim, arguments)
 
     def _sort(self, count: int, end_bit: int) -> None:
         if self._device.is_cpu:

@@ -398,22 +398,27 @@ class EventCamera:
         if scan_count is None:
             scan_count = len(self._under_way)
         if scan_count == 1 and not ends and self._is_alone():
-            self._taken.hold()
-            self._take_over()
-            return []
+            return self._read_windows(ends, scan_count)
         with on(self._reader):
-            self._taken.hold()
-            for _ in range(scan_count):
-                self._take_over()
-            now_ns = self._require_reset()
-            if not _are_ends(ends, self._window_start_ns, now_ns):
-                raise ValueError(
-                    f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
-                    f" and not pass {now_ns}, got {ends}"
-                )
-            packets = self._cut(ends)
-            self._taken.set()
-            return packets
+            return self._read_windows(ends, scan_count)
+
+    def _read_windows(self, ends: list[int], scan_count: int) -> list[Events]:
+        """Take scans over on the present stream, and return the windows that end so."""
+        self._taken.hold()
+        for _ in range(scan_count):
+            self._take_over()
+        self._taken.set()
+        now_ns = self._require_reset()
+        if not ends:
+            return []
+        if not _are_ends(ends, self._window_start_ns, now_ns):
+            raise ValueError(
+                f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
+                f" and not pass {now_ns}, got {ends}"
+            )
+        packets = self._cut(ends)
+        self._taken.set()
+        return packets
 
     def _is_alone(self) -> bool:
         """Return whether one scan is under way, and taking it over on this stream holds up no other."""
@@ -593,7 +598,6 @@ class EventCamera:
 
         for count, chunk in zip(counts, scan.chunks, strict=True):
             self._keys.append(chunk.keys, 0, count, scan.origin_us)
-        self._taken.set()
         self._finish(self._under_way.popleft())
 
     def _expect_keys(self, count: int) -> None:
@@ -651,8 +655,6 @@ class EventCamera:
 
     def _cut(self, ends: list[int]) -> list[Events]:
         """Sort the keys, hand out those of the windows that end so, and carry the others over."""
-        if not ends:
-            return []
         if self._readout is not None:
             self._keys.read_out(self._readout, self._require_reset())
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
@@ -704,7 +706,7 @@ def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
         )
     stamps = stamps.astype(np.int64)
     falls = stamps[1:] <= stamps[:-1]
-    if falls.any():
+    if falls.size and falls.any():
         index = int(np.argmax(falls))
         raise ValueError(
             f"stamps_ns must be strictly increasing, got {stamps[index + 1]} after {stamps[index]}"

@@ -123,7 +123,8 @@ def test_what_fails_is_said_in_its_row_and_ends_nothing(made, monkeypatch, tmp_p
         raise RuntimeError("no steps today")
 
     monkeypatch.setattr(throughput, "time_steps", broken)
-    for name in ("measure_split", "scan_alone", "compare_loops", "events_to_host_per_s", "Views"):
+    monkeypatch.setattr(throughput.frame_loops, "compare_loops", broken)
+    for name in ("measure_split", "scan_alone", "events_to_host_per_s", "Views"):
         monkeypatch.setattr(throughput.stages, name, broken)
     result = measure_throughput(quick=True, device="cpu")
     assert {row.failure for row in result.rows} == {"RuntimeError: no steps today"}
@@ -145,10 +146,10 @@ def naive_events(frames):
     camera = NaiveEventCamera(
         width=width, height=height, threshold_on=THRESHOLD, threshold_off=THRESHOLD, device="cpu"
     )
-    camera.reset(wp.array(frames[0], dtype=float))
+    camera.reset(wp.array(frames[0], dtype=float, device="cpu"))
     found = set()
     for number, frame in enumerate(frames[1:], 1):
-        count = camera.feed(wp.array(frame, dtype=float), number)
+        count = camera.feed(wp.array(frame, dtype=float, device="cpu"), number)
         x, y, t, polarity = camera.events(count)
         assert len(x) == count
         assert (t == number).all()

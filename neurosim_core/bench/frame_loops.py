@@ -1,0 +1,103 @@
+# mypy: disable-error-code="index,arg-type,no-untyped-call,var-annotated,union-attr,type-arg"
+"""One frame a call: loops that render, scan and have the host read a count, ours and a naive one."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from neurosim_core.bench.throughput_result import LOOP, Comparison
+from neurosim_core.bench.throughput_stages import FRAME_US, Views, make_camera, make_naive, seconds_per_call
+from neurosim_core.clock import NS_PER_US
+from neurosim_core.streams import Graphs, HostInput, Milestone, make_stream, on
+
+
+class _Eyes:
+    """Renders one view a call on a device, each in a stream and with buffers of its own, as a run does.
+
+    Args:
+        views: What to see.
+        count: How many may be under way.
+    """
+
+    def __init__(self, views: Views, count: int) -> None:
+        self._poses = views.p_WC.numpy(), views.q_WC.numpy()
+        self._graphs = Graphs(views.device)
+        self._renderers = [views.renderer("log_radiance", instants=1) for _ in range(count)]
+        self._inputs = [
+            [HostInput(wp.zeros(1, dtype=kind, device=views.device)) for kind in (wp.vec3, wp.quat)]
+            for _ in range(count)
+        ]
+        self._streams = [make_stream(views.device) for _ in range(count)]
+        self._seen = [Milestone(views.device) for _ in range(count)]
+        self._slot = wp.zeros(1, dtype=int, device=views.device)
+
+    def see(self, number: int, view: int) -> tuple[wp.array | None, Milestone]:
+        """Launch the render of a view; return where its log radiance will be, and when."""
+        eye = number % len(self._renderers)
+        renderer, inputs = self._renderers[eye], self._inputs[eye]
+        for pose, poses in zip(inputs, self._poses, strict=True):
+            pose.rows[0] = poses[view]
+
+        def render() -> None:
+            for pose in inputs:
+                pose.upload()
+            position, orientation = (pose.array for pose in inputs)
+            renderer.render(position, orientation, self._slot, instant_count=1)
+
+        with on(self._streams[eye]):
+            self._graphs.run(eye, render)
+            self._seen[eye].set()
+        return renderer.log_radiance, self._seen[eye]
+
+
+def compare_loops(views: Views, *, seconds: float) -> Comparison:
+    """Return frames a second where every call renders one frame, scans it and has the host read a count.
+
+    The naive camera has the count of its frame read at once. Ours lets the next frame render meanwhile: the
+    count that a call reads is that of the frame before. Each 16 frames ours are sorted and handed out as
+    well; the naive events stay where they are, unsorted.
+    """
+    camera, naive = make_camera(views, scan_count_max=2), make_naive(views)
+    camera.reset(views.frames[0], 0)
+    order = [*range(views.count), *reversed(range(views.count))]
+    eyes = _Eyes(views, 2)  # while one frame is scanned, the next is rendered
+    scans = make_stream(views.device, urgent=True)
+    renderer = views.renderer("log_radiance", instants=1)
+    shown, ours, theirs = 0, 0, 0
+
+    def stamp_ns(frame: int) -> int:
+        return frame * FRAME_US * NS_PER_US
+
+    def read(frame: int) -> int:
+        """Read how many events a frame has; return how many were handed out."""
+        ends = [stamp_ns(frame)] if frame % 16 == 0 else []
+        return sum(len(packet.numpy().t) for packet in camera.collect_windows(ends, scan_count=1))
+
+    def call_ours() -> None:
+        nonlocal shown, ours
+        frames, seen = eyes.see(shown, order[shown % len(order)])
+        shown += 1
+        with on(scans):
+            seen.hold()
+            camera.feed_device(frames, [stamp_ns(shown)])
+        if shown > 1:
+            ours += read(shown - 1)
+
+    def call_naive() -> None:
+        nonlocal shown, theirs
+        views.render(renderer, first=order[shown % len(order)], count=1)
+        shown += 1
+        assert renderer.log_radiance is not None
+        theirs += naive.feed(renderer.log_radiance[0], shown * FRAME_US)
+
+    ours_s = seconds_per_call(call_ours, views.device, seconds=seconds)
+    ours += len(camera.collect().numpy().t)
+    ours_shown, shown = shown, 0
+    naive_s = seconds_per_call(call_naive, views.device, seconds=seconds)
+    return Comparison(
+        name=LOOP,
+        ours_per_s=1.0 / ours_s,
+        naive_per_s=1.0 / naive_s,
+        ours_events=ours / ours_shown,
+        naive_events=theirs / shown,
+    )
