@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -22,7 +22,15 @@ class PinError(RuntimeError):
 
 
 class PinnedMapping:
-    """A mapping that is pinned until `close`, and is kept mapped until then."""
+    """A mapping that is pinned until `close`, and is kept mapped until then.
+
+    Attributes:
+        made_count: How many there have been in this process. An address may be that of an earlier mapping: a
+            graph that copies to it may only be replayed if no mapping was made since it was recorded.
+        memory: The mapping.
+    """
+
+    made_count: ClassVar[int] = 0
 
     def __init__(self, memory: Any, device: Any) -> None:
         """Pin it.
@@ -35,7 +43,6 @@ class PinnedMapping:
             PinError: That is not possible.
         """
         self.memory = memory
-        """The mapping."""
         self._device = wp.get_device(device)
         self._bytes: Any = np.frombuffer(memory, np.uint8)
         with wp.ScopedDevice(self._device):
@@ -43,6 +50,7 @@ class PinnedMapping:
         if code:
             self._bytes = self.memory = None
             raise PinError(f"CUDA error {code}")
+        PinnedMapping.made_count += 1
 
     @property
     def _address(self) -> ctypes.c_void_p:

@@ -13,7 +13,8 @@ import warp as wp
 
 from neurosim_core import pinned
 from neurosim_core.pinned import PinError, PinnedMapping
-from neurosim_core.streams import HostCopy, Milestone
+from neurosim_core.sensors.cast import launch_key
+from neurosim_core.streams import Graphs, HostCopy, Milestone
 
 
 class Driver:
@@ -48,7 +49,9 @@ def address_of(memory: mmap.mmap) -> int:
 def test_all_of_it_is_pinned_until_it_is_closed(memory, monkeypatch):
     driver = Driver()
     monkeypatch.setattr(pinned, "_driver", lambda: driver)
+    made = PinnedMapping.made_count
     mapping = PinnedMapping(memory, "cpu")
+    assert PinnedMapping.made_count == made + 1
     assert mapping.memory is memory
     assert driver.pinned == {address_of(memory): 5 * mmap.PAGESIZE}
     with pytest.raises(BufferError):  # it is kept mapped
@@ -74,6 +77,40 @@ def test_without_a_driver(monkeypatch):
     pinned._driver.cache_clear()
     with pytest.raises(PinError, match="cannot open"):
         pinned._driver()
+
+
+def test_launches_are_others_when_memory_was_pinned_anew(memory, monkeypatch):
+    """The same addresses may be those of a mapping that is gone: a graph of them is not replayed."""
+    monkeypatch.setattr(pinned, "_driver", Driver)
+    room = np.zeros((2, 3), dtype=np.uint8)
+    seen = SimpleNamespace(rooms={("rgb", 0): room}, pictures=((0, 0, "rgb"), (5, 1, "rgb")))
+    look: Any = SimpleNamespace(key="look", cast=SimpleNamespace(lends=True), instants=seen)
+    before = launch_key(look)
+    assert launch_key(look) == before
+    PinnedMapping(memory, "cpu")
+    assert launch_key(look) != before
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+def test_what_is_mapped_and_pinned_anew_gets_what_is_copied():
+    """Most often at the same address; graphs are told apart as those of pictures are."""
+    graphs = Graphs("cuda:0")
+    array = wp.zeros((1, 1 << 16), dtype=wp.uint8, device="cuda:0")
+    copy, there = HostCopy(array), Milestone("cuda:0")
+    for number in range(1, 13):
+        memory = mmap.mmap(-1, 1 << 16)
+        mapping = PinnedMapping(memory, "cuda:0")
+        view = np.frombuffer(memory, np.uint8)
+        for again in range(3):
+            array.fill_(10 * number + again)
+            key = PinnedMapping.made_count, view.ctypes.data
+            graphs.run(key, lambda view=view: copy.fetch_into(view, 0))
+            there.set()
+            there.wait()
+            assert (view == 10 * number + again).all()
+        mapping.close()
+        del view
+        memory.close()
 
 
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")

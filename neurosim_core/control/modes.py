@@ -441,7 +441,7 @@ def make_controller(
     config: Se3Config | None = None,
     *,
     count: int = 1,
-    device: Any = None,
+    device: Any = "cpu",
     paths: Path | Sequence[Path] | None = None,
 ) -> Controller:
     """Return a controller for `count` vehicles of one kind.
@@ -451,7 +451,7 @@ def make_controller(
         vehicle: The vehicle's parameters; the controller knows all of them but the wind.
         config: Gains and limits.
         count: Vehicles in the batch.
-        device: Warp device.
+        device: Warp device; that of the vehicles.
         paths: For mode `path`, and only there: one for all, or one for each vehicle.
 
     Raises:

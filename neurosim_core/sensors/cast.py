@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Image, ImageEncoding, Packet
+from neurosim_core.pinned import PinnedMapping
 from neurosim_core.render.renderer import Renderer, SceneOnDevice, make_renderer
 from neurosim_core.render.warp_renderer import SceneArrays
 from neurosim_core.scene.bodies import (
@@ -378,7 +379,8 @@ def launch_key(look: Look) -> Hashable | None:
         return look.key
     rooms = look.instants.rooms
     places = (rooms.get((name, stamp_ns)) for stamp_ns, _, name in look.instants.pictures)
-    return look.key, *(0 if room is None else room.__array_interface__["data"][0] for room in places)
+    addresses = (0 if room is None else room.__array_interface__["data"][0] for room in places)
+    return look.key, PinnedMapping.made_count, *addresses
 
 
 def close_eyes(cast: CastState, wanted: Collection[str]) -> None:

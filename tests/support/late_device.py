@@ -102,34 +102,6 @@ class LateDevice(str):
         return stream
 
 
-class _LateRecord:
-    """A recorded launch that is put off, with the arguments that it has when it is launched."""
-
-    def __init__(self, device: LateDevice, recorded: Any, launched: dict[str, Any]) -> None:
-        self._device, self._recorded, self._dim = device, recorded, launched["dim"]
-        self._values = {
-            index: value.__ctype__() if isinstance(value, wp.array) else value
-            for index, value in enumerate(launched["inputs"])
-        }
-
-    def set_dim(self, dim: int) -> None:
-        self._dim = dim
-
-    def set_param_at_index_from_ctype(self, index: int, value: Any) -> None:
-        self._values[index] = value
-
-    def launch(self) -> None:
-        dim, values = self._dim, dict(self._values)
-
-        def go() -> None:
-            self._recorded.set_dim(dim)
-            for index, value in values.items():
-                self._recorded.set_param_at_index_from_ctype(index, value)
-            self._recorded.launch()
-
-        self._device.add(go)
-
-
 class _LateWarp:
     """Warp, with what it launches put off."""
 
@@ -149,11 +121,8 @@ class _LateWarp:
     def copy(self, *args: Any, **kwargs: Any) -> None:
         self._device.add(lambda: wp.copy(*args, **kwargs))
 
-    def launch(self, *args: Any, record_cmd: bool = False, **kwargs: Any) -> Any:
-        if record_cmd:
-            return _LateRecord(self._device, wp.launch(*args, record_cmd=True, **kwargs), kwargs)
+    def launch(self, *args: Any, **kwargs: Any) -> None:
         self._device.add(lambda: wp.launch(*args, **kwargs))
-        return None
 
     def radix_sort_pairs(self, keys: Any, values: Any, count: int, **kwargs: Any) -> None:
         if min(keys.size, values.size) < 2 * count:  # which only a CUDA device minds
@@ -232,6 +201,9 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         device.flush()
         return numpy(array)
 
+    def relaunch(self: Any, dim: int, arguments: Any) -> None:
+        device.add(lambda: wp.launch(self._kernel, dim=dim, inputs=arguments, device=self._device))
+
     late = _LateWarp(device)
     for module in _MODULES:
         monkeypatch.setattr(module, "wp", late)
@@ -240,6 +212,7 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
             monkeypatch.setattr(module, "Graphs", lambda _: _LateGraphs(device), raising=False)
     monkeypatch.setattr(events, "on", device.on)
     monkeypatch.setattr(events, "make_stream", device.make_stream)
+    monkeypatch.setattr(streams.Relaunch, "launch", relaunch)
     monkeypatch.setattr(streams.HostInput, "__init__", host_input)
     monkeypatch.setattr(streams.HostCopy, "__init__", host_copy)
     monkeypatch.setattr(wp.array, "numpy", late_numpy)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+
 import numpy as np
 import pytest
 from multirotor_oracle import NO_AERO, angle, rotation_matrix, solve
@@ -52,13 +54,13 @@ def figure_eight(t: float) -> dict[str, np.ndarray]:
 
 def test_figure_eight_at_9_m_s(device):
     """Commands of RotorPy's SE(3) controller at 100 Hz, recorded in closed loop, then replayed by both."""
-    from rotorpy.controllers.quadrotor_control import SE3Control
-    from rotorpy.vehicles.hummingbird_params import quad_params
+    theirs = pytest.importorskip("rotorpy.controllers.quadrotor_control")
+    quad_params = importlib.import_module("rotorpy.vehicles.hummingbird_params").quad_params
 
     config = preset("hummingbird")
     vehicle = Multirotor(config, device=device)
     start = one(vehicle.state)
-    controller = SE3Control(quad_params)
+    controller = theirs.SE3Control(quad_params)
     commands, flown = [], []
     for k in range(500):
         s = one(vehicle.state)
