@@ -11,6 +11,7 @@ import contextlib
 import os
 import sys
 import threading
+import weakref
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,7 @@ _PROCESSOR = 36
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 _own = threading.local()
+_changing = threading.Lock()
 
 
 @cache
@@ -41,7 +43,6 @@ class OwnCore:
     def __init__(self) -> None:
         """Leave everything as it is."""
         all_cores()  # before anybody is kept to some of them
-        self._lock = threading.Lock()
         self._thread_id: int | None = None
         self._core: int | None = None
         self._before: set[int] = set()
@@ -64,12 +65,19 @@ class OwnCore:
         others = self._mine - {core}
         if not others:
             return
-        with self._lock:
+        with _changing:
+            if any(
+                other._core == core for other in _holders
+            ):  # another simulator of this process flies there
+                return
             try:
                 self._before = os.sched_getaffinity(thread_id)
+                if core not in self._before:  # somebody has said otherwise since it ran there
+                    return
                 os.sched_setaffinity(thread_id, {core})
             except OSError:  # it has ended, or the system says no
                 return
+            _holders.add(self)
             self._thread_id, self._core, self._threads = thread_id, core, _threads()
         _keep_to(others)
 
@@ -82,10 +90,11 @@ class OwnCore:
 
     def leave(self) -> None:
         """Let only the thread that has the core run where it could before. Any thread may say so."""
-        with self._lock:
+        with _changing:
             thread_id, self._thread_id = self._thread_id, None
             if thread_id is None:
                 return
+            _holders.discard(self)
             started = _threads() - self._threads
             if os.path.exists(
                 f"/proc/self/task/{thread_id}"
@@ -95,6 +104,10 @@ class OwnCore:
                 with contextlib.suppress(OSError):  # it has ended
                     if os.sched_getaffinity(number) == {self._core}:  # and nobody has said otherwise since
                         os.sched_setaffinity(number, self._before)
+
+
+_holders: weakref.WeakSet[OwnCore] = weakref.WeakSet()
+"""Those that some thread has a core by."""
 
 
 def following(work: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import pytest
-from processes import wait_for
+from processes import SOON_S, wait_for
 
 from neurosim_core import cores
 from neurosim_core.cores import OwnCore, all_cores, following
@@ -42,7 +42,7 @@ def sleeper() -> Iterator[int]:
 
     thread = threading.Thread(target=sleep)
     thread.start()
-    begun.wait()
+    assert begun.wait(SOON_S)
     try:
         yield number[0]
     finally:
@@ -144,11 +144,11 @@ def test_threads_that_it_starts_meanwhile_are_let_go_with_it():
         parent = threading.Thread(target=punctual)
         parent.start()
         try:
-            started.wait()
+            assert started.wait(SOON_S)
             started.clear()
             core.give(numbers[0])
             go.set()
-            started.wait()
+            assert started.wait(SOON_S)
             assert len(os.sched_getaffinity(numbers[1])) == 1
             core.take_back()
             assert [frozenset(os.sched_getaffinity(n)) for n in numbers] == [all_cores()] * 2
@@ -193,11 +193,14 @@ def test_nothing_happens_where_the_system_says_no(monkeypatch: pytest.MonkeyPatc
     in_thread(compute)
 
 
-def test_one_core_is_not_shared_out():
+def test_one_core_is_not_shared_out(monkeypatch: pytest.MonkeyPatch):
+    core = min(all_cores())
+    monkeypatch.setattr(cores, "_last_core", lambda _: core)
+
     def compute() -> None:
         with sleeper() as punctual:
             before = os.sched_getaffinity(punctual)
-            os.sched_setaffinity(0, {cores._last_core(punctual)})
+            os.sched_setaffinity(0, {core})
             OwnCore().give(punctual)
             assert os.sched_getaffinity(punctual) == before
 
@@ -225,3 +228,36 @@ def test_threads_of_a_pool_follow_whoever_has_them_work():
 
         in_thread(compute)
         assert ask() == all_cores()  # of a thread that never kept to any
+
+
+def test_two_simulators_do_not_have_the_same_core(monkeypatch: pytest.MonkeyPatch):
+    core = min(all_cores())
+    monkeypatch.setattr(cores, "_last_core", lambda _: core)
+
+    def compute() -> None:
+        one, two = OwnCore(), OwnCore()
+        with sleeper() as first, sleeper() as second:
+            one.give(first)
+            two.give(second)
+            assert os.sched_getaffinity(first) == {core}
+            assert os.sched_getaffinity(second) == all_cores()
+            one.take_back()
+            two.give(second)
+            assert os.sched_getaffinity(second) == {core}
+            two.take_back()
+
+    in_thread(compute)
+
+
+def test_a_core_that_a_thread_may_not_use_any_more_is_not_given(monkeypatch: pytest.MonkeyPatch):
+    """It ran there last, and was told since to run elsewhere."""
+    monkeypatch.setattr(cores, "_last_core", lambda _: min(all_cores()))
+
+    def compute() -> None:
+        with sleeper() as punctual:
+            os.sched_setaffinity(punctual, {max(all_cores())})
+            OwnCore().give(punctual)
+            assert os.sched_getaffinity(punctual) == {max(all_cores())}
+            assert own() == all_cores()
+
+    in_thread(compute)
