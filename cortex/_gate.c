@@ -259,14 +259,13 @@ static PyObject *gate_send_lent(Gate *gate, Ledger *ledger, PyObject *message, P
     const Py_ssize_t size = measure_in_place(gate->coder, message, memory, ledger_slot_bytes(ledger));
     if (size <= gate->limit) return NULL;
     Pack pack;
-    if (!write_body(gate->coder, message, &pack, memory, size, 1)) return NULL;
-    copy_deferred(&pack);
+    if (!write_body(gate->coder, message, &pack, memory, size, 0)) return NULL;
     return gate_commit(gate, ledger, slot, size, pack.stamp_ns, now_ns);
 }
 
 PyDoc_STRVAR(gate_send_slot_doc,
 "send_slot($self, message, ledger, slot, /)\n--\n\n"
-"Send a message whose large arrays lie where they belong in a slot that is being written, with the lock held.\n\n"
+"Send a message whose arrays lie where they belong in a slot that is being written, with the lock held.\n\n"
 "Returns:\n"
 "    As a call; None if it has to go the long way: then the arrays are as they were, and the slot is not given up.\n");
 

@@ -159,11 +159,9 @@ static Py_ssize_t find_dtype(const Array *known, PyObject *value, npy_intp *dime
     return -1;
 }
 
-/* Whether an array does not lie where the body goes, or just where it belongs. */
+/* Whether an array lies just where it belongs: others are copied, without the GIL, and checked on the long way. */
 static int is_placed(const Pack *pack, PyArrayObject *array, Py_ssize_t start) {
-    const char *data = PyArray_BYTES(array);
-    if (data == pack->place + start) return 1;
-    return data + PyArray_NBYTES(array) <= pack->place || data >= pack->place + pack->limit;
+    return PyArray_NBYTES(array) == 0 || PyArray_BYTES(array) == pack->place + start;
 }
 
 /* Copy the items of an array to where they belong, or leave that for later. */
@@ -283,7 +281,7 @@ Py_ssize_t measure_in_place(const Coder *coder, PyObject *message, const char *p
     Pack pack;
     pack.out = NULL;
     pack.end = block->size;
-    pack.limit = room;
+    pack.limit = room < BODY_LIMIT ? room : BODY_LIMIT - 1;
     pack.place = place;
     return block->has_tail && block->size <= room && pack_message(&pack, block, message, 0) ? pack.end : -1;
 }

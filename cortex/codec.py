@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from operator import attrgetter
 from typing import Any
 
@@ -160,9 +161,9 @@ class Codec:
         """
         return self._drafter.draft(buffer, dims, dtypes)
 
-    @property
+    @cached_property
     def drafts_by_tail(self) -> bool:
-        """Whether all views of a draft lie where `encode` would copy them, behind the block of the body."""
+        """Whether all arrays of a message lie behind its block, which `encode` clears before it copies them."""
         return not self._drafter.has_fixed_arrays
 
     def fill(self, draft: Draft, message: Any) -> None:

@@ -18,7 +18,7 @@ from cortex.layout import (
     array_dtype,
     measure_fields,
 )
-from cortex.schema import ArrayType, Schema
+from cortex.schema import ArrayType, FieldType, ListType, OptionalType, Schema
 from cortex.structure import new_message
 
 _PLACED_MAX = 64
@@ -139,8 +139,8 @@ class Drafter:
 
     @property
     def has_fixed_arrays(self) -> bool:
-        """Whether some views of a draft lie in the block with which a body begins."""
-        return bool(self._fixed)
+        """Whether arrays of the type, or of a message within it, lie in a block and not behind it."""
+        return any(_is_in_block(field.type) for field in self._schema.fields)
 
     def fill(self, draft: Draft, message: Any) -> None:
         """Set every field as in a message; what lies in its place already is not copied."""
@@ -235,6 +235,15 @@ class Drafter:
                 raise ValueError(f"{self._schema.name} has no array {name} of open dtype")
             if np.dtype(dtype) not in DTYPES:
                 raise ValueError(f"{name}: dtype {dtype} is none of {', '.join(DTYPE_CODES)}")
+
+
+def _is_in_block(kind: FieldType) -> bool:
+    """Return whether values of a type have arrays in their block."""
+    if isinstance(kind, Schema):
+        return any(_is_in_block(field.type) for field in kind.fields)
+    if isinstance(kind, OptionalType | ListType):
+        return _is_in_block(kind.item)
+    return isinstance(kind, ArrayType) and kind.is_fixed
 
 
 def _is_same(view: NDArray[Any], value: Any) -> bool:

