@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import logging
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
+_logger = logging.getLogger(__name__)
 _PORTABLE = 1
 """Pinned for every context: `CU_MEMHOSTREGISTER_PORTABLE`."""
 
@@ -60,10 +62,16 @@ class PinnedMapping:
         """Wait for copies that are under way, unpin the mapping, and let go of it; again: does nothing."""
         if self.memory is None:
             return
-        with wp.ScopedDevice(self._device):
-            wp.synchronize_device(self._device)
-            _driver().cuMemHostUnregister(self._address)
-        self._bytes = self.memory = None
+        try:
+            with wp.ScopedDevice(self._device):
+                try:
+                    wp.synchronize_device(self._device)
+                finally:
+                    code = _driver().cuMemHostUnregister(self._address)
+            if code:
+                _logger.warning("shared memory stays pinned: CUDA error %d", code)
+        finally:
+            self._bytes = self.memory = None
 
 
 @functools.cache

@@ -130,3 +130,25 @@ def test_a_device_copies_into_it(memory):
         assert (view[:offset] == 7).all()
         assert (view[offset + 1000 :] == 7).all()
     mapping.close()
+
+
+def test_memory_is_let_go_whatever_the_device_says(memory, monkeypatch, caplog):
+    """A device that has failed says so again when it is waited for, and when memory is to be unpinned."""
+    driver = Driver()
+    monkeypatch.setattr(pinned, "_driver", lambda: driver)
+    monkeypatch.setattr(driver, "cuMemHostUnregister", lambda address: driver.pinned.clear() or 700)
+    mapping = PinnedMapping(memory, "cpu")
+    mapping.close()
+    assert "700" in caplog.text
+    mapping = PinnedMapping(memory, "cpu")
+
+    def fail(device: Any) -> None:
+        raise RuntimeError("CUDA error 700")
+
+    monkeypatch.setattr(wp, "synchronize_device", fail)
+    with pytest.raises(RuntimeError, match="700"):
+        mapping.close()
+    assert driver.pinned == {}
+    assert mapping.memory is None
+    mapping.close()
+    memory.close()  # nobody keeps it

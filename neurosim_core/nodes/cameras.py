@@ -235,8 +235,11 @@ class Cameras:
         with self._changed:
             self._work = None
             self._changed.notify_all()
+            idle = not self._jobs
+        if idle:  # without the lock: who flies would wait for this thread, which is nicer
+            self._core.take_back()
+        with self._changed:
             while not self._jobs and not self._closed:
-                self._core.take_back()
                 self._changed.wait()
             if self._closed or self._failure is not None:
                 return None

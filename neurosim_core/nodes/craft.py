@@ -83,6 +83,8 @@ class Craft:
         self.has_newcomer = False
         self._cameras = frozenset(name for cast in model.casts for name in cast.names)
         self._active: frozenset[str] = frozenset()
+        self._is_begun = False
+        """A control period is under way, whose cameras are those with which it began."""
         self.lanes: Lanes = plan_lanes(model)
         self._is_late = config.live.mode == "lockstep" and sees_inline(model.device)
         """The device still writes pictures when they are offered."""
@@ -117,7 +119,7 @@ class Craft:
         self.helm.reset(seed=seed)
         self.inbox.reset()
         self.outlet.reset(seed=seed)
-        want(self.model, self.state, self._active & self._cameras)
+        self._show()
         self.outlet.offer_state(observe(state))
         self.answers_ns = self.outlet.streams["odometry"].delivered_ns
 
@@ -127,7 +129,8 @@ class Craft:
         active = self.outlet.active()
         if active != self._active:
             self._active = active
-            want(self.model, self.state, active & self._cameras)
+            if not self._is_begun:
+                self._show()
         self.has_newcomer |= self.inbox.find_newcomers()
         return (*counts, self.inbox.publisher_count)
 
@@ -173,11 +176,16 @@ class Craft:
             DynamicsError: The integration has failed.
         """
         mode, setpoint = self.helm.command_at(stamp_ns, self.observe)
-        return begin_step(self.model, self.state, setpoint, mode=mode)
+        begun = begin_step(self.model, self.state, setpoint, mode=mode)
+        self._is_begun = True
+        return begun
 
     def end_step(self, begun: Begun) -> None:
         """Send on its way what a control period yields that was begun."""
+        self._is_begun = False
         self.outlet.offer(end_step(self.model, self.state, begun))
+        if self.state.wanted != self._active & self._cameras:
+            self._show()
         self.outlet.offer_state(self.observe())
         if self._is_late:  # the device is still at work
             self._plan()
@@ -187,6 +195,10 @@ class Craft:
         if not self._is_late:
             self._plan()
         lend_rooms(self.state)
+
+    def _show(self) -> None:
+        """Have the cameras look that somebody listens to."""
+        want(self.model, self.state, self._active & self._cameras)
 
     def _plan(self) -> None:
         """Plan the next control period."""

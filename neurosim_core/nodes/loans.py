@@ -116,10 +116,10 @@ class PictureLoan:
             Closed: The publisher was closed.
         """
         with self._lock:
-            loan, self._loan, self._room = self._loan, None, None
-            assert loan is not None
+            assert self._loan is not None
             if self.settle is not None:
                 self.settle()
+            loan, self._loan, self._room = self._loan, None, None
             return loan.publish(message)
 
     def _pin(self, memory: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -147,12 +148,12 @@ class Stream(Post):
     def begin(self, *, seed: int) -> None:
         """Forget what is under way and begin again."""
         self.reset()
-        self.loan.drop()
         self.late_times.take()
         self.channel.reset(seed=seed)
         self.published_count = 0
         self.delivered_ns = None
         self._last = self._kept = None
+        self.loan.drop()  # after the packet that holds it
 
 
 class Outlet:
@@ -225,8 +226,9 @@ class Outlet:
 
     def drop_loans(self) -> None:
         """Give back the room of pictures, on which closing topics would wait, for good."""
-        for stream in self.streams.values():
-            stream.loan.close()
+        with contextlib.ExitStack() as stack:  # each of them, whatever the device says to another
+            for stream in self.streams.values():
+                stack.callback(stream.loan.close)
 
     def settle_with(self, settle: Callable[[], object]) -> None:
         """Have something called before a picture is published that was lent room: it waits for the device."""

@@ -267,8 +267,9 @@ class Simulator:
                 begun.append((craft, craft.begin_step(self.stamp_ns)))
             self._mind()  # while the device is at work
         finally:
-            for craft, step in begun:
-                craft.end_step(step)
+            with contextlib.ExitStack() as ends:  # all of them, in order, whatever one of them raises
+                for craft, step in reversed(begun):
+                    ends.callback(craft.end_step, step)
 
     def _wait_for_end(self, end_ns: int) -> bool:
         """Publish until the end of a control period [ns]; False if something else has to be done first."""

@@ -182,3 +182,28 @@ def test_filled_by_one_thread_and_published_by_another(pair):
         received[-1] = received[-1].sequence
     thread.join()
     assert received == list(range(count))
+
+
+def test_room_is_kept_until_the_device_has_written_there(pair):
+    """Where that fails, the picture is lost, and its room is not forgotten: the next one is lent it."""
+    publisher, subscriber = pair
+    picture, loan = picture_of(SHAPES[0]), PictureLoan(publisher)
+    free = count_free(publisher, SHAPES[0])
+
+    def fail():
+        raise RuntimeError("CUDA error 700")
+
+    loan.settle = fail
+    room = loan.lend(picture)
+    with pytest.raises(RuntimeError, match="700"):
+        loan.publish(message_of(room))
+    assert loan.holds(room)
+    loan.settle = None
+    room[:] = picture
+    assert loan.publish(message_of(room))
+    assert (subscriber.recv(60.0).data == picture).all()
+    loan.settle = fail
+    del room
+    loan.lend(picture)
+    loan.drop()
+    assert count_free(publisher, SHAPES[0]) == free
