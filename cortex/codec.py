@@ -163,7 +163,7 @@ class Codec:
 
     @cached_property
     def drafts_by_tail(self) -> bool:
-        """Whether all arrays of a message lie behind its block, which `encode` clears before it copies them."""
+        """Whether all arrays of a message lie behind its block, which is cleared before they are copied."""
         return not self._drafter.has_fixed_arrays
 
     def fill(self, draft: Draft, message: Any) -> None:

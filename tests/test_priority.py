@@ -15,7 +15,14 @@ import pytest
 import warp as wp
 
 from neurosim_core import priority
-from neurosim_core.priority import be_punctual, give_way, niceness, spared_count, sparing
+from neurosim_core.priority import (
+    be_punctual,
+    give_way,
+    let_the_woken_go_first,
+    niceness,
+    spared_count,
+    sparing,
+)
 from neurosim_core.render import launch
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 
@@ -74,6 +81,21 @@ def test_who_gives_way_has_longer_turns_than_usual_and_who_is_punctual_has_not()
     long_ns = priority._LONG_TURN_NS
     assert usual_ns < long_ns
     assert found == ([long_ns, long_ns, usual_ns, usual_ns] if turn_ns() else [0, 0, 0, 0])
+
+
+@on_linux
+@pytest.mark.skipif(platform.machine() not in priority._SET_ATTRIBUTES, reason="no number of the system call")
+def test_turns_of_who_lets_the_woken_go_first_are_between_the_usual_ones_and_those_of_who_gives_way():
+    """Shorter turns go first: readers before it, and it before the thread that renders."""
+    found, most_usual_ns = [], 2_800_000
+
+    def usual() -> None:
+        priority._take_turns(most_usual_ns)
+        in_thread(lambda: (let_the_woken_go_first(), found.append(turn_ns())))
+        in_thread(lambda: (give_way(), found.append(turn_ns())))
+
+    in_thread(usual)
+    assert found == [0, 0] or most_usual_ns < found[0] < found[1]
 
 
 @on_linux

@@ -11,6 +11,7 @@ from neurosim_core.nodes.cameras import Cameras
 from neurosim_core.nodes.craft import Craft
 from neurosim_core.nodes.status import Meter
 from neurosim_core.pacing import Pacer
+from neurosim_core.priority import let_the_woken_go_first
 
 HICCUP_NS = 10_000_000
 """The machine may be this late, or a control period if that is longer, and catch up [ns]."""
@@ -62,6 +63,7 @@ class Streaming:
         self._pacer = pacer
         self._meter = meter
         self._bell = bell
+        self._has_long_turns = False
 
     def fly(self, stamp_ns: int, live: LiveConfig, stop: Callable[[], bool]) -> bool:
         """Fly the control period that begins at a tick [ns], and leave its pictures to the cameras.
@@ -159,6 +161,8 @@ class Streaming:
     def let_readers_go_first(self, end_ns: int, period_ns: int) -> None:
         """Sleep for a moment, if there is time, after what is due at the end of a period [ns] was published.
 
+        Where periods are too short, the scheduler is asked to have readers interrupt this thread.
+
         A scheduler may put a reader that was woken onto the core of who woke it, even if another is idle, and
         let it wait there until the next period has been flown: half a millisecond, a picture's whole delivery
         four times over.
@@ -173,8 +177,16 @@ class Streaming:
         wall_ns = period_ns / factor
         least_s, most_s = READERS_S
         left_s = min(READERS_SHARE * wall_ns * 1e-9, most_s)
-        if left_s >= least_s and self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
+        if left_s < least_s:
+            self._let_the_woken_go_first()
+        elif self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
             time.sleep(left_s)
+
+    def _let_the_woken_go_first(self) -> None:
+        """Ask the scheduler, once, for what there is no time to sleep for."""
+        if not self._has_long_turns:
+            let_the_woken_go_first()
+            self._has_long_turns = True
 
     def offer_seen(self) -> None:
         """Send on their way what the cameras have seen."""

@@ -284,7 +284,9 @@ def test_readers_go_first_where_there_is_time(
     monkeypatch: pytest.MonkeyPatch, factor: float, period_ms: float, late_ms: float, pauses_us: list[int]
 ):
     slept_s: list[float] = []
+    asked: list[bool] = []
     monkeypatch.setattr("neurosim_core.nodes.streaming.time.sleep", slept_s.append)
+    monkeypatch.setattr("neurosim_core.nodes.streaming.let_the_woken_go_first", lambda: asked.append(True))
     period_ns = round(period_ms * MS)
     now_ns = 0
     pacer = Pacer(factor, clock_ns=lambda: now_ns)
@@ -293,3 +295,5 @@ def test_readers_go_first_where_there_is_time(
     now_ns = pacer.wall_ns(period_ns) + round(late_ms * MS)
     streaming.let_readers_go_first(period_ns, period_ns)
     assert slept_s == pytest.approx([pause * 1e-6 for pause in pauses_us])
+    streaming.let_readers_go_first(period_ns, period_ns)
+    assert len(asked) == (0.0 < period_ms / (factor or 1e-9) < 1.25)  # once
