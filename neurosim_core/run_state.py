@@ -187,7 +187,7 @@ def make_state(
         late_pictures: Ask for room before pictures are rendered, and do not wait for those that a device
             copies there: they are there after `settle`.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; called by the
-            thread that reads the cameras.
+            thread that reads the cameras; with `late_pictures` by the one that launches.
         seed: Seed of the sensor noise and of turbulence; None: as configured.
         start: Where the vehicle starts; None: as configured.
 
