@@ -12,10 +12,10 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 import itertools
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -35,7 +35,7 @@ from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, TILE_SIZE
 from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_stream, on
 
-__all__ = ["EventCamera", "EventCameraConfig"]
+__all__ = ["EventCamera", "EventCameraConfig", "Feed"]
 
 _log = logging.getLogger(__name__)
 
@@ -53,6 +53,16 @@ class _Chunk:
     keys: wp.array[wp.int64]
     counters: wp.array[wp.int64]
     counters_on_host: HostCopy
+
+
+class Feed(NamedTuple):
+    """The scan of a stack, planned."""
+
+    key: Hashable
+    """Same key, same launches: of a graph."""
+    launch: Callable[[], None]
+    end: Callable[[], None]
+    """To be called after the launch, on its stream."""
 
 
 @dataclass(eq=False)
@@ -280,7 +290,9 @@ class EventCamera:
         stamps = _as_stamps(stamps_ns)
         frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
         if len(stamps) > 0:
-            self._feed(frames, stamps, again=False)
+            scan = self._plan_scan(frames, stamps)
+            self._launch(scan, tabulate=False)
+            self._end_feed(scan)
         return self.collect()
 
     def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
@@ -300,16 +312,37 @@ class EventCamera:
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
-        self._feed(log_radiance, _as_stamps(stamps_ns), again=True)
+        feed = self.plan_feed(log_radiance, stamps_ns)
+        self._graphs.run(feed.key, feed.launch)
+        feed.end()
 
-    def _feed(
-        self,
-        log_radiance: wp.array3d[wp.float32],
-        stamps: NDArray[np.int64],
-        *,
-        again: bool,
-    ) -> None:
-        """Launch a scan; with `again`, frames are expected to come in the same memory again."""
+    def plan_feed(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> Feed:
+        """Plan what `feed_device` launches, for a graph that makes the frames as well (`streams.Graphs`).
+
+        What is planned has to be launched on the present stream, and ended, before anything else is done to
+        the camera.
+
+        Args:
+            log_radiance: As for `feed_device`; its contents matter when the scan is launched.
+            stamps_ns: As for `feed_device`.
+
+        Raises:
+            RuntimeError: As `feed_device`.
+            ValueError: As `feed_device`.
+        """
+        scan = self._plan_scan(log_radiance, _as_stamps(stamps_ns))
+        reset_ns = 0 if self._noise is None else self._noise.since_reset_ns(0)
+        keys = tuple((chunk.keys.ptr, chunk.keys.shape[0]) for chunk in scan.chunks)
+        key = (scan.number, scan.state, log_radiance.ptr, len(scan.stamps_ns), keys, reset_ns)
+
+        def end() -> None:
+            scan.done.set()
+            self._end_feed(scan)
+
+        return Feed(key, lambda: self._launch_chunks(scan, tabulate=False), end)
+
+    def _plan_scan(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> _Scan:
+        """Return a scan with all that its launches read from the host, and count the camera's state on."""
         self._check_feed(log_radiance, stamps)
         self._taken.hold()
         scan = self._idle.popleft()
@@ -330,7 +363,10 @@ class EventCamera:
         np.subtract(stamps, origin_ns, out=times[2 : count + 2])
         self._state = (self._state + 1) % len(self._last)
         self._fed_ns = int(stamps[-1])
-        self._launch(scan, tabulate=False, again=again)
+        return scan
+
+    def _end_feed(self, scan: _Scan) -> None:
+        """Note that a scan is launched, on the present stream."""
         self._under_way.append(scan)
         if self.device.is_cuda:
             self._feeder = self.device.stream
@@ -492,11 +528,12 @@ class EventCamera:
         flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
         return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
 
-    def _launch(self, scan: _Scan, *, tabulate: bool, again: bool = False) -> None:
-        """Scan a stack from the state before it; done again, it gives the same state after it.
+    def _launch(self, scan: _Scan, *, tabulate: bool) -> None:
+        """Scan a stack from the state before it; done again, it gives the same state after it."""
+        self._launch_chunks(scan, tabulate=tabulate)
+        scan.done.set()
 
-        With `again`, the same launches are expected to come again: a graph of them is kept.
-        """
+    def _launch_chunks(self, scan: _Scan, *, tabulate: bool) -> None:
         before, after = scan.state, (scan.state + 1) % len(self._last)
 
         def launch(chunk: _Chunk) -> None:
@@ -554,21 +591,10 @@ class EventCamera:
             )
             chunk.counters_on_host.fetch(0, 3)
 
-        if self.device.is_cuda:
-            (chunk,) = scan.chunks
-            reset_ns = 0 if self._noise is None else self._noise.since_reset_ns(0)
-            keys = (chunk.keys.ptr, chunk.keys.shape[0])
-            key = (scan.number, before, scan.frames.ptr, len(scan.stamps_ns), keys, reset_ns)
-            if again:
-                self._graphs.run(key, lambda: launch(chunk))
-            else:
-                launch(chunk)
-        else:
-            self._share(launch, scan.chunks)
-        scan.done.set()
+        self._share(launch, scan.chunks)
 
     def _share(self, launch: Callable[[_Chunk], None], chunks: list[_Chunk]) -> None:
-        """Launch for all chunks, on the cores of a CPU."""
+        """Launch for all chunks; there are several on a CPU, which go to its cores."""
         if len(chunks) > 1 and self._pool is None:
             self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
         own = 1 + spared_count()  # chunks that this thread does one after the other
