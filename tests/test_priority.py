@@ -146,7 +146,7 @@ def test_a_launch_leaves_cores_to_others(monkeypatch: pytest.MonkeyPatch, cores:
 
 
 def test_the_events_are_the_same_with_fewer_cores(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("neurosim_core.sensors.events.core_count", lambda: 4)
+    monkeypatch.setattr("neurosim_core.sensors.event_pixels.core_count", lambda: 4)
     frames = np.random.default_rng(5).normal(0.0, 0.5, (4, 128, 256)).astype(np.float32)
 
     def events(spared: int) -> list[bytes]:

@@ -3,8 +3,9 @@
 
 Each pixel holds a reference log radiance L_ref. Between two frames log radiance is linear in time; each time
 it reaches L_ref + threshold_on (or L_ref - threshold_off) an event is emitted at the crossing time, and L_ref
-becomes the level crossed. The tie rule is in `EventCamera`; the kernels are in `event_scan`. Pixels that are
-not ideal are in `event_noise`, and the arbiter that reads them out in `event_readout`.
+becomes the level crossed. The tie rule is in `EventCamera`; the pixels are in `event_pixels`, their kernels
+in `event_scan`. What is not ideal in them is in `event_noise`, and the arbiter that reads them out in
+`event_readout`.
 
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """
@@ -13,8 +14,6 @@ import itertools
 import logging
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,37 +21,20 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.cores import following
 from neurosim_core.packets import Events
-from neurosim_core.priority import spared_count
-from neurosim_core.render.launch import core_count
-from neurosim_core.sensors import event_cut, event_scan
+from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, EventKeys, roomy_keys
+from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise import PixelNoise, terms_of
+from neurosim_core.sensors.event_noise import terms_of
+from neurosim_core.sensors.event_pixels import Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.sensors.event_scan import BLOCK_SIZE, LOG_RADIANCE_MAX, TILE_SIZE
-from neurosim_core.streams import Graphs, HostCopy, HostInput, Milestone, make_stream, on
+from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
+from neurosim_core.streams import Graphs, Milestone, make_stream, on
 
 __all__ = ["EventCamera", "EventCameraConfig", "Feed"]
 
 _log = logging.getLogger(__name__)
-
-_PIXELS_PER_THREAD_MIN = 16_384
-_KEYS_PER_PIXEL = 4
-"""Events of a scan for which there is room on CUDA before any have come."""
-
-
-@dataclass
-class _Chunk:
-    """Pixels that one launch scans, and its own part of the buffer: launches write to nothing they share."""
-
-    first_pixel: int
-    end_pixel: int
-    keys: wp.array[wp.int64]
-    counters: wp.array[wp.int64]
-    counters_on_host: HostCopy
 
 
 class Feed(NamedTuple):
@@ -63,29 +45,6 @@ class Feed(NamedTuple):
     launch: Callable[[], None]
     end: Callable[[], None]
     """To be called after the launch, on its stream."""
-
-
-@dataclass(eq=False)
-class _Scan:
-    """The scan of one stack, and the buffers that are its own until its events have been taken over."""
-
-    number: int
-    """Its own for ever: a graph may be made of its buffers."""
-    chunks: list[_Chunk]
-    done: Milestone
-    times: HostInput
-    """Time from the reset to the origin [ns]; then `stamps`."""
-    since_reset_ns: wp.array[wp.int64]
-    stamps: wp.array[wp.int64]
-    """Of the state and of each frame, from the origin [ns]."""
-    row_limit: wp.array[wp.int32]
-    frames: Any = None
-    """Shape [frame, row, column]."""
-    stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    origin_us: int = 0
-    """Origin of its keys' time."""
-    state: int = 0
-    """Where in the ring the state before it is; the state after it comes next."""
 
 
 class EventCamera:
@@ -159,45 +118,34 @@ class EventCamera:
         self.device = wp.get_device(device)
         self._row_shift = SUB_BITS + (width - 1).bit_length()
         self._time_shift = self._row_shift + (height - 1).bit_length() + 1
-        self._pool: ThreadPoolExecutor | None = None
 
-        pixel_count = width * height
-        self._base = self._empty(pixel_count, wp.float32)
         # scans under way begin with a state each, and the last of them needs room for the state after it
-        ring = range(scan_count_max + 1)
-        self._last = [self._empty(pixel_count, wp.float32) for _ in ring]
-        self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in ring]
-        self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=self.device)
+        ring_size = scan_count_max + 1
         pixel_terms = terms_of(config) if terms is None else tuple(terms)
         self.terms = pixel_terms if config.readout is None else (*pixel_terms, "readout")
-        self._noise: PixelNoise | None = None
-        if pixel_terms:
-            self._noise = PixelNoise(
-                config,
-                pixel_count=pixel_count,
-                ring_size=len(ring),
-                seed=seed,
-                sensor=sensor,
-                device=self.device,
-                terms=pixel_terms,
-            )
-        self._screened = self.device.is_cpu and self._noise is None
-        scratch = pixel_count if self._screened else 0
-        self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
-        self._table = self._empty((1, height), wp.int32)
-        # on CUDA one more than is needed: scans and states then take turns together, in few graphs
+        self._pixels = Pixels(
+            config,
+            width=width,
+            height=height,
+            row_shift=self._row_shift,
+            time_shift=self._time_shift,
+            ring_size=ring_size,
+            device=self.device,
+            sensor=sensor,
+            seed=seed,
+            terms=pixel_terms,
+        )
         self._scan_count_max = scan_count_max
-        self._scan_number = itertools.count()
-        scan_count = len(ring) if self.device.is_cuda else scan_count_max
-        self._key_room = _KEYS_PER_PIXEL * pixel_count
-        self._idle = deque(self._make_scan(16) for _ in range(scan_count))
-        self._under_way: deque[_Scan] = deque()
+        # on CUDA one more than is needed: scans and states then take turns together, in few graphs
+        scan_count = ring_size if self.device.is_cuda else scan_count_max
+        self._idle = deque(self._pixels.make_scan(16) for _ in range(scan_count))
+        self._under_way: deque[Scan] = deque()
         self._graphs = Graphs(device)
         self._reader = make_stream(device, urgent=True)
         self._taken = Milestone(device)
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
-            pixel_count=pixel_count,
+            pixel_count=width * height,
             row_shift=self._row_shift,
             time_shift=self._time_shift,
             device=self.device,
@@ -213,8 +161,7 @@ class EventCamera:
                 device=self.device,
             )
         self._feeder: Any = None
-        for kernels in (event_scan, event_cut):
-            wp.load_module(kernels, device=self.device)
+        wp.load_module(event_cut, device=self.device)
 
         self._now_ns: int | None = None
         self._fed_ns = 0
@@ -259,11 +206,7 @@ class EventCamera:
         if not valid.all():
             row, col = (int(index) for index in np.argwhere(~valid)[0])
             raise ValueError(_invalid_message(int((~valid).sum()), f"[{row}, {col}]"))
-        wp.copy(self._base, frame.flatten())
-        wp.copy(self._last[0], self._base)
-        self._crossed[0].zero_()
-        if self._noise is not None:
-            self._noise.reset(self._base, int(stamp_ns))
+        self._pixels.reset(frame, int(stamp_ns))
         if self._readout is not None:
             self._readout.reset(int(stamp_ns))
         self._now_ns = self._fed_ns = int(stamp_ns)
@@ -291,7 +234,7 @@ class EventCamera:
         frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
         if len(stamps) > 0:
             scan = self._plan_scan(frames, stamps)
-            self._launch(scan, tabulate=False)
+            self._launch(scan)
             self._end_feed(scan)
         return self.collect()
 
@@ -331,26 +274,22 @@ class EventCamera:
             ValueError: As `feed_device`.
         """
         scan = self._plan_scan(log_radiance, _as_stamps(stamps_ns))
-        reset_ns = 0 if self._noise is None else self._noise.since_reset_ns(0)
-        keys = tuple((chunk.keys.ptr, chunk.keys.shape[0]) for chunk in scan.chunks)
-        key = (scan.number, scan.state, log_radiance.ptr, len(scan.stamps_ns), keys, reset_ns)
 
         def end() -> None:
             scan.done.set()
             self._end_feed(scan)
 
-        return Feed(key, lambda: self._launch_chunks(scan, tabulate=False), end)
+        return Feed(self._pixels.launch_key(scan), lambda: self._pixels.launch(scan), end)
 
-    def _plan_scan(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> _Scan:
+    def _plan_scan(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> Scan:
         """Return a scan with all that its launches read from the host, and count the camera's state on."""
         self._check_feed(log_radiance, stamps)
         self._taken.hold()
         scan = self._idle.popleft()
         count = len(stamps)
         if count > scan.row_limit.shape[0]:
-            scan = self._make_scan(count)
-        elif self.device.is_cuda and scan.chunks[0].keys.shape[0] < self._key_room:
-            scan.chunks[0].keys = self._empty(self._key_room, wp.int64)
+            scan = self._pixels.make_scan(count)
+        self._pixels.make_room(scan)
         scan.frames = log_radiance
         scan.stamps_ns = stamps
         self._keys.expect(count)
@@ -358,14 +297,14 @@ class EventCamera:
         scan.state = self._state
         origin_ns = scan.origin_us * NS_PER_US
         times = scan.times.rows
-        times[0] = 0 if self._noise is None else self._noise.since_reset_ns(origin_ns)
+        times[0] = self._pixels.since_reset_ns(origin_ns)
         times[1] = self._fed_ns - origin_ns
         np.subtract(stamps, origin_ns, out=times[2 : count + 2])
-        self._state = (self._state + 1) % len(self._last)
+        self._state = self._pixels.next_state(self._state)
         self._fed_ns = int(stamps[-1])
         return scan
 
-    def _end_feed(self, scan: _Scan) -> None:
+    def _end_feed(self, scan: Scan) -> None:
         """Note that a scan is launched, on the present stream."""
         self._under_way.append(scan)
         if self.device.is_cuda:
@@ -477,39 +416,6 @@ class EventCamera:
             raise RuntimeError("reset() must be called before frames are fed")
         return self._now_ns
 
-    def _empty(self, shape: int | tuple[int, int], dtype: Any) -> Any:
-        return wp.empty(shape, dtype=dtype, device=self.device)
-
-    def _chunk_bounds(self) -> list[tuple[int, int]]:
-        pixel_count = self.width * self.height
-        chunk_count = 1
-        if self.device.is_cpu:
-            chunk_count = max(1, min(core_count(), self.height, pixel_count // _PIXELS_PER_THREAD_MIN))
-        rows = [self.height * chunk // chunk_count for chunk in range(chunk_count + 1)]
-        return [(a * self.width, b * self.width) for a, b in itertools.pairwise(rows)]
-
-    def _make_scan(self, frame_count: int) -> _Scan:
-        """Return buffers for stacks of at most `frame_count` frames."""
-        chunks = []
-        bounds = self._chunk_bounds()
-        for first, end in bounds:
-            counters = self._empty(3, wp.int64)
-            if self.device.is_cpu:
-                keys = roomy_keys(ROOM_PER_PIXEL * (end - first), TOUCHED_COUNT_MAX // len(bounds))
-            else:
-                keys = self._empty(self._key_room, wp.int64)
-            chunks.append(_Chunk(first, end, keys, counters, HostCopy(counters)))
-        times = HostInput(wp.zeros(frame_count + 2, dtype=wp.int64, device=self.device))
-        return _Scan(
-            number=next(self._scan_number),
-            chunks=chunks,
-            done=Milestone(self.device),
-            times=times,
-            since_reset_ns=times.array[:1],
-            stamps=times.array[1:],
-            row_limit=wp.full(frame_count, self.height, dtype=wp.int32, device=self.device),
-        )
-
     def _as_warp(self, value: Any, shape: tuple[int, ...]) -> Any:
         """Return an array as a contiguous float32 Warp array of this shape on the device."""
         if not isinstance(value, wp.array):
@@ -528,81 +434,10 @@ class EventCamera:
         flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
         return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
 
-    def _launch(self, scan: _Scan, *, tabulate: bool) -> None:
-        """Scan a stack from the state before it; done again, it gives the same state after it."""
-        self._launch_chunks(scan, tabulate=tabulate)
+    def _launch(self, scan: Scan) -> None:
+        """Scan a stack at once, or again."""
+        self._pixels.launch(scan)
         scan.done.set()
-
-    def _launch_chunks(self, scan: _Scan, *, tabulate: bool) -> None:
-        before, after = scan.state, (scan.state + 1) % len(self._last)
-
-        def launch(chunk: _Chunk) -> None:
-            scan.times.upload()
-            chunk.counters.zero_()
-            thresholds = [self.config.threshold_on, self.config.threshold_off]
-            stack = scan.frames.reshape((scan.frames.shape[0], self.width * self.height))
-            extent = [chunk.first_pixel, chunk.end_pixel, stack]
-            frame_count = len(scan.stamps_ns)
-            if self._screened:
-                wp.launch(
-                    event_scan.screen,
-                    dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),
-                    inputs=[*thresholds, *extent, frame_count, self._base, self._crossed[before]],
-                    outputs=[*self._quiet_range, self._lead],
-                    device=self.device,
-                )
-            block = BLOCK_SIZE if self.device.is_cuda else 1
-            blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
-            noise = self._noise
-            own = [*thresholds] if noise is None else noise.inputs()
-            frames = [self._lead] if noise is None else []
-            since = [] if noise is None else [scan.since_reset_ns]
-            memory = [[] if noise is None else [noise.memory(slot)] for slot in (before, after)]
-            wp.launch(
-                event_scan.scan if noise is None else noise.scan,
-                dim=blocks * block,  # whole blocks: their threads reserve slots together
-                block_dim=BLOCK_SIZE,
-                inputs=[
-                    *own,
-                    self.width,
-                    self._row_shift,
-                    self._time_shift,
-                    *extent,
-                    scan.stamps,
-                    *since,
-                    frame_count,
-                    *frames,
-                    scan.row_limit,
-                    self._base,
-                    self._last[before],
-                    self._crossed[before],
-                    *memory[0],
-                    tabulate,
-                ],
-                outputs=[
-                    self._last[after],
-                    self._crossed[after],
-                    *memory[1],
-                    chunk.keys,
-                    chunk.counters,
-                    self._table,
-                ],
-                device=self.device,
-            )
-            chunk.counters_on_host.fetch(0, 3)
-
-        self._share(launch, scan.chunks)
-
-    def _share(self, launch: Callable[[_Chunk], None], chunks: list[_Chunk]) -> None:
-        """Launch for all chunks; there are several on a CPU, which go to its cores."""
-        if len(chunks) > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
-        own = 1 + spared_count()  # chunks that this thread does one after the other
-        futures = [self._pool.submit(following(launch), c) for c in chunks[own:]] if self._pool else []
-        for chunk in chunks[:own]:
-            launch(chunk)
-        for future in futures:
-            future.result()
 
     def _take_over(self) -> None:
         """Wait for the oldest scan, redo it if its buffer was too small, and append its keys."""
@@ -612,12 +447,8 @@ class EventCamera:
         if limited:
             counts = self._read_counts(scan)
         if any(count > chunk.keys.shape[0] for count, chunk in zip(counts, scan.chunks, strict=True)):
-            for count, chunk in zip(counts, scan.chunks, strict=True):
-                if count > chunk.keys.shape[0]:
-                    chunk.keys = self._empty(1 << (count - 1).bit_length(), wp.int64)
-            if self.device.is_cuda:
-                self._expect_keys(counts[0])
-            self._launch(scan, tabulate=False)
+            self._pixels.grow(scan, counts)
+            self._launch(scan)
             scan.done.wait()  # the frames are the caller's again
         if limited:
             scan.row_limit.fill_(self.height)
@@ -626,18 +457,13 @@ class EventCamera:
             self._keys.append(chunk.keys, 0, count, scan.origin_us)
         self._finish(self._under_way.popleft())
 
-    def _expect_keys(self, count: int) -> None:
-        """Have room in scans for twice as many keys as one has found; they grow when they are idle."""
-        if 2 * count > self._key_room:
-            self._key_room = 1 << (2 * count - 1).bit_length()
-
-    def _finish(self, scan: _Scan) -> None:
+    def _finish(self, scan: Scan) -> None:
         """Note that the oldest scan is read."""
         self._now_ns = int(scan.stamps_ns[-1])
         scan.frames = None
         self._idle.append(scan)
 
-    def _read_counts(self, scan: _Scan) -> list[int]:
+    def _read_counts(self, scan: Scan) -> list[int]:
         """Wait for a scan and return the number of events of each chunk."""
         scan.done.wait()
         counters = [chunk.counters_on_host.view(0, 3).tolist() for chunk in scan.chunks]
@@ -651,14 +477,11 @@ class EventCamera:
             raise ValueError(_invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
         return [count for count, _, _ in counters]
 
-    def _limit_rows(self, scan: _Scan) -> bool:
+    def _limit_rows(self, scan: Scan) -> bool:
         """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
         stamps = scan.stamps_ns
-        self._table = wp.zeros((len(stamps), self.height), dtype=wp.int32, device=self.device)
-        self._launch(scan, tabulate=True)
-        total = np.cumsum(self._table.numpy(), axis=1, dtype=np.int64)
+        total = np.cumsum(self._pixels.count_by_row(scan), axis=1, dtype=np.int64)
         rows = (total <= self.config.event_count_max).sum(axis=1)
-        self._table = self._empty((1, self.height), wp.int32)
         for frame in np.flatnonzero(rows < self.height):
             kept = int(total[frame, rows[frame] - 1]) if rows[frame] > 0 else 0
             self._dropped.append((int(stamps[frame]), int(total[frame, -1]) - kept))
@@ -676,7 +499,7 @@ class EventCamera:
             )
             self._drop_reported = True
         wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
-        self._launch(scan, tabulate=False)
+        self._launch(scan)
         return True
 
     def _cut(self, ends: list[int]) -> list[Events]:

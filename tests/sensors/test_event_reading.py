@@ -17,6 +17,7 @@ from neurosim_core import streams
 from neurosim_core.packets import Events
 from neurosim_core.sensors.event_config import ShotNoiseConfig
 from neurosim_core.sensors.event_keys import EventKeys
+from neurosim_core.sensors.event_pixels import Pixels
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 
 WIDTH, HEIGHT = 9, 7
@@ -265,7 +266,7 @@ def test_a_flight_of_changing_views_needs_no_memory(monkeypatch):
     install(monkeypatch, LateDevice(rng, 0.5))
     camera = make_camera("cpu", lanes=lanes)
     for owner, name in (
-        (EventCamera, "_empty"), (EventKeys, "_empty"),
+        (Pixels, "_empty"), (EventKeys, "_empty"),
         (streams.LentBlock, "__init__"), (streams.HostCopy, "__init__"),
     ):  # fmt: skip
         monkeypatch.setattr(owner, name, counted(getattr(owner, name)))

@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core import streams
-from neurosim_core.sensors import event_keys, event_noise, events
+from neurosim_core.sensors import event_keys, event_noise, event_pixels, events
 
-_MODULES = (streams, events, event_keys)
+_MODULES = (streams, events, event_keys, event_pixels)
 
 
 class LateStream:

@@ -1,0 +1,280 @@
+# mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,var-annotated"
+"""The pixels of an event camera: their state, and the launches that take them from one stack to the next.
+
+Scans may be under way one behind the other: each has the state before it and the state after it, in a ring.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.cores import following
+from neurosim_core.priority import spared_count
+from neurosim_core.render.launch import core_count
+from neurosim_core.sensors import event_scan
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
+from neurosim_core.sensors.event_noise import PixelNoise
+from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
+from neurosim_core.streams import HostCopy, HostInput, Milestone
+
+_PIXELS_PER_THREAD_MIN = 16_384
+_KEYS_PER_PIXEL = 4
+"""Events of a scan for which there is room on CUDA before any have come."""
+
+
+@dataclass
+class Chunk:
+    """Pixels that one launch scans, and its own part of the buffer: launches write to nothing they share."""
+
+    first_pixel: int
+    end_pixel: int
+    keys: wp.array[wp.int64]
+    counters: wp.array[wp.int64]
+    counters_on_host: HostCopy
+
+
+@dataclass(eq=False)
+class Scan:
+    """The scan of one stack, and the buffers that are its own until its events have been taken over."""
+
+    number: int
+    """Its own for ever: a graph may be made of its buffers."""
+    chunks: list[Chunk]
+    done: Milestone
+    times: HostInput
+    """Time from the reset to the origin [ns]; then `stamps`."""
+    since_reset_ns: wp.array[wp.int64]
+    stamps: wp.array[wp.int64]
+    """Of the state and of each frame, from the origin [ns]."""
+    row_limit: wp.array[wp.int32]
+    frames: Any = None
+    """Shape [frame, row, column]."""
+    stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    origin_us: int = 0
+    """Origin of its keys' time."""
+    state: int = 0
+    """Where in the ring the state before it is; the state after it comes next."""
+
+
+class Pixels:
+    """The pixels of one camera.
+
+    Args:
+        config: Thresholds, limits, and what is not ideal.
+        width: Columns.
+        height: Rows.
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        ring_size: States that there is room for: one more than scans may be under way.
+        device: Where they are.
+        sensor: Name of the sensor, for its noise.
+        seed: Seed of the run.
+        terms: What is compiled in beyond ideal pixels: some of `event_noise.TERMS`.
+
+    Attributes:
+        noise: What is not ideal; None: nothing.
+        screened: Frames that are quiet are skipped first, as is fast on a CPU.
+    """
+
+    def __init__(
+        self,
+        config: EventCameraConfig,
+        *,
+        width: int,
+        height: int,
+        row_shift: int,
+        time_shift: int,
+        ring_size: int,
+        device: Any,
+        sensor: str,
+        seed: int,
+        terms: Sequence[str],
+    ) -> None:
+        self._thresholds = [config.threshold_on, config.threshold_off]
+        self._width, self._height = width, height
+        self._row_shift, self._time_shift = row_shift, time_shift
+        self._device = device
+        pixel_count = width * height
+        self._base = self._empty(pixel_count, wp.float32)
+        self._last = [self._empty(pixel_count, wp.float32) for _ in range(ring_size)]
+        self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in range(ring_size)]
+        self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=device)
+        self.noise: PixelNoise | None = None
+        if terms:
+            self.noise = PixelNoise(
+                config,
+                pixel_count=pixel_count,
+                ring_size=ring_size,
+                seed=seed,
+                sensor=sensor,
+                device=device,
+                terms=terms,
+            )
+        self.screened = device.is_cpu and self.noise is None
+        scratch = pixel_count if self.screened else 0
+        self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
+        self._table = self._empty((1, height), wp.int32)
+        self._key_room = _KEYS_PER_PIXEL * pixel_count
+        self._scan_number = itertools.count()
+        self._pool: ThreadPoolExecutor | None = None
+        wp.load_module(event_scan, device=device)
+
+    def reset(self, log_radiance: wp.array2d[wp.float32], stamp_ns: int) -> None:
+        """Make a frame every pixel's reference; the first state of the ring is the one that follows."""
+        wp.copy(self._base, log_radiance.flatten())
+        wp.copy(self._last[0], self._base)
+        self._crossed[0].zero_()
+        if self.noise is not None:
+            self.noise.reset(self._base, stamp_ns)
+
+    def since_reset_ns(self, origin_ns: int) -> int:
+        """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""
+        return 0 if self.noise is None else self.noise.since_reset_ns(origin_ns)
+
+    def next_state(self, state: int) -> int:
+        """Return where in the ring the state after another is."""
+        return (state + 1) % len(self._last)
+
+    def make_scan(self, frame_count: int) -> Scan:
+        """Return buffers for stacks of at most `frame_count` frames."""
+        chunks = []
+        bounds = self._chunk_bounds()
+        for first, end in bounds:
+            counters = self._empty(3, wp.int64)
+            if self._device.is_cpu:
+                keys = roomy_keys(ROOM_PER_PIXEL * (end - first), TOUCHED_COUNT_MAX // len(bounds))
+            else:
+                keys = self._empty(self._key_room, wp.int64)
+            chunks.append(Chunk(first, end, keys, counters, HostCopy(counters)))
+        times = HostInput(wp.zeros(frame_count + 2, dtype=wp.int64, device=self._device))
+        return Scan(
+            number=next(self._scan_number),
+            chunks=chunks,
+            done=Milestone(self._device),
+            times=times,
+            since_reset_ns=times.array[:1],
+            stamps=times.array[1:],
+            row_limit=wp.full(frame_count, self._height, dtype=wp.int32, device=self._device),
+        )
+
+    def make_room(self, scan: Scan) -> None:
+        """Have as much room for the keys of an idle scan as is expected of scans, on CUDA."""
+        if self._device.is_cuda and scan.chunks[0].keys.shape[0] < self._key_room:
+            scan.chunks[0].keys = self._empty(self._key_room, wp.int64)
+
+    def grow(self, scan: Scan, counts: Sequence[int]) -> None:
+        """Make room for the keys that a scan has counted; on CUDA others get room for twice as many."""
+        for count, chunk in zip(counts, scan.chunks, strict=True):
+            if count > chunk.keys.shape[0]:
+                chunk.keys = self._empty(1 << (count - 1).bit_length(), wp.int64)
+        if 2 * counts[0] > self._key_room:
+            self._key_room = 1 << (2 * counts[0] - 1).bit_length()
+
+    def launch_key(self, scan: Scan) -> Hashable:
+        """Return the key of the launches of a scan: same key, same launches (`streams.Graphs`)."""
+        keys = tuple((chunk.keys.ptr, chunk.keys.shape[0]) for chunk in scan.chunks)
+        frames = scan.frames.ptr, len(scan.stamps_ns)
+        return scan.number, scan.state, *frames, keys, self.since_reset_ns(0)
+
+    def count_by_row(self, scan: Scan) -> NDArray[np.int32]:
+        """Return how many events each frame and row of a stack has, shape [frame, row]; waits for it."""
+        self._table = wp.zeros((len(scan.stamps_ns), self._height), dtype=wp.int32, device=self._device)
+        self.launch(scan, tabulate=True)
+        counts: NDArray[np.int32] = self._table.numpy()
+        self._table = self._empty((1, self._height), wp.int32)
+        return counts
+
+    def launch(self, scan: Scan, *, tabulate: bool = False) -> None:
+        """Scan a stack from the state before it; done again, it gives the same state after it.
+
+        With `tabulate` events are only counted, by frame and row.
+        """
+        before, after = scan.state, self.next_state(scan.state)
+
+        def launch(chunk: Chunk) -> None:
+            scan.times.upload()
+            chunk.counters.zero_()
+            thresholds = self._thresholds
+            stack = scan.frames.reshape((scan.frames.shape[0], self._width * self._height))
+            extent = [chunk.first_pixel, chunk.end_pixel, stack]
+            frame_count = len(scan.stamps_ns)
+            if self.screened:
+                wp.launch(
+                    event_scan.screen,
+                    dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),
+                    inputs=[*thresholds, *extent, frame_count, self._base, self._crossed[before]],
+                    outputs=[*self._quiet_range, self._lead],
+                    device=self._device,
+                )
+            block = BLOCK_SIZE if self._device.is_cuda else 1
+            blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
+            noise = self.noise
+            own = [*thresholds] if noise is None else noise.inputs()
+            frames = [self._lead] if noise is None else []
+            since = [] if noise is None else [scan.since_reset_ns]
+            memory = [[] if noise is None else [noise.memory(slot)] for slot in (before, after)]
+            wp.launch(
+                event_scan.scan if noise is None else noise.scan,
+                dim=blocks * block,  # whole blocks: their threads reserve slots together
+                block_dim=BLOCK_SIZE,
+                inputs=[
+                    *own,
+                    self._width,
+                    self._row_shift,
+                    self._time_shift,
+                    *extent,
+                    scan.stamps,
+                    *since,
+                    frame_count,
+                    *frames,
+                    scan.row_limit,
+                    self._base,
+                    self._last[before],
+                    self._crossed[before],
+                    *memory[0],
+                    tabulate,
+                ],
+                outputs=[
+                    self._last[after],
+                    self._crossed[after],
+                    *memory[1],
+                    chunk.keys,
+                    chunk.counters,
+                    self._table,
+                ],
+                device=self._device,
+            )
+            chunk.counters_on_host.fetch(0, 3)
+
+        self._share(launch, scan.chunks)
+
+    def _share(self, launch: Callable[[Chunk], None], chunks: list[Chunk]) -> None:
+        """Launch for all chunks; there are several on a CPU, which go to its cores."""
+        if len(chunks) > 1 and self._pool is None:
+            self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
+        own = 1 + spared_count()  # chunks that this thread does one after the other
+        futures = [self._pool.submit(following(launch), c) for c in chunks[own:]] if self._pool else []
+        for chunk in chunks[:own]:
+            launch(chunk)
+        for future in futures:
+            future.result()
+
+    def _chunk_bounds(self) -> list[tuple[int, int]]:
+        pixel_count = self._width * self._height
+        chunk_count = 1
+        if self._device.is_cpu:
+            chunk_count = max(1, min(core_count(), self._height, pixel_count // _PIXELS_PER_THREAD_MIN))
+        rows = [self._height * chunk // chunk_count for chunk in range(chunk_count + 1)]
+        return [(a * self._width, b * self._width) for a, b in itertools.pairwise(rows)]
+
+    def _empty(self, shape: int | tuple[int, int], dtype: Any) -> Any:
+        return wp.empty(shape, dtype=dtype, device=self._device)
