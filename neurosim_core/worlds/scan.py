@@ -20,6 +20,7 @@ from neurosim_core.sensors.event_noise import Memory, PixelModel, begin_pixel, m
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
     CLOSE,
+    LIMIT,
     OPEN,
     TILE_SIZE,
     scan_pixel,
@@ -274,12 +275,23 @@ def begin_pixels(
     base_out: wp.array2d[wp.float32],
     last_out: wp.array2d[wp.float32],
     crossed_out: wp.array2d[wp.vec2i],
+    # In/out:
+    counters: wp.array2d[wp.int64],
 ) -> None:
-    """Let the pixels of some worlds take frame 0 as their reference; threads are [world, pixel]."""
+    """Let the pixels of some worlds take frame 0 as their reference; threads are [world, pixel].
+
+    A value that is not finite, or beyond +-1000, is counted, and 0 is the reference in its place.
+    """
     world, pixel = wp.tid()
     if mask[world] != 0:
-        base_out[world, pixel] = log_radiance[world, 0, pixel]
-        last_out[world, pixel] = log_radiance[world, 0, pixel]
+        value = log_radiance[world, 0, pixel]
+        if not wp.abs(value) <= LIMIT:
+            value = wp.float32(0.0)
+            wp.atomic_add(counters, world, 1, wp.int64(1))
+            values = wp.int64(log_radiance.shape[1]) * wp.int64(log_radiance.shape[2])
+            wp.atomic_max(counters, world, 2, values - wp.int64(pixel))
+        base_out[world, pixel] = value
+        last_out[world, pixel] = value
         crossed_out[world, pixel] = wp.vec2i(0, 0)
 
 

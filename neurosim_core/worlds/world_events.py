@@ -190,11 +190,13 @@ class WorldEventCamera:
             parity: Which of the two states is the present one.
         """
         shape = self._base.shape
+        for array in (self.events.offsets, self.events.counts, self._stack.dropped, self._stack.counters):
+            array.zero_()
         wp.launch(
             scan.begin_pixels,
             dim=shape,
             inputs=[mask, self._stack.log_radiance],
-            outputs=[self._base, self._last[parity], self._crossed[parity]],
+            outputs=[self._base, self._last[parity], self._crossed[parity], self._stack.counters],
             device=self.device,
         )
         if self.terms:
@@ -205,8 +207,6 @@ class WorldEventCamera:
                 outputs=[self._memories[parity]],
                 device=self.device,
             )
-        for array in (self.events.offsets, self.events.counts, self._stack.dropped, self._stack.counters):
-            array.zero_()
 
     def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
         """Return offsets of a pattern on the device; whoever makes a graph with them keeps them."""

@@ -80,6 +80,29 @@ def test_values_that_are_no_radiance_are_counted(device):
     assert camera.events.counters.numpy().tolist() == [[0, 0, 0], [0, 2, 3 * 6 - (1 * 6 + 4)]]
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1001.0])
+def test_a_reference_that_is_no_radiance_is_counted_and_zero(device, value):
+    """No level can be reached from it: the pixel begins at 0, and the rest of its world as it is."""
+    frames = np.full((2, 3, 6), 0.25, np.float32)
+    camera = WorldEventCamera(
+        [EventCameraConfig(threshold_on=0.2, threshold_off=0.2)] * 2,
+        width=3,
+        height=2,
+        frames=(array := wp.array(frames, dtype=wp.float32, device=device)),
+        capacity=100,
+        sensor="e",
+        seeds=[0, 1],
+    )
+    frames[1, 0, 4] = value
+    array.assign(frames)
+    camera.begin(wp.ones(2, dtype=wp.int32, device=device), 0)
+    assert camera.events.counters.numpy().tolist() == [[0, 0, 0], [0, 1, 3 * 6 - 4]]
+    camera.find(wp.zeros(2, dtype=wp.int64, device=device), (0, 1000, 2000, 3000), 0)
+    t, x, y, polarity = camera.events.numpy(1)
+    assert len(camera.events.numpy(0)[0]) == 0
+    assert [(int(x[0]), int(y[0]), int(polarity[0]))] * len(t) == [(1, 1, 1)]
+
+
 def test_stamps_do_not_depend_on_the_clock(device):
     """A world that has flown for long gives the events of one that has just begun, later."""
     rng = np.random.default_rng(0)
