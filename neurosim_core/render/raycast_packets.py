@@ -16,10 +16,10 @@ from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.film import FilmData, asked_for, geometry_writer, radiance_writer
 from neurosim_core.render.list_search import find_faces
 from neurosim_core.render.packet_shading import packet_eye, packet_shader
-from neurosim_core.render.pixel_order import ViewData, WorldData, tile_finder
 from neurosim_core.render.ray_hit import FAR_M, UNFUSED, Hit, meet_bodies, meet_listed, meet_scene
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
+from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 from neurosim_core.render.walk_data import ASK, TILE, WalkData
 
 

@@ -33,11 +33,11 @@ from neurosim_core.render.lighting import (
     shading_mesh,
     spread_order,
 )
-from neurosim_core.render.pixel_order import WorldData, make_view
 from neurosim_core.render.ray_hit import face_normals
 from neurosim_core.render.raycast import asking_kernel, raycast_kernel
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.tile_walk import TileWalk, shared_walk
+from neurosim_core.render.view_data import WorldData, make_view
 from neurosim_core.render.walk_data import TILE, WalkData
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures

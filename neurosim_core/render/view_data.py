@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-def,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
-"""Where tiles are, of 8 x 8 pixels, whose rays walk the same nodes of the tree; and who looks at them."""
+"""Who looks: the rays and poses of a launch, its worlds, and where its tiles of 8 x 8 pixels are."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
