@@ -48,7 +48,6 @@ from neurosim_core.sensors.cast import (
     is_due,
     launch_key,
     leave_out,
-    plan_feeds,
 )
 
 __all__ = [
@@ -438,18 +437,10 @@ def _launch(model: Model, state: State, batch: Batch) -> None:
             looks = plan_looks(state, batch, choose(model, state, batch))
         for look in looks:
             ask_for_room(look)
-        feeds = [feed for look in looks for feed in plan_feeds(look)]
-
-        def launch_all() -> list[object]:
-            kept = [flight(), *(look.render() for look in looks)]
-            for feed in feeds:
-                feed.launch()
-            return kept
-
-        with timed(state.wall_s, "flight, render and scan"):
-            state.graphs.run((key, *map(launch_key, looks), *(feed.key for feed in feeds)), launch_all)
-            for feed in feeds:
-                feed.end()
+        with timed(state.wall_s, "flight and render"):
+            state.graphs.run(
+                (key, *map(launch_key, looks)), lambda: (flight(), *(look.render() for look in looks))
+            )
             for look in looks:
                 bring_images(look.cast, look.instants)
         scan(state, batch, looks)

@@ -150,7 +150,7 @@ class Relaunch:
     def launch(self, dim: int, arguments: Sequence[Any]) -> None:
         """Launch `dim` threads, at least one, with all arguments of the kernel.
 
-        What is as the last time costs nothing: the same arrays, and a number of threads that is rounded up.
+        What is as it was the last time costs nothing: pass the same arrays, and round `dim` up.
         """
         if self._recorded is None:
             self._recorded = wp.launch(

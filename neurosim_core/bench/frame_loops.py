@@ -54,8 +54,9 @@ def compare_loops(views: Views, *, seconds: float) -> Comparison:
     """Return frames a second where every call renders one frame, scans it and has the host read a count.
 
     The naive camera has the count of its frame read at once. Ours lets the next frame render meanwhile: the
-    count that a call reads is that of the frame before. Each 16 frames ours are sorted and handed out as
-    well; the naive events stay where they are, unsorted.
+    count that a call reads is that of the frame before. Our renders are graphs that are replayed, as in a
+    run; those of the naive loop are launched. Each 16 frames our events are sorted and handed out as well;
+    the naive ones stay where they are, unsorted.
     """
     camera, naive = make_camera(views, scan_count_max=2), make_naive(views)
     camera.reset(views.frames[0], 0)

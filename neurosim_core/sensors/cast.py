@@ -28,7 +28,7 @@ from neurosim_core.scene.bodies import (
     upload_motions,
 )
 from neurosim_core.sensors.displacement import DisplacementRule
-from neurosim_core.sensors.events import EventCamera, Feed
+from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig, SensorConfig
 from neurosim_core.streams import HostCopy, HostInput
 from neurosim_core.trace import Trace
@@ -117,8 +117,6 @@ class Instants:
     """Event cameras that see them."""
     rooms: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
     """Memory of the caller's that pictures are copied to, by camera and stamp."""
-    planned: set[str] = field(default_factory=set)
-    """Event cameras whose scans are launched with the rendering."""
 
 
 def make_cast_state(
@@ -398,24 +396,13 @@ def leave_out(cast: CastState, stamps_ns: Iterable[int], wanted: Collection[str]
             cast.images[name].sequence += 1
 
 
-def plan_feeds(look: Look) -> list[Feed]:
-    """Plan the scans of a look by the event cameras that go on from what they have seen, for one graph."""
-    cast, instants = look.cast, look.instants
-    log_radiance = cast.renderers[instants.lane].log_radiance
-    watching = [name for name in instants.events if cast.events[name].watching]
-    instants.planned.update(watching)
-    return [cast.events[name].camera.plan_feed(log_radiance, instants.stamps_ns) for name in watching]
-
-
 def scan_events(cast: CastState, instants: Instants) -> None:
-    """Let the event cameras see the instants just rendered, but for those whose scans were planned.
+    """Let the event cameras see the instants just rendered.
 
     One that has not seen the instants before takes the first as its reference.
     """
     log_radiance = cast.renderers[instants.lane].log_radiance
     for name in instants.events:
-        if name in instants.planned:
-            continue
         channel = cast.events[name]
         first = 0
         if not channel.watching:

@@ -140,12 +140,12 @@ class EventKeys:
             return [], [0] * len(ends_ns)
         if len(ends_ns) > self._found.shape[0]:
             self._make_window_buffers(len(ends_ns))
-        room = self._room_of_cut()
+        copied = count + count % 2  # columns in a block begin where they may
         told = self._told.rows
-        told[:_TOLD] = count, room + room % 2, self.origin_us  # columns in a block begin where they may
+        told[:_TOLD] = count, copied, self.origin_us
         told[_TOLD : _TOLD + len(ends_ns)] = np.array(ends_ns) - self.origin_us * NS_PER_US
         if self._blocks is not None and count <= _BLOCK_COUNT_MAX:
-            return self._cut_to_host(self._blocks, room, len(ends_ns), end_bit)
+            return self._cut_to_host(self._blocks, copied, len(ends_ns), end_bit)
         self._told.upload()
         prepared = [self._told.array, self._bounds, len(ends_ns), self._time_shift]
         self._launch(event_cut.prepare, count, prepared, [self.keys])
@@ -166,20 +166,14 @@ class EventKeys:
             columns = [column.numpy() for column in columns]
         return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
-    def _room_of_cut(self) -> int:
-        """Return for how many keys a cut is launched: few numbers serve for all graphs that are replayed."""
-        if self._blocks is None or self.count > _REPLAYED_COUNT_MAX:
-            return self.count
-        room: int = self._order.shape[0] // 2
-        return min(max(_ROOM_MIN, 1 << (self.count - 1).bit_length()), room)
-
     def _cut_to_host(
-        self, blocks: LentBlocks, room: int, window_count: int, end_bit: int
+        self, blocks: LentBlocks, copied: int, window_count: int, end_bit: int
     ) -> tuple[list[Any], list[int]]:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
-        shifts = [self._row_shift, self._time_shift]
-        copied = room + room % 2
-        block = blocks.take(_EVENT_BYTES * copied)
+        count, shifts = self.count, [self._row_shift, self._time_shift]
+        room = count
+        if count <= _REPLAYED_COUNT_MAX:
+            room = min(max(_ROOM_MIN, 1 << (count - 1).bit_length()), self._order.shape[0] // 2)
 
         def launch() -> None:
             self._told.upload()
@@ -189,12 +183,13 @@ class EventKeys:
             outputs = [*self._columns, self._found]
             self._launch(event_cut.decode_windows, room, [*told, self.keys, *shifts], outputs)
             self._found_on_host.fetch(0, window_count)
-            wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
 
-        if self.count <= _REPLAYED_COUNT_MAX:
-            self._graphs.run((room, window_count, end_bit, self.keys.ptr, block.array.ptr), launch)
+        if count <= _REPLAYED_COUNT_MAX:
+            self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
         else:
             launch()
+        block = blocks.take(_EVENT_BYTES * copied)
+        wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()
         self._read.wait()
         rows = blocks.lend(block, _EVENT_BYTES * copied)

@@ -13,8 +13,8 @@ Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (201
 import itertools
 import logging
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -32,19 +32,9 @@ from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
 from neurosim_core.streams import Graphs, Milestone, make_stream, on
 
-__all__ = ["EventCamera", "EventCameraConfig", "Feed"]
+__all__ = ["EventCamera", "EventCameraConfig"]
 
 _log = logging.getLogger(__name__)
-
-
-class Feed(NamedTuple):
-    """The scan of a stack, planned."""
-
-    key: Hashable
-    """Same key, same launches: of a graph."""
-    launch: Callable[[], None]
-    end: Callable[[], None]
-    """To be called after the launch, on its stream."""
 
 
 class EventCamera:
@@ -234,8 +224,8 @@ class EventCamera:
         frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
         if len(stamps) > 0:
             scan = self._plan_scan(frames, stamps)
-            self._launch(scan)
-            self._end_feed(scan)
+            self._pixels.launch(scan)
+            self._note_launched(scan)
         return self.collect()
 
     def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
@@ -255,40 +245,18 @@ class EventCamera:
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
-        feed = self.plan_feed(log_radiance, stamps_ns)
-        self._graphs.run(feed.key, feed.launch)
-        feed.end()
-
-    def plan_feed(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> Feed:
-        """Plan what `feed_device` launches, for a graph that makes the frames as well (`streams.Graphs`).
-
-        What is planned has to be launched on the present stream, and ended, before anything else is done to
-        the camera.
-
-        Args:
-            log_radiance: As for `feed_device`; its contents matter when the scan is launched.
-            stamps_ns: As for `feed_device`.
-
-        Raises:
-            RuntimeError: As `feed_device`.
-            ValueError: As `feed_device`.
-        """
         scan = self._plan_scan(log_radiance, _as_stamps(stamps_ns))
-
-        def end() -> None:
-            scan.done.set()
-            self._end_feed(scan)
-
-        return Feed(self._pixels.launch_key(scan), lambda: self._pixels.launch(scan), end)
+        self._graphs.run(self._pixels.launch_key(scan), lambda: self._pixels.launch(scan))
+        self._note_launched(scan)
 
     def _plan_scan(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> Scan:
-        """Return a scan with all that its launches read from the host, and count the camera's state on."""
+        """Return an idle scan with all that its launches read from the host."""
         self._check_feed(log_radiance, stamps)
         self._taken.hold()
-        scan = self._idle.popleft()
         count = len(stamps)
-        if count > scan.row_limit.shape[0]:
-            scan = self._pixels.make_scan(count)
+        if count > self._idle[0].row_limit.shape[0]:
+            self._idle[0] = self._pixels.make_scan(count)
+        scan = self._idle[0]
         self._pixels.make_room(scan)
         scan.frames = log_radiance
         scan.stamps_ns = stamps
@@ -300,13 +268,14 @@ class EventCamera:
         times[0] = self._pixels.since_reset_ns(origin_ns)
         times[1] = self._fed_ns - origin_ns
         np.subtract(stamps, origin_ns, out=times[2 : count + 2])
-        self._state = self._pixels.next_state(self._state)
-        self._fed_ns = int(stamps[-1])
         return scan
 
-    def _end_feed(self, scan: Scan) -> None:
-        """Note that a scan is launched, on the present stream."""
-        self._under_way.append(scan)
+    def _note_launched(self, scan: Scan) -> None:
+        """Note that the first idle scan is under way: what was planned and not launched leaves no trace."""
+        scan.done.set()
+        self._under_way.append(self._idle.popleft())
+        self._state = self._pixels.next_state(self._state)
+        self._fed_ns = int(scan.stamps_ns[-1])
         if self.device.is_cuda:
             self._feeder = self.device.stream
 
@@ -434,8 +403,8 @@ class EventCamera:
         flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
         return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
 
-    def _launch(self, scan: Scan) -> None:
-        """Scan a stack at once, or again."""
+    def _scan_again(self, scan: Scan) -> None:
+        """Scan a stack again."""
         self._pixels.launch(scan)
         scan.done.set()
 
@@ -448,7 +417,7 @@ class EventCamera:
             counts = self._read_counts(scan)
         if any(count > chunk.keys.shape[0] for count, chunk in zip(counts, scan.chunks, strict=True)):
             self._pixels.grow(scan, counts)
-            self._launch(scan)
+            self._scan_again(scan)
             scan.done.wait()  # the frames are the caller's again
         if limited:
             scan.row_limit.fill_(self.height)
@@ -499,7 +468,7 @@ class EventCamera:
             )
             self._drop_reported = True
         wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
-        self._launch(scan)
+        self._scan_again(scan)
         return True
 
     def _cut(self, ends: list[int]) -> list[Events]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 import warp as wp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from late_device import LateDevice, LateGraphs, install
+from late_device import LateDevice, install
 
 from neurosim_core import streams
 from neurosim_core.packets import Events
@@ -68,7 +67,6 @@ def fly(
     *,
     lanes: int,
     reads: list[str],
-    feed: Callable[[wp.array, np.ndarray], None] | None = None,
 ) -> list[Events]:
     """Feed stacks ahead of what is read, and read each somehow."""
     device, packets = camera.device, []
@@ -104,7 +102,7 @@ def fly(
         fed_ns = int(stamps[-1])
         frames = lane_frames[len(waiting) % lanes]  # the stack that was in them has been read
         wp.copy(frames, wp.array(stack, device=device))
-        (feed or camera.feed_device)(frames, stamps)
+        camera.feed_device(frames, stamps)
         under_way.append(fed_ns)
         if len(under_way) == lanes:
             read()
@@ -195,8 +193,7 @@ def test_events_stay_as_they_are_while_the_camera_goes_on(device):
 @pytest.mark.parametrize("eagerness", [0.0, 0.7])
 @pytest.mark.parametrize("lanes", [1, 2, 3])
 @pytest.mark.parametrize("config", [{}, {"event_count_max": 300}, {"shot_noise": {"rate_hz": 2e4}}])
-@pytest.mark.parametrize("planned", [False, True])
-def test_a_device_that_is_late_gives_the_same(monkeypatch, eagerness, lanes, config, planned):
+def test_a_device_that_is_late_gives_the_same(monkeypatch, eagerness, lanes, config):
     """As on a GPU, streams run behind the host and beside each other: nobody reads what is not ready."""
     count = 48
     rng = np.random.default_rng([lanes, int(10 * eagerness)])
@@ -213,15 +210,7 @@ def test_a_device_that_is_late_gives_the_same(monkeypatch, eagerness, lanes, con
         install(patch, late)
         camera = make_camera("cpu", lanes=lanes, **config)
         camera.reset(first)
-        graphs = LateGraphs(late)
-
-        def feed(frames: wp.array, stamps: np.ndarray) -> None:
-            """Let the scan be a part of somebody's graph."""
-            plan = camera.plan_feed(frames, stamps)
-            graphs.run(plan.key, plan.launch)
-            plan.end()
-
-        packets = fly(camera, stacks, lanes=lanes, reads=reads, feed=feed if planned else None)
+        packets = fly(camera, stacks, lanes=lanes, reads=reads)
     assert_same(packets, plain)
     assert late.replayed_count > count / 6
 

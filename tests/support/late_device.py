@@ -150,7 +150,7 @@ class _LateMilestone:
         self._device.add(lambda: None, after=self._point)
 
 
-class LateGraphs:
+class _LateGraphs:
     """Records sequences and replays them, for `streams.Graphs`."""
 
     def __init__(self, device: LateDevice) -> None:
@@ -209,7 +209,7 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         monkeypatch.setattr(module, "wp", late)
         if module is not streams:
             monkeypatch.setattr(module, "Milestone", lambda _: _LateMilestone(device), raising=False)
-            monkeypatch.setattr(module, "Graphs", lambda _: LateGraphs(device), raising=False)
+            monkeypatch.setattr(module, "Graphs", lambda _: _LateGraphs(device), raising=False)
     monkeypatch.setattr(events, "on", device.on)
     monkeypatch.setattr(events, "make_stream", device.make_stream)
     monkeypatch.setattr(streams.Relaunch, "launch", relaunch)
