@@ -8,11 +8,11 @@ import warp as wp
 from neurosim_core.bench.throughput_result import LOOP, Comparison
 from neurosim_core.bench.throughput_stages import FRAME_US, Views, make_camera, make_naive, seconds_per_call
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.streams import Graphs, HostInput, Milestone, make_stream, on
+from neurosim_core.streams import Graphs, Milestone, make_stream, on
 
 
 class _Eyes:
-    """Renders one view a call on a device, each in a stream and with buffers of its own, as a run does.
+    """Renders one view a call on a device, each in a stream and with a picture of its own, as a run does.
 
     Args:
         views: What to see.
@@ -20,32 +20,18 @@ class _Eyes:
     """
 
     def __init__(self, views: Views, count: int) -> None:
-        self._poses = views.p_WC.numpy(), views.q_WC.numpy()
+        self._views = views
         self._graphs = Graphs(views.device)
         self._renderers = [views.renderer("log_radiance", instants=1) for _ in range(count)]
-        self._inputs = [
-            [HostInput(wp.zeros(1, dtype=kind, device=views.device)) for kind in (wp.vec3, wp.quat)]
-            for _ in range(count)
-        ]
         self._streams = [make_stream(views.device) for _ in range(count)]
         self._seen = [Milestone(views.device) for _ in range(count)]
-        self._slot = wp.zeros(1, dtype=int, device=views.device)
 
     def see(self, number: int, view: int) -> tuple[wp.array | None, Milestone]:
         """Launch the render of a view; return where its log radiance will be, and when."""
         eye = number % len(self._renderers)
-        renderer, inputs = self._renderers[eye], self._inputs[eye]
-        for pose, poses in zip(inputs, self._poses, strict=True):
-            pose.rows[0] = poses[view]
-
-        def render() -> None:
-            for pose in inputs:
-                pose.upload()
-            position, orientation = (pose.array for pose in inputs)
-            renderer.render(position, orientation, self._slot, instant_count=1)
-
+        renderer = self._renderers[eye]
         with on(self._streams[eye]):
-            self._graphs.run(eye, render)
+            self._graphs.run((eye, view), lambda: self._views.render(renderer, first=view, count=1))
             self._seen[eye].set()
         return renderer.log_radiance, self._seen[eye]
 

@@ -523,8 +523,7 @@ def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
             f"stamps_ns must be integers of shape [K], got {stamps.dtype} of shape {list(stamps.shape)}"
         )
     stamps = stamps.astype(np.int64)
-    falls = stamps[1:] <= stamps[:-1]
-    if falls.size and falls.any():
+    if len(stamps) > 1 and (falls := stamps[1:] <= stamps[:-1]).any():
         index = int(np.argmax(falls))
         raise ValueError(
             f"stamps_ns must be strictly increasing, got {stamps[index + 1]} after {stamps[index]}"
