@@ -87,6 +87,33 @@ def _git(root: Path, *arguments: str) -> str:
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
+class Theft:
+    """CPU time that other machines of a virtual machine's host take: what is late may be late for that.
+
+    Args:
+        statistics: Where the system says so: proc(5), `steal`.
+    """
+
+    def __init__(self, statistics: Path = Path("/proc/stat")) -> None:
+        self._statistics = statistics
+        self._before_s = self._total_s()
+
+    def notes(self) -> list[str]:
+        """Return a line for people on what was taken since; none where that is not known."""
+        now_s = self._total_s()
+        if now_s is None or self._before_s is None:
+            return []
+        taken_s = now_s - self._before_s
+        return [f"{taken_s:.2f} s of CPU time were taken by other machines of its host meanwhile"]
+
+    def _total_s(self) -> float | None:
+        try:
+            _, *ticks = self._statistics.read_text(encoding="ascii").partition("\n")[0].split()
+            return int(ticks[7]) / os.sysconf("SC_CLK_TCK")
+        except (OSError, ValueError, IndexError):
+            return None
+
+
 def command_line() -> str:
     """Return the command that this process was started with."""
     return shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]])
