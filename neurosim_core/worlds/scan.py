@@ -280,7 +280,8 @@ def begin_pixels(
 ) -> None:
     """Let the pixels of some worlds take frame 0 as their reference; threads are [world, pixel].
 
-    A value that is not finite, or beyond +-1000, is counted, and 0 is the reference in its place.
+    A value that is not finite, or beyond +-1000, is counted, and 0 is the reference in its place; counters
+    are as those of a step with one frame.
     """
     world, pixel = wp.tid()
     if mask[world] != 0:
@@ -288,8 +289,7 @@ def begin_pixels(
         if not wp.abs(value) <= LIMIT:
             value = wp.float32(0.0)
             wp.atomic_add(counters, world, 1, wp.int64(1))
-            values = wp.int64(log_radiance.shape[1]) * wp.int64(log_radiance.shape[2])
-            wp.atomic_max(counters, world, 2, values - wp.int64(pixel))
+            wp.atomic_max(counters, world, 2, wp.int64(base_out.shape[1]) - wp.int64(pixel))
         base_out[world, pixel] = value
         last_out[world, pixel] = value
         crossed_out[world, pixel] = wp.vec2i(0, 0)

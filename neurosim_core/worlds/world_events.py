@@ -48,8 +48,9 @@ class WorldEvents:
     dropped: wp.array[wp.int32]
     """Events of each world that did not fit and are lost, shape [N]."""
     counters: wp.array2d[wp.int64]
-    """Of each world: events; values of log radiance that were not finite, whose pixels kept their last value;
-    and where the first of these is, shape [N, 3]."""
+    """Of each world, of its last step, or of its reset before the first: events; values of log radiance that
+    were not finite or beyond +-1000, whose pixels kept their last value, or began at 0; and how many values
+    there are from the first of these on, shape [N, 3]."""
     width: int
     """Width of the sensor [px]."""
     height: int
