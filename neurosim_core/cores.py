@@ -47,6 +47,8 @@ class OwnCore:
         self._core: int | None = None
         self._before: set[int] = set()
         self._mine: frozenset[int] = frozenset()
+        self._others: frozenset[int] = frozenset()
+        """Where the thread that computes keeps to meanwhile."""
         self._threads: set[str] = set()
 
     def give(self, thread_id: int) -> None:
@@ -62,13 +64,11 @@ class OwnCore:
         if core is None:
             return
         self._mine = frozenset(os.sched_getaffinity(0))
-        others = self._mine - {core}
-        if not others:
-            return
         with _changing:
-            if any(
-                other._core == core for other in _holders
-            ):  # another simulator of this process flies there
+            # other simulators of this process fly on a core of theirs, and compute on others
+            taken = {other._core for other in _holders}
+            others = self._mine - {core} - taken
+            if not others or core in taken or any(core in other._others for other in _holders):
                 return
             try:
                 self._before = os.sched_getaffinity(thread_id)
@@ -79,6 +79,7 @@ class OwnCore:
                 return
             _holders.add(self)
             self._thread_id, self._core, self._threads = thread_id, core, _threads()
+            self._others = others
         _keep_to(others)
 
     def take_back(self) -> None:
@@ -96,9 +97,8 @@ class OwnCore:
                 return
             _holders.discard(self)
             started = _threads() - self._threads
-            if os.path.exists(
-                f"/proc/self/task/{thread_id}"
-            ):  # or the number may be another process's by now
+            # if it has ended, the number may be another process's by now
+            if os.path.exists(f"/proc/self/task/{thread_id}"):
                 started.add(str(thread_id))
             for number in map(int, started):
                 with contextlib.suppress(OSError):  # it has ended

@@ -19,10 +19,12 @@ from collections.abc import Iterator
 _STEPS = 5
 """How much nicer a thread that gives way is: beside a busy program it gets a quarter of a core."""
 _LONG_TURN_NS = 3_000_000
-"""Longer than the usual turn, 2.8 ms on machines of 8 cores or more and less on others [ns]. Not much longer:
-with turns of 20 ms half of the pictures were late beside busy programs of others."""
+"""Longer than the usual turn, 2.8 ms on machines of 8 cores or more (3 on earlier kernels) and less on others
+[ns]. Not much longer: with turns of 20 ms half of the pictures were late beside busy programs of others."""
 _WAKER_TURN_NS = 2_900_000
 """Longer than the usual turn, and shorter than that of a thread that gives way [ns]."""
+_TURN_STEP_NS = 100_000
+"""How much longer than the turns that a thread has those are at least that it asks for [ns]."""
 _SLACK_NS = 1_000
 """How much later than asked for a thread that is punctual may be woken by a timer [ns]; usually 50,000."""
 _SET_TIMER_SLACK = 29  # PR_SET_TIMERSLACK of `prctl`
@@ -40,7 +42,7 @@ def give_way() -> None:
     """
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, 0, min(niceness() + _STEPS, 19))
-        _take_turns(_LONG_TURN_NS)
+        take_turns(max(_LONG_TURN_NS, _turn_ns() + 2 * _TURN_STEP_NS))
 
 
 def be_punctual() -> None:
@@ -53,14 +55,19 @@ def be_punctual() -> None:
         ctypes.CDLL(None).prctl(_SET_TIMER_SLACK, ctypes.c_ulong(_SLACK_NS), 0, 0, 0)
 
 
-def let_the_woken_go_first() -> None:
-    """Let those that the calling thread wakes go before it, where they have usual turns; for good.
+def let_the_woken_go_first() -> int:
+    """Let those that the calling thread wakes go before it, where they have usual turns.
 
     For one that is at work nearly all the time: beside a busy program it is later than with usual turns.
-    Only on Linux.
+    Threads and processes that it starts meanwhile are as it is. Only on Linux.
+
+    Returns:
+        How long its turns were, for `take_turns` [ns]; 0: not known, and as they were.
     """
-    if sys.platform == "linux":
-        _take_turns(_WAKER_TURN_NS)
+    before_ns = _turn_ns()
+    if before_ns:
+        take_turns(max(_WAKER_TURN_NS, before_ns + _TURN_STEP_NS))
+    return before_ns
 
 
 class _Attributes(ctypes.Structure):
@@ -78,15 +85,30 @@ class _Attributes(ctypes.Structure):
     )
 
 
-def _take_turns(turn_ns: int) -> None:
+def take_turns(turn_ns: int) -> None:
     """Say how long turns of the calling thread are [ns]; where that cannot be, they are as they were."""
-    call = _SET_ATTRIBUTES.get(platform.machine())
-    if call is None or os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:
-        return
-    system, attributes = ctypes.CDLL(None).syscall, _Attributes()
-    if system(call + 1, 0, ctypes.byref(attributes), ctypes.sizeof(attributes), 0) == 0:
+    attributes = _attributes()
+    if turn_ns and attributes is not None:
         attributes.runtime_ns = turn_ns
-        system(call, 0, ctypes.byref(attributes), 0)
+        call = _SET_ATTRIBUTES[platform.machine()]
+        ctypes.CDLL(None).syscall(call, 0, ctypes.byref(attributes), 0)
+
+
+def _turn_ns() -> int:
+    """Return how long turns of the calling thread are [ns]; 0: not known."""
+    attributes = _attributes()
+    return 0 if attributes is None else int(attributes.runtime_ns)
+
+
+def _attributes() -> _Attributes | None:
+    """Return how the calling thread is scheduled; None: not known, or not as usual."""
+    call = _SET_ATTRIBUTES.get(platform.machine()) if sys.platform == "linux" else None
+    if call is None or os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:
+        return None
+    attributes = _Attributes()
+    size = ctypes.sizeof(attributes)
+    failed = ctypes.CDLL(None).syscall(call + 1, 0, ctypes.byref(attributes), size, 0)
+    return None if failed else attributes
 
 
 def niceness() -> int:

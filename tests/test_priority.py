@@ -72,7 +72,7 @@ def test_who_gives_way_has_longer_turns_than_usual_and_who_is_punctual_has_not()
     usual_ns, found = 1_400_000, []
 
     def usual() -> None:
-        priority._take_turns(usual_ns)  # whatever those of the thread that tests are
+        priority.take_turns(usual_ns)  # whatever those of the thread that tests are
         in_thread(lambda: (give_way(), found.append(turn_ns()), in_thread(lambda: found.append(turn_ns()))))
         in_thread(lambda: (be_punctual(), found.append(turn_ns())))
         found.append(turn_ns())
@@ -85,17 +85,31 @@ def test_who_gives_way_has_longer_turns_than_usual_and_who_is_punctual_has_not()
 
 @on_linux
 @pytest.mark.skipif(platform.machine() not in priority._SET_ATTRIBUTES, reason="no number of the system call")
-def test_turns_of_who_lets_the_woken_go_first_are_between_the_usual_ones_and_those_of_who_gives_way():
+@pytest.mark.parametrize("most_usual_ns", [1_400_000, 2_800_000, 3_000_000, 4_000_000])
+def test_turns_of_who_lets_the_woken_go_first_are_between_the_usual_ones_and_those_of_who_gives_way(
+    most_usual_ns,
+):
     """Shorter turns go first: readers before it, and it before the thread that renders."""
-    found, most_usual_ns = [], 2_800_000
+    found: list[int] = []
 
     def usual() -> None:
-        priority._take_turns(most_usual_ns)
+        priority.take_turns(most_usual_ns)
         in_thread(lambda: (let_the_woken_go_first(), found.append(turn_ns())))
         in_thread(lambda: (give_way(), found.append(turn_ns())))
 
     in_thread(usual)
     assert found == [0, 0] or most_usual_ns < found[0] < found[1]
+
+
+@on_linux
+def test_turns_are_given_back():
+    def work() -> None:
+        before_ns = priority._turn_ns()
+        assert let_the_woken_go_first() == before_ns
+        priority.take_turns(before_ns)
+        assert priority._turn_ns() == before_ns
+
+    in_thread(work)
 
 
 @on_linux

@@ -142,9 +142,9 @@ class PictureLoan:
         return True
 
     def _unpin(self) -> None:
-        if self._pinned is not None:
-            self._pinned.close()
-            self._pinned = None
+        pinned, self._pinned = self._pinned, None
+        if pinned is not None:
+            pinned.close()
 
     def _give_back(self) -> bool:
         """Return whether nothing is lent, having dropped what nobody can publish; the lock is held."""

@@ -186,6 +186,7 @@ class Simulator:
         if not self._ended:
             self._flush()
         self._tell(at_once=True)
+        self._streaming.take_usual_turns()
         return self._exit or 0
 
     def close(self) -> None:
@@ -267,9 +268,14 @@ class Simulator:
                 begun.append((craft, craft.begin_step(self.stamp_ns)))
             self._mind()  # while the device is at work
         finally:
-            with contextlib.ExitStack() as ends:  # all of them, in order, whatever one of them raises
-                for craft, step in reversed(begun):
-                    ends.callback(craft.end_step, step)
+            errors = []
+            for craft, step in begun:  # all of them, whatever one of them raises
+                try:
+                    craft.end_step(step)
+                except Exception as error:
+                    errors.append(error)
+            if errors:
+                raise errors[0]
 
     def _wait_for_end(self, end_ns: int) -> bool:
         """Publish until the end of a control period [ns]; False if something else has to be done first."""
@@ -397,8 +403,9 @@ class Simulator:
             craft.outlet.publish_due(max(self.stamp_ns, craft.state.stamp_ns))
 
     def _drop_loans(self) -> None:
-        for craft in self.crafts:
-            craft.drop_loans()
+        with contextlib.ExitStack() as drops:  # of all, whatever one of them raises
+            for craft in reversed(self.crafts):
+                drops.callback(craft.drop_loans)
 
     def _culprit(self, error: DynamicsError) -> str:
         return next(craft.name for craft in self.crafts if craft.state.failure is error)

@@ -11,7 +11,7 @@ from neurosim_core.nodes.cameras import Cameras
 from neurosim_core.nodes.craft import Craft
 from neurosim_core.nodes.status import Meter
 from neurosim_core.pacing import Pacer
-from neurosim_core.priority import let_the_woken_go_first
+from neurosim_core.priority import let_the_woken_go_first, take_turns
 
 HICCUP_NS = 10_000_000
 """The machine may be this late, or a control period if that is longer, and catch up [ns]."""
@@ -63,7 +63,8 @@ class Streaming:
         self._pacer = pacer
         self._meter = meter
         self._bell = bell
-        self._has_long_turns = False
+        self._usual_turn_ns: int | None = None
+        """Of the thread that flies, while it has longer ones [ns]."""
 
     def fly(self, stamp_ns: int, live: LiveConfig, stop: Callable[[], bool]) -> bool:
         """Fly the control period that begins at a tick [ns], and leave its pictures to the cameras.
@@ -178,15 +179,18 @@ class Streaming:
         least_s, most_s = READERS_S
         left_s = min(READERS_SHARE * wall_ns * 1e-9, most_s)
         if left_s < least_s:
-            self._let_the_woken_go_first()
-        elif self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
+            if self._usual_turn_ns is None:
+                self._usual_turn_ns = let_the_woken_go_first()
+            return
+        self.take_usual_turns()
+        if self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
             time.sleep(left_s)
 
-    def _let_the_woken_go_first(self) -> None:
-        """Ask the scheduler, once, for what there is no time to sleep for."""
-        if not self._has_long_turns:
-            let_the_woken_go_first()
-            self._has_long_turns = True
+    def take_usual_turns(self) -> None:
+        """Let the thread that flies interrupt, and be interrupted, as any other."""
+        if self._usual_turn_ns is not None:
+            take_turns(self._usual_turn_ns)
+            self._usual_turn_ns = None
 
     def offer_seen(self) -> None:
         """Send on their way what the cameras have seen."""

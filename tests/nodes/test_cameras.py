@@ -286,7 +286,7 @@ def test_readers_go_first_where_there_is_time(
     slept_s: list[float] = []
     asked: list[bool] = []
     monkeypatch.setattr("neurosim_core.nodes.streaming.time.sleep", slept_s.append)
-    monkeypatch.setattr("neurosim_core.nodes.streaming.let_the_woken_go_first", lambda: asked.append(True))
+    monkeypatch.setattr("neurosim_core.nodes.streaming.let_the_woken_go_first", lambda: asked.append(1) or 1)
     period_ns = round(period_ms * MS)
     now_ns = 0
     pacer = Pacer(factor, clock_ns=lambda: now_ns)
@@ -297,3 +297,22 @@ def test_readers_go_first_where_there_is_time(
     assert slept_s == pytest.approx([pause * 1e-6 for pause in pauses_us])
     streaming.let_readers_go_first(period_ns, period_ns)
     assert len(asked) == (0.0 < period_ms / (factor or 1e-9) < 1.25)  # once
+
+
+def test_usual_turns_are_taken_again_where_there_is_time_to_sleep(monkeypatch: pytest.MonkeyPatch):
+    turns: list[int] = []
+    monkeypatch.setattr("neurosim_core.nodes.streaming.time.sleep", lambda _: None)
+    monkeypatch.setattr("neurosim_core.nodes.streaming.let_the_woken_go_first", lambda: 7)
+    monkeypatch.setattr("neurosim_core.nodes.streaming.take_turns", turns.append)
+    bell = threading.Event()
+    cameras, pacer = Cameras(inline=True, on_packets=bell.set), Pacer(1.0, clock_ns=lambda: 0)
+    streaming = Streaming([], cameras, pacer, Meter(), bell=bell)
+    for period_ns in (10 * MS, MS, MS):
+        streaming.let_readers_go_first(period_ns, period_ns)
+    assert turns == []
+    for _ in range(2):
+        streaming.let_readers_go_first(10 * MS, 10 * MS)
+    assert turns == [7]
+    streaming.let_readers_go_first(MS, MS)
+    streaming.take_usual_turns()
+    assert turns == [7, 7]

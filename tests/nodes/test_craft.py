@@ -67,7 +67,7 @@ def test_every_period_that_was_begun_is_ended(runtime: Any, monkeypatch: pytest.
 
     monkeypatch.setattr(module.Craft, "end_step", failing)
     with Simulator(config, models=models_of(config)) as simulator:
-        with pytest.raises(RuntimeError):
+        with pytest.raises(RuntimeError, match=r"^a$"):  # the first, and not what came of it
             simulator._step()
         assert ended == ["a", "b", "c"]
         assert [craft.state.launched_ns for craft in simulator.crafts] == [5_000_000] * 3
