@@ -156,13 +156,13 @@ class Relaunch:
             self._recorded = wp.launch(
                 self._kernel, dim=dim, inputs=list(arguments), device=self._device, record_cmd=True
             )
-            self._dim, self._arguments = dim, arguments
-        if dim != self._dim:
-            self._recorded.set_dim(dim)
-        for index, (value, last) in enumerate(zip(arguments, self._arguments, strict=True)):
-            if value is not last:
-                packed = value.__ctype__() if isinstance(value, wp.array) else value
-                self._recorded.set_param_at_index_from_ctype(index, packed)
+        else:
+            if dim != self._dim:
+                self._recorded.set_dim(dim)
+            for index, (value, last) in enumerate(zip(arguments, self._arguments, strict=True)):
+                if value is not last:
+                    packed = value.__ctype__() if isinstance(value, wp.array) else value
+                    self._recorded.set_param_at_index_from_ctype(index, packed)
         self._recorded.launch()
         self._dim, self._arguments = dim, arguments
 

@@ -28,7 +28,7 @@ from neurosim_core.bench.loop_trace import (
     received_hz,
     transport_ns,
 )
-from neurosim_core.bench.machine import Theft, describe_machine
+from neurosim_core.bench.machine import StealTime, describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
@@ -413,14 +413,14 @@ def bench_closed_loop(
     where = "the generated apartment" if config.scene.kind == "apartment" else Path(config.scene.file).name
     title = f"closed loop, RGB {lens.width}x{lens.height}, {config.renderer} renderer, hover in {where}"
     notes = describe_machine(None if config.device == "auto" else config.device)
-    theft = Theft()
+    steal_time = StealTime()
     with console.status("closed loop") as status:
         results = sweep(
             configs,
             seconds=seconds,
             on_case=lambda mode, rate_hz: status.update(f"closed loop: {mode}, {rate_hz:g} Hz"),
         )
-    notes += theft.notes()
+    notes += steal_time.notes()
     console.print("\n".join([title, *notes]), highlight=False, soft_wrap=True)
     print_sweep(results, console)
     plot = Plot(name="closed-loop", title=title, draw=lambda figure: _draw(results, figure))

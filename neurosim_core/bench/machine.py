@@ -87,7 +87,7 @@ def _git(root: Path, *arguments: str) -> str:
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
-class Theft:
+class StealTime:
     """CPU time that other machines of a virtual machine's host take: what is late may be late for that.
 
     Args:

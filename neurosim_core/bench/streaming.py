@@ -17,7 +17,7 @@ import rich.table
 from numpy.typing import NDArray
 from rich.console import Console
 
-from neurosim_core.bench.machine import Theft, describe_machine
+from neurosim_core.bench.machine import StealTime, describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.bench.step import measure_steps
@@ -389,9 +389,9 @@ def bench_streaming(
             calibration = Calibration(renders_hz=None, sampling_rate_hz=sampling_rate_hz)
         config = stream_config(calibration.sampling_rate_hz, seconds=seconds, settings=settings, **shape)
         status.update(f"streaming for {seconds:g} s")
-        theft = Theft()
+        steal_time = StealTime()
         trace = measure_stream(config, seconds=seconds)
-    notes += theft.notes()
+    notes += steal_time.notes()
     result = summarise(trace)
     title = (
         f"streaming at factor 1, IMU at {_IMU_RATE_HZ:g} Hz, event camera {width}x{height} rendered at "

@@ -173,20 +173,22 @@ class Simulator:
         self._stop = stop
         if self._recorder is not None:
             self._recorder.stop = stop
-        while not stop.is_set() and self._exit is None:
-            self._answer_requests()
-            self._mind()
-            if self._ended or (self._paused and not self._steps):
-                if self._tick and not self._ended:
-                    self._streaming.publish_seen(self.stamp_ns)
-                self._bell.wait(0.02)
-                self._bell.clear()
-            elif self._receive():
-                self._fly()
+        try:
+            while not stop.is_set() and self._exit is None:
+                self._answer_requests()
+                self._mind()
+                if self._ended or (self._paused and not self._steps):
+                    if self._tick and not self._ended:
+                        self._streaming.publish_seen(self.stamp_ns)
+                    self._bell.wait(0.02)
+                    self._bell.clear()
+                elif self._receive():
+                    self._fly()
+        finally:
+            self._streaming.take_usual_turns()
         if not self._ended:
             self._flush()
         self._tell(at_once=True)
-        self._streaming.take_usual_turns()
         return self._exit or 0
 
     def close(self) -> None:

@@ -305,9 +305,9 @@ def test_time_that_the_host_took_is_said(tmp_path, rest):
     statistics = tmp_path / "stat"
     second = os.sysconf("SC_CLK_TCK")
     statistics.write_text(f"cpu 1 2 3 4 5 6 7 {10 * second}{rest}\n")
-    theft = machine.Theft(statistics)
+    steal_time = machine.StealTime(statistics)
     statistics.write_text(f"cpu 9 9 9 9 9 9 9 {10 * second + second // 2}{rest}\n")
-    assert theft.notes() == ["0.50 s of CPU time were taken by other machines of its host meanwhile"]
+    assert steal_time.notes() == ["0.50 s of CPU time were taken by other machines of its host meanwhile"]
 
 
 @pytest.mark.parametrize("text", [None, "", "cpu 1 2 3", "cpu 1 2 3 4 5 6 7 many"])
@@ -315,4 +315,4 @@ def test_where_nobody_knows_what_the_host_took_nothing_is_said(tmp_path, text):
     statistics = tmp_path / "stat"
     if text is not None:
         statistics.write_text(text)
-    assert machine.Theft(statistics).notes() == []
+    assert machine.StealTime(statistics).notes() == []
