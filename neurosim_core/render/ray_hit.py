@@ -11,6 +11,7 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.ray_tree import walk_tree
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.walk_data import ASK
 
@@ -54,13 +55,14 @@ def meet_face(id: wp.uint64, face: int, origin: wp.vec3, ray: wp.vec3) -> wp.vec
 @wp.func
 def meet_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
     """Return what a ray hits first that stands still; it walks through the tree by itself."""
-    query = wp.mesh_query_ray(scene.mesh, origin, ray, FAR_M)
+    met = walk_tree(scene.tree, origin, ray, FAR_M)
     hit = Hit()
-    hit.face = wp.where(query.result, query.face, -1)
-    hit.t = query.t
-    hit.u = query.u
-    hit.v = query.v
-    hit.normal = query.normal
+    hit.face = wp.cast(met[3], int)
+    if hit.face >= 0:
+        hit.t = met[0]
+        hit.u = met[1]
+        hit.v = met[2]
+        hit.normal = scene.face_normal[hit.face]
     return hit
 
 

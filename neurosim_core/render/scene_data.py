@@ -4,6 +4,8 @@
 
 import warp as wp
 
+from neurosim_core.render.ray_tree import RayTree
+
 
 @wp.struct
 class SceneData:
@@ -13,6 +15,8 @@ class SceneData:
     """
 
     mesh: wp.uint64
+    tree: RayTree
+    """What rays walk through; not filled if Embree finds what they hit."""
     embree_scene: wp.uint64
     """`EmbreeTree.scene`; 0 if Warp finds what rays hit."""
     embree_intersect: wp.uint64
@@ -20,7 +24,7 @@ class SceneData:
     face_material: wp.array[int]
     face_instance: wp.array[int]
     face_normal: wp.array[wp.vec3]
-    """Unit normal of each face's front; only for rays that share walks."""
+    """Unit normal of each face's front; not filled if Embree finds what rays hit."""
     face_lod: wp.array[float]
     """log2 of texels per metre on each face."""
     corner_uv: wp.array[wp.vec2]

@@ -34,6 +34,7 @@ from neurosim_core.render.lighting import (
     spread_order,
 )
 from neurosim_core.render.ray_hit import face_normals
+from neurosim_core.render.ray_tree import make_ray_tree
 from neurosim_core.render.raycast import asking_kernel, raycast_kernel
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.tile_walk import TileWalk, shared_walk
@@ -140,8 +141,8 @@ def upload_scene(
     if embree is not None:
         data.embree_scene = wp.uint64(embree.scene)
         data.embree_intersect = wp.uint64(embree.intersect)
-    asked = isinstance(config.shared_walk, WalkConfig)
-    if asked or (config.shared_walk == "auto" and wp.get_device(device).is_cuda):
+    else:
+        data.tree = make_ray_tree(tree)
         data.face_normal = face_normals(tree)
     instance = scene.face_instance[mesh.origin]
     data.face_material = wp.array(np.append(material, joined.material), dtype=int, device=device)
