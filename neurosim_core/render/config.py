@@ -48,13 +48,13 @@ class RenderConfig(Settings):
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
     """Who finds what rays hit on a CPU device. `embree`: Embree, in packets of rays, several times faster.
-    `warp`: Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp where a `shared_walk` is asked
-    for."""
+    `warp`: a kernel of ours in Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp where a
+    `shared_walk` is asked for."""
     shared_walk: WalkConfig | Literal["auto"] | None = "auto"
     """The rays of a tile of pixels share one walk through Warp's tree over several instants, instead of one
-    for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 4
-    instants or more, pixels are at most 0.2 degrees wide (3.5 mrad, in the median) and the lens looks
-    forward. null: each ray walks by itself."""
+    for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 8
+    instants or more of pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of
+    3.2 mrad, and the lens looks forward. null: each ray walks by itself."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"

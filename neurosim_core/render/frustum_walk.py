@@ -13,6 +13,7 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.render.ray_hit import FAR_M
+from neurosim_core.render.ray_tree import READ_ROWS, RayTree, walk_tree
 from neurosim_core.render.walk_data import WalkData
 
 _ROUNDING = wp.constant(4.0e-6)
@@ -67,18 +68,17 @@ def _block_max(value: float) -> float:
 
 
 # A thread takes a node: of a leaf it lists the triangles that are not outside, else it puts children back.
-_LIST_FACES = """
-    using namespace wp;
+_LIST_FACES = (
+    READ_ROWS
+    + """
     constexpr int ROOM = 1024, THREADS = 64;
-    const Mesh mesh = mesh_get(id);
     const vec3 normal[6] = {
         frustum.x - frustum.slope_high[0] * frustum.z, frustum.slope_low[0] * frustum.z - frustum.x,
         frustum.y - frustum.slope_high[1] * frustum.z, frustum.slope_low[1] * frustum.z - frustum.y,
         frustum.z, -frustum.z};
     const float offset[6] = {frustum.foot_high[0], -frustum.foot_low[0], frustum.foot_high[1],
                              -frustum.foot_low[1], frustum.far, -frustum.near};
-    auto box_outside = [&](const BVHPackedNodeHalf& low, const BVHPackedNodeHalf& high) {
-        const vec3 upper(high.x, high.y, high.z), lower(low.x, low.y, low.z);
+    auto box_outside = [&](const vec3& lower, const vec3& upper) {
         const vec3 middle = 0.5f * (lower + upper) - frustum.origin, half = 0.5f * (upper - lower);
         bool outside = false;
         for (int k = 0; k < 6; ++k) {
@@ -88,10 +88,9 @@ _LIST_FACES = """
         }
         return outside;
     };
-    auto face_outside = [&](int face) {
-        const vec3 a = mesh.points[mesh.indices[3 * face]] - frustum.origin;
-        const vec3 b = mesh.points[mesh.indices[3 * face + 1]] - frustum.origin;
-        const vec3 c = mesh.points[mesh.indices[3 * face + 2]] - frustum.origin;
+    auto face_outside = [&](const Row& p, const Row& q, const Row& r) {
+        const vec3 a = vec3(p.x, p.y, p.z) - frustum.origin, b = vec3(q.x, q.y, q.z) - frustum.origin,
+                   c = vec3(r.x, r.y, r.z) - frustum.origin;
         bool outside = false;
         for (int k = 0; k < 6; ++k) {
             const vec3& n = normal[k];
@@ -99,36 +98,39 @@ _LIST_FACES = """
         }
         return outside;
     };
-    auto visit = [&](uint64_t node, auto&& list, auto&& push) {
-        const int first = bvh_query_node_lower_payload(node), second = bvh_query_node_upper_payload(node);
-        if (bvh_query_node_is_leaf(node)) {
-            for (int k = first; k < second; ++k)
-                if (const int face = mesh.bvh.primitive_indices[k]; !face_outside(face))
-                    list(face);
+    auto visit = [&](int node, auto&& list, auto&& push) {
+        if (node < 0) {
+            bool more = true;
+            for (int place = -1 - node; more; ++place) {
+                const Row a = row(tree.triangles, 3 * place), b = row(tree.triangles, 3 * place + 1),
+                          c = row(tree.triangles, 3 * place + 2);
+                if (!face_outside(a, b, c))
+                    list(__float_as_int(a.w));
+                more = __float_as_int(b.w) == 0;
+            }
             return;
         }
-        const int children[2] = {first, second};
-        for (int child : children) {
-            const BVHPackedNodeHalf low = bvh_load_node(mesh.bvh.node_lowers, child);
-            const BVHPackedNodeHalf high = bvh_load_node(mesh.bvh.node_uppers, child);
-            if (!box_outside(low, high))
-                push(bvh_query_node_pack(low, high));
-        }
+        const Row a = row(tree.nodes, 4 * node), b = row(tree.nodes, 4 * node + 1),
+                  c = row(tree.nodes, 4 * node + 2), d = row(tree.nodes, 4 * node + 3);
+        if (!box_outside(vec3(a.x, a.z, c.x), vec3(a.y, a.w, c.y)))
+            push(__float_as_int(d.x));
+        if (!box_outside(vec3(b.x, b.z, c.z), vec3(b.y, b.w, c.w)))
+            push(__float_as_int(d.y));
     };
 #ifdef __CUDA_ARCH__
-    __shared__ uint64_t stack[ROOM];
+    __shared__ int stack[ROOM];
     __shared__ int height, found;
     const int thread = threadIdx.x;
     __syncthreads();
     if (thread == 0) {
-        stack[0] = bvh_query_node_load(mesh.bvh, *mesh.bvh.root);
+        stack[0] = tree.root;
         height = 1;
         found = 0;
     }
     __syncthreads();
     while (height > 0 && height <= ROOM - THREADS && found <= limit) {
         const int taken = wp::min(height, THREADS), rest = height - taken;
-        const uint64_t node = thread < taken ? stack[rest + thread] : 0;
+        const int node = thread < taken ? stack[rest + thread] : 0;
         __syncthreads();
         if (thread == 0)
             height = rest;
@@ -141,14 +143,13 @@ _LIST_FACES = """
                     if (place < limit)
                         faces_out.data[begin + place] = face;
                 },
-                [&](uint64_t child) { stack[atomicAdd(&height, 1)] = child; });
+                [&](int child) { stack[atomicAdd(&height, 1)] = child; });
         __syncthreads();
     }
     const int left = height, count = found;
 #else
-    uint64_t stack[ROOM];
-    int left = 1, count = 0;
-    stack[0] = bvh_query_node_load(mesh.bvh, *mesh.bvh.root);
+    int stack[ROOM], left = 1, count = 0;
+    stack[0] = tree.root;
     while (left > 0 && left <= ROOM - THREADS && count <= limit)
         visit(
             stack[--left],
@@ -156,14 +157,15 @@ _LIST_FACES = """
                 if (count++ < limit)
                     faces_out.data[begin + count - 1] = face;
             },
-            [&](uint64_t child) { stack[left++] = child; });
+            [&](int child) { stack[left++] = child; });
 #endif
     return left > 0 || count > limit ? -1 : count;
 """
+)
 
 
 @wp.func_native(_LIST_FACES)
-def _list_faces(id: wp.uint64, frustum: _Frustum, limit: int, begin: int, faces_out: wp.array[int]) -> int:
+def _list_faces(tree: RayTree, frustum: _Frustum, limit: int, begin: int, faces_out: wp.array[int]) -> int:
     """Write the triangles that reach into a frustum from `begin` on, in any order; return how many.
 
     -1: more than `limit`. On CUDA a block of 64 threads calls it together.
@@ -184,7 +186,7 @@ def walk_kernel(lanes: int) -> wp.Kernel:
     def walk_tiles(
         first: int,
         # Model:
-        mesh: wp.uint64,
+        tree: RayTree,
         rays: wp.array2d[wp.vec4],
         width: int,
         height: int,
@@ -215,8 +217,7 @@ def walk_kernel(lanes: int) -> wp.Kernel:
             row = wp.min(top + (7 * ((probe // 4) % 4) + 1) // 3, height - 1)
             ray_C = rays[0, row * width + col]
             ray = wp.quat_rotate(q_WC[instant], wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-            query = wp.mesh_query_ray(mesh, p_WC[instant], ray, FAR_M)
-            reach = wp.max(reach, wp.where(query.result, query.t, FAR_M))
+            reach = wp.max(reach, walk_tree(tree, p_WC[instant], ray, FAR_M)[0])
         reach = wp.min(_block_max(reach) * _REACH + _REACH_M, FAR_M)
 
         frustum = _Frustum()
@@ -259,7 +260,7 @@ def walk_kernel(lanes: int) -> wp.Kernel:
         count = -1
         if cosine > _COSINE_MIN:  # of all lanes or of none
             begin_of_list = (walk * data.bounds.shape[0] + tile) * data.limit
-            count = _list_faces(mesh, frustum, data.limit, begin_of_list, data.faces)
+            count = _list_faces(tree, frustum, data.limit, begin_of_list, data.faces)
         if lane == 0:
             data.count[walk, tile] = count
             data.reach[walk, tile] = reach

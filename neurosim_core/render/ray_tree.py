@@ -3,12 +3,12 @@
 
 A node holds the boxes of its two children side by side, and a leaf holds the corners of its triangles: one
 step of a ray reads 64 bytes in one place where `wp.mesh_query_ray` reads four times 16, and a triangle is
-read at once where that reads three arrays one after the other. On an H200 the rays of a picture in a house of
-145,844 triangles take 86 us in place of 138 (`neurosim bench throughput`).
+read at once where that reads three arrays one after the other. On an H200, in a house of 145,844 triangles, a
+picture of 640x480 takes 85 us in place of 138, and 45 in place of 90 where others fill the gaps.
 
 A triangle is met where Woop's test says, with the operations and so the bits of `wp.mesh_query_ray`; of two
-at the same distance, the one with the lesser number. A box counts as met up to rounding: where the far side is
-less than 1 + 2 gamma_3 times as far as the near one, the products that say so may be wrong (Ize).
+at the same distance, it is the one with the lesser number. A box is met up to rounding: where its far side
+is less than 1 + 2 gamma_3 times as far as its near one, the products that say so may be wrong (Ize).
 
 References: Woop, Benthin, Wald (2013), Watertight Ray/Triangle Intersection; Ize (2013), Robust BVH Ray
 Traversal; Aila, Laine (2009), Understanding the Efficiency of Ray Traversal on GPUs.
@@ -28,8 +28,8 @@ class RayTree:
     root: int
     """The first child."""
     nodes: wp.array[wp.vec4]
-    """Four rows a node: of its first child, then of its second, low x, high x, low y, high y; low and high z of
-    the first, then of the second; both children, as the bits of integers."""
+    """Four rows a node: low x, high x, low y, high y of its first child; the same of its second; low and high
+    z of the first, then of the second; both children, as the bits of integers."""
     triangles: wp.array[wp.vec4]
     """Three rows a triangle, in the order of the leaves: its corners. Beside them, as the bits of integers:
     which face it is; 1 for the last of its leaf."""
@@ -116,7 +116,7 @@ def make_ray_tree(mesh: wp.Mesh) -> RayTree:
     device, node_limit = mesh.device, 2 * face_count
     tree = RayTree()
     root = wp.empty(1, dtype=int, device=device)
-    bounds = wp.array([node_limit, -1], dtype=int, device=device)
+    bounds: wp.array[int] = wp.array([node_limit, -1], dtype=int, device=device)
     wp.launch(_bound_nodes, dim=node_limit, inputs=[mesh.id], outputs=[root, bounds], device=device)
     first, last = (int(x) for x in bounds.numpy())
     tree.nodes = wp.zeros(4 * max(last - first + 1, 1), dtype=wp.vec4, device=device)
@@ -127,18 +127,27 @@ def make_ray_tree(mesh: wp.Mesh) -> RayTree:
     return tree
 
 
-@wp.func_native("""
+READ_ROWS = """
     using namespace wp;
-    constexpr int DEPTH = 32;  // of the trees that Warp builds
-    constexpr float SPARE = 1.0000005f;
 #ifdef __CUDA_ARCH__
     using Row = float4;
     auto row = [](const array_t<vec4>& rows, int k) { return __ldg((const float4*)rows.data + k); };
-    auto least = [](float a, float b) { return fminf(a, b); };
-    auto most = [](float a, float b) { return fmaxf(a, b); };
 #else
     struct Row { float x, y, z, w; };
     auto row = [](const array_t<vec4>& rows, int k) { return ((const Row*)rows.data)[k]; };
+#endif
+"""
+"""Beginning of native code: `row` reads one of the rows of a `RayTree`."""
+
+_WALK_TREE = (
+    READ_ROWS
+    + """
+    constexpr int DEPTH = 32;  // of the trees that Warp builds
+    constexpr float SPARE = 1.0000005f;
+#ifdef __CUDA_ARCH__
+    auto least = [](float a, float b) { return fminf(a, b); };
+    auto most = [](float a, float b) { return fmaxf(a, b); };
+#else
     auto least = [](float a, float b) { return a < b ? a : b; };
     auto most = [](float a, float b) { return a > b ? a : b; };
 #endif
@@ -198,40 +207,48 @@ def make_ray_tree(mesh: wp.Mesh) -> RayTree:
     };
 
     // no direction is 0, so that no product below is 0 times infinity
-    const float rx = 1.0f / (ray[0] == 0.0f ? 1.0e-20f : ray[0]), ry = 1.0f / (ray[1] == 0.0f ? 1.0e-20f : ray[1]),
-                rz = 1.0f / (ray[2] == 0.0f ? 1.0e-20f : ray[2]);
+    auto invert = [](float x) { return 1.0f / (x == 0.0f ? 1.0e-20f : x); };
+    const float rx = invert(ray[0]), ry = invert(ray[1]), rz = invert(ray[2]);
     auto meets = [&](float x0, float x1, float y0, float y1, float z0, float z1, float& near) {
         const float a = (x0 - ox) * rx, b = (x1 - ox) * rx, c = (y0 - oy) * ry, d = (y1 - oy) * ry,
                     e = (z0 - oz) * rz, f = (z1 - oz) * rz;
         near = most(most(least(a, b), least(c, d)), most(least(e, f), 0.0f));
         return near <= SPARE * least(least(most(a, b), most(c, d)), least(most(e, f), best));
     };
+    // `continue`, and not one place that takes the next node, is a third faster: threads of a warp part there
     int waiting[DEPTH], depth = 0, node = tree.root;
     while (true) {
-        bool done = true;  // with this node and what is below it
         if (node < 0) {
             test_leaf(-1 - node);
-        } else {
-            const Row a = row(tree.nodes, 4 * node), b = row(tree.nodes, 4 * node + 1),
-                      c = row(tree.nodes, 4 * node + 2), d = row(tree.nodes, 4 * node + 3);
-            const int first = __float_as_int(d.x), second = __float_as_int(d.y);
-            float near_first, near_second;
-            const bool meets_first = meets(a.x, a.y, a.z, a.w, c.x, c.y, near_first);
-            const bool meets_second = meets(b.x, b.y, b.z, b.w, c.z, c.w, near_second);
-            const bool swap = meets_second && !(meets_first && near_first <= near_second);
-            if (meets_first && meets_second)
-                waiting[depth++] = swap ? first : second;
-            node = swap ? second : first;
-            done = !meets_first && !meets_second;
+            if (depth == 0)
+                break;
+            node = waiting[--depth];
+            continue;
         }
-        if (done) {
+        const Row a = row(tree.nodes, 4 * node), b = row(tree.nodes, 4 * node + 1),
+                  c = row(tree.nodes, 4 * node + 2), d = row(tree.nodes, 4 * node + 3);
+        const int first = __float_as_int(d.x), second = __float_as_int(d.y);
+        float near_first, near_second;
+        const bool meets_first = meets(a.x, a.y, a.z, a.w, c.x, c.y, near_first);
+        const bool meets_second = meets(b.x, b.y, b.z, b.w, c.z, c.w, near_second);
+        if (meets_first && meets_second) {
+            const bool swap = near_second < near_first;
+            waiting[depth++] = swap ? first : second;
+            node = swap ? second : first;
+        } else if (meets_first || meets_second) {
+            node = meets_first ? first : second;
+        } else {
             if (depth == 0)
                 break;
             node = waiting[--depth];
         }
     }
     return vec4(best, best_u, best_v, __int_as_float(best_face));
-""")
+"""
+)
+
+
+@wp.func_native(_WALK_TREE)
 def walk_tree(tree: RayTree, origin: wp.vec3, ray: wp.vec3, far_m: float) -> wp.vec4:
     """Return what a ray hits first: the distance, u and v of `ray_hit.Hit`, and the bits of the face.
 

@@ -12,9 +12,9 @@ camera. One walk lists the triangles that reach into it, and each ray is tested 
    tree's own intersection says where exactly. A ray of which that is not sure asks the tree, as do all of a
    tile with too long a list.
 
-So nothing is approximated: the answers are those of `wp.mesh_query_ray` to the last bit, as far as a compiler
-makes the same code of the same intersection in two places. Neither the number of instants per launch, nor how
-many share a walk, nor the order in which threads find triangles, changes them.
+So nothing is approximated: the answers are those of rays that walk by themselves (`ray_tree.py`) to the last
+bit, as far as a compiler makes the same code of the same intersection in two places. Neither the number of
+instants per launch, nor how many share a walk, nor the order in which threads find triangles, changes them.
 
 The walk of 1 and 2 is in `frustum_walk.py`; the test of 3 and its rounding in `list_search.py`; what the
 sides of tiles have to spare in `tile_bounds.py`.
@@ -32,19 +32,21 @@ from numpy.typing import NDArray
 from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.frustum_walk import walk_kernel
 from neurosim_core.render.launch import launch_split
+from neurosim_core.render.ray_tree import RayTree
 from neurosim_core.render.tile_bounds import looks_forward, tile_bounds
 from neurosim_core.render.walk_data import BLOCK, TILE, WalkData
 
 _INDEX_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
-_AUTO_INSTANTS_MIN = 4
-_AUTO_PIXEL_RAD = 3.5e-3
-"""With fewer instants a walk takes as long as it saves, and with larger pixels, whose lists are long."""
+_AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 3.2e-3))
+"""From so many instants on, tiles of pixels up to so wide [rad] share walks: with fewer instants a walk takes
+as long as it saves, and with larger pixels, whose lists are long. As measured on an H200, 240x180 to 1280x720,
+in a house of 145,844 triangles."""
 _LEFT_SHARE = 8
 """There is room for one in so many pixels to be left; if there are more, the launch is done again by rays
 that walk by themselves."""
-_THREADS_PER_MULTIPROCESSOR = 640
-"""Of those that render what is left: as many as run at a time."""
+_THREADS_PER_MULTIPROCESSOR = 1280
+"""Of those that render what is left: twice as many as run at a time, since some take longer than others."""
 
 
 def shared_walk(
@@ -64,11 +66,10 @@ def shared_walk(
     """
     if asked != "auto":
         return asked
-    if not is_cuda or instant_count < _AUTO_INSTANTS_MIN or not looks_forward(rays):
-        return None
+    widest = max((pixel_rad for least, pixel_rad in _AUTO if instant_count >= least), default=0.0)
     sample_count = max(1, len(rays) - 1)  # each of which has its share of the pixel
     pixel_rad = float(np.median(rays[..., 3])) * math.sqrt(sample_count)
-    return WalkConfig() if pixel_rad <= _AUTO_PIXEL_RAD else None
+    return WalkConfig() if is_cuda and pixel_rad <= widest and looks_forward(rays) else None
 
 
 def _check_counts(config: WalkConfig, *, walks: int, tiles: int) -> None:
@@ -92,7 +93,7 @@ class TileWalk:
 
     def __init__(
         self,
-        mesh: wp.Mesh,
+        tree: RayTree,
         rays: NDArray[np.float32],
         *,
         width: int,
@@ -106,7 +107,7 @@ class TileWalk:
         """Allocate the lists.
 
         Args:
-            mesh: What rays hit.
+            tree: What rays hit.
             rays: Rays of the pixels in C, shape [layer, H * W, 4].
             width: Columns of the picture [px].
             height: Rows of the picture [px].
@@ -123,10 +124,10 @@ class TileWalk:
         walks = -(-instant_count // config.instants)
         _check_counts(config, walks=walks, tiles=-(-width // TILE) * -(-height // TILE))
         bounds = tile_bounds(rays, width, height)
-        self._mesh, self._width, self._height, self._extent_m = mesh, width, height, extent_m
-        self._device = str(mesh.device)
+        self._tree, self._width, self._height, self._extent_m = tree, width, height, extent_m
+        self._device = str(tree.nodes.device)
         self._thread_count = thread_count
-        self._lanes = 1 if mesh.device.is_cpu else BLOCK
+        self._lanes = 1 if tree.nodes.device.is_cpu else BLOCK
         self.data = WalkData()
         self.data.instants = config.instants
         self.data.limit = config.face_count_max
@@ -138,7 +139,7 @@ class TileWalk:
         self.data.left_count = wp.zeros(1, dtype=int, device=self._device)
         room = instant_count * len(bounds) * BLOCK // _LEFT_SHARE if leaves else 0
         self.data.left = wp.zeros(room, dtype=int, device=self._device)
-        processors = mesh.device.sm_count if mesh.device.is_cuda else 0
+        processors = tree.nodes.device.sm_count if tree.nodes.device.is_cuda else 0
         self.data.left_threads = max(1, processors * _THREADS_PER_MULTIPROCESSOR)
 
     def launch(
@@ -163,7 +164,7 @@ class TileWalk:
             walk_kernel(self._lanes),
             dim=walks * self.data.bounds.shape[0] * self._lanes,
             inputs=[
-                self._mesh.id,
+                self._tree,
                 rays,
                 self._width,
                 self._height,

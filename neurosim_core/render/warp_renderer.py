@@ -336,7 +336,7 @@ class WarpRenderer:
         self.walk = None
         if shared is not None:
             self.walk = TileWalk(
-                arrays.mesh,
+                arrays.data.tree,
                 rays,
                 width=lens.width,
                 height=lens.height,

@@ -238,7 +238,7 @@ class WorldCast:
             tiles = -(-self._size[0] // TILE) * -(-self._size[1] // TILE)
             changes["face_count_max"] = min(config.face_count_max, _INDEX_MAX // (self._count * tiles))
         return TileWalk(
-            arrays.mesh,
+            arrays.data.tree,
             rays,
             width=self._size[0],
             height=self._size[1],

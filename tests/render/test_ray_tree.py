@@ -161,12 +161,14 @@ def test_a_pile_deeper_than_the_tree_is_one_leaf(device):
     """More triangles in one place than the tree has levels to tell apart."""
     pile = np.repeat(soup(1, 7, size=1.0), 3000, axis=0) + np.linspace(0.0, 1e-12, 3000)[:, None, None]
     target = pile[0].mean(axis=0)
-    _, face, _, _ = cast(mesh_of(pile, device), target + [0.0, 0.0, 2.0], [(0.0, 0.0, -1.0)])
+    _, face, _, _ = cast(mesh_of(pile, device), target + np.array([0.0, 0.0, 2.0]), [(0.0, 0.0, -1.0)])
     assert face.tolist() == [0]
 
 
 def test_nothing_is_laid_out_that_embree_finds():
-    arrays = upload_scene(scene_of(plane(1.0)), UNSHADOWED.model_copy(update={"cpu_traversal": "auto"}), "cpu")
+    arrays = upload_scene(
+        scene_of(plane(1.0)), UNSHADOWED.model_copy(update={"cpu_traversal": "auto"}), "cpu"
+    )
     if not arrays.terms.embree:
         pytest.skip("embreex is not installed")
     assert arrays.data.tree.nodes is None

@@ -354,7 +354,7 @@ def test_what_kernels_cannot_count_is_refused():
 
     def walks(count, face_count_max):
         return TileWalk(
-            upload_scene(scene_of(plane(1.0)), ALONE, "cpu").mesh,
+            upload_scene(scene_of(plane(1.0)), ALONE, "cpu").data.tree,
             rays,
             width=128,
             height=128,
@@ -415,26 +415,27 @@ def test_there_are_no_walks_unless_asked_for(device):
     assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=8).walk is None
 
 
-@pytest.mark.parametrize(("pixel_rad", "shared"), [(3.3e-3, True), (3.7e-3, False), (6.5e-3, False)])
+@pytest.mark.parametrize(
+    ("pixel_rad", "least"), [(1.2e-3, 8), (1.7e-3, 16), (2.4e-3, 16), (3.1e-3, 32), (3.4e-3, None)]
+)
 @pytest.mark.parametrize("samples", [1, 4])
-def test_the_default_is_for_small_pixels_whatever_their_samples(pixel_rad, shared, samples):
+def test_the_default_is_for_many_instants_of_small_pixels(pixel_rad, least, samples):
     lens = PinholeConfig(width=16, height=16, fx=1.0 / pixel_rad, fy=1.0 / pixel_rad, cx=8.0, cy=8.0)
     rays = ray_layers(lens, samples)
-    walk = shared_walk("auto", rays, instant_count=4, is_cuda=True)
-    assert (walk is not None) is shared
-    assert shared_walk("auto", rays, instant_count=3, is_cuda=True) is None
-    assert shared_walk("auto", rays, instant_count=4, is_cuda=False) is None
-    assert shared_walk("auto", -rays, instant_count=4, is_cuda=True) is None
+    for count in (1, 7, 8, 15, 16, 31, 32, 1000):
+        walk = shared_walk("auto", rays, instant_count=count, is_cuda=True)
+        assert (walk is not None) is (least is not None and count >= least)
+    assert shared_walk("auto", rays, instant_count=1000, is_cuda=False) is None
+    assert shared_walk("auto", -rays, instant_count=1000, is_cuda=True) is None
 
 
 def test_walks_are_the_default_on_cuda_alone(device):
     arrays = upload_scene(scene_of(plane(1.0)), UNSHADOWED, device)
     is_cuda = wp.get_device(device).is_cuda
-    narrow = PinholeConfig(width=45, height=34, fx=400.0, fy=380.0, cx=21.0, cy=18.5)
-    for lens, count, shared in ((narrow, 3, False), (narrow, 4, is_cuda), (LENS, 4, False)):
+    narrow = PinholeConfig(width=45, height=34, fx=800.0, fy=760.0, cx=21.0, cy=18.5)
+    for lens, count, shared in ((narrow, 7, False), (narrow, 8, is_cuda), (LENS, 8, False)):
         renderer = WarpRenderer(arrays, lens, outputs=("depth",), instant_count=count)
         assert (renderer.walk is not None) is shared
-    assert (arrays.data.face_normal is not None) is is_cuda
     shared = upload_scene(scene_of(plane(1.0)), together(instants=2, face_count_max=8), device)
     walk = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5).walk
     assert isinstance(walk, TileWalk)
