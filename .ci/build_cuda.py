@@ -72,7 +72,6 @@ def make_kernels() -> None:
         everything._replace(bodies=True, baked=False),
         everything._replace(worlds=True, bodies=True),
         everything._replace(worlds=True, world_scenes=True, world_lenses=True),
-        everything._replace(single=True),
         everything._replace(walked=4, bodies=True),
         everything._replace(walked=4, worlds=True, supersampled=False),
     ):

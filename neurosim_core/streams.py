@@ -52,20 +52,26 @@ def make_stream(device: Any, *, urgent: bool = False) -> wp.Stream | None:
 class _On:
     """Makes a stream the present one; `wp.ScopedStream` also chooses the device, and takes twice as long."""
 
-    def __init__(self, stream: wp.Stream) -> None:
+    def __init__(self, stream: wp.Stream, after: bool) -> None:
         self._stream = stream
+        self._after = after
 
     def __enter__(self) -> None:
         self._before = self._stream.device.stream
-        self._stream.device.set_stream(self._stream, sync=True)
+        self._stream.device.set_stream(self._stream, sync=self._after)
 
     def __exit__(self, *_: object) -> None:
         self._stream.device.set_stream(self._before, sync=False)
 
 
-def on(stream: wp.Stream | None) -> AbstractContextManager[Any]:
-    """Launch what follows on a stream, after what the present stream holds; None: stay."""
-    return nullcontext() if stream is None else _On(stream)
+def on(stream: wp.Stream | None, *, after: bool = True) -> AbstractContextManager[Any]:
+    """Launch what follows on a stream.
+
+    Args:
+        stream: Which; None: stay.
+        after: It follows what the present stream holds. If not, milestones say what it follows.
+    """
+    return nullcontext() if stream is None else _On(stream, after)
 
 
 class Milestone:

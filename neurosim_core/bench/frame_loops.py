@@ -34,7 +34,7 @@ class _Eyes:
         """Launch the render of a view; return where its log radiance will be, and when."""
         eye = number % len(self._renderers)
         renderer = self._renderers[eye]
-        with on(self._streams[eye]):
+        with on(self._streams[eye], after=False):
             self._graphs.run((eye, view), lambda: self._views.render(renderer, first=view, count=1))
             self._seen[eye].set()
         return renderer.log_radiance, self._seen[eye]
@@ -43,16 +43,17 @@ class _Eyes:
 def compare_loops(views: Views, *, seconds: float) -> Comparison:
     """Return frames a second where every call renders one frame, scans it and has the host read a count.
 
-    The naive camera has the count of its frame read at once. Ours lets the next frame render meanwhile: the
-    count that a call reads is that of the frame before. Our renders are graphs that are replayed, as in a
-    run; those of the naive loop are launched. Each 16 frames our events are sorted and handed out as well;
-    the naive ones stay where they are, unsorted. The two take turns, and the median of the rounds counts.
+    The naive camera has the count of its frame read at once. Ours first lets the next frame render, and then
+    waits for the scan of the one before: the count that a call reads is that one's. Our renders are graphs
+    that are replayed, as in a run; those of the naive loop are launched. Each 16 frames our events are sorted
+    and handed out as well; the naive ones stay where they are, unsorted. The two take turns, and the median
+    of the rounds counts.
 
     Args:
         views: What to see.
         seconds: How long a round of either is, about.
     """
-    camera, naive = make_camera(views, scan_count_max=2), make_naive(views)
+    camera, naive = make_camera(views, scan_count_max=1), make_naive(views)
     camera.reset(views.frames[0], 0)
     order = [*range(views.count), *reversed(range(views.count))]
     eyes = _Eyes(views, 2)  # while one frame is scanned, the next is rendered
@@ -71,12 +72,12 @@ def compare_loops(views: Views, *, seconds: float) -> Comparison:
     def call_ours() -> None:
         nonlocal ours_shown, ours
         frames, seen = eyes.see(ours_shown, order[ours_shown % len(order)])
-        ours_shown += 1
-        with on(scans):
+        with on(scans, after=False):
+            if ours_shown > 0:
+                ours += read(ours_shown)
+            ours_shown += 1
             seen.hold()
             camera.feed_device(frames, [stamp_ns(ours_shown)])
-        if ours_shown > 1:
-            ours += read(ours_shown - 1)
 
     def call_naive() -> None:
         nonlocal naive_shown, theirs

@@ -40,8 +40,6 @@ class Terms(NamedTuple):
     """Of the pixels that `walked` left, and no others: each ray walks by itself."""
     by_tile: bool = False
     """`walked` means a thread for each tile, which leaves nothing: on a CPU."""
-    single: bool = False
-    """One instant is looked at in a launch, on CUDA."""
 
 
 def with_walks(terms: Terms, walk: WalkConfig | None, *, group: int | None = None) -> Terms:

@@ -54,7 +54,8 @@ class RenderConfig(Settings):
     """The rays of a tile of pixels share one walk through Warp's tree over several instants, instead of one
     for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 8
     instants or more of pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of
-    3.2 mrad, and the lens looks forward. null: each ray walks by itself."""
+    3.2 mrad, the lens looks forward, and lists do not get long: the square of a pixel's width [rad] times the
+    triangles of the scene is at most 2.2. null: each ray walks by itself."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"

@@ -24,15 +24,13 @@ from neurosim_core.render.walk_data import ASK, WalkData
 
 _BOUNDS = (64, 14)
 """Threads and, on CUDA, blocks of a multiprocessor that registers must do for: as measured on an H200."""
-_SINGLE_BOUNDS = (64, 10)
-"""The same for one instant, which is a few waves of blocks: that each is done soon counts for more."""
 _TOGETHER_BOUNDS = (64, 10)
 """The same for shared walks: a few registers are spilled, and it is still 1 to 3 % faster."""
 
 
 def _bounds_of(outputs: tuple[str, ...], terms: Terms) -> tuple[int, int] | None:
     if terms.walked == 0:
-        return _SINGLE_BOUNDS if terms.single else _BOUNDS
+        return _BOUNDS
     simple = len(outputs) == 1 and not (terms.worlds or terms.bodies or terms.supersampled)
     return _TOGETHER_BOUNDS if simple else None
 

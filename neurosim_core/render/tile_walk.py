@@ -40,8 +40,10 @@ _INDEX_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
 _AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 3.2e-3))
 """From so many instants on, tiles of pixels up to so wide [rad] share walks: with fewer instants a walk takes
-as long as it saves, and with larger pixels, whose lists are long. As measured on an H200, 240x180 to 1280x720,
-in a house of 145,844 triangles."""
+as long as it saves, and so it does with fewer tiles, of larger pixels. As measured on an H200, 240x180 to
+1280x720, in a house of 145,844 triangles and in halls of 20,000 to 2 million."""
+_AUTO_FACES_MAX = 2.2
+"""Nor do they with more triangles in the scene times the solid angle of a pixel [sr]: lists have about 50."""
 _LEFT_SHARE = 8
 """There is room for one in so many pixels to be left; if there are more, the launch is done again by rays
 that walk by themselves."""
@@ -54,6 +56,7 @@ def shared_walk(
     rays: NDArray[np.float32],
     *,
     instant_count: int,
+    face_count: int,
     is_cuda: bool,
 ) -> WalkConfig | None:
     """Return how rays share walks; None: each walks by itself.
@@ -62,6 +65,7 @@ def shared_walk(
         asked: `RenderConfig.shared_walk`.
         rays: Rays of the pixels in C, shape [layer, H * W, 4], as `warp_renderer.ray_layers` gives them.
         instant_count: The most instants of a launch, of one world.
+        face_count: Triangles that rays may hit.
         is_cuda: Where they are rendered.
     """
     if asked != "auto":
@@ -69,7 +73,8 @@ def shared_walk(
     widest = max((pixel_rad for least, pixel_rad in _AUTO if instant_count >= least), default=0.0)
     sample_count = max(1, len(rays) - 1)  # each of which has its share of the pixel
     pixel_rad = float(np.median(rays[..., 3])) * math.sqrt(sample_count)
-    return WalkConfig() if is_cuda and pixel_rad <= widest and looks_forward(rays) else None
+    small = pixel_rad <= widest and face_count * pixel_rad**2 <= _AUTO_FACES_MAX
+    return WalkConfig() if is_cuda and small and looks_forward(rays) else None
 
 
 def _check_counts(config: WalkConfig, *, walks: int, tiles: int) -> None:

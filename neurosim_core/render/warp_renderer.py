@@ -311,10 +311,15 @@ class WarpRenderer:
         """
         rays = ray_layers(lens, arrays.config.samples_per_pixel)
         is_cuda = wp.get_device(arrays.device).is_cuda
-        shared = shared_walk(arrays.config.shared_walk, rays, instant_count=instant_count, is_cuda=is_cuda)
+        shared = shared_walk(
+            arrays.config.shared_walk,
+            rays,
+            instant_count=instant_count,
+            face_count=arrays.face_origin.shape[0],
+            is_cuda=is_cuda,
+        )
         self.terms = terms = with_walks(arrays.terms, shared)
-        single = is_cuda and instant_count == 1 and shared is None
-        self._kernel = raycast_kernel(outputs, terms._replace(single=single))
+        self._kernel = raycast_kernel(outputs, terms)
         self._asking = asking_kernel(outputs, terms)
         self._group = group_of(terms)
         self._arrays = arrays

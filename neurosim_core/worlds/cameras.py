@@ -88,6 +88,7 @@ class WorldCast:
                 arrays.config.shared_walk,
                 rays,
                 instant_count=instant_count,
+                face_count=arrays.face_origin.shape[0],
                 is_cuda=wp.get_device(device).is_cuda,
             )
         # groups end with the instants of a world

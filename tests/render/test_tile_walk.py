@@ -423,10 +423,19 @@ def test_the_default_is_for_many_instants_of_small_pixels(pixel_rad, least, samp
     lens = PinholeConfig(width=16, height=16, fx=1.0 / pixel_rad, fy=1.0 / pixel_rad, cx=8.0, cy=8.0)
     rays = ray_layers(lens, samples)
     for count in (1, 7, 8, 15, 16, 31, 32, 1000):
-        walk = shared_walk("auto", rays, instant_count=count, is_cuda=True)
+        walk = shared_walk("auto", rays, instant_count=count, face_count=1000, is_cuda=True)
         assert (walk is not None) is (least is not None and count >= least)
-    assert shared_walk("auto", rays, instant_count=1000, is_cuda=False) is None
-    assert shared_walk("auto", -rays, instant_count=1000, is_cuda=True) is None
+    assert shared_walk("auto", rays, instant_count=1000, face_count=1000, is_cuda=False) is None
+    assert shared_walk("auto", -rays, instant_count=1000, face_count=1000, is_cuda=True) is None
+
+
+@pytest.mark.parametrize(("pixel_rad", "most"), [(1.2e-3, 1_528_000), (2.24e-3, 438_000)])
+def test_the_default_is_not_for_lists_that_are_long(pixel_rad, most):
+    lens = PinholeConfig(width=16, height=16, fx=1.0 / pixel_rad, fy=1.0 / pixel_rad, cx=8.0, cy=8.0)
+    rays = ray_layers(lens, 1)
+    for face_count, shared in ((int(0.98 * most), True), (int(1.02 * most), False)):
+        walk = shared_walk("auto", rays, instant_count=64, face_count=face_count, is_cuda=True)
+        assert (walk is not None) is shared
 
 
 def test_walks_are_the_default_on_cuda_alone(device):
