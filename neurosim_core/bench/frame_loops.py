@@ -86,6 +86,7 @@ def compare_loops(views: Views, *, seconds: float) -> Comparison:
         assert renderer.log_radiance is not None
         theirs += naive.feed(renderer.log_radiance[0], naive_shown * FRAME_US)
 
+    wp.synchronize_device(views.device)  # what was made on other streams is there
     rounds = [
         [seconds_per_call(call, views.device, seconds=seconds) for call in (call_ours, call_naive)]
         for _ in range(_ROUNDS)

@@ -356,7 +356,7 @@ def _comparison_table(result: ThroughputResult) -> Table:
         f"interpolated, alone {result.roofline.instants} frames per launch, and in the loop sorted and "
         "handed out each 16 frames; there a call reads the count of the frame before, while its own renders. "
         "Our renders are graphs that are replayed on two streams, as in a run; those of the naive loop are "
-        "launched one by one. "
+        "launched one by one; the median of five rounds in turn counts. "
         "Events reach the host, sorted, at "
         + (
             f"{1e-6 * result.events_per_s:,.1f} M/s (each pixel fires in each frame)."

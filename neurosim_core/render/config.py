@@ -51,11 +51,11 @@ class RenderConfig(Settings):
     `warp`: a kernel of ours in Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp where a
     `shared_walk` is asked for."""
     shared_walk: WalkConfig | Literal["auto"] | None = "auto"
-    """The rays of a tile of pixels share one walk through Warp's tree over several instants, instead of one
+    """The rays of a tile of pixels share one walk through the tree over several instants, instead of one
     for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 8
     instants or more of pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of
     3.2 mrad, the lens looks forward, and lists do not get long: the square of a pixel's width [rad] times the
-    triangles of the scene is at most 2.2. null: each ray walks by itself."""
+    triangles of the scene, as cut for baked light, is at most 2.2. null: each ray walks by itself."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
@@ -75,9 +75,11 @@ class RenderConfig(Settings):
     two alias, which event cameras see as events that no sensor gives."""
 
     @model_validator(mode="after")
-    def _walks_are_in_the_tree_of_warp(self) -> RenderConfig:
+    def _walks_are_of_rays_that_warp_casts(self) -> RenderConfig:
         if isinstance(self.shared_walk, WalkConfig) and self.cpu_traversal == "embree":
-            raise ValueError("shared_walk is for Warp's tree: cpu_traversal must be auto or warp, got embree")
+            raise ValueError(
+                "shared_walk is for rays that Warp casts: cpu_traversal must be auto or warp, got embree"
+            )
         return self
 
     @model_validator(mode="after")

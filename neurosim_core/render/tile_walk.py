@@ -43,12 +43,13 @@ _AUTO = ((8, 1.5e-3), (16, 2.5e-3), (32, 3.2e-3))
 as long as it saves, and so it does with fewer tiles, of larger pixels. As measured on an H200, 240x180 to
 1280x720, in a house of 145,844 triangles and in halls of 20,000 to 2 million."""
 _AUTO_FACES_MAX = 2.2
-"""Nor do they with more triangles in the scene times the solid angle of a pixel [sr]: lists have about 50."""
+"""Nor do they with more triangles, as cut for the light, times the solid angle of a pixel [sr]: lists have
+about 50 then."""
 _LEFT_SHARE = 8
 """There is room for one in so many pixels to be left; if there are more, the launch is done again by rays
 that walk by themselves."""
 _THREADS_PER_MULTIPROCESSOR = 1280
-"""Of those that render what is left: twice as many as run at a time, since some take longer than others."""
+"""Of those that render what is left: more than run at a time, since some take longer than others."""
 
 
 def shared_walk(

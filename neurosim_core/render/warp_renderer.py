@@ -309,6 +309,13 @@ class WarpRenderer:
             ValueError: If an output is unknown or none is asked for, the instants have more than 2^31 - 1
                 rays of a layer together, or rays that share a walk do not look forward or are too many.
         """
+        tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
+        most = _THREAD_COUNT_MAX // (tiles * TILE * TILE)
+        if instant_count > most:
+            raise ValueError(
+                f"{instant_count} instants of {lens.width} x {lens.height} px are more than 2^31 - 1 rays a "
+                f"launch: at most {most} instants of this size (instants_per_launch), or take fewer pixels"
+            )
         rays = ray_layers(lens, arrays.config.samples_per_pixel)
         is_cuda = wp.get_device(arrays.device).is_cuda
         shared = shared_walk(
@@ -324,13 +331,6 @@ class WarpRenderer:
         self._group = group_of(terms)
         self._arrays = arrays
         self._thread_count = thread_count
-        tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
-        most = _THREAD_COUNT_MAX // (tiles * TILE * TILE)
-        if instant_count > most:
-            raise ValueError(
-                f"{instant_count} instants of {lens.width} x {lens.height} px are more than 2^31 - 1 rays a "
-                f"launch: at most {most} instants of this size (instants_per_launch), or take fewer pixels"
-            )
         rays_together = TILE * TILE if terms.by_tile else PACKET if terms.embree else 1
         self._instant_threads = tiles * TILE * TILE // rays_together
         device = arrays.device

@@ -1,4 +1,4 @@
-"""Rays that walk through their tree, against every triangle tested and against Warp's own walk."""
+"""Rays that walk through their tree, against every triangle tested by itself and against Warp's own walk."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import trimesh
 import warp as wp
 from render_scenes import UNSHADOWED, plane, scene_of
 
-from neurosim_core.render.ray_hit import UNFUSED
+from neurosim_core.render.ray_hit import UNFUSED, meet_face
 from neurosim_core.render.ray_tree import RayTree, make_ray_tree, walk_tree
 from neurosim_core.render.warp_renderer import upload_scene
 
@@ -36,6 +36,27 @@ def walk_both(
     theirs_out[k] = wp.vec3(query.t, query.u, query.v)
 
 
+@wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
+def every_triangle(
+    mesh: wp.uint64,
+    face_count: int,
+    origin: wp.array[wp.vec3],
+    ray: wp.array[wp.vec3],
+    met_out: wp.array[wp.vec3],
+    face_out: wp.array[int],
+):
+    k = wp.tid()
+    nearest = wp.vec3(1.0e9, 0.0, 0.0)
+    nearest_face = int(-1)  # noqa: UP018, RUF046
+    for face in range(face_count):
+        met = meet_face(mesh, face, origin[k], ray[k])
+        if met[0] >= 0.0 and met[0] < nearest[0]:
+            nearest = met
+            nearest_face = face
+    met_out[k] = nearest
+    face_out[k] = nearest_face
+
+
 def mesh_of(triangles, device, leaf_size=1):
     corners = np.asarray(triangles, dtype=np.float32).reshape(-1, 3)
     return wp.Mesh(
@@ -46,13 +67,27 @@ def mesh_of(triangles, device, leaf_size=1):
     )
 
 
-def cast(mesh, origins, rays, far_m=FAR):
-    """Return where rays hit, (t, u, v) and the face, by our walk and by Warp's."""
+def upload(mesh, origins, rays):
+    """Return origins and directions of rays, of unit length, on the device of a mesh."""
     origins = np.broadcast_to(np.asarray(origins, dtype=np.float32), np.shape(rays))
     rays = (np.asarray(rays) / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return [wp.array(x, dtype=wp.vec3, device=mesh.device) for x in (origins, rays)]
+
+
+def nearest_of_all(mesh, origins, rays):
+    """Return where rays hit, (t, u, v) and the face: of all triangles the nearest, the first of equals."""
+    met = wp.zeros(len(rays), dtype=wp.vec3, device=mesh.device)
+    face = wp.zeros(len(rays), dtype=int, device=mesh.device)
+    inputs = [mesh.id, mesh.indices.shape[0] // 3, *upload(mesh, origins, rays)]
+    wp.launch(every_triangle, dim=len(rays), inputs=inputs, outputs=[met, face], device=mesh.device)
+    return met.numpy(), face.numpy()
+
+
+def cast(mesh, origins, rays, far_m=FAR):
+    """Return where rays hit, (t, u, v) and the face, by our walk and by Warp's."""
     device, count = mesh.device, len(rays)
     found = [wp.zeros(count, dtype=dtype, device=device) for dtype in (wp.vec3, int, wp.vec3, int)]
-    seen = [wp.array(x, dtype=wp.vec3, device=device) for x in (origins, rays)]
+    seen = upload(mesh, origins, rays)
     wp.launch(
         walk_both,
         dim=count,
@@ -91,6 +126,18 @@ def test_the_bits_of_warp(device, count, leaf_size):
     assert assert_same(cast(mesh_of(soup(count, 1, size), device, leaf_size), origins, rays)) > 30
 
 
+@pytest.mark.parametrize("leaf_size", [1, 4])
+def test_the_nearest_of_all_triangles(device, leaf_size):
+    rng = np.random.default_rng(10)
+    mesh = mesh_of(np.concatenate([soup(1500, 11), soup(100, 12, size=1.0)]), device, leaf_size)
+    rays, origins = rng.normal(size=(4000, 3)), rng.uniform(-1.5, 1.5, (4000, 3))
+    expected, expected_face = nearest_of_all(mesh, origins, rays)
+    ours, face, _, _ = cast(mesh, origins, rays)
+    np.testing.assert_array_equal(face, expected_face)
+    np.testing.assert_array_equal(ours, expected)
+    assert (face >= 0).sum() > 3000
+
+
 def test_the_first_of_those_in_one_place(device):
     """Whatever the order of the leaves is: Warp's own walk tells here one, there another."""
     triangles = np.repeat(soup(40, 2, size=0.5), 5, axis=0)
@@ -101,7 +148,7 @@ def test_the_first_of_those_in_one_place(device):
     assert hit.sum() > 1000
     first = np.array([np.flatnonzero(order // 5 == k // 5).min() for k in order])
     np.testing.assert_array_equal(face[hit], first[face[hit]])
-    np.testing.assert_array_equal(face // 1 >= 0, their_face >= 0)
+    np.testing.assert_array_equal(hit, their_face >= 0)
     again = cast(mesh_of(triangles[order], device, leaf_size=4), np.zeros(3), rays)
     np.testing.assert_array_equal(again[1], face)
     np.testing.assert_array_equal(again[0], ours)
@@ -145,7 +192,7 @@ def test_the_corners_of_boxes(device):
 
 def test_what_is_far_or_behind_is_not_hit(device):
     mesh = mesh_of([[(-1.0, -1.0, 3.0), (1.0, -1.0, 3.0), (0.0, 1.0, 3.0)]], device)
-    for far_m, ray, expected in ((3.1, 1.0, 0), (2.9, 1.0, -1), (FAR, -1.0, -1)):
+    for far_m, ray, expected in ((3.1, 1.0, 0), (3.0, 1.0, -1), (2.9, 1.0, -1), (FAR, -1.0, -1)):
         _, face, _, _ = cast(mesh, np.zeros(3), [(0.0, 0.0, ray)], far_m)
         assert face.tolist() == [expected]
 
@@ -157,12 +204,57 @@ def test_rays_that_are_no_numbers_hit_nothing(device):
     assert face.tolist() == [-1, -1]
 
 
-def test_a_pile_deeper_than_the_tree_is_one_leaf(device):
-    """More triangles in one place than the tree has levels to tell apart."""
-    pile = np.repeat(soup(1, 7, size=1.0), 3000, axis=0) + np.linspace(0.0, 1e-12, 3000)[:, None, None]
-    target = pile[0].mean(axis=0)
-    _, face, _, _ = cast(mesh_of(pile, device), target + np.array([0.0, 0.0, 2.0]), [(0.0, 0.0, -1.0)])
-    assert face.tolist() == [0]
+def test_rays_along_the_sides_of_boxes(device):
+    """A ray in the plane of a side of a box, exactly or nearly, meets what is in it."""
+    square = [[(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0)],
+              [(-1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)]]  # fmt: skip
+    for offset in (np.zeros(3), np.array([1000.0, 5.0, 0.0]), np.array([-1.0, -1.0, 0.0])):
+        mesh = mesh_of(np.array(square) + offset, device)
+        starts = [(1.0, 0.3, 2.0), (-1.0, 0.3, 2.0), (0.3, 1.0, 2.0), (0.3, -1.0, 2.0), (1.0, 1.0, 2.0)]
+        for tilt in (0.0, 1e-39, -1e-39, 1e-21):
+            rays = np.tile([0.0, 0.0, -1.0], (len(starts), 1))
+            rays[:, 0] = tilt
+            found, face, _, _ = cast(mesh, np.array(starts) + offset, rays)
+            expected, expected_face = nearest_of_all(mesh, np.array(starts) + offset, rays)
+            np.testing.assert_array_equal(face, expected_face)  # a tilt may take it past the edge
+            np.testing.assert_array_equal(found, expected)
+            assert tilt != 0.0 or (face >= 0).all()
+
+
+def test_a_step_seen_from_above_its_edge(device):
+    """The upper plate ends where the lower one begins: the ray between them hits the upper one."""
+
+    def plate(left, right, height):
+        a, b, c, d = ((x, y, height) for x, y in ((left, 0.0), (right, 0.0), (right, 1.0), (left, 1.0)))
+        return [[a, b, c], [a, c, d]]
+
+    mesh = mesh_of(np.array([*plate(-0.5, 0.5, 0.0), *plate(0.5, 1.5, -1.0)]), device)
+    found, face, _, _ = cast(mesh, (0.5, 0.3, 2.0), [(0.0, 0.0, -1.0)])
+    assert face[0] in (0, 1)
+    assert found[0, 0] == 2.0
+
+
+def test_more_triangles_than_the_tree_has_levels_to_tell_apart(device):
+    """Each half as large as the last: the tree is as deep as it gets, and its last leaf has the rest."""
+    corners = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)])
+    sizes = 1e30 * 0.5 ** np.arange(200)
+    mesh = mesh_of(sizes[:, None, None] * corners, device)
+    last = make_ray_tree(mesh).triangles.numpy()[1::3, 3].view(np.int32)
+    assert np.diff(np.flatnonzero(last), prepend=-1).max() > 10  # triangles of a leaf
+    rng = np.random.default_rng(8)
+    targets = sizes[rng.integers(200, size=2000), None] * corners.mean(axis=0)
+    rays = targets / np.linalg.norm(targets, axis=1, keepdims=True) + 0.1 * rng.normal(size=(2000, 3))
+    expected, expected_face = nearest_of_all(mesh, np.zeros(3), rays)
+    ours, face, _, _ = cast(mesh, np.zeros(3), rays)
+    np.testing.assert_array_equal(face, expected_face)
+    np.testing.assert_array_equal(ours, expected)
+    assert (face >= 0).sum() > 1000
+
+
+def test_a_mesh_without_triangles_is_refused(device):
+    mesh = wp.Mesh(wp.zeros(3, dtype=wp.vec3, device=device), wp.zeros(0, dtype=int, device=device))
+    with pytest.raises(ValueError, match="the scene has no triangles"):
+        make_ray_tree(mesh)
 
 
 def test_nothing_is_laid_out_that_embree_finds():
