@@ -11,15 +11,9 @@ import warp as wp
 
 from neurosim_core.bench import events as study_of
 from neurosim_core.bench.chapter import Chapter
-from neurosim_core.bench.events import (
-    EventStudy,
-    Score,
-    events_chapter,
-    falls,
-    measure_events,
-    saving,
-    timing_gain,
-)
+from neurosim_core.bench.events import measure_events
+from neurosim_core.bench.events_chapter import events_chapter
+from neurosim_core.bench.events_result import EventStudy, Score, falls, saving, timing_gain
 from neurosim_core.sensors.rig import EventSensorConfig
 
 
