@@ -26,7 +26,8 @@ from neurosim_core.render.frustum_walk import walk_kernel
 from neurosim_core.render.raycast import asking_kernel, raycast_kernel
 from neurosim_core.render.walk_data import BLOCK
 from neurosim_core.sensors.displacement import rule_kernels
-from neurosim_core.sensors.event_noise import TERMS, make_scan
+from neurosim_core.sensors.event_noise import make_scan
+from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.trajectory import HoverConfig, hover

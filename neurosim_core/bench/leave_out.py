@@ -384,7 +384,7 @@ def pixel_difference() -> Difference:
     stamps, and infinite where an event is missing or of another pixel or polarity.
     """
     from neurosim_core.sensors.event_config import EventCameraConfig
-    from neurosim_core.sensors.event_noise import TERMS
+    from neurosim_core.sensors.event_noise_model import TERMS
     from neurosim_core.sensors.events import EventCamera
 
     height, width = 48, 64

@@ -78,7 +78,7 @@ class Pixels:
         device: Where they are.
         sensor: Name of the sensor, for its noise.
         seed: Seed of the run.
-        terms: What is compiled in beyond ideal pixels: some of `event_noise.TERMS`.
+        terms: What is compiled in beyond ideal pixels: some of `event_noise_model.TERMS`.
 
     Attributes:
         noise: What is not ideal; None: nothing.

@@ -5,7 +5,7 @@
 What a pixel does with its samples is in `scan_pixel`, once; levels, the tie rule and keys are in
 `event_levels`. Between stacks a pixel holds its last sample and how many levels it has crossed.
 
-Pixels that are not ideal have a scan of their own, made to measure, in `event_noise`.
+Pixels that are not ideal have a scan of their own, made to measure, in `event_noise_scan`.
 """
 
 import warp as wp

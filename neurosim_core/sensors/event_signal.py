@@ -2,7 +2,7 @@
 # mypy: disable-error-code="call-overload,untyped-decorator,assignment,return-value"
 """When the signal of an event pixel reaches a level, and when a voltage with noise touches a threshold.
 
-Times are nanoseconds since the frame before. The law of these signals is described in `event_noise`.
+Times are nanoseconds since the frame before. The law of these signals is described in `event_noise_model`.
 """
 
 import warp as wp

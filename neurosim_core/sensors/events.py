@@ -4,7 +4,7 @@
 Each pixel holds a reference log radiance L_ref. Between two frames log radiance is linear in time; each time
 it reaches L_ref + threshold_on (or L_ref - threshold_off) an event is emitted at the crossing time, and L_ref
 becomes the level crossed. The tie rule is in `EventCamera`; the pixels are in `event_pixels`, their kernels
-in `event_scan`. What is not ideal in them is in `event_noise`, and the arbiter that reads them out in
+in `event_scan`. What is not ideal in them is in `event_noise_model`, and the arbiter that reads them out in
 `event_readout`.
 
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
@@ -26,7 +26,7 @@ from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise import terms_of
+from neurosim_core.sensors.event_noise_model import terms_of
 from neurosim_core.sensors.event_pixels import Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
@@ -73,11 +73,11 @@ class EventCamera:
         scan_count_max: How many stacks may be fed before the first of them is collected.
         on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
-        terms: What is compiled in beyond ideal pixels, some of `event_noise.TERMS`; by default what the
+        terms: What is compiled in beyond ideal pixels, some of `event_noise_model.TERMS`; by default what the
             configuration asks for.
 
     Attributes:
-        terms: What is computed beyond ideal pixels: some of `event_noise.TERMS`, and "readout".
+        terms: What is computed beyond ideal pixels: some of `event_noise_model.TERMS`, and "readout".
 
     Raises:
         ValueError: If width, height or seed is out of range.

@@ -2,9 +2,10 @@
 # mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment,no-untyped-def,valid-type"
 """Kernels of the events of many worlds: the scan of all their pixels, and their keys in order.
 
-The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise`: their functions get the arrays
-of one world. Every world has keys and counters of its own, and no block of threads takes pixels of two, so a
-block finds room for its events in its world with one atomic operation. Nothing here depends on other worlds.
+The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise_scan`: their functions get the
+arrays of one world. Every world has keys and counters of its own, and no block of threads takes pixels of
+two, so a block finds room for its events in its world with one atomic operation. Nothing here depends on
+other worlds.
 
 Keys are sorted within each world, by one block each: how many there are is known only to the device, and a
 sort of all worlds together would have to be launched over all the room there is.
@@ -16,7 +17,8 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.sensors.event_cut import take_apart
-from neurosim_core.sensors.event_noise import Memory, PixelModel, begin_pixel, make_pixel_scan
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel
+from neurosim_core.sensors.event_noise_scan import begin_pixel, make_pixel_scan
 from neurosim_core.sensors.event_scan import (
     BLOCK_SIZE,
     CLOSE,
@@ -200,7 +202,7 @@ def scan(
 
 @functools.cache
 def make_noisy_scan(terms: frozenset[str]) -> Any:
-    """Return the kernel that does the same for pixels with the given `event_noise.TERMS`.
+    """Return the kernel that does the same for pixels with the given `event_noise_model.TERMS`.
 
     In place of thresholds it takes a `PixelModel` of each world, and a `Memory` of each before and after.
     """

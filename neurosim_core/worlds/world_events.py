@@ -15,7 +15,8 @@ import warp as wp
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise import Memory, PixelModel, PixelNoise, terms_of
+from neurosim_core.sensors.event_noise import PixelNoise
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 from neurosim_core.worlds import scan
 from neurosim_core.worlds.timetable import PATTERN_COUNT_MAX
@@ -110,7 +111,7 @@ class WorldEventCamera:
         self._last = [self._empty((world_count, pixel_count), wp.float32) for _ in range(2)]
         self._crossed = [self._empty((world_count, pixel_count), wp.vec2i) for _ in range(2)]
         self.terms = tuple(sorted({term for config in configs for term in terms_of(config)}))
-        """What is computed beyond ideal pixels in some world: some of `event_noise.TERMS`."""
+        """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
         self._thresholds: Any = wp.array(
             [(config.threshold_on, config.threshold_off) for config in configs],
             dtype=wp.vec2d,

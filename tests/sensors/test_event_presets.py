@@ -10,7 +10,7 @@ import yaml
 
 from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
 from neurosim_core.sensors.event_config import EventCameraConfig, LeakConfig
-from neurosim_core.sensors.event_noise import terms_of
+from neurosim_core.sensors.event_noise_model import terms_of
 from neurosim_core.sensors.event_presets import PRESETS
 from neurosim_core.sensors.events import EventCamera
 

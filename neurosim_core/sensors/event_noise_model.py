@@ -1,0 +1,97 @@
+"""What is not ideal in event pixels: the law of each term, its parameters, and what pixels remember of it.
+
+**Photoreceptor** (term low_pass). tau(I) dy/dt = L - y, solved exactly for log radiance L that is linear in
+time and tau that is constant; an interval is cut where L moves by more than 1/8, and tau is taken in the
+middle of each piece. One pole is what measurements show (v2e).
+
+**Mismatch** (spread). Thresholds of each pixel are normal numbers, drawn once, at least `minimum`.
+
+**Leak** (leak). The reference falls by rate times ON threshold, so a still pixel fires ON events at `rate`. A
+pixel begins at a random phase, as if it had been on for long.
+
+**Refractory time** (refractory). After an event a pixel is held in reset, and its reference is the signal at
+the end of that: a ramp of slope s fires every t_ref + C / s.
+
+**Shot noise, hot pixels** (spontaneous). One Poisson process for each pixel, drawn as waiting times of its
+largest rate and thinned to the rate at the light of that instant. A noise event resets a pixel like any
+other: its reference becomes the signal.
+
+**First passage** (stochastic). DVS-Voltmeter: voltage is a Brownian motion with constant drift and spread
+between frames. Its increment is drawn, then whether the bridge between its ends touched a threshold, and
+when: with t the first time in an interval of length T, t / (T - t) is inverse Gaussian. This is the law in
+continuous time, whatever the frames, but that a piece of at most a quarter of a threshold of noise is taken
+to touch one threshold only (an error below e^-32).
+
+Reference: Hu, Liu, Delbruck (2021), v2e: from video frames to realistic DVS events, CVPRW; Nozaki, Delbruck
+(2017), Temperature and parasitic photocurrent effects in dynamic vision sensors; Lin et al. (2022),
+DVS-Voltmeter, ECCV; Beghin, Orsingher (1999), On the maximum of the generalized Brownian bridge; Michael,
+Schucany, Haas (1976), Generating random variates using transformations with multiple roots.
+"""
+
+import warp as wp
+
+from neurosim_core.sensors.event_config import EventCameraConfig
+
+wp.set_module_options({"enable_backward": False})
+
+TERMS = ("spread", "low_pass", "refractory", "leak", "spontaneous", "stochastic")
+"""All terms that may be compiled in."""
+
+
+@wp.struct
+class PixelModel:
+    """Parameters as the kernel reads them, times in ns; arrays of absent terms are empty."""
+
+    threshold_on: wp.float64
+    threshold_off: wp.float64
+    white_radiance: wp.float64
+    refractory_ns: wp.float64
+    corner_per_ns: wp.float64  # 1 / tau at white
+    dark_radiance: wp.float64
+    bright_factor: wp.float64
+    shot_on_fraction: wp.float64
+    hot_on_fraction: wp.float64
+    k1: wp.float64
+    k2: wp.float64
+    k3: wp.float64  # per root ns
+    k4: wp.float64  # per ns
+    k5: wp.float64
+    k6: wp.float64
+    seed: wp.uint64  # of numbers in time
+    spontaneous_stream: wp.uint32
+    step_stream: wp.uint32
+    touch_stream: wp.uint32
+    thresholds: wp.array[wp.vec2d]  # ON, OFF
+    leak: wp.array[wp.vec2d]  # cycles per ns, phase in cycles
+    rates: wp.array[wp.vec2d]  # shot noise in the dark and hot pixel, per ns
+
+
+@wp.struct
+class Memory:
+    """What pixels remember beside their last sample and the levels they crossed, shape [pixel]."""
+
+    reference: wp.array[wp.float64]
+    """What `base` is to an ideal pixel; changes when a pixel is reset (refractory, spontaneous)."""
+    filtered: wp.array[wp.float64]
+    """Output of the photoreceptor."""
+    held_ns: wp.array[wp.float64]
+    """Time in reset that is left; negative: not in reset."""
+    next_ns: wp.array[wp.int64]
+    """Time of the next noise event that may be, since the reset."""
+    noise_count: wp.array[wp.int32]
+    """Its number."""
+    voltage: wp.array[wp.float64]
+    """Of the Brownian motion, in thresholds."""
+
+
+def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
+    """Return the terms that a configuration asks for; none: the pixels are ideal."""
+    present = {
+        "spread": config.threshold_spread is not None,
+        "low_pass": config.low_pass is not None,
+        "refractory": config.refractory_s > 0.0,
+        "leak": config.leak is not None,
+        "spontaneous": config.shot_noise is not None or config.hot_pixels is not None,
+        "stochastic": config.stochastic is not None,
+    }
+    return tuple(term for term, asked in present.items() if asked)

@@ -1,0 +1,462 @@
+# mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
+# mypy: disable-error-code="no-untyped-def,return-value"
+"""The scan of an event pixel that is not ideal, made to measure: only the terms that are asked for.
+
+The signal of a pixel, its log radiance through the photoreceptor plus what its reference has leaked, is known
+in closed form between frames. Events are taken one after the other, at the time at which the signal reaches a
+level, or at which noise fires; so refractory time and noise act at their own times, wherever frames lie.
+
+What each term does is described in `event_noise_model`.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from neurosim_core.random import random_bits, uniform2
+from neurosim_core.sensors.event_levels import COLUMN_SHIFT, key_after, level_at, quiet_range
+from neurosim_core.sensors.event_noise_model import TERMS, Memory, PixelModel
+from neurosim_core.sensors.event_scan import LIMIT, PUT, call_up, write_key
+from neurosim_core.sensors.event_signal import (
+    Crossing,
+    Signal,
+    curve_at,
+    curve_crossing,
+    first_passage,
+    line_at,
+    line_crossing,
+    reached,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_TWO = wp.constant(wp.float64(2.0))
+_NEVER = wp.constant(wp.int64(2**62))
+_PIECE = wp.constant(wp.float64(0.125))
+"""Change of log radiance over which tau is held constant."""
+_PIECE_COUNT_MAX = wp.constant(1024)
+_DARKEST = wp.constant(wp.float64(1e-9))
+"""Least share of the photoreceptor's bandwidth, so that it has a time constant without light."""
+_FULL_SCALE = wp.constant(wp.float64(255.0))
+_FAINTEST = wp.constant(wp.float64(1e-12))
+_BRIGHTEST = wp.constant(wp.float64(255e3))
+"""Most light that a voltage is driven by, 1000 times white."""
+_DRAW_BITS = wp.constant(wp.int64(12))
+
+
+@wp.struct
+class _Pixel:
+    """One pixel in registers."""
+
+    on: wp.float64
+    off: wp.float64
+    reference: wp.float64
+    up: wp.int32
+    down: wp.int32
+    fold: wp.int32  # whole cycles of leak: they count against `up`
+    held_ns: wp.float64  # end of reset, since the frame before
+    next_ns: wp.int64
+    noise_count: wp.int32
+    shot_rate: wp.float64
+    hot_rate: wp.float64
+    voltage: wp.float64
+
+
+@wp.func
+def _digital(model: PixelModel, sample: wp.float32) -> wp.float64:
+    """Return light in units of white / 255."""
+    light = _FULL_SCALE / model.white_radiance * wp.exp(wp.float64(sample))
+    return wp.clamp(light, _FAINTEST, _BRIGHTEST)
+
+
+@wp.func
+def _wait_ns(rate: wp.float64, uniform: wp.float64) -> wp.int64:
+    """Return an exponential waiting time, at least 1 ns."""
+    if rate <= _ZERO:
+        return _NEVER
+    return wp.max(wp.int64(wp.ceil(wp.min(-wp.log(uniform) / rate, wp.float64(1e18)))), wp.int64(1))
+
+
+@wp.func
+def _spontaneous(model: PixelModel, index: wp.int32, state: _Pixel) -> wp.vec2d:
+    """Return two uniform numbers for the wait for a noise event and for what becomes of it."""
+    return uniform2(random_bits(model.seed, model.spontaneous_stream, wp.int64(state.noise_count), index))
+
+
+@wp.func
+def _noise_polarity(
+    model: PixelModel, state: _Pixel, log_radiance: wp.float64, uniform: wp.float64
+) -> wp.int32:
+    """Return the polarity of a noise event that may be; -1: at this light it is none."""
+    place = uniform * (state.shot_rate + state.hot_rate)
+    if place < state.hot_rate:
+        return wp.where(place < state.hot_rate * model.hot_on_fraction, 1, 0)
+    place -= state.hot_rate
+    light = wp.min(wp.exp(log_radiance) / model.white_radiance, _ONE)
+    rate = state.shot_rate * (_ONE + (model.bright_factor - _ONE) * light)
+    if place >= rate:
+        return -1
+    return wp.where(place < rate * model.shot_on_fraction, 1, 0)
+
+
+@functools.cache
+def make_pixel_scan(terms: frozenset[str]) -> Any:
+    """Return the function that takes a pixel with only the given `TERMS` over a stack of frames.
+
+    Its parameters are those of the kernel of `make_scan`, with the pixel in place of the range of pixels.
+    """
+    if unknown := terms - set(TERMS):
+        raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
+    spread = "spread" in terms
+    low_pass = "low_pass" in terms
+    refractory = "refractory" in terms
+    leak = "leak" in terms
+    spontaneous = "spontaneous" in terms
+    stochastic = "stochastic" in terms
+    resets = refractory or spontaneous
+    value_at = curve_at if low_pass else line_at
+    find_crossing = curve_crossing if low_pass else line_crossing
+
+    @wp.func
+    def range_of(state: _Pixel) -> wp.vec2:
+        return quiet_range(state.reference, state.up - state.fold, state.down, state.on, state.off)
+
+    @wp.func
+    def next_noise(model: PixelModel, pixel: wp.int32, state: _Pixel) -> _Pixel:
+        state.noise_count += 1
+        wait = _wait_ns(state.shot_rate + state.hot_rate, _spontaneous(model, pixel, state)[0])
+        state.next_ns = wp.min(state.next_ns + wait, _NEVER)
+        return state
+
+    @wp.func
+    def release(signal: Signal, time_ns: wp.float64, state: _Pixel) -> _Pixel:
+        """Let the reference be the signal at a time."""
+        if wp.static(stochastic):
+            state.voltage = _ZERO
+        else:
+            state.reference = value_at(signal, time_ns)
+            state.up = state.fold
+            state.down = 0
+        state.held_ns = -_ONE
+        return state
+
+    @wp.func
+    def react(
+        model: PixelModel,
+        pixel: wp.int32,
+        row: wp.int32,
+        place: wp.int64,
+        time_shift: wp.int32,
+        signal: Signal,
+        drift: wp.float64,
+        deviation: wp.float64,
+        first_light: wp.float64,
+        light_slope: wp.float64,
+        start_ns: wp.int64,
+        since_ns: wp.int64,
+        frame: wp.int32,
+        row_limit: wp.int32,
+        tabulate: wp.bool,
+        state: _Pixel,
+        quiet: wp.vec2,
+        table: wp.array2d[wp.int32],
+        keys: wp.array[wp.int64],
+        counters: wp.array[wp.int64],
+    ) -> _Pixel:
+        """Take a pixel over one piece of the signal, event by event."""
+        now = signal.begin
+        draw = wp.int64(0)
+        while now < signal.end:
+            if wp.static(refractory):
+                if state.held_ns > signal.end:
+                    break
+                if state.held_ns >= _ZERO:
+                    now = wp.max(now, state.held_ns)
+                    state = release(signal, now, state)
+                    quiet = range_of(state)
+            end = signal.end
+            noisy = wp.bool(False)
+            if wp.static(spontaneous):
+                while wp.float64(state.next_ns - since_ns) <= now:  # in reset
+                    state = next_noise(model, pixel, state)
+                noise_ns = wp.float64(state.next_ns - since_ns)
+                if noise_ns <= end:
+                    end = noise_ns
+                    noisy = wp.bool(True)
+
+            crossing = Crossing()
+            if wp.static(stochastic):
+                ratio = wp.min(state.on, state.off) / wp.max(deviation, wp.float64(1e-30))
+                longest_ns = ratio * ratio / wp.float64(16.0)
+                if end - now > longest_ns:
+                    end = wp.min(now + wp.max(longest_ns, _ONE), end)
+                    noisy = wp.bool(False)
+                step = (since_ns << _DRAW_BITS) + draw
+                draw += wp.int64(1)
+                crossing = first_passage(
+                    model.seed,
+                    model.step_stream,
+                    model.touch_stream,
+                    step,
+                    pixel,
+                    state.voltage,
+                    state.on,
+                    state.off,
+                    drift,
+                    deviation,
+                    now,
+                    end,
+                )
+                state.voltage = crossing.voltage
+            else:
+                lower = level_at(state.reference, state.up - state.fold, state.down + 1, state.on, state.off)
+                upper = level_at(state.reference, state.up - state.fold + 1, state.down, state.on, state.off)
+                crossing = find_crossing(signal, now, end, quiet, lower, upper)
+
+            polarity = crossing.polarity
+            reset = wp.bool(False)
+            if polarity >= 0:
+                now = crossing.time_ns
+            else:
+                now = end
+                if wp.static(spontaneous):  # noqa: SIM102, one of them is for the compiler
+                    if noisy:
+                        light = first_light + light_slope * now
+                        polarity = _noise_polarity(model, state, light, _spontaneous(model, pixel, state)[1])
+                        state = next_noise(model, pixel, state)
+                        reset = wp.bool(True)
+            if polarity >= 0:
+                if tabulate:
+                    wp.atomic_add(table, frame, row, 1)
+                elif row < row_limit:
+                    key = key_after(now, start_ns, place, time_shift, polarity)
+                    write_key(PUT, key, keys, counters)
+                if not reset:
+                    state.up += polarity
+                    state.down += 1 - polarity
+                if wp.static(refractory):  # noqa: SIM102
+                    if model.refractory_ns > _ZERO:
+                        state.held_ns = now + model.refractory_ns
+                        reset = wp.bool(False)
+                if reset:
+                    state = release(signal, now, state)
+                quiet = range_of(state)
+        return state
+
+    @wp.func
+    def scan_pixel(
+        model: PixelModel,
+        width: wp.int32,
+        row_shift: wp.int32,
+        time_shift: wp.int32,
+        pixel: wp.int32,
+        log_radiance: wp.array2d[wp.float32],
+        stamps: wp.array[wp.int64],
+        since_reset_ns: wp.int64,
+        frame_count: wp.int32,
+        row_limit: wp.array[wp.int32],
+        base: wp.array[wp.float32],
+        last: wp.array[wp.float32],
+        crossed: wp.array[wp.vec2i],
+        before: Memory,
+        tabulate: wp.bool,
+        last_out: wp.array[wp.float32],
+        crossed_out: wp.array[wp.vec2i],
+        after: Memory,
+        keys_out: wp.array[wp.int64],
+        counters_out: wp.array[wp.int64],
+        table_out: wp.array2d[wp.int32],
+    ):
+        """Take one pixel from its state before a stack to that after it."""
+        call_up(log_radiance, pixel, frame_count)
+        row = pixel // width
+        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+        state = _Pixel()
+        state.on = model.threshold_on
+        state.off = model.threshold_off
+        if wp.static(spread):
+            state.on = model.thresholds[pixel][0]
+            state.off = model.thresholds[pixel][1]
+        if wp.static(stochastic):
+            state.on = state.on / model.threshold_on
+            state.off = state.off / model.threshold_off
+            state.voltage = before.voltage[pixel]
+        state.reference = wp.float64(base[pixel])
+        if wp.static(resets):
+            state.reference = before.reference[pixel]
+        state.up = crossed[pixel][0]
+        state.down = crossed[pixel][1]
+        state.held_ns = -_ONE
+        if wp.static(refractory):
+            state.held_ns = before.held_ns[pixel]
+        if wp.static(spontaneous):
+            state.next_ns = before.next_ns[pixel]
+            state.noise_count = before.noise_count[pixel]
+            state.shot_rate = model.rates[pixel][0]
+            state.hot_rate = model.rates[pixel][1]
+        filtered = _ZERO
+        if wp.static(low_pass):
+            filtered = before.filtered[pixel]
+        sample_before = last[pixel]
+        dn_end = _ZERO
+        if wp.static(stochastic):
+            dn_end = _digital(model, sample_before)
+        invalid_count = wp.int32(0)
+        invalid_first = wp.int32(0)
+        quiet = range_of(state)
+
+        for frame in range(frame_count):
+            sample = log_radiance[frame, pixel]
+            if wp.abs(sample) <= LIMIT:
+                start_ns = stamps[frame]
+                since_ns = start_ns + since_reset_ns
+                span_ns = wp.float64(stamps[frame + 1] - start_ns)
+                light = wp.float64(sample_before)
+                light_slope = (wp.float64(sample) - light) / span_ns
+                leaked = _ZERO
+                leak_slope = _ZERO
+                if wp.static(leak):
+                    cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
+                    whole = wp.floor(cycles)
+                    leaked = (cycles - whole) * state.on
+                    leak_slope = model.leak[pixel][0] * state.on
+                    if wp.int32(whole) != state.fold:
+                        state.fold = wp.int32(whole)
+                        quiet = range_of(state)
+                drift = _ZERO
+                deviation = _ZERO
+                if wp.static(stochastic):
+                    dn_begin = dn_end
+                    dn_end = _digital(model, sample)
+                    dn = (dn_begin + dn_end) / _TWO
+                    drift = model.k1 * wp.log((dn_end + model.k2) / (dn_begin + model.k2)) / span_ns
+                    drift += model.k4 + model.k5 * dn
+                    deviation = model.k3 * wp.sqrt(dn) / (dn + model.k2) + model.k6
+
+                pieces = wp.int32(1)
+                if wp.static(low_pass):
+                    rise = wp.abs(wp.float64(sample) - light)
+                    pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
+                for piece in range(pieces):
+                    signal = Signal()
+                    signal.begin = span_ns * (wp.float64(piece) / wp.float64(pieces))
+                    signal.end = span_ns * (wp.float64(piece + 1) / wp.float64(pieces))
+                    busy = wp.bool(True)
+                    if wp.static(low_pass):
+                        length_ns = signal.end - signal.begin
+                        light_begin = light + light_slope * signal.begin
+                        middle = light_begin + light_slope * length_ns / _TWO
+                        share = (wp.exp(middle) + model.dark_radiance) / (
+                            model.white_radiance + model.dark_radiance
+                        )
+                        signal.tau = _ONE / (model.corner_per_ns * wp.clamp(share, _DARKEST, _ONE))
+                        decay = filtered - light_begin + light_slope * signal.tau
+                        gain = wp.exp(-length_ns / signal.tau) - _ONE
+                        signal.start = filtered + leaked + leak_slope * signal.begin
+                        signal.slope = light_slope + leak_slope
+                        signal.decay = decay
+                        filtered += light_slope * length_ns + decay * gain
+                        signal.last = filtered + leaked + leak_slope * signal.end
+                        steepness = signal.slope - decay / signal.tau
+                        turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
+                        busy = turns or reached(signal.last, quiet) >= 0
+                        if wp.static(refractory):
+                            busy = busy or state.held_ns >= _ZERO
+                        if wp.static(spontaneous):
+                            busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
+                    elif wp.static(not stochastic):
+                        signal.start = light + leaked
+                        signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
+                        busy = reached(signal.last, quiet) >= 0
+                        if wp.static(refractory):
+                            busy = busy or state.held_ns >= _ZERO
+                        if wp.static(spontaneous):
+                            busy = busy or wp.float64(state.next_ns - since_ns) <= span_ns
+                    if busy:
+                        state = react(
+                            model,
+                            pixel,
+                            row,
+                            place,
+                            time_shift,
+                            signal,
+                            drift,
+                            deviation,
+                            light,
+                            light_slope,
+                            start_ns,
+                            since_ns,
+                            frame,
+                            row_limit[frame],
+                            tabulate,
+                            state,
+                            quiet,
+                            table_out,
+                            keys_out,
+                            counters_out,
+                        )
+                        quiet = range_of(state)
+                if wp.static(refractory):  # noqa: SIM102
+                    if state.held_ns >= _ZERO:
+                        state.held_ns = wp.max(state.held_ns - span_ns, _ZERO)
+                sample_before = sample
+            else:
+                if invalid_count == 0:
+                    invalid_first = frame
+                invalid_count += 1
+
+        if not tabulate:
+            last_out[pixel] = sample_before
+            crossed_out[pixel] = wp.vec2i(state.up, state.down)
+            if wp.static(resets):
+                after.reference[pixel] = state.reference
+            if wp.static(low_pass):
+                after.filtered[pixel] = filtered
+            if wp.static(refractory):
+                after.held_ns[pixel] = state.held_ns
+            if wp.static(spontaneous):
+                after.next_ns[pixel] = state.next_ns
+                after.noise_count[pixel] = state.noise_count
+            if wp.static(stochastic):
+                after.voltage[pixel] = state.voltage
+            if invalid_count > 0:
+                pixel_count = base.shape[0]
+                flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
+                wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
+                wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+
+    return scan_pixel
+
+
+@wp.func
+def begin_pixel(
+    model: PixelModel,
+    phase_stream: wp.uint32,
+    random_phase: wp.bool,
+    base: wp.array[wp.float32],
+    pixel: wp.int32,
+    memory_out: Memory,
+) -> None:
+    """Let a pixel begin anew at what it sees now."""
+    value = wp.float64(base[pixel])
+    if memory_out.reference.shape[0] > 0:
+        memory_out.reference[pixel] = value
+    if memory_out.filtered.shape[0] > 0:
+        memory_out.filtered[pixel] = value
+    if memory_out.held_ns.shape[0] > 0:
+        memory_out.held_ns[pixel] = -_ONE
+    if memory_out.next_ns.shape[0] > 0:
+        state = _Pixel()
+        rate = model.rates[pixel][0] + model.rates[pixel][1]
+        memory_out.next_ns[pixel] = _wait_ns(rate, _spontaneous(model, pixel, state)[0])
+        memory_out.noise_count[pixel] = 0
+    if memory_out.voltage.shape[0] > 0:
+        voltage = _ZERO
+        if random_phase:
+            voltage = uniform2(random_bits(model.seed, phase_stream, wp.int64(0), pixel))[0]
+            if model.thresholds.shape[0] > 0:
+                voltage *= model.thresholds[pixel][0] / model.threshold_on
+        memory_out.voltage[pixel] = voltage
