@@ -1,7 +1,8 @@
 """A test bench for event pixels: ramp, step, sine, moving bar, darkness, readout.
 
 What a sensor is characterised with in a laboratory is shown to the pixel models, and what they do is set
-beside the closed form of the law that they claim to follow. The patterns are in `pixel_measure`.
+beside the closed form of the law that they claim to follow. The patterns are in `pixel_response` and
+`pixel_noise`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from neurosim_core.bench import pixel_measure as measure
+from neurosim_core.bench import pixel_noise, pixel_response
+from neurosim_core.bench.pixel_bench import TestBench
 from neurosim_core.bench.pixel_plots import pixel_plots
 from neurosim_core.bench.pixel_result import Curve, Jitter, PixelResult, PresetRow
 from neurosim_core.bench.report import Bar, Chapter, Table
@@ -38,26 +40,26 @@ def measure_pixel(
     """
     tell = progress or (lambda _: None)
     device = ("cuda:0" if wp.get_cuda_device_count() else "cpu") if device == "auto" else device
-    bench = measure.TestBench(device=device, quick=quick)
+    bench = TestBench(device=device, quick=quick)
     tell("ramp (kernels are compiled on the first run)")
-    ramp, threshold = measure.measure_ramp(bench)
+    ramp, threshold = pixel_response.measure_ramp(bench)
     tell("step")
-    staircase = measure.measure_staircase(bench)
-    s_curve, s_curve_distance = measure.measure_s_curves(bench)
-    latency = measure.measure_latency(bench)
+    staircase = pixel_response.measure_staircase(bench)
+    s_curve, s_curve_distance = pixel_response.measure_s_curves(bench)
+    latency = pixel_response.measure_latency(bench)
     tell("sine")
-    gain, corner = measure.measure_gain(bench)
+    gain, corner = pixel_response.measure_gain(bench)
     tell("moving bar")
-    bar, jitter = measure.measure_bar(bench)
+    bar, jitter = pixel_response.measure_bar(bench)
     tell("darkness")
-    dark = measure.measure_dark(bench)
-    survival, survival_distance = measure.measure_survival(bench)
-    competition = measure.measure_competition(bench)
-    hot = measure.measure_hot(bench)
+    dark = pixel_noise.measure_dark(bench)
+    survival, survival_distance = pixel_noise.measure_survival(bench)
+    competition = pixel_noise.measure_competition(bench)
+    hot = pixel_noise.measure_hot(bench)
     tell("readout")
-    throughput = measure.measure_throughput(bench)
-    batch = measure.measure_batch(bench)
-    wait = measure.measure_wait(bench)
+    throughput = pixel_noise.measure_throughput(bench)
+    batch = pixel_noise.measure_batch(bench)
+    wait = pixel_noise.measure_wait(bench)
     tell("presets")
     return PixelResult(
         quick=quick,
@@ -80,7 +82,7 @@ def measure_pixel(
         throughput=throughput,
         batch=batch,
         wait=wait,
-        presets=measure.measure_presets(bench),
+        presets=pixel_noise.measure_presets(bench),
     )
 
 

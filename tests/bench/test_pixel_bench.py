@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from neurosim_core.bench.pixel import measure_pixel, pixel_chapter
-from neurosim_core.bench.pixel_measure import TestBench, make_pixel
+from neurosim_core.bench.pixel_bench import TestBench, make_pixel
 from neurosim_core.bench.report import print_chapter
 
 TestBench.__test__ = False  # a class of the product, whatever its name
