@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -64,6 +65,16 @@ class Refusal:
 
     case: str
     message: str
+
+
+def trial_of(trials: Iterable[Trial], method: str) -> Trial:
+    """Return the trial of a method."""
+    return next(trial for trial in trials if trial.method == method)
+
+
+def trial_position_m(trial: Trial) -> float:
+    """Position error [m]; infinite where the flight was not flown to its end."""
+    return math.inf if trial.errors is None else trial.errors.position_m
 
 
 def light(airframe: str, mass_kg: float) -> Flight:

@@ -83,3 +83,15 @@ class DynamicsResult:
             if (sample.flight, sample.method, sample.setting) == (flight, method, setting):
                 return sample
         raise KeyError((flight, method, setting))
+
+
+def cheapest_called(result: DynamicsResult, peer: PeerSample) -> PeerSample | None:
+    """Return the cheapest flight of one vehicle of ours, called once a command, that is no less exact."""
+    ours = [
+        p
+        for p in result.peers
+        if p.flight == peer.flight
+        and p.method.startswith("ours")
+        and p.errors.position_m <= peer.errors.position_m
+    ]
+    return min(ours, key=lambda p: p.cpu_s_per_s, default=None)

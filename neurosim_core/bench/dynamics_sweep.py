@@ -48,6 +48,12 @@ class Sweep:
         return int(np.argmax(np.where(np.isfinite(self.position_m), self.position_m, np.inf)))
 
 
+def sweep_worst_m(sweep: Sweep) -> float:
+    """Largest error of a sweep [m]; infinite if a flight was held."""
+    error_m = float(sweep.position_m[sweep.worst])
+    return error_m if math.isfinite(error_m) else math.inf
+
+
 def measure_sweep(name: str, count: int) -> Sweep:
     """Fly a sweep of `count` flights, and of those on both sides of the guard's edge, if it has one."""
     if name == AT_ONCE:
