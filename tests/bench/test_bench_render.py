@@ -5,15 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neurosim_core.bench.render import (
-    DEFAULT,
-    POINT,
-    Sampling,
-    checkerboard_floor,
-    looking,
-    measure_render,
-    render_chapter,
-)
+from neurosim_core.bench.render import checkerboard_floor, looking, measure_render
+from neurosim_core.bench.render_chapter import render_chapter
+from neurosim_core.bench.render_result import DEFAULT, POINT, Sampling
 from neurosim_core.bench.report import write_report
 
 
