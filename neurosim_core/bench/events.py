@@ -38,7 +38,7 @@ from neurosim_core.clock import NS_PER_US, Rate
 from neurosim_core.config import load_config
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.renderer import make_renderer
-from neurosim_core.render.warp_renderer import SceneArrays, upload_scene
+from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sensors.rig import EventSensorConfig

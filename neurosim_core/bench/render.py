@@ -36,7 +36,8 @@ from neurosim_core.bench.render_result import (
 from neurosim_core.packets import EventArrays
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig, TextureFilter
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
+from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Ambient, Material, Scene, Texture

@@ -29,8 +29,9 @@ from neurosim_core.render.config import LightingConfig, RenderConfig, WalkConfig
 from neurosim_core.render.embree import EmbreeError
 from neurosim_core.render.list_search import together_finder
 from neurosim_core.render.ray_hit import FAR_M
+from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
 from neurosim_core.render.walk_data import ASK, WalkData
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.sensors.rig import EventSensorConfig
 

@@ -50,7 +50,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.packets import Events
 from neurosim_core.render.launch import core_count
 from neurosim_core.render.renderer import upload_scene
-from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.simulation import Model, make_model, make_state, refit, run_model
 
 __all__ = ["measure_throughput", "throughput_chapter"]

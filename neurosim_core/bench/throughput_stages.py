@@ -32,7 +32,8 @@ from neurosim_core.bench.throughput_result import (
     Split,
 )
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer
+from neurosim_core.render.scene_arrays import SceneArrays
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.schedule import batch_end_ns
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.simulation import Model, advance, make_state, run_model, start, want

@@ -10,9 +10,10 @@ import warp as wp
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
+from neurosim_core.render.scene_arrays import SceneArrays
+from neurosim_core.render.scene_arrays import upload_scene as upload_warp_scene
 from neurosim_core.render.synthetic_renderer import SyntheticRenderer, SyntheticScene
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer
-from neurosim_core.render.warp_renderer import upload_scene as upload_warp_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
 

@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
+from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Scene

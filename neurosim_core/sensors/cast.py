@@ -18,7 +18,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Image, ImageEncoding, Packet
 from neurosim_core.pinned import PinnedMapping
 from neurosim_core.render.renderer import Renderer, SceneOnDevice, make_renderer
-from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.scene.bodies import (
     BodyConfig,
     BodyPoses,

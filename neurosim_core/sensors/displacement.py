@@ -55,7 +55,7 @@ from neurosim_core.clock import NS_PER_S, Rate
 from neurosim_core.frames import quaternion_exp
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.warp_renderer import SceneArrays
+from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.scene.bodies import bounding_points, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.streams import HostCopy, HostInput, Milestone
 

@@ -17,10 +17,11 @@ from neurosim_core.render.embree import PACKET
 from neurosim_core.render.film import make_film
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.raycast import asking_kernel, raycast_kernel
+from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.tile_walk import TileWalk, shared_walk
 from neurosim_core.render.view_data import WorldData, make_view
 from neurosim_core.render.walk_data import TILE, WalkData
-from neurosim_core.render.warp_renderer import SceneArrays, ray_layers
+from neurosim_core.render.warp_renderer import ray_layers
 from neurosim_core.scene.bodies import BodyConfig, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig
 from neurosim_core.vehicle import Multirotor

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.render.cast_terms import Terms
 from neurosim_core.render.config import WalkConfig
+from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.warp_renderer import SceneArrays
 from neurosim_core.scene.freespace import DistanceField
 from neurosim_core.simulation import Model, find_device, make_model, refit
 

@@ -10,7 +10,8 @@ import warp as wp
 
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
+from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.scene import Ambient, Light, Material, Scene, Texture
 
 UNSHADOWED = RenderConfig(lighting=LightingConfig(mode="unshadowed"), exposure=1.0)

@@ -15,7 +15,8 @@ import warp as wp
 from neurosim_core.bench.throughput_scene import hall
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
-from neurosim_core.render.warp_renderer import WarpRenderer, upload_scene
+from neurosim_core.render.scene_arrays import upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.scene import Material, Texture
 
 LENS = PinholeConfig(width=53, height=38, horizontal_fov_rad=1.5)  # no multiples of a packet

@@ -10,7 +10,7 @@ from render_scenes import UNSHADOWED, plane, scene_of
 
 from neurosim_core.render.ray_hit import UNFUSED, meet_face
 from neurosim_core.render.ray_tree import RayTree, make_ray_tree, walk_tree
-from neurosim_core.render.warp_renderer import upload_scene
+from neurosim_core.render.scene_arrays import upload_scene
 
 FAR = 1.0e9
 

@@ -26,7 +26,7 @@ from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.film import OUTPUTS
 from neurosim_core.render.raycast import raycast_kernel
-from neurosim_core.render.warp_renderer import upload_scene
+from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.scene.materials import encode_texels
 from neurosim_core.scene.scene import Ambient, Material, Texture
 

@@ -17,9 +17,10 @@ from neurosim_core.render.cast_terms import Terms
 from neurosim_core.render.config import RenderConfig, WalkConfig
 from neurosim_core.render.film import OUTPUTS
 from neurosim_core.render.raycast import raycast_kernel
+from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.render.tile_bounds import tile_bounds
 from neurosim_core.render.tile_walk import TileWalk, shared_walk
-from neurosim_core.render.warp_renderer import WarpRenderer, ray_layers, upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer, ray_layers
 from neurosim_core.scene.bodies import BodyConfig, body_poses, make_bodies, make_body_poses
 from neurosim_core.scene.scene import Material
 

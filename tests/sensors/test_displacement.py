@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from neurosim_core.clock import Rate
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.warp_renderer import SceneArrays, WarpRenderer, upload_scene
+from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
+from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.bodies import BodyConfig, make_bodies
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.sensors import displacement
