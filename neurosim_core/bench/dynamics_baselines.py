@@ -114,9 +114,67 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
     if unknown := terms - KNOWN_TERMS:
         raise ValueError(f"the baselines have the terms {sorted(KNOWN_TERMS)}, got {sorted(unknown)} as well")
     motor_lag = "motor_lag" in terms
-    full_inertia = "full_inertia" in terms
-    wrench = make_wrench(terms)
     module = wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'rigid'}")
+    body_wrench = _make_body_wrench(terms)
+    angular_acceleration = _make_angular_acceleration(full_inertia="full_inertia" in terms)
+    motion_rate = _make_motion_rate(body_wrench, angular_acceleration, motor_lag=motor_lag)
+    midpoint_map = _make_midpoint_map(body_wrench, angular_acceleration)
+    middle = _make_middle(midpoint_map, _make_newton(midpoint_map))
+    load = _make_load(motor_lag=motor_lag)
+    return Baselines(
+        derivative=_make_derivative(module, motion_rate),
+        euler=_make_advance(module, load, _make_euler_step(motion_rate)),
+        rk4=_make_advance(module, load, _make_rk4_step(motion_rate)),
+        midpoint=_make_advance(module, load, _make_midpoint_step(middle, motor_lag=motor_lag)),
+    )
+
+
+@wp.func
+def _clamped(airframe: Airframe, rotor_speed_command: wp.array2d[wp.float64], vehicle: int) -> wp.vec4d:
+    """Return the commands of one vehicle within its limits [rad/s]."""
+    command = wp.vec4d()
+    for rotor in range(4):
+        command[rotor] = wp.clamp(
+            rotor_speed_command[vehicle, rotor], airframe.rotor_speed_min, airframe.rotor_speed_max
+        )
+    return command
+
+
+def _make_load(*, motor_lag: bool) -> Any:
+    """Return the device function that gathers the `Motion` of one vehicle from arrays [N] and [N, 4].
+
+    Without motor lag its rotors turn as commanded [rad/s].
+    """
+
+    @wp.func
+    def load(
+        vehicle: int,
+        position: wp.array[wp.vec3d],
+        velocity: wp.array[wp.vec3d],
+        orientation: wp.array[wp.quatd],
+        body_rate: wp.array[wp.vec3d],
+        rotor_speed: wp.array2d[wp.float64],
+        command: wp.vec4d,
+    ) -> Motion:
+        s = Motion()
+        s.position = position[vehicle]
+        s.velocity = velocity[vehicle]
+        s.orientation = orientation[vehicle]
+        s.body_rate = body_rate[vehicle]
+        s.rotor_speed = command
+        if wp.static(motor_lag):
+            for rotor in range(4):
+                s.rotor_speed[rotor] = rotor_speed[vehicle, rotor]
+        return s
+
+    return load
+
+
+def _make_angular_acceleration(*, full_inertia: bool) -> Any:
+    """Return the device function of Euler's equations: dw/dt in B [rad/s^2] from torque [N m] and w [rad/s].
+
+    Without full inertia it reads the diagonal alone.
+    """
 
     @wp.func
     def angular_acceleration(airframe: Airframe, torque: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
@@ -125,6 +183,17 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         else:
             momentum = wp.cw_mul(airframe.inertia_diagonal, w)
             return wp.cw_mul(airframe.inertia_diagonal_inverse, torque - wp.cross(w, momentum))
+
+    return angular_acceleration
+
+
+def _make_body_wrench(terms: frozenset[str]) -> Any:
+    """Return the device function of force [N] and torque [N m] in B, from the motion and four rotor speeds.
+
+    Its velocity is v_WB in W [m/s], its w the body rate in B [rad/s]; its weights have shape [4], one for
+    each rotor (`aerodynamics.quadratic_weights`, `aerodynamics.linear_weights`).
+    """
+    wrench = make_wrench(terms)
 
     @wp.func
     def body_wrench(
@@ -143,6 +212,15 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
             linear += rotor_speed[rotor] * linear_weight[rotor]
         air = wp.quat_rotate_inv(attitude, velocity - airframe.wind)
         return wrench(airframe, quadratic, linear, air, w)
+
+    return body_wrench
+
+
+def _make_motion_rate(body_wrench: Any, angular_acceleration: Any, *, motor_lag: bool) -> Any:
+    """Return the device function of d/dt of a `Motion`, for commands [rad/s] that hold.
+
+    Without motor lag the rate of the rotor speeds is zero.
+    """
 
     @wp.func
     def motion_rate(
@@ -168,35 +246,11 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
             rate.rotor_speed = (command - s.rotor_speed) / time_constant_s
         return rate
 
-    @wp.func
-    def load(
-        vehicle: int,
-        position: wp.array[wp.vec3d],
-        velocity: wp.array[wp.vec3d],
-        orientation: wp.array[wp.quatd],
-        body_rate: wp.array[wp.vec3d],
-        rotor_speed: wp.array2d[wp.float64],
-        command: wp.vec4d,
-    ) -> Motion:
-        s = Motion()
-        s.position = position[vehicle]
-        s.velocity = velocity[vehicle]
-        s.orientation = orientation[vehicle]
-        s.body_rate = body_rate[vehicle]
-        s.rotor_speed = command
-        if wp.static(motor_lag):
-            for rotor in range(4):
-                s.rotor_speed[rotor] = rotor_speed[vehicle, rotor]
-        return s
+    return motion_rate
 
-    @wp.func
-    def clamped(airframe: Airframe, rotor_speed_command: wp.array2d[wp.float64], vehicle: int) -> wp.vec4d:
-        command = wp.vec4d()
-        for rotor in range(4):
-            command[rotor] = wp.clamp(
-                rotor_speed_command[vehicle, rotor], airframe.rotor_speed_min, airframe.rotor_speed_max
-            )
-        return command
+
+def _make_euler_step(motion_rate: Any) -> Any:
+    """Return the device function of one step of h [s] of explicit Euler, normalised at its end."""
 
     @wp.func
     def euler_step(
@@ -212,6 +266,15 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         end = _moved(s, rate, h)
         end.orientation = wp.normalize(end.orientation)
         return end
+
+    return euler_step
+
+
+def _make_rk4_step(motion_rate: Any) -> Any:
+    """Return the device function of one step of h [s] of classical Runge-Kutta, normalised at its end.
+
+    Reference: Hairer, Lubich, Wanner (2006), II.1.
+    """
 
     @wp.func
     def rk4_step(
@@ -237,10 +300,22 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         end.orientation = wp.normalize(end.orientation)
         return end
 
-    @wp.func
-    def cayley_turn(orientation: wp.quatd, h: wp.float64, w: wp.vec3d) -> wp.quatd:
-        u = wp.float64(0.5) * h * w
-        return orientation * wp.normalize(wp.quatd(u[0], u[1], u[2], wp.float64(1.0)))
+    return rk4_step
+
+
+@wp.func
+def _cayley_turn(orientation: wp.quatd, h: wp.float64, w: wp.vec3d) -> wp.quatd:
+    """Return the orientation turned by cay(h w), with w in B [rad/s] and h [s]."""
+    u = wp.float64(0.5) * h * w
+    return orientation * wp.normalize(wp.quatd(u[0], u[1], u[2], wp.float64(1.0)))
+
+
+def _make_midpoint_map(body_wrench: Any, angular_acceleration: Any) -> Any:
+    """Return the device function whose fixed point solves a step of the implicit midpoint.
+
+    It maps guesses of velocity in W [m/s] and body rate in B [rad/s] in the middle of the step, shape [6], to
+    better ones, at given rotor speeds in the middle [rad/s].
+    """
 
     @wp.func
     def midpoint_map(
@@ -252,16 +327,95 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         rotor_speed: wp.vec4d,
         middle: _vec6d,
     ) -> _vec6d:
-        """Velocity and body rate in the middle of the step, from guesses of them: a fixed point solves it."""
         half = wp.float64(0.5) * h
         v = wp.vec3d(middle[0], middle[1], middle[2])
         w = wp.vec3d(middle[3], middle[4], middle[5])
-        attitude = wp.normalize(s.orientation + cayley_turn(s.orientation, h, w))
+        attitude = wp.normalize(s.orientation + _cayley_turn(s.orientation, h, w))
         force, torque = body_wrench(airframe, quadratic_weight, linear_weight, attitude, v, w, rotor_speed)
         down = wp.vec3d(wp.float64(0.0), wp.float64(0.0), -airframe.gravity)
         v = s.velocity + half * (down + airframe.mass_inverse * wp.quat_rotate(attitude, force))
         w = s.body_rate + half * angular_acceleration(airframe, torque, w)
         return _vec6d(v[0], v[1], v[2], w[0], w[1], w[2])
+
+    return midpoint_map
+
+
+def _make_newton(midpoint_map: Any) -> Any:
+    """Return the device function that solves z = midpoint_map(z), shape [6], by Newton's method.
+
+    It begins at `start`; the Jacobian is of forward differences.
+    """
+
+    @wp.func
+    def newton(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        h: wp.float64,
+        s: Motion,
+        rotor_speed: wp.vec4d,
+        start: _vec6d,
+    ) -> _vec6d:
+        z = wp.float64(1.0) * start
+        for _iteration in range(_NEWTON_COUNT_MAX):
+            image = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, rotor_speed, z)
+            jacobian = _mat66d()
+            for column in range(6):
+                moved = wp.float64(1.0) * z
+                step = _DIFFERENCE * (wp.float64(1.0) + wp.abs(z[column]))
+                moved[column] = z[column] + step
+                slope = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, rotor_speed, moved)
+                for row in range(6):
+                    jacobian[row, column] = -(slope[row] - image[row]) / step
+                jacobian[column, column] = jacobian[column, column] + wp.float64(1.0)
+            change = _solve6(jacobian, image - z)
+            z = z + change
+            if wp.length(change) <= _NEWTON_CONVERGED * wp.length(z):
+                break
+        return z
+
+    return newton
+
+
+def _make_middle(midpoint_map: Any, newton: Any) -> Any:
+    """Return the device function that solves z = midpoint_map(z), shape [6], by fixed-point iteration.
+
+    Where that does not converge from `start`, it begins again with Newton's method.
+    """
+
+    @wp.func
+    def middle(
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        h: wp.float64,
+        s: Motion,
+        rotor_speed: wp.vec4d,
+        start: _vec6d,
+    ) -> _vec6d:
+        z = wp.float64(1.0) * start  # a copy: a bare name would be the same variable
+        solved = wp.bool(False)
+        for _iteration in range(_ITERATION_COUNT_MAX):
+            z_next = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, rotor_speed, z)
+            size = wp.length(z_next)
+            solved = wp.length(z_next - z) <= _CONVERGED * size and wp.isfinite(size)
+            z = z_next
+            if solved or not wp.isfinite(size):
+                break
+        if not solved:
+            z = newton(airframe, quadratic_weight, linear_weight, h, s, rotor_speed, start)
+        return z
+
+    return middle
+
+
+def _make_midpoint_step(middle: Any, *, motor_lag: bool) -> Any:
+    """Return the device function of one step of h [s] of the implicit midpoint, the motor in closed form.
+
+    Velocity, body rate and rotor speed at its end are mirrored at the middle of the step.
+
+    Reference: Hairer, Lubich, Wanner (2006), VII.5.
+    """
 
     @wp.func
     def midpoint_step(
@@ -280,76 +434,67 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         start = _vec6d(
             s.velocity[0], s.velocity[1], s.velocity[2], s.body_rate[0], s.body_rate[1], s.body_rate[2]
         )
-        z = wp.float64(1.0) * start  # a copy: a bare name would be the same variable
-        solved = wp.bool(False)
-        for _iteration in range(_ITERATION_COUNT_MAX):
-            z_next = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, speed, z)
-            size = wp.length(z_next)
-            solved = wp.length(z_next - z) <= _CONVERGED * size and wp.isfinite(size)
-            z = z_next
-            if solved or not wp.isfinite(size):
-                break
-        if not solved:
-            z = wp.float64(1.0) * start
-            for _iteration in range(_NEWTON_COUNT_MAX):
-                image = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, speed, z)
-                jacobian = _mat66d()
-                for column in range(6):
-                    moved = wp.float64(1.0) * z
-                    step = _DIFFERENCE * (wp.float64(1.0) + wp.abs(z[column]))
-                    moved[column] = z[column] + step
-                    slope = midpoint_map(airframe, quadratic_weight, linear_weight, h, s, speed, moved)
-                    for row in range(6):
-                        jacobian[row, column] = -(slope[row] - image[row]) / step
-                    jacobian[column, column] = jacobian[column, column] + wp.float64(1.0)
-                change = _solve6(jacobian, image - z)
-                z = z + change
-                if wp.length(change) <= _NEWTON_CONVERGED * wp.length(z):
-                    break
+        z = middle(airframe, quadratic_weight, linear_weight, h, s, speed, start)
         v = wp.vec3d(z[0], z[1], z[2])
         w = wp.vec3d(z[3], z[4], z[5])
         end = Motion()
         end.position = s.position + h * v
         end.velocity = wp.float64(2.0) * v - s.velocity
         end.body_rate = wp.float64(2.0) * w - s.body_rate
-        end.orientation = wp.normalize(cayley_turn(s.orientation, h, w))
+        end.orientation = wp.normalize(_cayley_turn(s.orientation, h, w))
         end.rotor_speed = speed
         if wp.static(motor_lag):
             end.rotor_speed = wp.float64(2.0) * speed - s.rotor_speed
         return end
 
-    def make_advance(step: Any) -> Any:
-        @wp.kernel(module=module, enable_backward=False)
-        def advance(
-            # Model:
-            airframe: Airframe,
-            quadratic_weight: wp.array[wp.vec4d],
-            linear_weight: wp.array[vec10d],
-            time_constant_s: wp.float64,
-            step_s: wp.float64,
-            step_count: wp.int32,
-            # In:
-            rotor_speed_command: wp.array2d[wp.float64],
-            # In/out:
-            position: wp.array[wp.vec3d],
-            velocity: wp.array[wp.vec3d],
-            orientation: wp.array[wp.quatd],
-            body_rate: wp.array[wp.vec3d],
-            rotor_speed: wp.array2d[wp.float64],
-        ):
-            vehicle = wp.tid()
-            command = clamped(airframe, rotor_speed_command, vehicle)
-            s = load(vehicle, position, velocity, orientation, body_rate, rotor_speed, command)
-            for _step in range(step_count):
-                s = step(airframe, quadratic_weight, linear_weight, time_constant_s, step_s, command, s)
-            position[vehicle] = s.position
-            velocity[vehicle] = s.velocity
-            orientation[vehicle] = s.orientation
-            body_rate[vehicle] = s.body_rate
-            for rotor in range(4):
-                rotor_speed[vehicle, rotor] = s.rotor_speed[rotor]
+    return midpoint_step
 
-        return advance
+
+def _make_advance(module: wp.Module, load: Any, step: Any) -> Any:
+    """Return the kernel that makes `step_count` steps of `step_s` for each vehicle, in place.
+
+    Commands and rotor speeds have shape [N, 4] [rad/s], all else [N] with the units of `Motion`.
+    """
+
+    @wp.kernel(module=module, enable_backward=False)
+    def advance(
+        # Model:
+        airframe: Airframe,
+        quadratic_weight: wp.array[wp.vec4d],
+        linear_weight: wp.array[vec10d],
+        time_constant_s: wp.float64,
+        step_s: wp.float64,
+        step_count: wp.int32,
+        # In:
+        rotor_speed_command: wp.array2d[wp.float64],
+        # In/out:
+        position: wp.array[wp.vec3d],
+        velocity: wp.array[wp.vec3d],
+        orientation: wp.array[wp.quatd],
+        body_rate: wp.array[wp.vec3d],
+        rotor_speed: wp.array2d[wp.float64],
+    ):
+        vehicle = wp.tid()
+        command = _clamped(airframe, rotor_speed_command, vehicle)
+        s = load(vehicle, position, velocity, orientation, body_rate, rotor_speed, command)
+        for _step in range(step_count):
+            s = step(airframe, quadratic_weight, linear_weight, time_constant_s, step_s, command, s)
+        position[vehicle] = s.position
+        velocity[vehicle] = s.velocity
+        orientation[vehicle] = s.orientation
+        body_rate[vehicle] = s.body_rate
+        for rotor in range(4):
+            rotor_speed[vehicle, rotor] = s.rotor_speed[rotor]
+
+    return advance
+
+
+def _make_derivative(module: wp.Module, motion_rate: Any) -> Any:
+    """Return the kernel of the rate of one vehicle's motion, launched with one thread.
+
+    It reads p_WB [m], v_WB in W [m/s], q_WB, w_WB in B [rad/s] and rotor speeds [rad/s], shape [17], and
+    overwrites the rates of the first four, shape [13].
+    """
 
     @wp.kernel(module=module, enable_backward=False)
     def derivative(
@@ -379,6 +524,4 @@ def make_baselines(terms: frozenset[str]) -> Baselines:
         for part in range(4):
             rate_out[6 + part] = rate.orientation[part]
 
-    return Baselines(
-        derivative, make_advance(euler_step), make_advance(rk4_step), make_advance(midpoint_step)
-    )
+    return derivative
