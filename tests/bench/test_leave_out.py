@@ -11,17 +11,15 @@ import numpy as np
 import pytest
 
 from neurosim_core.bench.leave_out import (
-    _cases,
     dynamics_differences,
     imu_difference,
     leave_out_chapter,
     measure_leave_out,
     pixel_difference,
-    plain_room,
     radiance_difference,
     run_probe,
-    textured_room,
 )
+from neurosim_core.bench.leave_out_cases import make_cases, plain_room, textured_room
 from neurosim_core.bench.report import write_report
 from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.vehicle.multirotor import TERMS
@@ -147,7 +145,7 @@ def test_the_room_is_closed_and_plain(tmp_path):
 
 
 def test_the_full_set_of_cases(tmp_path):
-    cases = {case.name: case for case in _cases(tmp_path / "a.gltf", tmp_path / "b.gltf", quick=False)}
+    cases = {case.name: case for case in make_cases(tmp_path / "a.gltf", tmp_path / "b.gltf", quick=False)}
     names = ["imu", "imu-file", "events-plain", "events", "pictures", "sensors"]
     assert list(cases) == [*names, "all-plain", "all-file", "all"]
     for case in cases.values():
