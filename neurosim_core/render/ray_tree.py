@@ -116,14 +116,9 @@ def make_ray_tree(mesh: wp.Mesh) -> RayTree:
     """Return the tree of a mesh as it is now; waits for the device.
 
     Args:
-        mesh: Made with `bvh_constructor="sah"`.
-
-    Raises:
-        ValueError: It has no triangles.
+        mesh: Made with `bvh_constructor="sah"`, with at least one triangle.
     """
     face_count = mesh.indices.shape[0] // 3
-    if face_count == 0:
-        raise ValueError("there is nothing to render: the scene has no triangles")
     device, node_limit = mesh.device, 2 * face_count
     tree = RayTree()
     root = wp.empty(1, dtype=int, device=device)

@@ -74,7 +74,6 @@ def upload_scene(
 
     Raises:
         EmbreeError: `config` asks for Embree on a CPU and it cannot be used here.
-        ValueError: The scene has no triangles, and rays are not cast by Embree.
     """
     baked = config.lighting.mode == "baked"
     mesh = refine(scene, config.lighting.edge_max_m if baked else None)

@@ -66,7 +66,11 @@ class Ambient:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """Triangles with materials and lights. World frame: metres, z up."""
+    """Triangles with materials and lights. World frame: metres, z up.
+
+    Raises:
+        ValueError: There are no triangles.
+    """
 
     name: str
     vertices: NDArray[np.float32]
@@ -91,6 +95,11 @@ class Scene:
     """What was assumed, dropped or repaired while loading, one sentence each; shown to the user."""
     inside_m: tuple[float, float, float] | None = None
     """A point known to be in free space, if the source of the scene knows one [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what renderers cannot show: a GPU would look for its tree in memory that is not there."""
+        if len(self.faces) == 0:
+            raise ValueError(f"a scene must have triangles, and {self.name!r} has none")
 
     @property
     def bounds_m(self) -> NDArray[np.float64]:

@@ -251,12 +251,6 @@ def test_more_triangles_than_the_tree_has_levels_to_tell_apart(device):
     assert (face >= 0).sum() > 1000
 
 
-def test_a_mesh_without_triangles_is_refused(device):
-    mesh = wp.Mesh(wp.zeros(3, dtype=wp.vec3, device=device), wp.zeros(0, dtype=int, device=device))
-    with pytest.raises(ValueError, match="the scene has no triangles"):
-        make_ray_tree(mesh)
-
-
 def test_nothing_is_laid_out_that_embree_finds():
     arrays = upload_scene(
         scene_of(plane(1.0)), UNSHADOWED.model_copy(update={"cpu_traversal": "auto"}), "cpu"
