@@ -80,11 +80,14 @@ class Milestone:
     def __init__(self, device: Any) -> None:
         self._device = wp.get_device(device)
         self._event = wp.Event(self._device) if self._device.is_cuda else None
+        self._behind: wp.Stream | None = None
+        """A stream whose launches come after it anyway."""
 
-    def set(self) -> None:
-        """Put it behind what the present stream holds."""
+    def set(self, stream: wp.Stream | None = None) -> None:
+        """Put it behind what a stream holds; None: the present one."""
         if self._event is not None:
-            self._device.stream.record_event(self._event)
+            self._behind = stream or self._device.stream
+            self._behind.record_event(self._event)
 
     def wait(self) -> None:
         """Let the host wait until the device has come here."""
@@ -93,8 +96,9 @@ class Milestone:
 
     def hold(self) -> None:
         """Let the present stream wait until the device has come here."""
-        if self._event is not None:
-            self._device.stream.wait_event(self._event)
+        if self._event is not None and self._device.stream is not self._behind:
+            self._behind = self._device.stream
+            self._behind.wait_event(self._event)
 
 
 class Graphs:
@@ -109,27 +113,29 @@ class Graphs:
         self._graphs: dict[Hashable, tuple[Any, Any]] = {}
         self.dropped_count = 0
 
-    def run(self, key: Hashable, launch: Callable[[], Any]) -> None:
+    def run(self, key: Hashable, launch: Callable[[], Any], *, stream: wp.Stream | None = None) -> None:
         """Do what `launch` does.
 
         Args:
             key: Same key, same launches with the same arguments.
             launch: Called the first time, which compiles and warms up, and the second time to record it. What
                 it returns is kept as long as the graph: arrays that nothing else holds.
+            stream: Where, and milestones say what it follows; None: on the present stream.
         """
         if self._device.is_cpu:
             launch()
             return
         graph, kept = self._graphs.pop(key, (None, None))
         if graph is None:
-            launch()
+            with on(stream, after=False):
+                launch()
             graph = False
         else:
             if graph is False:
-                with wp.ScopedCapture(self._device) as capture:
+                with on(stream, after=False), wp.ScopedCapture(self._device) as capture:
                     kept = launch()
                 graph = capture.graph
-            wp.capture_launch(graph)
+            wp.capture_launch(graph, stream)
         if len(self._graphs) >= _GRAPH_COUNT_MAX:
             del self._graphs[next(iter(self._graphs))]
             self.dropped_count += 1

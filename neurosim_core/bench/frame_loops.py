@@ -3,14 +3,21 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 
-from neurosim_core.bench.throughput_result import LOOP, Comparison
+from neurosim_core.bench.throughput_result import LOOP, LOOP_AT_ONCE, Comparison
 from neurosim_core.bench.throughput_stages import FRAME_US, Views, make_camera, make_naive, seconds_per_call
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.streams import Graphs, Milestone, make_stream, on
 
+_AHEAD = 2
+"""Frames whose renders are launched before the count of one is read: more of them are no faster."""
+_HANDED_OUT = 16
+"""Frames after which our events are sorted and handed out."""
 _ROUNDS = 5
 """One round alone comes out up to a tenth higher or lower."""
 
@@ -20,64 +27,109 @@ class _Eyes:
 
     Args:
         views: What to see.
-        count: How many may be under way.
+        streams: They take turns.
     """
 
-    def __init__(self, views: Views, count: int) -> None:
+    def __init__(self, views: Views, streams: Sequence[wp.Stream | None]) -> None:
         self._views = views
+        self._streams = streams
         self._graphs = Graphs(views.device)
-        self._renderers = [views.renderer("log_radiance", instants=1) for _ in range(count)]
-        self._streams = [make_stream(views.device) for _ in range(count)]
-        self._seen = [Milestone(views.device) for _ in range(count)]
+        self._renderers = [views.renderer("log_radiance", instants=1) for _ in streams]
+        self._seen = [Milestone(views.device) for _ in streams]
 
     def see(self, number: int, view: int) -> tuple[wp.array | None, Milestone]:
         """Launch the render of a view; return where its log radiance will be, and when."""
         eye = number % len(self._renderers)
-        renderer = self._renderers[eye]
-        with on(self._streams[eye], after=False):
-            self._graphs.run((eye, view), lambda: self._views.render(renderer, first=view, count=1))
-            self._seen[eye].set()
+        renderer, stream = self._renderers[eye], self._streams[eye]
+        self._graphs.run(
+            (eye, view), lambda: self._views.render(renderer, first=view, count=1), stream=stream
+        )
+        self._seen[eye].set(stream)
         return renderer.log_radiance, self._seen[eye]
 
 
-def compare_loops(views: Views, *, seconds: float) -> Comparison:
-    """Return frames a second where every call renders one frame, scans it and has the host read a count.
-
-    The naive camera has the count of its frame read at once. Ours first lets the next frame render, and then
-    waits for the scan of the one before: the count that a call reads is that one's. Our renders are graphs
-    that are replayed, as in a run; those of the naive loop are launched. Each 16 frames our events are sorted
-    and handed out as well; the naive ones stay where they are, unsorted. The two take turns, and the median
-    of the rounds counts.
+class _Loop:
+    """Our loop: each call renders a frame, scans one, and reads how many events one has.
 
     Args:
         views: What to see.
-        seconds: How long a round of either is, about.
+        ahead: How many frames are rendered before the count of one is read; 0: it is that of the same call.
     """
-    camera, naive = make_camera(views, scan_count_max=1), make_naive(views)
-    camera.reset(views.frames[0], 0)
+
+    def __init__(self, views: Views, ahead: int) -> None:
+        self._views = views
+        self._order = [*range(views.count), *reversed(range(views.count))]
+        self._camera = make_camera(views, scan_count_max=1)
+        self._camera.reset(views.frames[0], 0)
+        self.stream = make_stream(views.device, urgent=True)
+        """Where calls are to be made."""
+        streams = [make_stream(views.device) for _ in range(ahead + 1)] if ahead else [self.stream]
+        self._eyes = _Eyes(views, streams)
+        self._ahead = ahead
+        self._rendered: deque[tuple[wp.array | None, Milestone]] = deque()
+        self._seen_count = self._scanned_count = self._read_count = 0
+        self.event_count = 0
+        """Events that were handed out."""
+
+    @property
+    def events_per_frame(self) -> float:
+        """Return how many events a frame had."""
+        return self.event_count / self._read_count
+
+    def call(self) -> None:
+        """Render the next frame."""
+        view = self._order[self._seen_count % len(self._order)]
+        self._rendered.append(self._eyes.see(self._seen_count, view))
+        self._seen_count += 1
+        if self._scanned_count > self._read_count:
+            self._read()
+        if len(self._rendered) >= self._ahead:
+            self._scan()
+        if self._ahead == 0:
+            self._read()
+
+    def end(self) -> None:
+        """Read what has been scanned, and hand out the events that are left."""
+        self.event_count += len(self._camera.collect().numpy().t)
+        self._read_count = self._scanned_count
+
+    def _scan(self) -> None:
+        """Launch the scan of the oldest frame that has been rendered."""
+        frames, seen = self._rendered.popleft()
+        self._scanned_count += 1
+        seen.hold()
+        self._camera.feed_device(frames, [_stamp_ns(self._scanned_count)])
+
+    def _read(self) -> None:
+        """Wait for the scan, and read how many events its frame has."""
+        self._read_count += 1
+        ends = [_stamp_ns(self._read_count)] if self._read_count % _HANDED_OUT == 0 else []
+        packets = self._camera.collect_windows(ends, scan_count=1)
+        self.event_count += sum(len(packet.numpy().t) for packet in packets)
+
+
+def _stamp_ns(frame: int) -> int:
+    return frame * FRAME_US * NS_PER_US
+
+
+def compare_loops(views: Views, *, seconds: float) -> tuple[Comparison, Comparison]:
+    """Return frames a second where every call renders one frame, scans it and has the host read a count.
+
+    The naive camera has the count of its frame read at once. So has ours in the second comparison; in the
+    first a call reads the count of the frame two before, while others render. Our renders are graphs that
+    are replayed, as in a run; those of the naive loop are launched. Each 16 frames our events are sorted and
+    handed out as well; the naive ones stay where they are, unsorted. The loops take turns, and the median of
+    the rounds counts.
+
+    Args:
+        views: What to see.
+        seconds: How long a round of each is, about.
+    """
+    loops = [_Loop(views, _AHEAD), _Loop(views, 0)]
+    naive = make_naive(views)
     order = [*range(views.count), *reversed(range(views.count))]
-    eyes = _Eyes(views, 2)  # while one frame is scanned, the next is rendered
-    scans = make_stream(views.device, urgent=True)
     renderer = views.renderer("log_radiance", instants=1)
-    ours_shown, ours, naive_shown, theirs = 0, 0, 0, 0
-
-    def stamp_ns(frame: int) -> int:
-        return frame * FRAME_US * NS_PER_US
-
-    def read(frame: int) -> int:
-        """Read how many events a frame has; return how many were handed out."""
-        ends = [stamp_ns(frame)] if frame % 16 == 0 else []
-        return sum(len(packet.numpy().t) for packet in camera.collect_windows(ends, scan_count=1))
-
-    def call_ours() -> None:
-        nonlocal ours_shown, ours
-        frames, seen = eyes.see(ours_shown, order[ours_shown % len(order)])
-        with on(scans, after=False):
-            if ours_shown > 0:
-                ours += read(ours_shown)
-            ours_shown += 1
-            seen.hold()
-            camera.feed_device(frames, [stamp_ns(ours_shown)])
+    naive_shown, theirs = 0, 0
 
     def call_naive() -> None:
         nonlocal naive_shown, theirs
@@ -87,16 +139,24 @@ def compare_loops(views: Views, *, seconds: float) -> Comparison:
         theirs += naive.feed(renderer.log_radiance[0], naive_shown * FRAME_US)
 
     wp.synchronize_device(views.device)  # what was made on other streams is there
-    rounds = [
-        [seconds_per_call(call, views.device, seconds=seconds) for call in (call_ours, call_naive)]
-        for _ in range(_ROUNDS)
-    ]
-    ours += len(camera.collect().numpy().t)
-    ours_s, naive_s = np.median(rounds, axis=0)
-    return Comparison(
-        name=LOOP,
-        ours_per_s=1.0 / ours_s,
-        naive_per_s=1.0 / naive_s,
-        ours_events=ours / ours_shown,
-        naive_events=theirs / naive_shown,
+    rounds_s = []
+    for _ in range(_ROUNDS):
+        round_s = []
+        for loop in loops:
+            with on(loop.stream):
+                round_s.append(seconds_per_call(loop.call, views.device, seconds=seconds))
+        rounds_s.append((*round_s, seconds_per_call(call_naive, views.device, seconds=seconds)))
+    *ours_s, naive_s = np.median(rounds_s, axis=0)
+    for loop in loops:
+        loop.end()
+    ahead, at_once = (
+        Comparison(
+            name=name,
+            ours_per_s=1.0 / loop_s,
+            naive_per_s=1.0 / naive_s,
+            ours_events=loop.events_per_frame,
+            naive_events=theirs / naive_shown,
+        )
+        for name, loop, loop_s in zip((LOOP, LOOP_AT_ONCE), loops, ours_s, strict=True)
     )
+    return ahead, at_once

@@ -30,6 +30,7 @@ from neurosim_core.bench.throughput_result import (
     BARE_CAST,
     EXACT,
     LOOP,
+    LOOP_AT_ONCE,
     PHYSICS_ALONE,
     RAYS_ALONE,
     READ_ALONE,
@@ -214,7 +215,7 @@ class _Study:
         views = {size: self._try(partial(self._views, size)) for size in sizes}
         roofline, scan = self._roofline(*views[plan.launch_size], rows)
         self._tell("one render and one scan per call")
-        loop, loop_failure = self._with(
+        loops, loop_failure = self._with(
             views[plan.launch_size], lambda seen: frame_loops.compare_loops(seen, seconds=plan.alone_s)
         )
         self._tell("events to the host")
@@ -236,7 +237,8 @@ class _Study:
             split_failure=split_failure,
             roofline=roofline,
             scan=scan,
-            loop=loop or Comparison(name=LOOP, failure=loop_failure),
+            loop=loops[0] if loops else Comparison(name=LOOP, failure=loop_failure),
+            loop_at_once=loops[1] if loops else Comparison(name=LOOP_AT_ONCE, failure=loop_failure),
             events_per_s=events_per_s,
             events_failure=events_failure,
             agreements=tuple(self._agreements()),

@@ -349,14 +349,14 @@ def _comparison_table(result: ThroughputResult) -> Table:
                 "naive_events": row.naive_events,
                 "failure": row.failure or None,
             }
-            for row in (result.scan, result.loop)
+            for row in (result.scan, result.loop, result.loop_at_once)
         ],
         note="Naive: one frame per call, at most one event per pixel and frame, stamped at the frame, an "
         "atomic per event, and the host reads the count each time. Ours: the exact law, crossing times "
         f"interpolated, alone {result.roofline.instants} frames per launch, and in the loop sorted and "
-        "handed out each 16 frames; there a call reads the count of the frame before, while its own renders. "
-        "Our renders are graphs that are replayed on two streams, as in a run; those of the naive loop are "
-        "launched one by one; the median of five rounds in turn counts. "
+        "handed out each 16 frames; there a call reads the count of the frame two before, while two render, "
+        "or that of its own frame. Our renders are graphs that are replayed, as in a run; those of the naive "
+        "loop are launched one by one; the median of five rounds in turn counts. "
         "Events reach the host, sorted, at "
         + (
             f"{1e-6 * result.events_per_s:,.1f} M/s (each pixel fires in each frame)."

@@ -114,7 +114,8 @@ PHYSICS_ALONE = "physics"
 READ_ALONE = "sort, decode, copy"
 
 SCAN = "event scan alone"
-LOOP = "one render and one scan per call, a count read by the host (ours of the frame before)"
+LOOP = "one render and one scan per call, a count read by the host (ours of the frame two before)"
+LOOP_AT_ONCE = "one render and one scan per call, the count of that frame read by the host"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,6 +175,7 @@ class ThroughputResult:
     roofline: Roofline
     scan: Comparison
     loop: Comparison
+    loop_at_once: Comparison
     events_per_s: float | None
     """Sorted, on the host, sustained [1/s]."""
     events_failure: str

@@ -78,6 +78,8 @@ class EventKeys:
         self._read_count = 0
         self._spare = self._buffer(0)
         self._order = self._empty(0, wp.int32)
+        self._rooms: dict[int, wp.array[wp.int64]] = {}
+        """Of both buffers, by address, what keys may be in."""
         self._blocks = LentBlocks(device) if on_host and device.is_cuda else None
         """Where events go that are copied to the host."""
         self._columns: list[Any] = []
@@ -103,21 +105,56 @@ class EventKeys:
     def append(self, keys: wp.array[wp.int64], first: int, count: int, origin_us: int) -> None:
         """Add `count` keys from `first` on, whose time has its own origin [us]."""
         start = self.count
+        self.reserve(start + count)
         self.count += count
-        self._reserve(kept=start)
         # on CUDA a launch that comes again takes less of the host than a copy
         if count > 0 and origin_us == self.origin_us and self._device.is_cpu:
             wp.copy(self.keys, keys, src_offset=first, dest_offset=start, count=count)
         elif count > 0:
             self._move(keys, first, count, self.keys, start, self.origin_us - origin_us)
 
+    def room(self) -> wp.array[wp.int64]:
+        """Return the buffer as far as there may be keys, for a scan to write them behind those there are."""
+        self.reserve(self.count + 1)
+        return self._rooms[self.keys.ptr]
+
+    def note(self, count: int) -> None:
+        """Note that a scan has written `count` keys, from the same origin of time, behind those there are."""
+        self.count += count
+
+    def reserve(self, count: int) -> None:
+        """Make room for so many keys; those there are stay."""
+        if count * (2 if self._device.is_cuda else 1) <= self.keys.shape[0]:
+            return
+        room = 1 << (count - 1).bit_length()
+        if self._device.is_cpu:
+            room = max(room, ROOM_PER_PIXEL * self._pixel_count)
+            keys = roomy_keys(room, TOUCHED_COUNT_MAX)
+        else:
+            room = max(2 * room, 4 * self._pixel_count, _ROOM_MIN)
+            keys = self._buffer(room)
+        if self.count > 0:
+            wp.copy(keys, self.keys, count=self.count)
+        self.keys = keys
+        self._graphs = Graphs(self._device)
+        self._spare = self._buffer(room)
+        self._rooms = {buffer.ptr: buffer[:room] for buffer in (self.keys, self._spare)}
+        if self._device.is_cuda:
+            self._order = self._empty(2 * room, wp.int32)
+            if self._on_host:
+                block = self._empty(_EVENT_BYTES * min(room, _BLOCK_COUNT_MAX), wp.uint8)
+                self._columns = [
+                    wp.array(ptr=block.ptr, dtype=dtype, shape=block.shape[0] // size, device=self._device)
+                    for dtype, size in ((wp.int64, 8), (wp.uint16, 2))
+                ]
+                self._columns.append(block)
+
     def read_out(self, readout: Readout, now_ns: int) -> None:
         """Put the events that the arbiter reads until now in place of those that have happened."""
         first, count = self._read_count, self.count - self._read_count
         if count == 0 and readout.waiting_count == 0:
             return
-        self.count += readout.waiting_count
-        self._reserve(kept=first + count)
+        self.reserve(self.count + readout.waiting_count)
         read = readout.read(
             self.keys,
             first=first,
@@ -232,32 +269,6 @@ class EventKeys:
         """Return a buffer for keys that are to be sorted: the radix sort on CUDA wants twice the room."""
         keys: wp.array[wp.int64] = self._empty(2 * count if self._device.is_cuda else count, wp.int64)
         return keys
-
-    def _reserve(self, *, kept: int) -> None:
-        """Make room for the keys there are now, of which the first `kept` are in the buffer."""
-        if self.count * (2 if self._device.is_cuda else 1) <= self.keys.shape[0]:
-            return
-        room = 1 << (self.count - 1).bit_length()
-        if self._device.is_cpu:
-            room = max(room, ROOM_PER_PIXEL * self._pixel_count)
-            keys = roomy_keys(room, TOUCHED_COUNT_MAX)
-        else:
-            room = max(2 * room, 4 * self._pixel_count, _ROOM_MIN)
-            keys = self._buffer(room)
-        if kept > 0:
-            wp.copy(keys, self.keys, count=kept)
-        self.keys = keys
-        self._graphs = Graphs(self._device)
-        self._spare = self._buffer(room)
-        if self._device.is_cuda:
-            self._order = self._empty(2 * room, wp.int32)
-            if self._on_host:
-                block = self._empty(_EVENT_BYTES * min(room, _BLOCK_COUNT_MAX), wp.uint8)
-                self._columns = [
-                    wp.array(ptr=block.ptr, dtype=dtype, shape=block.shape[0] // size, device=self._device)
-                    for dtype, size in ((wp.int64, 8), (wp.uint16, 2))
-                ]
-                self._columns.append(block)
 
     def _make_window_buffers(self, window_count: int) -> None:
         self._graphs = Graphs(self._device)  # they name the buffers

@@ -29,6 +29,9 @@ from neurosim_core.streams import HostCopy, HostInput, Milestone
 _PIXELS_PER_THREAD_MIN = 16_384
 _KEYS_PER_PIXEL = 4
 """Events of a scan for which there is room on CUDA before any have come."""
+_COUNTERS = 3
+_COUNTERS_ROOM = 16
+"""Numbers from the counters of a chunk to those of the next, which another core writes."""
 
 
 @dataclass
@@ -40,6 +43,12 @@ class Chunk:
     keys: wp.array[wp.int64]
     counters: wp.array[wp.int64]
     counters_on_host: HostCopy
+    first_key: int = 0
+    """Where its keys begin."""
+
+    def has_room(self, count: int) -> bool:
+        """Return whether so many keys were written, as there is room for them."""
+        return self.first_key + count <= int(self.keys.shape[0])
 
 
 @dataclass(eq=False)
@@ -50,8 +59,10 @@ class Scan:
     """Its own for ever: a graph may be made of its buffers."""
     chunks: list[Chunk]
     done: Milestone
-    times: HostInput
-    """Time from the reset to the origin [ns]; then `stamps`."""
+    inputs: HostInput
+    """The counters of each chunk, as they begin; then `times`."""
+    times: NDArray[np.int64]
+    """Of the inputs: time from the reset to the origin [ns]; then `stamps`."""
     since_reset_ns: wp.array[wp.int64]
     stamps: wp.array[wp.int64]
     """Of the state and of each frame, from the origin [ns]."""
@@ -63,6 +74,12 @@ class Scan:
     """Origin of its keys' time."""
     state: int = 0
     """Where in the ring the state before it is; the state after it comes next."""
+
+    def begin(self) -> None:
+        """Have each chunk count from its first key on; on a CPU that comes before each launch."""
+        for number, chunk in enumerate(self.chunks):
+            start = number * _COUNTERS_ROOM
+            self.inputs.rows[start : start + _COUNTERS] = chunk.first_key, 0, 0
 
 
 class Pixels:
@@ -123,6 +140,7 @@ class Pixels:
         scratch = pixel_count if self.screened else 0
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._table = self._empty((1, height), wp.int32)
+        self._bounds = self._chunk_bounds()
         self._key_room = _KEYS_PER_PIXEL * pixel_count
         self._scan_number = itertools.count()
         self._pool: ThreadPoolExecutor | None = None
@@ -144,27 +162,43 @@ class Pixels:
         """Return where in the ring the state after another is."""
         return (state + 1) % len(self._last)
 
-    def make_scan(self, frame_count: int) -> Scan:
-        """Return buffers for stacks of at most `frame_count` frames."""
+    @property
+    def chunk_count(self) -> int:
+        """How many launches share a scan."""
+        return len(self._bounds)
+
+    def make_scan(self, frame_count: int, *, keys: wp.array[wp.int64] | None = None) -> Scan:
+        """Return buffers for stacks of at most `frame_count` frames.
+
+        Args:
+            frame_count: Most frames.
+            keys: Where its keys go if there is one chunk; None: to buffers of its own.
+        """
+        first_time = len(self._bounds) * _COUNTERS_ROOM
+        inputs = HostInput(wp.zeros(first_time + frame_count + 2, dtype=wp.int64, device=self._device))
         chunks = []
-        bounds = self._chunk_bounds()
-        for first, end in bounds:
-            counters = self._empty(3, wp.int64)
-            if self._device.is_cpu:
-                keys = roomy_keys(ROOM_PER_PIXEL * (end - first), TOUCHED_COUNT_MAX // len(bounds))
-            else:
-                keys = self._empty(self._key_room, wp.int64)
-            chunks.append(Chunk(first, end, keys, counters, HostCopy(counters)))
-        times = HostInput(wp.zeros(frame_count + 2, dtype=wp.int64, device=self._device))
+        for number, (first, end) in enumerate(self._bounds):
+            start = number * _COUNTERS_ROOM
+            counters = inputs.array[start : start + _COUNTERS]
+            own = self._make_keys(end - first) if keys is None else keys
+            chunks.append(Chunk(first, end, own, counters, HostCopy(counters)))
         return Scan(
             number=next(self._scan_number),
             chunks=chunks,
             done=Milestone(self._device),
-            times=times,
-            since_reset_ns=times.array[:1],
-            stamps=times.array[1:],
+            inputs=inputs,
+            times=inputs.rows[first_time:],
+            since_reset_ns=inputs.array[first_time : first_time + 1],
+            stamps=inputs.array[first_time + 1 :],
             row_limit=wp.full(frame_count, self._height, dtype=wp.int32, device=self._device),
         )
+
+    def _make_keys(self, pixel_count: int) -> wp.array[wp.int64]:
+        """Return a buffer for the keys of so many pixels."""
+        if self._device.is_cpu:
+            return roomy_keys(ROOM_PER_PIXEL * pixel_count, TOUCHED_COUNT_MAX // self.chunk_count)
+        keys: wp.array[wp.int64] = self._empty(self._key_room, wp.int64)
+        return keys
 
     def make_room(self, scan: Scan) -> None:
         """Have as much room for the keys of an idle scan as is expected of scans, on CUDA."""
@@ -174,7 +208,7 @@ class Pixels:
     def grow(self, scan: Scan, counts: Sequence[int]) -> None:
         """Make room for the keys that a scan has counted; on CUDA others get room for twice as many."""
         for count, chunk in zip(counts, scan.chunks, strict=True):
-            if count > chunk.keys.shape[0]:
+            if not chunk.has_room(count):
                 chunk.keys = self._empty(1 << (count - 1).bit_length(), wp.int64)
         if 2 * counts[0] > self._key_room:
             self._key_room = 1 << (2 * counts[0] - 1).bit_length()
@@ -188,21 +222,21 @@ class Pixels:
     def count_by_row(self, scan: Scan) -> NDArray[np.int32]:
         """Return how many events each frame and row of a stack has, shape [frame, row]; waits for it."""
         self._table = wp.zeros((len(scan.stamps_ns), self._height), dtype=wp.int32, device=self._device)
+        scan.begin()
         self.launch(scan, tabulate=True)
         counts: NDArray[np.int32] = self._table.numpy()
         self._table = self._empty((1, self._height), wp.int32)
         return counts
 
     def launch(self, scan: Scan, *, tabulate: bool = False) -> None:
-        """Scan a stack from the state before it; done again, it gives the same state after it.
+        """Scan a stack that begins from the state before it; done again, it gives the same state after it.
 
         With `tabulate` events are only counted, by frame and row.
         """
         before, after = scan.state, self.next_state(scan.state)
 
         def launch(chunk: Chunk) -> None:
-            scan.times.upload()
-            chunk.counters.zero_()
+            scan.inputs.upload()
             thresholds = self._thresholds
             stack = scan.frames.reshape((scan.frames.shape[0], self._width * self._height))
             extent = [chunk.first_pixel, chunk.end_pixel, stack]
@@ -253,7 +287,7 @@ class Pixels:
                 ],
                 device=self._device,
             )
-            chunk.counters_on_host.fetch(0, 3)
+            chunk.counters_on_host.fetch(0, _COUNTERS)
 
         self._share(launch, scan.chunks)
 

@@ -126,10 +126,6 @@ class EventCamera:
             terms=pixel_terms,
         )
         self._scan_count_max = scan_count_max
-        # on CUDA one more than is needed: scans and states then take turns together, in few graphs
-        scan_count = ring_size if self.device.is_cuda else scan_count_max
-        self._idle = deque(self._pixels.make_scan(16) for _ in range(scan_count))
-        self._under_way: deque[Scan] = deque()
         self._graphs = Graphs(device)
         self._reader = make_stream(device, urgent=True)
         self._taken = Milestone(device)
@@ -141,6 +137,12 @@ class EventCamera:
             device=self.device,
             on_host=self._on_host,
         )
+        # a scan that nothing is read beside writes its keys to where they stay
+        self._in_place = scan_count_max == 1 and self._pixels.chunk_count == 1
+        # on CUDA one more than is needed: scans and states then take turns together, in few graphs
+        scan_count = ring_size if self.device.is_cuda and not self._in_place else scan_count_max
+        self._idle = deque(self._make_scan(16) for _ in range(scan_count))
+        self._under_way: deque[Scan] = deque()
         self._readout: Readout | None = None
         if config.readout is not None:
             self._readout = Readout(
@@ -150,7 +152,6 @@ class EventCamera:
                 time_shift=self._time_shift,
                 device=self.device,
             )
-        self._feeder: Any = None
         wp.load_module(event_cut, device=self.device)
 
         self._now_ns: int | None = None
@@ -255,20 +256,26 @@ class EventCamera:
         self._taken.hold()
         count = len(stamps)
         if count > self._idle[0].row_limit.shape[0]:
-            self._idle[0] = self._pixels.make_scan(count)
+            self._idle[0] = self._make_scan(count)
         scan = self._idle[0]
-        self._pixels.make_room(scan)
+        if self._in_place:
+            scan.chunks[0].keys, scan.chunks[0].first_key = self._keys.room(), self._keys.count
+        else:
+            self._pixels.make_room(scan)
+        scan.begin()
         scan.frames = log_radiance
         scan.stamps_ns = stamps
         self._keys.expect(count)
         scan.origin_us = self._keys.origin_us
         scan.state = self._state
         origin_ns = scan.origin_us * NS_PER_US
-        times = scan.times.rows
-        times[0] = self._pixels.since_reset_ns(origin_ns)
-        times[1] = self._fed_ns - origin_ns
-        np.subtract(stamps, origin_ns, out=times[2 : count + 2])
+        scan.times[0] = self._pixels.since_reset_ns(origin_ns)
+        scan.times[1] = self._fed_ns - origin_ns
+        np.subtract(stamps, origin_ns, out=scan.times[2 : count + 2])
         return scan
+
+    def _make_scan(self, frame_count: int) -> Scan:
+        return self._pixels.make_scan(frame_count, keys=self._keys.room() if self._in_place else None)
 
     def _note_launched(self, scan: Scan) -> None:
         """Note that the first idle scan is under way: what was planned and not launched leaves no trace."""
@@ -276,8 +283,6 @@ class EventCamera:
         self._under_way.append(self._idle.popleft())
         self._state = self._pixels.next_state(self._state)
         self._fed_ns = int(scan.stamps_ns[-1])
-        if self.device.is_cuda:
-            self._feeder = self.device.stream
 
     def _check_feed(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> None:
         self._require_reset()
@@ -331,7 +336,7 @@ class EventCamera:
             ends_ns: Ends of the windows [ns]; increasing by at least 1 us, not after the last frame that was
                 waited for.
             scan_count: How many of the stacks that have not been collected to wait for, from the oldest on;
-                None: all.
+                None: all. Where only one may be under way, a window that ends waits for it.
 
         Raises:
             RuntimeError: If the camera was not reset.
@@ -341,35 +346,33 @@ class EventCamera:
         ends = [int(end) for end in ends_ns]
         if scan_count is None:
             scan_count = len(self._under_way)
-        if scan_count == 1 and not ends and self._is_alone():
-            return self._read_windows(ends, scan_count)
-        with on(self._reader):
-            return self._read_windows(ends, scan_count)
-
-    def _read_windows(self, ends: list[int], scan_count: int) -> list[Events]:
-        """Take scans over on the present stream, and return the windows that end so."""
-        self._taken.hold()
-        for _ in range(scan_count):
-            self._take_over()
-        self._taken.set()
-        now_ns = self._require_reset()
-        if not ends:
+        if self._in_place and not ends:  # nothing has to be launched
+            for _ in range(scan_count):
+                self._take_over()
+            self._require_reset()
             return []
-        if not _are_ends(ends, self._window_start_ns, now_ns):
-            raise ValueError(
-                f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
-                f" and not pass {now_ns}, got {ends}"
-            )
-        packets = self._cut(ends)
-        self._taken.set()
-        return packets
-
-    def _is_alone(self) -> bool:
-        """Return whether one scan is under way, and taking it over on this stream holds up no other."""
-        stream = self.device.stream if self.device.is_cuda else None
-        return len(self._under_way) == 1 and stream is self._feeder
+        if self._in_place:
+            scan_count = len(self._under_way)  # it writes where keys are cut
+        with on(self._reader):
+            self._taken.hold()
+            for _ in range(scan_count):
+                self._take_over()
+            self._taken.set()
+            now_ns = self._require_reset()
+            if not ends:
+                return []
+            if not _are_ends(ends, self._window_start_ns, now_ns):
+                raise ValueError(
+                    f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
+                    f" and not pass {now_ns}, got {ends}"
+                )
+            packets = self._cut(ends)
+            self._taken.set()
+            return packets
 
     def _forget(self) -> None:
+        for scan in self._under_way:
+            scan.done.wait()  # it reads what the host writes next
         scans = [*self._idle, *self._under_way]
         self._idle = deque(sorted(scans, key=lambda scan: scan.number))  # as at the first time: same graphs
         self._under_way.clear()
@@ -405,26 +408,42 @@ class EventCamera:
 
     def _scan_again(self, scan: Scan) -> None:
         """Scan a stack again."""
+        scan.begin()
         self._pixels.launch(scan)
         scan.done.set()
 
     def _take_over(self) -> None:
-        """Wait for the oldest scan, redo it if its buffer was too small, and append its keys."""
+        """Wait for the oldest scan, redo it if there was too little room, and add its keys to the others."""
         scan = self._under_way[0]
         counts = self._read_counts(scan)
+        if sum(counts) > self.config.event_count_max or not _have_room(scan, counts):
+            with on(self._reader):
+                self._taken.hold()
+                counts = self._redo(scan, counts)
+                self._taken.set()
+        if self._in_place:
+            self._keys.note(counts[0])
+        else:
+            for count, chunk in zip(counts, scan.chunks, strict=True):
+                self._keys.append(chunk.keys, 0, count, scan.origin_us)
+        self._finish(self._under_way.popleft())
+
+    def _redo(self, scan: Scan, counts: list[int]) -> list[int]:
+        """Scan a stack again, within the limit and with room for all events; return how many there are."""
         limited = sum(counts) > self.config.event_count_max and self._limit_rows(scan)
         if limited:
             counts = self._read_counts(scan)
-        if any(count > chunk.keys.shape[0] for count, chunk in zip(counts, scan.chunks, strict=True)):
-            self._pixels.grow(scan, counts)
+        if not _have_room(scan, counts):
+            if self._in_place:
+                self._keys.reserve(self._keys.count + counts[0])
+                scan.chunks[0].keys = self._keys.room()
+            else:
+                self._pixels.grow(scan, counts)
             self._scan_again(scan)
             scan.done.wait()  # the frames are the caller's again
         if limited:
             scan.row_limit.fill_(self.height)
-
-        for count, chunk in zip(counts, scan.chunks, strict=True):
-            self._keys.append(chunk.keys, 0, count, scan.origin_us)
-        self._finish(self._under_way.popleft())
+        return counts
 
     def _finish(self, scan: Scan) -> None:
         """Note that the oldest scan is read."""
@@ -444,7 +463,7 @@ class EventCamera:
             self._idle += self._under_way
             self._under_way.clear()
             raise ValueError(_invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
-        return [count for count, _, _ in counters]
+        return [end - chunk.first_key for (end, _, _), chunk in zip(counters, scan.chunks, strict=True)]
 
     def _limit_rows(self, scan: Scan) -> bool:
         """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
@@ -512,6 +531,11 @@ class EventCamera:
             self._sequence += 1
             self._window_start_ns = end_ns
         return packets
+
+
+def _have_room(scan: Scan, counts: Sequence[int]) -> bool:
+    """Return whether all events of a scan were written, of which each chunk has so many."""
+    return all(chunk.has_room(count) for count, chunk in zip(counts, scan.chunks, strict=True))
 
 
 def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:

@@ -22,6 +22,7 @@ from neurosim_core.bench.throughput_result import (
     ADAPTIVE,
     EXACT,
     LOOP,
+    LOOP_AT_ONCE,
     RAYS_ALONE,
     SCAN,
     STAGES,
@@ -92,7 +93,7 @@ def test_every_part_is_measured_alone(result):
     rays = [part.rays_per_step for part in result.roofline.parts if part.rays_per_step]
     assert rays == [result.roofline.width * result.roofline.height] * 2
     assert result.roofline.copy_gigabytes_per_s > 0.0
-    for comparison in (result.scan, result.loop):
+    for comparison in (result.scan, result.loop, result.loop_at_once):
         assert not comparison.failure
         assert comparison.ratio > 0.0
         assert comparison.ours_events > 0.0
@@ -273,6 +274,7 @@ def made_up(device="NVIDIA H200", *, scale=1.0, **changes):
         ),
         scan=Comparison(name=SCAN, ours_per_s=300_000.0 * scale, naive_per_s=30_000.0),
         loop=Comparison(name=LOOP, ours_per_s=15_000.0 * scale, naive_per_s=10_000.0),
+        loop_at_once=Comparison(name=LOOP_AT_ONCE, ours_per_s=12_000.0 * scale, naive_per_s=10_000.0),
         events_per_s=5e8 * scale,
         events_failure="",
         agreements=(
