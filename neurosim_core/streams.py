@@ -31,6 +31,9 @@ _PLACES_MAX = 64
 _LENT_BYTES_MAX = 256 << 20
 """Most memory of one kind that is lent out: pages that are pinned are nobody else's."""
 
+_LENT_COUNT_MIN = 3
+"""So many blocks are lent however large they are: who reads one after the other holds two."""
+
 
 def size_class(size: int) -> int:
     """Return the least of 2^n and 3 * 2^n that is not below a size, at least 1: few sizes serve for many."""
@@ -273,8 +276,9 @@ class LentBlock:
 class LentBlocks:
     """Blocks that go round: who gets one may keep it, and it comes back when its last view is gone.
 
-    So nothing is copied for those who read and forget. Who keeps more than 256 MB gets copies. Blocks come
-    in few sizes and stay: to pin memory takes milliseconds, in which the device stands still.
+    So nothing is copied for those who read and forget. Who keeps more than 256 MB and three blocks gets
+    copies. Blocks come in few sizes and stay: to pin memory takes milliseconds, in which the device stands
+    still.
 
     Args:
         device: What copies to them.
@@ -313,8 +317,9 @@ class LentBlocks:
     def lend(self, block: LentBlock, size: int) -> NDArray[np.uint8]:
         """Return the first bytes of a block for the caller to keep, or a copy; the block is not theirs."""
         free = self._free[block.size]
-        free_bytes = sum(known * len(blocks) for known, blocks in self._free.items())
-        if self._made_bytes - free_bytes > _LENT_BYTES_MAX:  # with this one
+        lent_bytes = self._made_bytes - sum(known * len(blocks) for known, blocks in self._free.items())
+        lent_count = self.made_count - sum(map(len, self._free.values()))
+        if lent_bytes > _LENT_BYTES_MAX and lent_count > _LENT_COUNT_MIN:  # with this one
             rows = np.array(block.rows()[:size])
             free.append(block)
             return rows

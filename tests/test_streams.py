@@ -130,6 +130,16 @@ def test_who_keeps_too_much_gets_copies(device, monkeypatch):
     assert not blocks.lend(blocks.take(100), 100).flags.owndata
 
 
+def test_who_reads_one_after_the_other_gets_no_copies_of_large_blocks(device, monkeypatch):
+    monkeypatch.setattr(streams, "_LENT_BYTES_MAX", 50)
+    blocks = LentBlocks(device)
+    rows = None
+    for _ in range(5):
+        rows = blocks.lend(blocks.take(100), 100)  # the one before is let go afterwards
+        assert not rows.flags.owndata
+    assert blocks.made_count <= 3
+
+
 def test_blocks_that_were_reserved_serve_all_sizes_below(device):
     blocks = LentBlocks(device)
     blocks.reserve(1000, 3)
