@@ -22,14 +22,16 @@ from numpy.typing import NDArray
 
 _GRAPH_COUNT_MAX = 512
 """Most graphs that are kept. Steps whose sensors do not divide the control clock come in many patterns, each
-in two states of the pixels; batches that are streamed take turns among slots: each combination is a graph.
-With fewer places than a cycle has, each would be given up before it comes again."""
+in two states of the pixels and, of a camera that has one stack under way, with two buffers of keys; batches
+that are streamed take turns among slots: each combination is a graph. With fewer places than a cycle has,
+each would be given up before it comes again."""
 
 _PLACES_MAX = 64
 """Most addresses that copies of one array go to and that are remembered."""
 
 _LENT_BYTES_MAX = 256 << 20
-"""Most memory of one kind that is lent out: pages that are pinned are nobody else's."""
+"""Most memory of one kind that is lent out in more than a few blocks: pages that are pinned are nobody
+else's."""
 
 _LENT_COUNT_MIN = 3
 """So many blocks are lent however large they are: who reads one after the other holds two."""
@@ -276,9 +278,9 @@ class LentBlock:
 class LentBlocks:
     """Blocks that go round: who gets one may keep it, and it comes back when its last view is gone.
 
-    So nothing is copied for those who read and forget. Who keeps more than 256 MB and three blocks gets
-    copies. Blocks come in few sizes and stay: to pin memory takes milliseconds, in which the device stands
-    still.
+    So nothing is copied for those who read and forget. Who keeps more than 256 MB and three blocks, of any
+    size, gets copies. Blocks come in few sizes and stay: to pin memory takes milliseconds, in which the
+    device stands still.
 
     Args:
         device: What copies to them.

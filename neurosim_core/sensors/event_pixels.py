@@ -36,7 +36,7 @@ _COUNTERS_ROOM = 16
 
 @dataclass
 class Chunk:
-    """Pixels that one launch scans, and its own part of the buffer: launches write to nothing they share."""
+    """Pixels that one launch scans, and where their keys go: launches write to nothing they share."""
 
     first_pixel: int
     end_pixel: int
@@ -44,7 +44,7 @@ class Chunk:
     counters: wp.array[wp.int64]
     counters_on_host: HostCopy
     first_key: int = 0
-    """Where its keys begin."""
+    """Where its keys begin: there are others before."""
 
     def has_room(self, count: int) -> bool:
         """Return whether so many keys were written, as there is room for them."""
@@ -53,7 +53,10 @@ class Chunk:
 
 @dataclass(eq=False)
 class Scan:
-    """The scan of one stack, and the buffers that are its own until its events have been taken over."""
+    """The scan of one stack, and buffers: they are its own until its events have been taken over.
+
+    Keys that are written to where they stay are not: other scans and the camera know that buffer.
+    """
 
     number: int
     """Its own for ever: a graph may be made of its buffers."""
@@ -76,7 +79,7 @@ class Scan:
     """Where in the ring the state before it is; the state after it comes next."""
 
     def begin(self) -> None:
-        """Have each chunk count from its first key on; on a CPU that comes before each launch."""
+        """Have each chunk count from its first key on; the next `upload` brings it to the device."""
         for number, chunk in enumerate(self.chunks):
             start = number * _COUNTERS_ROOM
             self.inputs.rows[start : start + _COUNTERS] = chunk.first_key, 0, 0
@@ -180,8 +183,8 @@ class Pixels:
         for number, (first, end) in enumerate(self._bounds):
             start = number * _COUNTERS_ROOM
             counters = inputs.array[start : start + _COUNTERS]
-            own = self._make_keys(end - first) if keys is None else keys
-            chunks.append(Chunk(first, end, own, counters, HostCopy(counters)))
+            place = self._make_keys(end - first) if keys is None else keys
+            chunks.append(Chunk(first, end, place, counters, HostCopy(counters)))
         return Scan(
             number=next(self._scan_number),
             chunks=chunks,
@@ -222,16 +225,15 @@ class Pixels:
     def count_by_row(self, scan: Scan) -> NDArray[np.int32]:
         """Return how many events each frame and row of a stack has, shape [frame, row]; waits for it."""
         self._table = wp.zeros((len(scan.stamps_ns), self._height), dtype=wp.int32, device=self._device)
-        scan.begin()
         self.launch(scan, tabulate=True)
         counts: NDArray[np.int32] = self._table.numpy()
         self._table = self._empty((1, self._height), wp.int32)
         return counts
 
     def launch(self, scan: Scan, *, tabulate: bool = False) -> None:
-        """Scan a stack that begins from the state before it; done again, it gives the same state after it.
+        """Scan a stack, after `scan.begin`, from the state before it; again, it gives the same one after it.
 
-        With `tabulate` events are only counted, by frame and row.
+        With `tabulate` events are only counted, by frame and row, and counters stay as they are.
         """
         before, after = scan.state, self.next_state(scan.state)
 

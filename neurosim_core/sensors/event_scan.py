@@ -567,8 +567,9 @@ def scan(
         last_out: `last` after the scan.
         crossed_out: `crossed` after the scan.
         keys_out: Keys of the events, in no defined order; those past its end are not written.
-        counters_out: Zeros before. Events kept (written or not); invalid samples; and the flat index of the
-            first of these in the stack, as frame_count * pixel_count minus it.
+        counters_out: Where the next key goes, which counts events kept (written or not); invalid samples; and
+            the flat index of the first of these in the stack, as frame_count * pixel_count minus it: zero
+            both before.
         table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
     """
     thread = wp.tid()

@@ -129,6 +129,7 @@ class EventCamera:
         self._graphs = Graphs(device)
         self._reader = make_stream(device, urgent=True)
         self._taken = Milestone(device)
+        """All that was launched to the reader, the only stream that moves keys; feeders wait for it."""
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
             pixel_count=width * height,
@@ -137,7 +138,7 @@ class EventCamera:
             device=self.device,
             on_host=self._on_host,
         )
-        # a scan that nothing is read beside writes its keys to where they stay
+        # a scan that nothing is cut beside writes its keys to where they stay
         self._in_place = scan_count_max == 1 and self._pixels.chunk_count == 1
         # on CUDA one more than is needed: scans and states then take turns together, in few graphs
         scan_count = ring_size if self.device.is_cuda and not self._in_place else scan_count_max
@@ -197,6 +198,8 @@ class EventCamera:
         if not valid.all():
             row, col = (int(index) for index in np.argwhere(~valid)[0])
             raise ValueError(_invalid_message(int((~valid).sum()), f"[{row}, {col}]"))
+        for scan in (*self._idle, *self._under_way):
+            scan.done.wait()  # it writes states, and reads what the host writes next
         self._pixels.reset(frame, int(stamp_ns))
         if self._readout is not None:
             self._readout.reset(int(stamp_ns))
@@ -232,7 +235,8 @@ class EventCamera:
     def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
         """Launch the scan of a stack of frames, without waiting for it.
 
-        Nothing is allocated unless the stack is longer than any before. After `scan_count_max` calls
+        Nothing is allocated unless the stack is longer than any before, or there is no room for one event
+        more. After `scan_count_max` calls
         `collect` or `collect_windows` comes next; until then `log_radiance` must stay as it is. All calls
         must be on one stream.
 
@@ -318,7 +322,6 @@ class EventCamera:
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
         with on(self._reader):
-            self._taken.hold()
             while self._under_way:
                 self._take_over()
             packets = self._cut([self._require_reset()])
@@ -335,8 +338,9 @@ class EventCamera:
         Args:
             ends_ns: Ends of the windows [ns]; increasing by at least 1 us, not after the last frame that was
                 waited for.
-            scan_count: How many of the stacks that have not been collected to wait for, from the oldest on;
-                None: all. Where only one may be under way, a window that ends waits for it.
+            scan_count: How many of the stacks that have not been collected to wait for at most, from the
+                oldest on; None: all. With a `scan_count_max` of 1 a window that ends waits for the one that
+                is under way in any case.
 
         Raises:
             RuntimeError: If the camera was not reset.
@@ -344,18 +348,17 @@ class EventCamera:
                 in which case the camera must be reset.
         """
         ends = [int(end) for end in ends_ns]
-        if scan_count is None:
-            scan_count = len(self._under_way)
+        under_way = len(self._under_way)
+        count = under_way if scan_count is None else min(scan_count, under_way)
+        if ends and self._scan_count_max == 1:
+            count = under_way  # in place it writes where keys are cut
         if self._in_place and not ends:  # nothing has to be launched
-            for _ in range(scan_count):
+            for _ in range(count):
                 self._take_over()
             self._require_reset()
             return []
-        if self._in_place:
-            scan_count = len(self._under_way)  # it writes where keys are cut
         with on(self._reader):
-            self._taken.hold()
-            for _ in range(scan_count):
+            for _ in range(count):
                 self._take_over()
             self._taken.set()
             now_ns = self._require_reset()
@@ -371,8 +374,6 @@ class EventCamera:
             return packets
 
     def _forget(self) -> None:
-        for scan in self._under_way:
-            scan.done.wait()  # it reads what the host writes next
         scans = [*self._idle, *self._under_way]
         self._idle = deque(sorted(scans, key=lambda scan: scan.number))  # as at the first time: same graphs
         self._under_way.clear()
@@ -418,7 +419,6 @@ class EventCamera:
         counts = self._read_counts(scan)
         if sum(counts) > self.config.event_count_max or not _have_room(scan, counts):
             with on(self._reader):
-                self._taken.hold()
                 counts = self._redo(scan, counts)
                 self._taken.set()
         if self._in_place:

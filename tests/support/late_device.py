@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core import streams
-from neurosim_core.sensors import event_keys, event_noise, event_pixels, events
+from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, events
 
-_MODULES = (streams, events, event_keys, event_pixels)
+_MODULES = (streams, events, event_keys, event_pixels, event_readout)
 
 
 class LateStream:
@@ -121,8 +121,11 @@ class _LateWarp:
     def copy(self, *args: Any, **kwargs: Any) -> None:
         self._device.add(lambda: wp.copy(*args, **kwargs))
 
-    def launch(self, *args: Any, **kwargs: Any) -> None:
-        self._device.add(lambda: wp.launch(*args, **kwargs))
+    def launch(self, *args: Any, device: Any, **kwargs: Any) -> None:
+        if isinstance(device, LateDevice):
+            self._device.add(lambda: wp.launch(*args, device=device, **kwargs))
+        else:  # a launch of the host, as the arbiter's
+            wp.launch(*args, device=device, **kwargs)
 
     def radix_sort_pairs(self, keys: Any, values: Any, count: int, **kwargs: Any) -> None:
         if min(keys.size, values.size) < 2 * count:  # which only a CUDA device minds
@@ -131,15 +134,17 @@ class _LateWarp:
 
 
 class _LateMilestone:
-    """A point in a stream, for `streams.Milestone`."""
+    """A point in a stream, for `streams.Milestone`; no wait is launched where that launches none."""
 
     def __init__(self, device: LateDevice) -> None:
         self._device = device
         self._point = _Point()
         self._point.passed = True
+        self._behind: LateStream | None = None
 
     def set(self) -> None:
         self._point = _Point()
+        self._behind = self._device.stream
         self._device.add(self._point.run)
 
     def wait(self) -> None:
@@ -147,7 +152,9 @@ class _LateMilestone:
         self._device.run_until(lambda: point.passed)
 
     def hold(self) -> None:
-        self._device.add(lambda: None, after=self._point)
+        if self._device.stream is not self._behind:
+            self._behind = self._device.stream
+            self._device.add(lambda: None, after=self._point)
 
 
 class _LateGraphs:
@@ -179,7 +186,9 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
     def after_all(function: Any) -> Any:
         def call(*args: Any) -> Any:
             device.flush()
-            return function(*args)
+            result = function(*args)
+            device.flush()
+            return result
 
         return call
 
@@ -193,12 +202,17 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         self._row_size = array.size // array.shape[0] if array.size else 0
         self._places = {}
 
-    for name in ("reset", "_draw"):  # noise begins at once, from arrays that are ready
-        monkeypatch.setattr(event_noise.PixelNoise, name, after_all(getattr(event_noise.PixelNoise, name)))
+    # noise and arbiters begin at once, from arrays that are ready
+    noise, readout = event_noise.PixelNoise, event_readout.Readout
+    for owner, name in ((noise, "reset"), (noise, "_draw"), (readout, "reset")):
+        monkeypatch.setattr(owner, name, after_all(getattr(owner, name)))
     numpy, zero, fill = wp.array.numpy, wp.array.zero_, wp.array.fill_
 
     def late_numpy(array: Any) -> Any:
-        device.flush()
+        if device.recording is None:
+            point = _Point()
+            device.add(point.run)
+            device.run_until(lambda: point.passed)  # as on CUDA, other streams may go on
         return numpy(array)
 
     def relaunch(self: Any, dim: int, arguments: Any) -> None:
