@@ -141,16 +141,16 @@ def test_what_fails_is_said_in_its_row_and_ends_nothing(made, monkeypatch, tmp_p
 # --- the naive camera
 
 
-def naive_events(frames):
+def naive_events(frames, device):
     """Return (frame, y, x, polarity) of the naive camera, as a set."""
     height, width = frames.shape[1:]
     camera = NaiveEventCamera(
-        width=width, height=height, threshold_on=THRESHOLD, threshold_off=THRESHOLD, device="cpu"
+        width=width, height=height, threshold_on=THRESHOLD, threshold_off=THRESHOLD, device=device
     )
-    camera.reset(wp.array(frames[0], dtype=float, device="cpu"))
+    camera.reset(wp.array(frames[0], dtype=float, device=device))
     found = set()
     for number, frame in enumerate(frames[1:], 1):
-        count = camera.feed(wp.array(frame, dtype=float, device="cpu"), number)
+        count = camera.feed(wp.array(frame, dtype=float, device=device), number)
         x, y, t, polarity = camera.events(count)
         assert len(x) == count
         assert (t == number).all()
@@ -169,7 +169,7 @@ def lawful_events(frames):
     return [tuple(map(int, e)) for e in zip(frame, events.y, events.x, events.polarity, strict=True)]
 
 
-def test_where_one_event_fires_the_naive_camera_sees_what_the_law_says():
+def test_where_one_event_fires_the_naive_camera_sees_what_the_law_says(device):
     """Every pixel changes once, at some frame, by less than two thresholds; some by less than one."""
     rng = np.random.default_rng(3)
     height, width, count = 24, 40, 9
@@ -180,17 +180,17 @@ def test_where_one_event_fires_the_naive_camera_sees_what_the_law_says():
     frames = (base + step * (np.arange(count)[:, None, None] >= at)).astype(np.float32)
     lawful = lawful_events(frames)
     assert len(lawful) > 500
-    assert naive_events(frames) == set(lawful)
+    assert naive_events(frames, device) == set(lawful)
     assert len(lawful) == len(set(lawful))
 
 
-def test_the_naive_camera_forgets_and_swings():
+def test_the_naive_camera_forgets_and_swings(device):
     """What the law does not do: one event for a step of three thresholds, and one for a swing below one."""
     leap = np.array([0.0, 3.2 * THRESHOLD], dtype=np.float32)[:, None, None]
-    assert len(naive_events(leap)) == 1
+    assert len(naive_events(leap, device)) == 1
     assert len(lawful_events(leap)) == 3
     swing = np.array([0.0, -0.6, 0.6, -0.6], dtype=np.float32)[:, None, None] * THRESHOLD
-    assert naive_events(swing) == {(2, 0, 0, 1), (3, 0, 0, 0)}
+    assert naive_events(swing, device) == {(2, 0, 0, 1), (3, 0, 0, 0)}
     assert lawful_events(swing) == []
 
 
