@@ -102,7 +102,7 @@ def _add_options(parser: argparse.ArgumentParser, options: frozenset[str]) -> No
         parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
     if "worlds" in options:
         parser.add_argument(
-            "--worlds", type=_counts, metavar="N,...", help="worlds (default: as the device can)"
+            "--worlds", type=_counts, metavar="N,...", help="worlds (default: 1 to 128, on CUDA to 4096)"
         )
     if "seconds" in options:
         parser.add_argument(
@@ -111,7 +111,7 @@ def _add_options(parser: argparse.ArgumentParser, options: frozenset[str]) -> No
     for name, side in (("width", "columns"), ("height", "rows")):
         if name in options:
             parser.add_argument(
-                f"--{name}", type=int, metavar="PX", help=f"{side} of the camera (default: as the device can)"
+                f"--{name}", type=int, metavar="PX", help=f"{side} of the camera (default: 64, and 128)"
             )
 
 
@@ -370,7 +370,11 @@ def _bench_study(study: Study, arguments: argparse.Namespace) -> int:
 
     console = Console()
     with handle_signals(signal.default_int_handler):
-        chapters = [_measure(part, arguments, console) for part in _parts(study, arguments)]
+        parts = _parts(study, arguments)
+        if study.then and len(parts) == 1 and getattr(arguments, "scene", None):
+            told = f"--scene is not used: it is for the chapter {study.then}, which --device asks for"
+            console.print(told, style="yellow", markup=False, highlight=False)
+        chapters = [_measure(part, arguments, console) for part in parts]
         _write(chapters, arguments.out, console)
     return _judge(chapters, console, strict=arguments.strict)
 

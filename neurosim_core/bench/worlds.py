@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.bench.report import Bar, Chapter, Plot, Table
+from neurosim_core.bench.throughput_chapter import HOUSE_TRIANGLES
 from neurosim_core.config import load_config
 from neurosim_core.simulation import Model, State, make_model, make_state, refit, step
 from neurosim_core.worlds import Worlds, make_worlds
@@ -242,13 +243,20 @@ def _fly_singles(model: Model, singles: list[State], commands: Any, budget_s: fl
 def _bar(result: WorldsResult) -> Bar:
     promised = [c for c in result.cases if (c.count, c.width, c.height) == (_BAR_COUNT, _BAR_PX, _BAR_PX)]
     text = (
-        f"{_BAR_COUNT:,} worlds of {_BAR_PX} x {_BAR_PX} event cameras give at least "
-        f"{_BAR_RENDERS_PER_S:,.0f} renders a second in total, on an H200"
+        f"{_BAR_COUNT:,} worlds of {_BAR_PX} x {_BAR_PX} event cameras in a house of 145,844 triangles give "
+        f"at least {_BAR_RENDERS_PER_S:,.0f} renders a second in total, on an H200"
     )
     if not promised:
         return Bar(text=text, measured=f"not flown on {result.device}", met=None)
-    found = promised[0].renders_per_s
-    return Bar(text=text, measured=f"{found:,.0f} /s on {result.device}", met=found >= _BAR_RENDERS_PER_S)
+    found, dropped = promised[0].renders_per_s, promised[0].dropped
+    measured = f"{found:,.0f} /s on {result.device}, best of {_ROUNDS} rounds, {dropped:,} events dropped"
+    if result.triangles < HOUSE_TRIANGLES:
+        return Bar(text=text, measured=f"needs --scene with the house; here {measured}", met=None)
+    if found >= _BAR_RENDERS_PER_S and dropped == 0:
+        return Bar(text=text, measured=measured, met=True)
+    if "H200" not in result.device:
+        return Bar(text=text, measured=f"needs an H200; here {measured}", met=None)
+    return Bar(text=text, measured=measured, met=False)
 
 
 def _table(result: WorldsResult) -> Table:

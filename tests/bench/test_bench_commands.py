@@ -225,6 +225,20 @@ def test_options_reach_those_who_take_them(monkeypatch, tmp_path):
         cli.main(["bench", "one", "--device", "cpu", *out])
 
 
+def test_a_scene_that_no_chapter_takes_is_told(monkeypatch, tmp_path, capsys):
+    def study(name, then=""):
+        options = frozenset() if then else frozenset({"device", "scene"})
+        chapter = lambda given, _: chapter_of(name, given["quick"])  # noqa: E731
+        return Study(name=name, help="", description="", chapter=chapter, options=options, then=then)
+
+    monkeypatch.setattr(commands, "STUDIES", (study("one", then="two"), study("two")))
+    asked = ["bench", "one", "--scene", "a.glb", "--out", str(tmp_path)]
+    assert cli.main(asked) == 0
+    assert "--scene is not used" in capsys.readouterr().out
+    assert cli.main([*asked, "--device", "cpu"]) == 0
+    assert "not used" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

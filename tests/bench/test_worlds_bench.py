@@ -59,10 +59,20 @@ def test_a_report_of_it(result, tmp_path):
     assert [bar.met for bar in chapter.bars] == [None]
 
 
-@pytest.mark.parametrize(("renders_per_s", "met"), [(250_000.0, True), (249_999.0, False)])
-def test_the_bar_is_judged_where_it_is_flown(renders_per_s, met):
-    case = dataclasses.replace(CASE, renders_per_s=renders_per_s)
-    result = WorldsResult(device="H200", scene="flat", triangles=80_000, cases=(case,))
+@pytest.mark.parametrize(
+    ("renders_per_s", "device", "triangles", "dropped", "met"),
+    [
+        (250_000.0, "H200", 145_840, 0, True),
+        (249_999.0, "H200", 145_840, 0, False),
+        (250_000.0, "H200", 145_840, 1, False),
+        (250_000.0, "H200", 80_000, 0, None),
+        (249_999.0, "CPU", 145_840, 0, None),
+        (250_000.0, "L40", 145_840, 0, True),
+    ],
+)
+def test_the_bar_is_judged_where_it_is_flown(renders_per_s, device, triangles, dropped, met):
+    case = dataclasses.replace(CASE, renders_per_s=renders_per_s, dropped=dropped)
+    result = WorldsResult(device=device, scene="flat", triangles=triangles, cases=(case,))
     chapter = worlds_chapter(result)
     assert [bar.met for bar in chapter.bars] == [met]
     assert chapter.tables[0].rows[0]["ratio"] == pytest.approx(renders_per_s / 13_000.0)

@@ -45,13 +45,13 @@ def event_count(seen: list[list[dict]], name: str = "front") -> int:
 
 
 @pytest.mark.parametrize("mode", ["rates", "attitude", "position", "velocity", "motor_speeds"])
-def test_each_world_is_a_single_simulation(mode, plain):
+def test_each_world_is_a_single_simulation(mode, plain, device):
     """Events, pictures, IMU with noise and states, for commands of every level."""
     commands = commands_of(mode, 8, 3)
-    seen = record(make_worlds(settings(plain), count=3), commands, mode=mode)
+    seen = record(make_worlds(settings(plain, device), count=3), commands, mode=mode)
     assert event_count(seen) > 1000
     for world in range(3):
-        alone = fly_alone(settings(plain, seed=7 + world), commands[:, world], mode=mode)
+        alone = fly_alone(settings(plain, device, seed=7 + world), commands[:, world], mode=mode)
         for step, packets in enumerate(alone):
             assert_same(seen[step][world], packets)
 
@@ -104,7 +104,7 @@ NOISE = {
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_pixels_and_lenses_of_their_own(noisy, plain):
+def test_pixels_and_lenses_of_their_own(noisy, plain, device):
     """Thresholds, noise and field of view that differ from world to world."""
     pixel = {"threshold_on": 0.12, "threshold_off": 0.1, **(NOISE if noisy else {})}
     rig = {"front": {**RIG["front"], "pixel": pixel}, "imu": RIG["imu"]}
@@ -116,7 +116,7 @@ def test_pixels_and_lenses_of_their_own(noisy, plain):
     if noisy:
         given |= {"front.refractory_s": [1e-3, 0.0, 2e-3], "front.shot_noise.rate_hz": [1.0, 100.0, 30.0]}
     commands = commands_of("rates", 6, 3)
-    config = settings(plain, sensors=rig)
+    config = settings(plain, device, sensors=rig)
     seen = record(make_worlds(config, count=3, parameters=given), commands)
     assert event_count(seen) > 500
     for world in range(3):
@@ -233,16 +233,16 @@ def test_what_moves_by_itself(plain):
 
 
 @pytest.mark.parametrize("on_device", [False, True])
-def test_a_world_that_is_reset_alone(on_device, plain):
+def test_a_world_that_is_reset_alone(on_device, plain, device):
     """It begins like a fresh simulation, and the others do not notice."""
     rig = {**RIG, "front": {**RIG["front"], "pixel": {"threshold_on": 0.12, **NOISE}}}
     rig["rgb"] = {**RIG["rgb"], "rate_hz": 100}
-    config = settings(plain, sensors=rig, vehicle={"on_collision": "report"})
+    config = settings(plain, device, sensors=rig, vehicle={"on_collision": "report"})
     commands = commands_of("rates", 7, 3)
     worlds = make_worlds(config, count=3)
     seen = record(worlds, commands[:3])
     mask: Any = np.array([0, 1, 0], dtype=np.uint8)
-    worlds.reset(mask=wp.array(mask, dtype=wp.uint8, device="cpu") if on_device else mask.astype(bool))
+    worlds.reset(mask=wp.array(mask, dtype=wp.uint8, device=device) if on_device else mask.astype(bool))
     first = snapshot(worlds.reset(mask=mask), 1)  # again: nothing is left of the one before
     for command in commands[3:]:
         observation = worlds.step(command)
@@ -405,6 +405,34 @@ def test_events_that_are_not_sorted(plain):
             order = np.lexsort((polarity, x, y, t))
             for column, expected in zip((t, x, y, polarity), a[world]["front"], strict=True):
                 np.testing.assert_array_equal(column[order], expected)
+
+
+def test_results_are_arrays_of_others_without_a_copy(plain):
+    """NumPy sees, through DLPack, the memory that the next step writes to."""
+    worlds = make_worlds(settings(plain), count=2)
+    observation = worlds.reset()
+    position, pictures = observation.state.position, observation.images["rgb"]
+    seen: Any = np.from_dlpack(position)
+    assert seen.__array_interface__["data"][0] == position.ptr
+    assert np.from_dlpack(pictures).__array_interface__["data"][0] == pictures.ptr
+    before = seen.copy()
+    for command in commands_of("rates", 3, 2):
+        worlds.step(command)
+    assert (seen != before).all()
+
+
+def test_four_thousand_worlds(plain, device):
+    """The last of them is a single simulation as well."""
+    camera = {**RIG["front"], "lens": {"width": 16, "height": 12, "horizontal_fov_rad": 1.5}}
+    config = settings(plain, device, sensors={"front": camera})
+    commands = commands_of("rates", 2, 4096)
+    worlds = make_worlds(config, count=4096)
+    seen = [snapshot(worlds.reset(), 4095)]
+    seen += [snapshot(worlds.step(command), 4095) for command in commands]
+    alone = fly_alone({**config, "seed": 7 + 4095}, commands[:, 4095])
+    for step, packets in enumerate(alone):
+        assert_same(seen[step], packets)
+    assert len(alone) == 3
 
 
 def test_results_are_tensors_without_a_copy(plain):
