@@ -26,20 +26,26 @@ class _Eyes:
     """Renders one view a call on a device, each in a stream and with a picture of its own, as a run does.
 
     Args:
-        views: What to see.
+        views: What to see, forth and back.
         streams: They take turns.
+
+    Attributes:
+        count: Views that were rendered.
     """
 
     def __init__(self, views: Views, streams: Sequence[wp.Stream | None]) -> None:
+        self.count = 0
         self._views = views
+        self._order = [*range(views.count), *reversed(range(views.count))]
         self._streams = streams
         self._graphs = Graphs(views.device)
         self._renderers = [views.renderer("log_radiance", instants=1) for _ in streams]
         self._seen = [Milestone(views.device) for _ in streams]
 
-    def see(self, number: int, view: int) -> tuple[wp.array | None, Milestone]:
-        """Launch the render of a view; return where its log radiance will be, and when."""
-        eye = number % len(self._renderers)
+    def see(self) -> tuple[wp.array | None, Milestone]:
+        """Launch the render of the next view; return where its log radiance will be, and when."""
+        eye, view = self.count % len(self._renderers), self._order[self.count % len(self._order)]
+        self.count += 1
         renderer, stream = self._renderers[eye], self._streams[eye]
         self._graphs.run(
             (eye, view), lambda: self._views.render(renderer, first=view, count=1), stream=stream
@@ -57,8 +63,6 @@ class _Loop:
     """
 
     def __init__(self, views: Views, ahead: int) -> None:
-        self._views = views
-        self._order = [*range(views.count), *reversed(range(views.count))]
         self._camera = make_camera(views, scan_count_max=1)
         self._camera.reset(views.frames[0], 0)
         self.stream = make_stream(views.device, urgent=True)
@@ -67,7 +71,7 @@ class _Loop:
         self._eyes = _Eyes(views, streams)
         self._ahead = ahead
         self._rendered: deque[tuple[wp.array | None, Milestone]] = deque()
-        self._seen_count = self._scanned_count = self._read_count = 0
+        self._scanned_count = self._read_count = 0
         self.event_count = 0
         """Events that were handed out."""
 
@@ -78,9 +82,7 @@ class _Loop:
 
     def call(self) -> None:
         """Render the next frame."""
-        view = self._order[self._seen_count % len(self._order)]
-        self._rendered.append(self._eyes.see(self._seen_count, view))
-        self._seen_count += 1
+        self._rendered.append(self._eyes.see())
         if self._scanned_count > self._read_count:
             self._read()
         if len(self._rendered) >= self._ahead:
@@ -126,18 +128,15 @@ def compare_loops(views: Views, *, seconds: float) -> tuple[Comparison, Comparis
     """
     loops = [_Loop(views, _AHEAD), _Loop(views, 0)]
     naive = make_naive(views)
-    order = [*range(views.count), *reversed(range(views.count))]
     naive_stream = make_stream(views.device)
     naive_eyes = _Eyes(views, [naive_stream])
-    frame = None
-    naive_shown, theirs = 0, 0
+    frame = naive_eyes.see()[0][0]  # where each of them will be
+    theirs = 0
 
     def call_naive() -> None:
-        nonlocal frame, naive_shown, theirs
-        frames, _ = naive_eyes.see(naive_shown, order[naive_shown % len(order)])
-        frame = frames[0] if frame is None else frame  # the same each time
-        naive_shown += 1
-        theirs += naive.feed(frame, naive_shown * FRAME_US)
+        nonlocal theirs
+        naive_eyes.see()
+        theirs += naive.feed(frame, naive_eyes.count * FRAME_US)
 
     wp.synchronize_device(views.device)  # what was made on other streams is there
     rounds_s = []
@@ -158,7 +157,7 @@ def compare_loops(views: Views, *, seconds: float) -> tuple[Comparison, Comparis
             ours_per_s=1.0 / loop_s,
             naive_per_s=1.0 / naive_s,
             ours_events=loop.events_per_frame,
-            naive_events=theirs / naive_shown,
+            naive_events=theirs / (naive_eyes.count - 1),  # the first was not fed
         )
         for name, loop, loop_s in zip((LOOP, LOOP_AT_ONCE), loops, ours_s, strict=True)
     )

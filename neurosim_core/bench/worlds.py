@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from neurosim_core.bench.h200 import HOUSE_TRIANGLES, is_enough
 from neurosim_core.bench.report import Bar, Chapter, Plot, Table
-from neurosim_core.bench.throughput_chapter import HOUSE_TRIANGLES
 from neurosim_core.config import load_config
 from neurosim_core.simulation import Model, State, make_model, make_state, refit, step
 from neurosim_core.worlds import Worlds, make_worlds
@@ -252,11 +252,10 @@ def _bar(result: WorldsResult) -> Bar:
     measured = f"{found:,.0f} /s on {result.device}, best of {_ROUNDS} rounds, {dropped:,} events dropped"
     if result.triangles < HOUSE_TRIANGLES:
         return Bar(text=text, measured=f"needs --scene with the house; here {measured}", met=None)
-    if found >= _BAR_RENDERS_PER_S and dropped == 0:
-        return Bar(text=text, measured=measured, met=True)
-    if "H200" not in result.device:
-        return Bar(text=text, measured=f"needs an H200; here {measured}", met=None)
-    return Bar(text=text, measured=measured, met=False)
+    met = is_enough(result.device, found if dropped == 0 else 0.0, _BAR_RENDERS_PER_S)
+    return Bar(
+        text=text, measured=measured if met is not None else f"needs an H200; here {measured}", met=met
+    )
 
 
 def _table(result: WorldsResult) -> Table:
