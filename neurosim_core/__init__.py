@@ -10,19 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from neurosim_core.config import SimulationConfig, load_config
-    from neurosim_core.simulation import make_model, make_state, run, step
+    from neurosim_core.sim.model import make_model
+    from neurosim_core.sim.rollout import run, step
+    from neurosim_core.sim.simulation import Simulation
+    from neurosim_core.sim.state import make_state
 
 __version__ = "0.1.0"
 
-__all__ = ["SimulationConfig", "load_config", "make_model", "make_state", "run", "step"]
+__all__ = ["Simulation", "SimulationConfig", "load_config", "make_model", "make_state", "run", "step"]
 
 _HOME = {
     "SimulationConfig": "neurosim_core.config",
     "load_config": "neurosim_core.config",
-    "make_model": "neurosim_core.simulation",
-    "make_state": "neurosim_core.simulation",
-    "run": "neurosim_core.simulation",
-    "step": "neurosim_core.simulation",
+    "Simulation": "neurosim_core.sim.simulation",
+    "make_model": "neurosim_core.sim.model",
+    "make_state": "neurosim_core.sim.state",
+    "run": "neurosim_core.sim.rollout",
+    "step": "neurosim_core.sim.rollout",
 }
 
 

@@ -58,6 +58,10 @@ class Rate:
         numerator, denominator = self._period
         return -(-operator.index(stamp_ns) * denominator // numerator)
 
+    def contains(self, other: Rate) -> bool:
+        """Return whether every tick of another clock is one of this."""
+        return (Fraction(str(self.rate_hz)) / Fraction(str(other.rate_hz))).denominator == 1
+
     def has_tick(self, stamp_ns: int) -> bool:
         """Return whether a tick is at this stamp."""
         return self.stamp_ns(self.first_tick(stamp_ns)) == stamp_ns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
@@ -17,14 +17,13 @@ from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
-from neurosim_core.sensors.rig import (
-    DepthSensorConfig,
-    EventSensorConfig,
-    ImuSensorConfig,
-    OdometrySensorConfig,
-    RgbSensorConfig,
-    SensorConfig,
-)
+from neurosim_core.registry import kinds, on_change
+from neurosim_core.sensors.base import SensorConfig
+from neurosim_core.sensors.depth import DepthSensorConfig
+from neurosim_core.sensors.event_camera import EventSensorConfig
+from neurosim_core.sensors.imu import ImuSensorConfig
+from neurosim_core.sensors.odometry import OdometrySensorConfig
+from neurosim_core.sensors.rgb import RgbSensorConfig
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import Integrator, MultirotorConfig, preset
@@ -93,7 +92,11 @@ def _default_sensors() -> dict[str, SensorConfig]:
 
 SceneConfig = Annotated[ApartmentConfig | MeshSceneConfig, Field(discriminator="kind")]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-Sensors = dict[Name, SensorConfig]
+if TYPE_CHECKING:
+    AnySensor = SensorConfig
+else:
+    AnySensor = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]
+Sensors = dict[Name, AnySensor]
 Links = dict[Name, LinkConfig]
 
 STREAMS = ("odometry", "rotor_speeds", "command")
@@ -232,6 +235,20 @@ class SimulationConfig(Settings):
                 "vehicles": {name: FleetMember()},
             }
         )
+
+
+def _take_new_kinds(seam: str) -> None:
+    """Let settings name kinds of sensors that were registered after this module was imported."""
+    if seam != "sensor":
+        return
+    known = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]  # noqa: UP007
+    FleetMember.model_fields["sensors"].annotation = dict[Name, known] | None  # type: ignore[valid-type]
+    SimulationConfig.model_fields["sensors"].annotation = dict[Name, known]  # type: ignore[valid-type]
+    for settings in (FleetMember, SimulationConfig):
+        settings.model_rebuild(force=True)
+
+
+on_change(_take_new_kinds)
 
 
 def load_config(

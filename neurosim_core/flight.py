@@ -23,11 +23,14 @@ from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
-from neurosim_core.sensors.cast import render_terms
 from neurosim_core.sensors.event_config import describe_pixel
-from neurosim_core.sensors.rig import Cast, EventSensorConfig
+from neurosim_core.sensors.event_camera import EventSensorConfig
+from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.simulation import Model, State, load_scene, make_model, make_state, run_model
+from neurosim_core.sim.model import Model, load_scene, make_model
+from neurosim_core.sim.render_group import render_terms
+from neurosim_core.sim.rollout import run_model
+from neurosim_core.sim.state import State, make_state
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.view.overview import FlightSummary, Track, save_overview
 from neurosim_core.view.rerun_log import RerunLogger
@@ -317,9 +320,9 @@ def print_report(console: Console, model: Model, state: State, report: Report, f
     facts.add_row("steps", _describe_steps(model, counts))
     if model.bodies:
         facts.add_row("bodies", ", ".join(body.name for body in model.bodies))
-    if model.casts:
-        casts = "; ".join(_describe_cast(cast) for cast in model.casts)
-        facts.add_row("renders", f"{counts['renders']:,} ({casts})")
+    if model.groups:
+        groups = "; ".join(_describe_group(group) for group in model.groups)
+        facts.add_row("renders", f"{counts['renders']:,} ({groups})")
         if model.schedule.sparse:
             facts.add_row("left out", _describe_left_out(counts))
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
@@ -371,11 +374,12 @@ def _describe_steps(model: Model, counts: Mapping[str, int]) -> str:
     return f"{counts['steps']:,} of the dynamics ({steps}), {commands}"
 
 
-def _describe_cast(cast: Cast) -> str:
-    limit_px = cast.max_displacement_px
+def _describe_group(group: RenderGroup) -> str:
+    limit_px = group.max_displacement_px
     where = "" if limit_px is None else f" where something moves {limit_px:g} px"
     return (
-        f"{cast.lens.width}x{cast.lens.height} at {cast.rate.rate_hz:g} Hz{where} for {', '.join(cast.names)}"
+        f"{group.lens.width}x{group.lens.height} at {group.rate.rate_hz:g} Hz{where} "
+        f"for {', '.join(group.names)}"
     )
 
 
@@ -400,7 +404,7 @@ def _describe_collisions(report: Report) -> str:
 def _terms(model: Model, state: State) -> dict[str, tuple[str, ...]]:
     """What each kernel computes, beyond what every run needs."""
     terms: dict[str, tuple[str, ...]] = {"dynamics": state.vehicle.terms}
-    terms |= {name: imu.terms for name, imu in state.imus.items()}
-    for cast, seeing in zip(model.casts, state.casts, strict=True):
-        terms[", ".join(cast.names)] = (*sorted(cast.outputs), *render_terms(seeing))
+    terms |= {name: sampler.terms for name, sampler in state.samplers.items()}
+    for group, seeing in zip(model.groups, state.groups, strict=True):
+        terms[", ".join(group.names)] = (*sorted(group.outputs), *render_terms(seeing))
     return terms

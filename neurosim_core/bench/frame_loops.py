@@ -12,7 +12,7 @@ import warp as wp
 from neurosim_core.bench.throughput_result import LOOP, LOOP_AT_ONCE, Comparison
 from neurosim_core.bench.throughput_stages import FRAME_US, Views, make_camera, make_naive, seconds_per_call
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.streams import Graphs, Milestone, make_stream, on
+from neurosim_core.runtime.cuda import GraphCache, Fence, make_stream, use_stream
 
 _AHEAD = 2
 """Frames whose renders are launched before the count of one is read: more of them are no faster."""
@@ -38,11 +38,11 @@ class _Eyes:
         self._views = views
         self._order = [*range(views.count), *reversed(range(views.count))]
         self._streams = streams
-        self._graphs = Graphs(views.device)
+        self._graphs = GraphCache(views.device)
         self._renderers = [views.renderer("log_radiance", instants=1) for _ in streams]
-        self._seen = [Milestone(views.device) for _ in streams]
+        self._seen = [Fence(views.device) for _ in streams]
 
-    def see(self) -> tuple[wp.array | None, Milestone]:
+    def see(self) -> tuple[wp.array | None, Fence]:
         """Launch the render of the next view; return where its log radiance will be, and when."""
         eye, view = self.count % len(self._renderers), self._order[self.count % len(self._order)]
         self.count += 1
@@ -65,12 +65,12 @@ class _Loop:
     def __init__(self, views: Views, ahead: int) -> None:
         self._camera = make_camera(views, scan_count_max=1)
         self._camera.reset(views.frames[0], 0)
-        self.stream = make_stream(views.device, urgent=True)
+        self.stream = make_stream(views.device, high_priority=True)
         """Where calls are to be made."""
         streams = [make_stream(views.device) for _ in range(ahead + 1)] if ahead else [self.stream]
         self._eyes = _Eyes(views, streams)
         self._ahead = ahead
-        self._rendered: deque[tuple[wp.array | None, Milestone]] = deque()
+        self._rendered: deque[tuple[wp.array | None, Fence]] = deque()
         self._scanned_count = self._read_count = 0
         self.event_count = 0
         """Events that were handed out."""
@@ -99,7 +99,7 @@ class _Loop:
         """Launch the scan of the oldest frame that has been rendered."""
         frames, seen = self._rendered.popleft()
         self._scanned_count += 1
-        seen.hold()
+        seen.wait_on_stream()
         self._camera.feed_device(frames, [_stamp_ns(self._scanned_count)])
 
     def _read(self) -> None:
@@ -143,9 +143,9 @@ def compare_loops(views: Views, *, seconds: float) -> tuple[Comparison, Comparis
     for _ in range(_ROUNDS):
         round_s = []
         for loop in loops:
-            with on(loop.stream):
+            with use_stream(loop.stream):
                 round_s.append(seconds_per_call(loop.call, views.device, seconds=seconds))
-        with on(naive_stream):
+        with use_stream(naive_stream):
             round_s.append(seconds_per_call(call_naive, views.device, seconds=seconds))
         rounds_s.append(round_s)
     *ours_s, naive_s = np.median(rounds_s, axis=0)

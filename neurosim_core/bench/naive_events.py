@@ -16,7 +16,7 @@ This is no part of the simulator. Nobody should want these events.
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.streams import Relaunch
+from neurosim_core.runtime.cuda import RecordedLaunch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -101,7 +101,7 @@ class NaiveEventCamera:
         self._upper, self._lower = empty(float), empty(float)
         self._count = empty(int, 1)
         self._columns = [empty(wp.uint16), empty(wp.uint16), empty(wp.int64), empty(wp.uint8)]
-        self._compare = Relaunch(_compare, self._device)
+        self._compare = RecordedLaunch(_compare, self._device)
 
     def reset(self, log_radiance: wp.array) -> None:
         """Set the bounds around a frame, shape [H, W]."""

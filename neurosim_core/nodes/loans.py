@@ -18,7 +18,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortex import Loan, Publisher
-from neurosim_core.pinned import PinError, PinnedMapping
+from neurosim_core.runtime.pinned import PinError, PinnedMapping
 
 _logger = logging.getLogger(__name__)
 _BYTES_MIN = 1 << 16

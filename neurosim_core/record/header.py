@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from neurosim_core.sensors.rig import SensorConfig
+    from neurosim_core.sensors.base import SensorConfig
 
 
 @dataclass(frozen=True, kw_only=True)

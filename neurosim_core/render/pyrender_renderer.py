@@ -235,6 +235,7 @@ class PyrenderRenderer:
         *,
         instant_count: int,
         bodies: BodyPoses | None = None,
+        active: Any = None,
     ) -> None:
         """Render those of the first `instant_count` poses that have an image slot; see `Renderer.render`."""
         rotations = Rotation.from_quat(q_WC.numpy()[:instant_count]).as_matrix()

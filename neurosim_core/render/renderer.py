@@ -13,13 +13,15 @@ from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderSce
 from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.scene_arrays import upload_scene as upload_warp_scene
 from neurosim_core.render.synthetic_renderer import SyntheticRenderer, SyntheticScene
-from neurosim_core.render.warp_renderer import WarpRenderer
+from neurosim_core.render.warp_renderer import ONE_WORLD, RenderWorlds, WarpRenderer
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
 
 __all__ = [
+    "ONE_WORLD",
     "LightingConfig",
     "RenderConfig",
+    "RenderWorlds",
     "Renderer",
     "RendererName",
     "SceneOnDevice",
@@ -35,10 +37,13 @@ SceneOnDevice = SceneArrays | PyrenderScene | SyntheticScene
 
 
 class Renderer(Protocol):
-    """Renders up to K instants of one lens per call into arrays of its own; those not asked for are None."""
+    """Renders up to K instants of one lens in N worlds per call into arrays of its own.
+
+    Instants are [world, K] in this order; outputs that were not asked for are None.
+    """
 
     log_radiance: Any
-    """Logarithm of linear luma plus the dark floor, float32 [K, H, W]."""
+    """Logarithm of linear luma plus the dark floor, float32 [N K, H, W]."""
     rgb: Any
     """8-bit sRGB, uint8 [M, H, W, 3]."""
     depth: Any
@@ -57,15 +62,17 @@ class Renderer(Protocol):
         *,
         instant_count: int,
         bodies: BodyPoses | None = None,
+        active: Any = None,
     ) -> None:
-        """Render the first `instant_count` poses.
+        """Render the first `instant_count` poses of each world.
 
         Args:
-            p_WC: Position of the camera [m], shape [K].
-            q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
-            image_slot: Where the images of an instant go, shape [K]; -1: nowhere.
-            instant_count: How many of the K instants are rendered.
+            p_WC: Position of the camera [m], shape [N K].
+            q_WC: Orientation of the camera's optical frame, xyzw, shape [N K].
+            image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
+            instant_count: How many of the K instants of each world are rendered.
             bodies: Where bodies are at the instants; not needed without bodies.
+            active: With several worlds: 1 where a world is rendered, device array of int32, shape [N].
         """
 
 
@@ -108,6 +115,7 @@ def make_renderer(
     outputs: Collection[str],
     instant_count: int,
     image_count: int = 1,
+    worlds: RenderWorlds = ONE_WORLD,
 ) -> Renderer:
     """Return a renderer for one lens.
 
@@ -115,16 +123,21 @@ def make_renderer(
         scene: What `upload_scene` returned.
         lens: The camera.
         outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance".
-        instant_count: K, the most instants per call.
-        image_count: M, number of image slots.
+        instant_count: K, the most instants of a world per call.
+        image_count: M, number of image slots, of all worlds together.
+        worlds: Who is rendered together: several only by `warp`.
 
     Raises:
-        ValueError: An output is unknown, or the renderer does not have it.
+        ValueError: An output is unknown, or the renderer does not have it; or it renders one world only.
     """
+    if worlds.count > 1 and not isinstance(scene, SceneArrays):
+        raise ValueError(f"{worlds.count} worlds are rendered by renderer 'warp' only")
     if isinstance(scene, PyrenderScene):
         return PyrenderRenderer(scene, lens, outputs=outputs, image_count=image_count)
     if isinstance(scene, SyntheticScene):
         return SyntheticRenderer(
             scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count
         )
-    return WarpRenderer(scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count)
+    return WarpRenderer(
+        scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count, worlds=worlds
+    )

@@ -222,6 +222,7 @@ class SyntheticRenderer:
         *,
         instant_count: int,
         bodies: BodyPoses | None = None,
+        active: Any = None,
     ) -> None:
         """Draw the cards of the first `instant_count` poses; see `Renderer.render`. Bodies are not seen."""
         key = (p_WC.ptr, q_WC.ptr, image_slot.ptr, instant_count)

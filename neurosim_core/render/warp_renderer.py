@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,7 +16,8 @@ from neurosim_core.render.body_arrays import (
     place_camera,
 )
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.cast_terms import group_of, with_walks
+from neurosim_core.render.cast_terms import Terms, group_of, with_walks
+from neurosim_core.render.config import WalkConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.film import OUTPUTS, make_film
 from neurosim_core.render.launch import launch_split
@@ -49,18 +52,44 @@ def ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
     return np.stack(layers)
 
 
-class WarpRenderer:
-    """Renders K instants of one lens per launch. `render` neither allocates nor waits for a CUDA device.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderWorlds:
+    """The worlds that one launch renders together, and how they differ."""
 
-    Outputs that were not asked for are None. See `film.FilmData` for what they are.
+    count: int = 1
+    """Number of worlds N."""
+    lenses: Sequence[Lens] = ()
+    """The lenses there are, all of one size; empty: every world has the lens of the renderer."""
+    lens_of_world: Sequence[int] = ()
+    """Index into `lenses` of each world, shape [N]."""
+    scenes: Any = None
+    """All scenes, device array of `SceneData`; None: every world is in the scene of the renderer."""
+    scene_of_world: Any = None
+    """Index into `scenes` of each world, device array of int32, shape [N]."""
+    terms: Terms | None = None
+    """What some scene needs in the kernel; None: as the scene of the renderer says."""
+
+
+ONE_WORLD = RenderWorlds()
+"""A single world."""
+
+
+class WarpRenderer:
+    """Renders K instants of one lens in N worlds per launch. `render` neither allocates nor waits for a device.
+
+    Instants are [world, K] in this order in all arrays: instant k of world n is row n K + k. On a device they
+    are launched in the order world, tile, instant, pixel: the instants of a tile, which see the same
+    triangles, run side by side. Outputs that were not asked for are None. See `film.FilmData` for what they
+    are.
 
     Attributes:
-        log_radiance: float32, shape [K, H, W].
+        log_radiance: float32, shape [N K, H, W].
         rgb: uint8, shape [M, H, W, 3].
         depth: float32, shape [M, H, W].
         normal: vec3, shape [M, H, W].
         instance: int32, shape [M, H, W].
-        rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W].
+        rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W]; of several
+            lenses, one after the other.
         walk: What the rays of a tile share; None: each walks by itself.
         terms: What its kernels compute because of the scene, the settings, and the lens.
     """
@@ -74,6 +103,7 @@ class WarpRenderer:
         instant_count: int,
         image_count: int = 1,
         thread_count: int | None = None,
+        worlds: RenderWorlds = ONE_WORLD,
     ) -> None:
         """Allocate the outputs and choose the kernel.
 
@@ -81,63 +111,42 @@ class WarpRenderer:
             arrays: The scene; `upload_scene`.
             lens: Rays of the pixels.
             outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance".
-            instant_count: K, the most instants per launch.
-            image_count: M, number of image slots.
+            instant_count: K, the most instants of a world per launch.
+            image_count: M, number of image slots, of all worlds together.
             thread_count: Threads on a CPU device; all cores if None.
+            worlds: Who is rendered together.
 
         Raises:
             ValueError: If an output is unknown or none is asked for, the instants have more than 2^31 - 1
                 rays of a layer together, or rays that share a walk do not look forward or are too many.
         """
-        tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
-        most = _THREAD_COUNT_MAX // (tiles * TILE * TILE)
-        if instant_count > most:
-            raise ValueError(
-                f"{instant_count} instants of {lens.width} x {lens.height} px are more than 2^31 - 1 rays a "
-                f"launch: at most {most} instants of this size (instants_per_launch), or take fewer pixels"
-            )
-        rays = ray_layers(lens, arrays.config.samples_per_pixel)
-        is_cuda = wp.get_device(arrays.device).is_cuda
-        shared = shared_walk(
-            arrays.config.shared_walk,
-            rays,
-            instant_count=instant_count,
-            face_count=arrays.face_origin.shape[0],
-            is_cuda=is_cuda,
-        )
-        self.terms = terms = with_walks(arrays.terms, shared)
-        self._kernel = raycast_kernel(outputs, terms)
-        self._asking = asking_kernel(outputs, terms)
-        self._group = group_of(terms)
+        self._worlds = worlds
+        self._tile_count = -(-lens.width // TILE) * -(-lens.height // TILE)
+        _check_thread_count(self._tile_count, lens, instant_count, worlds.count)
         self._arrays = arrays
         self._thread_count = thread_count
-        rays_together = TILE * TILE if terms.by_tile else PACKET if terms.embree else 1
-        self._instant_threads = tiles * TILE * TILE // rays_together
+        self._stride = instant_count
         device = arrays.device
+        lenses = worlds.lenses or (lens,)
+        rays = np.concatenate([ray_layers(each, arrays.config.samples_per_pixel) for each in lenses], axis=1)
+        shared = self._choose_terms(rays, several=worlds.count > 1)
+        self._kernel = raycast_kernel(outputs, self.terms)
+        self._asking = asking_kernel(outputs, self.terms)
+        self._group = group_of(self.terms)
+        rays_together = TILE * TILE if self.terms.by_tile else PACKET if self.terms.embree else 1
+        self._instant_threads = self._tile_count * TILE * TILE // rays_together
         self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
         self._view = make_view(self.rays, lens.width, lens.height)
-        self._body_data = make_body_data(arrays.bodies, instant_count, device)
-        self._world_data = WorldData()
-        self.walk = None
-        if shared is not None:
-            self.walk = TileWalk(
-                arrays.data.tree,
-                rays,
-                width=lens.width,
-                height=lens.height,
-                extent_m=float(np.abs(arrays.scene.bounds_m).max()),
-                config=shared,
-                instant_count=instant_count,
-                leaves=self._asking is not None,
-                thread_count=thread_count,
-            )
+        self._body_data = make_body_data(arrays.bodies, worlds.count * instant_count, device)
+        self._world_data = self._make_world_data()
+        self.walk = None if shared is None else self._make_walk(lens, rays, shared)
         self._walk_data = WalkData() if self.walk is None else self.walk.data
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
             return wp.zeros(shape, dtype=dtype, device=device) if name in outputs else None
 
-        self.log_radiance = allocate("log_radiance", (instant_count, *images[1:]), float)
+        self.log_radiance = allocate("log_radiance", (worlds.count * instant_count, *images[1:]), float)
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
@@ -152,28 +161,34 @@ class WarpRenderer:
         *,
         instant_count: int,
         bodies: BodyPoses | None = None,
+        active: Any = None,
     ) -> None:
-        """Render the first `instant_count` poses into the outputs.
+        """Render the first `instant_count` poses of each world into the outputs.
 
         Args:
-            p_WC: Position of the camera [m], shape [K].
-            q_WC: Orientation of the camera's optical frame, xyzw, shape [K].
-            image_slot: Where the images of an instant go, shape [K]; -1: nowhere.
-            instant_count: How many of the K instants are rendered.
+            p_WC: Position of the camera [m], shape [N K].
+            q_WC: Orientation of the camera's optical frame, xyzw, shape [N K].
+            image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
+            instant_count: How many of the K instants of each world are rendered.
             bodies: Where bodies are at the instants; not needed without bodies.
+            active: With several worlds: 1 where a world is rendered, int32, shape [N].
 
         Raises:
             ValueError: The scene has bodies and there are no poses of them.
         """
+        count = self._worlds.count
+        pose_count = instant_count if count == 1 else count * self._stride
         if self._arrays.bodies is not None:
             if bodies is None:
                 names = ", ".join(body.name for body in self._arrays.bodies.bodies)
                 raise ValueError(f"bodies move in this scene ({names}): render() needs their poses")
             place_camera(
-                self._arrays.bodies, bodies, p_WC, q_WC, instant_count=instant_count, data=self._body_data
+                self._arrays.bodies, bodies, p_WC, q_WC, instant_count=pose_count, data=self._body_data
             )
         if self.walk is not None:
-            self.walk.launch(self.rays, p_WC, q_WC, instant_count=instant_count)
+            self.walk.launch(self.rays, p_WC, q_WC, instant_count=pose_count)
+        if active is not None:
+            self._world_data.active = active
         view = self._view
         view.instant_count, view.p_WC, view.q_WC, view.image_slot = instant_count, p_WC, q_WC, image_slot
         inputs = [self._arrays.data, view, self._body_data, self._world_data, self._walk_data]
@@ -181,7 +196,7 @@ class WarpRenderer:
         device = self._arrays.device
         launch_split(
             self._kernel,
-            dim=-(-instant_count // self._group) * self._instant_threads,
+            dim=count * -(-instant_count // self._group) * self._instant_threads,
             inputs=inputs,
             outputs=outputs,
             device=device,
@@ -191,3 +206,66 @@ class WarpRenderer:
             launch_split(
                 self._asking, dim=self.walk.data.left_threads, inputs=inputs, outputs=outputs, device=device
             )
+
+    def _choose_terms(self, rays: NDArray[np.float32], *, several: bool) -> WalkConfig | None:
+        """Set `terms`, and return how rays share walks, if they do."""
+        arrays, worlds = self._arrays, self._worlds
+        terms = (worlds.terms or arrays.terms)._replace(worlds=several, world_lenses=len(worlds.lenses) > 1)
+        shared = None
+        if not (terms.world_scenes or terms.world_lenses):  # walks change nothing but the speed
+            shared = shared_walk(
+                arrays.config.shared_walk,
+                rays,
+                instant_count=self._stride,
+                face_count=arrays.face_origin.shape[0],
+                is_cuda=wp.get_device(arrays.device).is_cuda,
+            )
+        # with several worlds, groups end with the instants of a world
+        group = 1 << min(2, self._stride.bit_length() - 1) if several else None
+        self.terms = with_walks(terms, shared, group=group)
+        return shared
+
+    def _make_world_data(self) -> WorldData:
+        worlds, data = self._worlds, WorldData()
+        data.stride = self._stride
+        if worlds.scenes is not None:
+            data.scenes, data.scene = worlds.scenes, worlds.scene_of_world
+        if len(worlds.lenses) > 1:
+            data.lens = wp.array(list(worlds.lens_of_world), dtype=int, device=self._arrays.device)
+        return data
+
+    def _make_walk(self, lens: Lens, rays: NDArray[np.float32], config: WalkConfig) -> TileWalk:
+        """Return the walks that the instants of a tile share in each world."""
+        arrays, count = self._arrays, self._worlds.count
+        if count > 1:
+            changes = {"instants": self._stride}
+            if arrays.config.shared_walk == "auto":  # lists are counted in 32 bits
+                most = _THREAD_COUNT_MAX // (count * self._tile_count)
+                changes["face_count_max"] = min(config.face_count_max, most)
+            config = config.model_copy(update=changes)
+        return TileWalk(
+            arrays.data.tree,
+            rays,
+            width=lens.width,
+            height=lens.height,
+            extent_m=float(np.abs(arrays.scene.bounds_m).max()),
+            config=config,
+            instant_count=count * self._stride,
+            leaves=self._asking is not None,
+            thread_count=self._thread_count,
+        )
+
+
+def _check_thread_count(tile_count: int, lens: Lens, instant_count: int, world_count: int) -> None:
+    most = _THREAD_COUNT_MAX // (tile_count * TILE * TILE)
+    if world_count * instant_count <= most:
+        return
+    if world_count > 1:
+        raise ValueError(
+            f"{world_count} worlds of {instant_count} instants of {lens.width} x {lens.height} px "
+            "are more than 2^31 rays a step: take fewer worlds, or commands more often"
+        )
+    raise ValueError(
+        f"{instant_count} instants of {lens.width} x {lens.height} px are more than 2^31 - 1 rays a "
+        f"launch: at most {most} instants of this size (instants_per_launch), or take fewer pixels"
+    )

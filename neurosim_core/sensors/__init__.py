@@ -1,1 +1,1 @@
-"""Sensors: what turns the state of a vehicle, or the picture that it sees, into packets."""
+"""The sensors, one file for each kind."""

@@ -56,8 +56,8 @@ from neurosim_core.frames import quaternion_exp
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.scene_arrays import SceneArrays
+from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.scene.bodies import bounding_points, make_body_poses, pose_bodies, upload_motions
-from neurosim_core.streams import HostCopy, HostInput, Milestone
 
 PROBE_SPACING_PX = 16
 """Distance between the rays that look for what moves [px]: a 256th of the rays of a render. Flying sideways
@@ -459,7 +459,7 @@ class DisplacementRule:
         self._slots, self._step_s = zeros(self._block, int), zeros(self._block, wp.float64)
         self._shifts = zeros(rows, wp.vec2)
         self._inputs = [HostInput(array) for array in (self._slots, self._step_s, self._shifts)]
-        self._done = Milestone(device)
+        self._done = Fence(device)
         self._started = False
         self._last_ns = 0
         self._measured: dict[int, int] = {}

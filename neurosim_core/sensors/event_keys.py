@@ -11,10 +11,18 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.clock import NS_PER_US
+from neurosim_core.runtime.cuda import (
+    BufferPool,
+    Fence,
+    GraphCache,
+    HostCopy,
+    HostInput,
+    RecordedLaunch,
+    size_class,
+)
 from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.streams import Graphs, HostCopy, HostInput, LentBlocks, Milestone, Relaunch, size_class
 
 ROOM_PER_PIXEL = 16
 """Events for which there is room on a CPU before any have come: pages that nobody touched cost nothing there,
@@ -80,13 +88,13 @@ class EventKeys:
         self._order = self._empty(0, wp.int32)
         self._rooms: dict[int, wp.array[wp.int64]] = {}
         """Of both buffers, by address, what keys may be in."""
-        self._blocks = LentBlocks(device) if on_host and device.is_cuda else None
+        self._blocks = BufferPool(device) if on_host and device.is_cuda else None
         """Where events go that are copied to the host."""
         self._columns: list[Any] = []
         """What is copied to them: one block of memory, as each type that is in it."""
         self._frame_count = 0
-        self._read = Milestone(device)
-        self._carry_over = Relaunch(event_cut.carry_over, device)
+        self._read = Fence(device)
+        self._carry_over = RecordedLaunch(event_cut.carry_over, device)
         self._make_window_buffers(16)
 
     def clear(self, origin_us: int) -> None:
@@ -136,7 +144,7 @@ class EventKeys:
         if self.count > 0:
             wp.copy(keys, self.keys, count=self.count)
         self.keys = keys
-        self._graphs = Graphs(self._device)
+        self._graphs = GraphCache(self._device)
         self._spare = self._buffer(room)
         self._rooms = {buffer.ptr: buffer[:room] for buffer in (self.keys, self._spare)}
         if self._device.is_cuda:
@@ -205,7 +213,7 @@ class EventKeys:
         return columns, self._found_on_host.rows(0, len(ends_ns)).tolist()
 
     def _cut_to_host(
-        self, blocks: LentBlocks, copied: int, window_count: int, end_bit: int
+        self, blocks: BufferPool, copied: int, window_count: int, end_bit: int
     ) -> tuple[list[Any], list[int]]:
         """Do the same on CUDA with a copy of all events to the host, one column after the other."""
         count, shifts = self.count, [self._row_shift, self._time_shift]
@@ -226,11 +234,11 @@ class EventKeys:
             self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
         else:
             launch()
-        block = blocks.take(_EVENT_BYTES * copied)
+        block = blocks.acquire(_EVENT_BYTES * copied)
         wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()
         self._read.wait()
-        rows = blocks.lend(block, _EVENT_BYTES * copied)
+        rows = blocks.hand_out(block, _EVENT_BYTES * copied)
         columns = []
         for offset, dtype in zip(_OFFSETS, map(wp.dtype_to_numpy, _COLUMN_TYPES), strict=True):
             size = np.dtype(dtype).itemsize
@@ -271,7 +279,7 @@ class EventKeys:
         return keys
 
     def _make_window_buffers(self, window_count: int) -> None:
-        self._graphs = Graphs(self._device)  # they name the buffers
+        self._graphs = GraphCache(self._device)  # they name the buffers
         self._told = HostInput(wp.zeros(_TOLD + window_count, dtype=wp.int64, device=self._device))
         self._bounds = self._told.array[_TOLD:]
         self._found = wp.zeros(window_count, dtype=wp.int32, device=self._device)

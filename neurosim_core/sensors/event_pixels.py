@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from neurosim_core.cores import following
 from neurosim_core.priority import spared_count
 from neurosim_core.render.launch import core_count
+from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.sensors import event_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
-from neurosim_core.streams import HostCopy, HostInput, Milestone
 
 _PIXELS_PER_THREAD_MIN = 16_384
 _KEYS_PER_PIXEL = 4
@@ -61,7 +61,7 @@ class Scan:
     number: int
     """Its own for ever: a graph may be made of its buffers."""
     chunks: list[Chunk]
-    done: Milestone
+    done: Fence
     inputs: HostInput
     """The counters of each chunk, as they begin; then `times`."""
     times: NDArray[np.int64]
@@ -188,7 +188,7 @@ class Pixels:
         return Scan(
             number=next(self._scan_number),
             chunks=chunks,
-            done=Milestone(self._device),
+            done=Fence(self._device),
             inputs=inputs,
             times=inputs.rows[first_time:],
             since_reset_ns=inputs.array[first_time : first_time + 1],
@@ -217,7 +217,7 @@ class Pixels:
             self._key_room = 1 << (2 * counts[0] - 1).bit_length()
 
     def launch_key(self, scan: Scan) -> Hashable:
-        """Return the key of the launches of a scan: same key, same launches (`streams.Graphs`)."""
+        """Return the key of the launches of a scan: same key, same launches (`streams.GraphCache`)."""
         keys = tuple((chunk.keys.ptr, chunk.keys.shape[0]) for chunk in scan.chunks)
         frames = scan.frames.ptr, len(scan.stamps_ns)
         return scan.number, scan.state, *frames, keys, self.since_reset_ns(0)

@@ -27,9 +27,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
+from neurosim_core.runtime.cuda import Fence
 from neurosim_core.sensors.event_config import ReadoutConfig
 from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.streams import Milestone
 
 wp.set_module_options({"enable_backward": False})
 
@@ -284,7 +284,7 @@ class Readout:
         bus.head, bus.tail, bus.rows = (wp.empty(rows, dtype=wp.int32, device="cpu") for _ in range(3))
         self._bus = bus
         self._counters = wp.zeros(_COUNTERS, dtype=wp.int32, device="cpu")
-        self._arrived = Milestone(self._device)
+        self._arrived = Fence(self._device)
         self._make_buffers(0)
         self._reset_ns = 0
         self._dropped: deque[NDArray[np.int64]] = deque()

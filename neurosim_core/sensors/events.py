@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
+from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_stream
 from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import EventKeys
@@ -30,7 +31,6 @@ from neurosim_core.sensors.event_noise_model import terms_of
 from neurosim_core.sensors.event_pixels import Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
-from neurosim_core.streams import Graphs, Milestone, make_stream, on
 
 __all__ = ["EventCamera", "EventCameraConfig"]
 
@@ -126,9 +126,9 @@ class EventCamera:
             terms=pixel_terms,
         )
         self._scan_count_max = scan_count_max
-        self._graphs = Graphs(device)
-        self._reader = make_stream(device, urgent=True)
-        self._taken = Milestone(device)
+        self._graphs = GraphCache(device)
+        self._reader = make_stream(device, high_priority=True)
+        self._taken = Fence(device)
         """All that was launched to the reader, the only stream that moves keys; feeders wait for it."""
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
@@ -257,7 +257,7 @@ class EventCamera:
     def _plan_scan(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> Scan:
         """Return an idle scan with all that its launches read from the host."""
         self._check_feed(log_radiance, stamps)
-        self._taken.hold()
+        self._taken.wait_on_stream()
         count = len(stamps)
         if count > self._idle[0].row_limit.shape[0]:
             self._idle[0] = self._make_scan(count)
@@ -321,7 +321,7 @@ class EventCamera:
             RuntimeError: If the camera was not reset.
             ValueError: If a value of the frames was not finite or beyond +-1000; it must be reset then.
         """
-        with on(self._reader):
+        with use_stream(self._reader):
             while self._under_way:
                 self._take_over()
             packets = self._cut([self._require_reset()])
@@ -357,7 +357,7 @@ class EventCamera:
                 self._take_over()
             self._require_reset()
             return []
-        with on(self._reader):
+        with use_stream(self._reader):
             for _ in range(count):
                 self._take_over()
             self._taken.set()
@@ -418,7 +418,7 @@ class EventCamera:
         scan = self._under_way[0]
         counts = self._read_counts(scan)
         if sum(counts) > self.config.event_count_max or not _have_room(scan, counts):
-            with on(self._reader):
+            with use_stream(self._reader):
                 counts = self._redo(scan, counts)
                 self._taken.set()
         if self._in_place:

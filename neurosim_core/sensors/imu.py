@@ -17,8 +17,8 @@ Reference: IEEE Std 952-1997, annex C, for the Allan variances: N^2 / T (white),
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -26,8 +26,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from neurosim_core.frames import Mount
+from neurosim_core.packets import ImuSample
 from neurosim_core.random import normal2, random_bits, stream_id
-from neurosim_core.settings import Settings
+from neurosim_core.registry import register
+from neurosim_core.sensors.base import Sampler, SamplerContext, StateSensorConfig
 from neurosim_core.vehicle import Multirotor
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
@@ -47,7 +49,7 @@ vec_processes = wp.types.vector(length=_PROCESSES, dtype=wp.float64)
 NonNegative = Annotated[float, Field(ge=0.0)]
 
 
-class ImuConfig(Settings):
+class ImuConfig(StateSensorConfig):
     """An inertial measurement unit: its place, its rate, and its errors, of which it has none by default."""
 
     mount: Mount = Mount()
@@ -76,6 +78,17 @@ class ImuConfig(Settings):
     """Largest angular rate that can be told about an axis, of either sign [rad/s]; none: no limit."""
     gyroscope_resolution_rad_s: NonNegative = 0.0
     """Step between values of angular rate [rad/s]; 0: continuous."""
+
+
+@register("sensor", "imu")
+class ImuSensorConfig(ImuConfig):
+    """An inertial measurement unit."""
+
+    kind: Literal["imu"] = "imu"
+
+    def make(self, context: SamplerContext) -> "ImuSampler":
+        """Return the sensor at work."""
+        return ImuSampler(self, context)
 
 
 class ImuReading(NamedTuple):
@@ -326,6 +339,37 @@ class Imu:
         """Take the next sample of every vehicle and wait for it; overwrites slot 0."""
         self.measure(0)
         return ImuReading(np.array(self.specific_force.numpy()[0]), np.array(self.angular_rate.numpy()[0]))
+
+
+class ImuSampler(Sampler):
+    """The IMUs of all worlds; arrays are named as the fields of an `ImuSample`."""
+
+    def __init__(self, config: ImuConfig, context: SamplerContext) -> None:
+        self._imu = Imu(
+            config,
+            context.vehicle,
+            name=context.name,
+            slot_count=context.slot_count,
+            seeds=context.seeds,
+            active=context.active,
+        )
+        self.terms = self._imu.terms
+        self.arrays = {
+            "specific_force": self._imu.specific_force,
+            "angular_rate": self._imu.angular_rate,
+        }
+
+    def measure(self, slot: int) -> None:
+        """Measure all vehicles at their present state."""
+        self._imu.measure(slot)
+
+    def reset(self, mask: Any) -> None:
+        """Begin again at sample 0 in some worlds."""
+        self._imu.reset(mask)
+
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> ImuSample:
+        """Return one sample as a packet."""
+        return ImuSample(**header, **rows)
 
 
 def _terms(config: ImuConfig) -> tuple[str, ...]:

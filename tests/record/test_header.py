@@ -11,13 +11,11 @@ from scipy.spatial.transform import Rotation
 from neurosim_core.frames import Mount
 from neurosim_core.record import Intrinsics, describe_sensors
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.sensors.rig import (
-    DepthSensorConfig,
-    EventSensorConfig,
-    ImuSensorConfig,
-    OdometrySensorConfig,
-    RgbSensorConfig,
-)
+from neurosim_core.sensors.depth import DepthSensorConfig
+from neurosim_core.sensors.event_camera import EventSensorConfig
+from neurosim_core.sensors.imu import ImuSensorConfig
+from neurosim_core.sensors.odometry import OdometrySensorConfig
+from neurosim_core.sensors.rgb import RgbSensorConfig
 
 LENS = PinholeConfig(width=20, height=10, fx=11.0, fy=12.0, cx=9.5, cy=5.5)
 

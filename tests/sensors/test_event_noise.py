@@ -16,7 +16,7 @@ from neurosim_core.packets import EventArrays, Events
 from neurosim_core.sensors import event_noise, event_pixels
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.events import EventCamera
-from neurosim_core.simulation import run
+from neurosim_core.sim import run
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from neurosim_core import streams
+from neurosim_core.runtime import cuda
 from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, events
 
 _MODULES = (streams, events, event_keys, event_pixels, event_readout)
@@ -98,7 +98,7 @@ class LateDevice(str):
     def make_stream(self, device: Any, *, urgent: bool = False) -> LateStream:
         """Return a new stream."""
         stream = LateStream()
-        self.streams.append(stream)
+        self.cuda.append(stream)
         return stream
 
 
@@ -133,8 +133,8 @@ class _LateWarp:
         self._device.add(lambda: wp.utils.radix_sort_pairs(keys, values, count, **kwargs))
 
 
-class _LateMilestone:
-    """A point in a stream, for `streams.Milestone`; no wait is launched where that launches none."""
+class _LateFence:
+    """A point in a stream, for `cuda.Fence`; no wait is launched where that launches none."""
 
     def __init__(self, device: LateDevice) -> None:
         self._device = device
@@ -157,8 +157,8 @@ class _LateMilestone:
             self._device.add(lambda: None, after=self._point)
 
 
-class _LateGraphs:
-    """Records sequences and replays them, for `streams.Graphs`."""
+class _LateGraphCache:
+    """Records sequences and replays them, for `cuda.GraphCache`."""
 
     def __init__(self, device: LateDevice) -> None:
         self._device = device
@@ -222,13 +222,13 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
     for module in _MODULES:
         monkeypatch.setattr(module, "wp", late)
         if module is not streams:
-            monkeypatch.setattr(module, "Milestone", lambda _: _LateMilestone(device), raising=False)
-            monkeypatch.setattr(module, "Graphs", lambda _: _LateGraphs(device), raising=False)
-    monkeypatch.setattr(events, "on", device.on)
+            monkeypatch.setattr(module, "Fence", lambda _: _LateFence(device), raising=False)
+            monkeypatch.setattr(module, "GraphCache", lambda _: _LateGraphCache(device), raising=False)
+    monkeypatch.setattr(events, "use_stream", device.on)
     monkeypatch.setattr(events, "make_stream", device.make_stream)
-    monkeypatch.setattr(streams.Relaunch, "launch", relaunch)
-    monkeypatch.setattr(streams.HostInput, "__init__", host_input)
-    monkeypatch.setattr(streams.HostCopy, "__init__", host_copy)
+    monkeypatch.setattr(cuda.RecordedLaunch, "launch", relaunch)
+    monkeypatch.setattr(cuda.HostInput, "__init__", host_input)
+    monkeypatch.setattr(cuda.HostCopy, "__init__", host_copy)
     monkeypatch.setattr(wp.array, "numpy", late_numpy)
     monkeypatch.setattr(wp.array, "zero_", lambda array: device.add(lambda: zero(array)))
     monkeypatch.setattr(wp.array, "fill_", lambda array, value: device.add(lambda: fill(array, value)))

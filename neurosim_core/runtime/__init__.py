@@ -1,0 +1,1 @@
+"""What keeps a device busy: streams, graphs, pinned memory, and wall-clock time by phase."""

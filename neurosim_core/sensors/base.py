@@ -1,0 +1,253 @@
+"""What a sensor is to the engine: a sensor is one file that registers one subclass of these classes.
+
+A *state sensor* (IMU, odometry) reads the state of the vehicles at its stamps: its config makes a `Sampler`.
+An *image sensor* (RGB, depth) takes a picture that the renderer has computed: its config names the output of
+the renderer, and turns the picture into a packet. A *frame sensor* (the event camera) sees every instant that
+is rendered for it: its config makes a `FrameSensor`. The engine asks for nothing else, and never which sensor
+it is.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
+
+from numpy.typing import NDArray
+from pydantic import Field
+
+from neurosim_core.clock import Rate
+from neurosim_core.frames import Mount
+from neurosim_core.packets import Image, ImageEncoding, Packet
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.settings import Settings
+from neurosim_core.vehicle import Multirotor
+
+RateHz = Annotated[float, Field(gt=0.0, le=1e6)]
+
+
+class RenderRequest(NamedTuple):
+    """What a camera asks of the renderer."""
+
+    outputs: frozenset[str]
+    """Some of `render.film.OUTPUTS`."""
+    rate_hz: float
+    """How often [Hz]."""
+    every_instant: bool = False
+    """It has to see all instants that are rendered in its group, in order, and sets the clock of the group."""
+    max_displacement_px: float | None = None
+    """Adaptive sampling: an instant is rendered only where something would move further than this [px]."""
+    required: Rate | None = None
+    """Ticks that are rendered in any case."""
+
+
+class SensorConfig(Settings):
+    """Settings of a sensor. Subclasses add `kind: Literal["..."]` and are registered under that kind."""
+
+    @property
+    def clock(self) -> Rate:
+        """When it samples."""
+        return Rate(self.rate_hz)  # type: ignore[attr-defined,no-any-return]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SamplerContext:
+    """What a state sensor is made for."""
+
+    name: str
+    """Its name in the settings; two sensors with different names have independent noise."""
+    vehicle: Multirotor
+    """The vehicles of all worlds."""
+    slot_count: int
+    """How many samples its arrays hold."""
+    seeds: Any
+    """Seed of each world, device array of uint64, shape [world]."""
+    active: Any
+    """0 where a world is not measured, device array of int32, shape [world]."""
+
+
+class Sampler(ABC):
+    """A state sensor at work, in all worlds.
+
+    Attributes:
+        terms: What is computed beyond what every such sensor needs.
+        arrays: What it measures, by name: device arrays of shape [slot, world, ...].
+    """
+
+    terms: tuple[str, ...] = ()
+    arrays: Mapping[str, Any]
+
+    @abstractmethod
+    def measure(self, slot: int) -> None:
+        """Measure all vehicles at their present state into a slot of the arrays; launches only."""
+
+    @abstractmethod
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet:
+        """Return one sample of one world as a packet.
+
+        Args:
+            rows: The sample's element of each array, on the host.
+            header: `stamp_ns`, `sequence` and `sensor` of the packet.
+        """
+
+    def reset(self, mask: Any) -> None:  # noqa: B027  (most sensors have no memory)
+        """Begin anew where the mask is not 0, device array of int32, shape [world]; launches only."""
+
+
+class StateSensorConfig(SensorConfig):
+    """A sensor that reads the state of the vehicle."""
+
+    def make(self, context: SamplerContext) -> Sampler:
+        """Return the sensor at work."""
+        raise NotImplementedError(f"{type(self).__name__} must say how it is made")
+
+
+class CameraConfig(SensorConfig):
+    """What every camera has: a lens and a place on the body."""
+
+    lens: PinholeConfig = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
+    """Resolution and field of view."""
+    mount: Mount = Mount(position_m=(0.1, 0.0, 0.03))
+    """Pose of the camera on the body."""
+
+    def render_request(self) -> RenderRequest:
+        """Return what it asks of the renderer."""
+        raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
+
+
+class ImageSensorConfig(CameraConfig):
+    """A camera that takes pictures of one output of the renderer."""
+
+    rate_hz: RateHz = 20.0
+    """Pictures a second [Hz]."""
+
+    output: ClassVar[str]
+    """What it takes pictures of, one of `render.film.OUTPUTS`."""
+    encoding: ClassVar[ImageEncoding]
+    """What a pixel of its pictures is."""
+
+    def render_request(self) -> RenderRequest:
+        """Return what it asks of the renderer."""
+        return RenderRequest(outputs=frozenset([self.output]), rate_hz=self.rate_hz)
+
+    def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
+        """Return a picture as a packet.
+
+        Args:
+            picture: The output of the renderer on the host, shape [H, W] or [H, W, C]; the packet's to keep.
+            header: `stamp_ns`, `sequence` and `sensor` of the packet.
+        """
+        return Image(data=picture, encoding=self.encoding, **header)
+
+
+class FrameSensor(Protocol):
+    """A frame sensor at work in one world, whose packets go to the host."""
+
+    terms: tuple[str, ...]
+    watching: bool
+    """It has a reference, and saw every instant that was rendered since."""
+
+    def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
+        """Launch what it makes of the frames of a batch, device array, shape [>= K, H, W]."""
+
+    def read(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[Packet]:
+        """Wait for the oldest batch, and return the packets that end in it, at most at a stamp."""
+
+    def flush(self, *, until_ns: int) -> list[Packet]:
+        """Return the packet that has begun and not ended."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameContext:
+    """What a frame sensor is made for."""
+
+    name: str
+    width: int
+    """[px]."""
+    height: int
+    """[px]."""
+    device: str
+    in_flight: int
+    """The most batches that it has seen and that were not read."""
+    seed: int
+    """Of the episode."""
+
+
+class WorldFrameSensor(Protocol):
+    """A frame sensor at work in all worlds, whose results stay on the device.
+
+    Its pixels have two states, the present one and that after the next frames, which take turns: the *parity*
+    of a step says which is the present one.
+    """
+
+    terms: Sequence[str]
+    results: Any
+    """What it found in the last step, on the device."""
+
+    def begin(self, mask: Any, parity: int) -> None:
+        """Let some worlds take frame 0 as their reference, device array of int32, shape [N]; launches only."""
+
+    def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
+        """Return offsets of a step on the device; whoever makes a graph with them keeps them."""
+
+    def find(self, clock_ns: Any, offsets_ns: tuple[int, ...], parity: int) -> None:
+        """Look at the frames of a step; launches only, on CUDA.
+
+        Args:
+            clock_ns: Time of each world at the begin of the step [ns], int64, shape [N].
+            offsets_ns: From there to the last frame seen before (<= 0), and to each frame [ns].
+            parity: Which of the two states is the present one.
+        """
+
+    def seed(self, seeds: Sequence[int]) -> None:
+        """Draw what stays in the pixels anew; waits for the device."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorldFrameContext:
+    """What a frame sensor of many worlds is made for."""
+
+    name: str
+    configs: Sequence[Any]
+    """Its settings in each world."""
+    frames: Any
+    """Log radiance of all worlds, float32, shape [N, K, H W]."""
+    capacity: int
+    """Room for results of one world in one step (`FrameSensorConfig.world_capacity`)."""
+    seeds: Sequence[int]
+    """Of each world."""
+    ordered: bool
+    """Sort the results of each world."""
+
+
+class FrameSensorConfig(CameraConfig):
+    """A camera that sees every instant that is rendered for it."""
+
+    def make(self, context: FrameContext) -> FrameSensor:
+        """Return the sensor at work in one world."""
+        raise NotImplementedError(f"{type(self).__name__} must say how it is made")
+
+    def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
+        """Return for how many results of each world there is room in a step.
+
+        Args:
+            world_count: Number of worlds N.
+            event_capacity: What the user asks for; None: as the sensor likes.
+
+        Raises:
+            ValueError: They are more than can be counted.
+        """
+        return event_capacity or 0
+
+    def make_worlds(self, context: WorldFrameContext) -> WorldFrameSensor:
+        """Return the sensor at work in many worlds.
+
+        Raises:
+            ValueError: It cannot be in many worlds; the message says why.
+        """
+        raise ValueError(f"{context.name!r} is for single runs")
+
+    def packet_clock(self) -> Rate:
+        """Return the clock at which packets end."""
+        raise NotImplementedError(f"{type(self).__name__} must say when its packets end")

@@ -1,0 +1,172 @@
+"""The event camera as a sensor of a vehicle: what is rendered for it, and when its packets end."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from neurosim_core.clock import Rate
+from neurosim_core.packets import Events, Packet
+from neurosim_core.registry import register
+from neurosim_core.sensors.base import (
+    FrameContext,
+    FrameSensorConfig,
+    RateHz,
+    RenderRequest,
+    WorldFrameContext,
+)
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_worlds import WorldEventCamera
+from neurosim_core.sensors.events import EventCamera
+
+_ROOM_MIN = 1024
+"""Events of one world in one step for which there is room at least."""
+_INDEX_MAX = 2**31 - 1
+"""Events of all worlds are counted in 32 bits."""
+
+
+@register("sensor", "event_camera")
+class EventSensorConfig(FrameSensorConfig):
+    """An event camera."""
+
+    kind: Literal["event_camera"] = "event_camera"
+    pixel: EventCameraConfig = EventCameraConfig()
+    """The law of its pixels."""
+    sampling_rate_hz: RateHz = 500.0
+    """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
+    max_displacement_px: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+    """Adaptive sampling: a tick of the sampling rate is rendered only if without it some point would have
+    moved further than this between two renders [px]; ends of packets are always rendered. `sampling_rate_hz`
+    is then the finest step, and may be high, such as 10000. null: every tick is rendered."""
+    packet_rate_hz: RateHz | None = None
+    """How many packets of events are sent a second [Hz]; each holds the events of its whole window. null: the
+    highest rate up to 100 Hz that divides the sampling rate."""
+
+    @property
+    def clock(self) -> Rate:
+        """When log radiance is rendered for it."""
+        return Rate(self.sampling_rate_hz)
+
+    def packet_clock(self) -> Rate:
+        """Return the clock at which packets end."""
+        if self.packet_rate_hz is not None:
+            return Rate(self.packet_rate_hz)
+        sampling = Fraction(str(self.sampling_rate_hz))
+        shares = (sampling / count for count in itertools.count(max(1, math.ceil(sampling / 100))))
+        return Rate(float(next(share for share in shares if Fraction(str(float(share))) == share)))
+
+    def render_request(self) -> RenderRequest:
+        """Return what it asks of the renderer."""
+        adaptive = self.max_displacement_px is not None
+        return RenderRequest(
+            outputs=frozenset(["log_radiance"]),
+            rate_hz=self.sampling_rate_hz,
+            every_instant=True,
+            max_displacement_px=self.max_displacement_px,
+            required=self.packet_clock() if adaptive else None,
+        )
+
+    def make(self, context: FrameContext) -> EventChannel:
+        """Return the camera at work in one world."""
+        return EventChannel(self, context)
+
+    def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
+        """Return for how many events of each world there is room in a step."""
+        capacity = event_capacity or max(_ROOM_MIN, 2 * self.lens.width * self.lens.height)
+        if world_count * capacity > _INDEX_MAX:
+            raise ValueError(
+                f"{world_count} worlds with room for {capacity} events each are more than 2^31: give a "
+                f"smaller event_capacity, at most {_INDEX_MAX // world_count}, or take fewer worlds"
+            )
+        return capacity
+
+    def make_worlds(self, context: WorldFrameContext) -> WorldEventCamera:
+        """Return the camera at work in many worlds."""
+        pixels = [config.pixel for config in context.configs]
+        if any(pixel.readout is not None for pixel in pixels):
+            raise ValueError(
+                f"readout of {context.name!r} is for single runs: events wait for each other on the host"
+            )
+        return WorldEventCamera(
+            pixels,
+            width=self.lens.width,
+            height=self.lens.height,
+            frames=context.frames,
+            capacity=context.capacity,
+            sensor=context.name,
+            seeds=context.seeds,
+            ordered=context.ordered,
+        )
+
+    @model_validator(mode="after")
+    def _packets_end_on_renders(self) -> EventSensorConfig:
+        rate_hz, sampling_hz = self.packet_rate_hz, self.sampling_rate_hz
+        if rate_hz is not None and not Rate(sampling_hz).contains(Rate(rate_hz)):
+            raise ValueError(
+                f"packet_rate_hz must divide sampling_rate_hz = {sampling_hz:g} without remainder, "
+                f"got {rate_hz:g}"
+            )
+        return self
+
+
+class EventChannel:
+    """An event camera of one world, whose packets go to the host.
+
+    Attributes:
+        camera: Finds the events.
+        terms: What is computed beyond ideal pixels.
+        watching: It has a reference, and saw every instant that was rendered since.
+    """
+
+    def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
+        self.camera = EventCamera(
+            config.pixel,
+            width=context.width,
+            height=context.height,
+            device=context.device,
+            sensor=context.name,
+            seed=context.seed,
+            scan_count_max=context.in_flight,
+            on_host=True,
+        )
+        self.terms = self.camera.terms
+        self.watching = False
+        self._packets = config.packet_clock()
+        self._sequence = 0
+        self._seen_ns = 0
+
+    def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
+        """Launch the scan of the instants of a batch; the first that it sees is its reference."""
+        first = 0
+        if not self.watching:
+            self.camera.reset(frames[0], stamps_ns[0], sequence=self._sequence)
+            self.watching = True
+            first = 1
+        stamps_ns = stamps_ns[first:]
+        if stamps_ns:
+            self.camera.feed_device(frames[first:] if first else frames, stamps_ns)
+
+    def read(self, stamps_ns: Sequence[int], *, until_ns: int) -> list[Packet]:
+        """Wait for the oldest batch, and return the packets whose windows end in it, at most at a stamp."""
+        begun_ns = self.camera.window_start_ns
+        ticks = self._packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
+        ends = [tick for tick in ticks if tick in stamps_ns and begun_ns < tick <= until_ns]
+        fed = stamps_ns[-1] > self.camera.stamp_ns
+        self._seen_ns = max((stamp for stamp in stamps_ns if stamp <= until_ns), default=self._seen_ns)
+        packets: list[Events] = self.camera.collect_windows(ends, scan_count=int(fed))
+        self._sequence += len(ends)
+        return [*packets]
+
+    def flush(self, *, until_ns: int) -> list[Packet]:
+        """Return the packet whose window has begun and not ended, cut at the last instant until a stamp."""
+        cut_ns = min(until_ns, self._seen_ns)
+        if not self.watching or self.camera.window_start_ns >= cut_ns:
+            return []
+        packets = self.camera.collect_windows([cut_ns], scan_count=0)
+        self._sequence += 1
+        return [*packets]

@@ -1,0 +1,371 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,index,assignment"
+"""One event camera in many worlds: frames of all worlds in, events of all worlds out, on the device."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from neurosim_core.render.launch import core_count
+from neurosim_core.sensors import event_worlds_scan as scan
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_levels import SUB_BITS
+from neurosim_core.sensors.event_noise import PixelNoise
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
+from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
+
+_SORT_BLOCK_SIZE = 1024
+"""Threads that sort the events of a world, where there may be many."""
+_MANY_EVENTS = 8192
+_OFFSETS_MAX = 4096
+"""Most lists of offsets that are remembered."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorldEvents:
+    """The events of a step in all worlds, on the device, valid until the next step or reset.
+
+    Those of world i are [offsets[i], offsets[i + 1]); beyond the end of the last the arrays have no meaning.
+    They are sorted by (t, y, x, polarity) within each world, unless `make_worlds(sorted=False)`.
+    """
+
+    t: wp.array[wp.int64]
+    """Time since the reset of the world, floored to the microsecond [us], shape [room]."""
+    x: wp.array[wp.uint16]
+    """Column [px], shape [room]."""
+    y: wp.array[wp.uint16]
+    """Row [px], shape [room]."""
+    polarity: wp.array[wp.uint8]
+    """1: brighter, 0: darker, shape [room]."""
+    offsets: wp.array[wp.int32]
+    """Where each world begins, and the end, shape [N + 1]."""
+    counts: wp.array[wp.int32]
+    """Events of each world, shape [N]."""
+    dropped: wp.array[wp.int32]
+    """Events of each world that did not fit and are lost, shape [N]."""
+    counters: wp.array2d[wp.int64]
+    """Of each world, of its last step, or of its reset before the first: events; values of log radiance that
+    were not finite or beyond +-1000, whose pixels kept their last value, or began at 0; and how many values
+    there are from the first of these on, shape [N, 3]."""
+    width: int
+    """Width of the sensor [px]."""
+    height: int
+    """Height of the sensor [px]."""
+
+    def numpy(self, world: int) -> tuple[Any, Any, Any, Any]:
+        """Return t, x, y and polarity of one world on the host; waits for the device."""
+        begin, end = (int(edge) for edge in self.offsets.numpy()[world : world + 2])
+        columns = (self.t, self.x, self.y, self.polarity)
+        if begin == end:  # Warp refuses an empty slice
+            return tuple(np.empty(0, dtype=wp.dtype_to_numpy(column.dtype)) for column in columns)  # type: ignore[return-value]
+        return tuple(np.array(column[begin:end].numpy()) for column in columns)  # type: ignore[return-value]
+
+
+class WorldEventCamera:
+    """Finds the events of one camera of the rig in all worlds.
+
+    Each world gives the events that an `EventCamera` gives alone, also where there are too many: of a step
+    with more than `capacity` events each of its K renders keeps `capacity / K` at most, the rows from the top
+    that fit, and the others are counted in `dropped`.
+
+    Args:
+        configs: The pixels of each world.
+        width: Width of the sensor [px].
+        height: Height of the sensor [px].
+        frames: Log radiance of all worlds, float32, shape [world, K, pixel]; read at each scan.
+        capacity: Room for events of one world in one step.
+        sensor: Name of the sensor: noise depends on it.
+        seeds: Of each world.
+        ordered: Sort the events.
+    """
+
+    def __init__(
+        self,
+        configs: Sequence[EventCameraConfig],
+        *,
+        width: int,
+        height: int,
+        frames: wp.array3d[wp.float32],
+        capacity: int,
+        sensor: str,
+        seeds: Sequence[int],
+        ordered: bool = True,
+    ) -> None:
+        self.device: Any = wp.get_device(frames.device)
+        world_count, frame_count, pixel_count = frames.shape
+        self._configs = list(configs)
+        self._width, self._height, self._sensor = width, height, sensor
+        self._ordered = ordered
+        self._row_shift = SUB_BITS + (width - 1).bit_length()
+        self._time_shift = self._row_shift + (height - 1).bit_length() + 1
+        self._capacity = capacity
+        self._event_count_max: Any = wp.array(
+            [config.event_count_max for config in configs], dtype=wp.int32, device=self.device
+        )
+        self._base = self._empty((world_count, pixel_count), wp.float32)
+        self._last = [self._empty((world_count, pixel_count), wp.float32) for _ in range(2)]
+        self._crossed = [self._empty((world_count, pixel_count), wp.vec2i) for _ in range(2)]
+        self.terms = tuple(sorted({term for config in configs for term in terms_of(config)}))
+        """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
+        self._thresholds: Any = wp.array(
+            [(config.threshold_on, config.threshold_off) for config in configs],
+            dtype=wp.vec2d,
+            device=self.device,
+        )
+        self._screened = self.device.is_cpu and not self.terms
+        scratch = (world_count, pixel_count if self._screened else 0)
+        self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
+        self._lead = self._zeros((world_count, 0 if self.terms else pixel_count), wp.int32)
+        self._stack = self._make_stack(frames, frame_count)
+        self._sections = self._zeros(-(-world_count // int(scan.SECTION)), wp.int64)
+        self._offsets_ns: dict[tuple[int, ...], Any] = {}
+        room = world_count * capacity
+        self.results = WorldEvents(
+            t=self._empty(room, wp.int64),
+            x=self._empty(room, wp.uint16),
+            y=self._empty(room, wp.uint16),
+            polarity=self._empty(room, wp.uint8),
+            offsets=self._zeros(world_count + 1, wp.int32),
+            counts=self._zeros(world_count, wp.int32),
+            dropped=self._stack.dropped,
+            counters=self._stack.counters,
+            width=width,
+            height=height,
+        )
+        self._noise: list[PixelNoise] = []
+        self._models: Any = None
+        self._phase_stream = 0
+        self._random_phase: Any = None
+        self._memories: list[Any] = []
+        if self.terms:
+            self.seed(seeds)
+        self._pool: ThreadPoolExecutor | None = None
+        self._scan = scan.make_noisy_scan(frozenset(self.terms)) if self.terms else scan.scan
+        for module in (scan, self._scan.module):
+            wp.load_module(module, device=self.device)
+
+    def seed(self, seeds: Sequence[int]) -> None:
+        """Draw what stays in the pixels anew, and let later noise have other seeds; waits for the device."""
+        if not self.terms:
+            return
+        noise = [
+            PixelNoise(
+                config,
+                pixel_count=self._base.shape[1],
+                ring_size=2,
+                seed=seed,
+                sensor=self._sensor,
+                device=self.device,
+                terms=self.terms,
+            )
+            for config, seed in zip(self._configs, seeds, strict=True)
+        ]
+        for each in noise:
+            each.set_reset(0)
+        models: Any = wp.array([each.model for each in noise], dtype=PixelModel, device=self.device)
+        memories: list[Any] = [
+            wp.array([each.memory(slot) for each in noise], dtype=Memory, device=self.device)
+            for slot in range(2)
+        ]
+        if self._models is None:
+            self._models, self._memories = models, memories
+            self._phase_stream = noise[0].phase()[0]  # it hangs on the name of the sensor
+            self._random_phase = wp.array(
+                [each.phase()[1] for each in noise], dtype=wp.bool, device=self.device
+            )
+        else:  # graphs hold these arrays
+            for array, values in zip((self._models, *self._memories), (models, *memories), strict=True):
+                wp.copy(array, values)
+            wp.synchronize_device(self.device)  # before what the copies were made of is freed
+        self._noise = noise
+
+    def begin(self, mask: wp.array[wp.int32], parity: int) -> None:
+        """Let some worlds take frame 0 as their reference, and forget all events; launches only.
+
+        Args:
+            mask: Not 0: this world, shape [world].
+            parity: Which of the two states is the present one.
+        """
+        shape = self._base.shape
+        for array in (self.results.offsets, self.results.counts, self._stack.dropped, self._stack.counters):
+            array.zero_()
+        wp.launch(
+            scan.begin_pixels,
+            dim=shape,
+            inputs=[mask, self._stack.log_radiance],
+            outputs=[self._base, self._last[parity], self._crossed[parity], self._stack.counters],
+            device=self.device,
+        )
+        if self.terms:
+            wp.launch(
+                scan.begin_noise,
+                dim=shape,
+                inputs=[self._models, self._phase_stream, self._random_phase, mask, self._base],
+                outputs=[self._memories[parity]],
+                device=self.device,
+            )
+
+    def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
+        """Return offsets of a pattern on the device; whoever makes a graph with them keeps them."""
+        if offsets_ns not in self._offsets_ns:
+            if len(self._offsets_ns) >= _OFFSETS_MAX:
+                self._offsets_ns.clear()
+            self._offsets_ns[offsets_ns] = wp.array(
+                np.array(offsets_ns, dtype=np.int64), dtype=wp.int64, device=self.device
+            )
+        return self._offsets_ns[offsets_ns]
+
+    def find(self, clock_ns: wp.array[wp.int64], offsets_ns: tuple[int, ...], parity: int) -> None:
+        """Find the events of a step; launches only, on CUDA.
+
+        Args:
+            clock_ns: Time of each world at the begin of the step [ns].
+            offsets_ns: From there to the last frame seen before, and to each frame [ns]; seen before on the
+                host, so that nothing is allocated.
+            parity: Which of the two states is the present one; the other is after this, if there is a frame.
+        """
+        frame_count = len(offsets_ns) - 1
+        world_count = self._base.shape[0]
+        self._launch(scan.begin_step, world_count, [clock_ns, self.offsets(offsets_ns)], [self._stack])
+        if frame_count > 0:
+            self._take_frames(frame_count, scan.ALL, parity)
+            self._launch(
+                scan.find_overflow, world_count, [self._capacity, self._event_count_max], [self._stack]
+            )
+            if self.device.is_cuda or self._stack.overflow.numpy().any():
+                self._take_frames(frame_count, scan.COUNT, parity)
+                each = self._capacity // frame_count
+                self._launch(scan.limit_rows, world_count, [each, self._event_count_max], [self._stack])
+                self._take_frames(frame_count, scan.AGAIN, parity)
+        self._hand_out()
+
+    def _hand_out(self) -> None:
+        events, world_count = self.results, self._base.shape[0]
+        lanes = BLOCK_SIZE if self.device.is_cuda else 1
+        if self._ordered:
+            self._sort()
+        counters, sections = self._stack.counters, self._sections
+        self._launch(scan.add_up_sections, sections.shape[0], [counters], [sections])
+        self._launch(scan.add_up, world_count + 1, [counters, sections], [events.offsets, events.counts])
+        wp.launch(
+            scan.decode,
+            dim=(world_count, lanes),
+            block_dim=BLOCK_SIZE,
+            inputs=[self._row_shift, self._time_shift, lanes, self._stack, events.offsets],
+            outputs=[events.t, events.x, events.y, events.polarity],
+            device=self.device,
+        )
+
+    def _sort(self) -> None:
+        world_count = self._base.shape[0]
+        if self.device.is_cuda:
+            block = _SORT_BLOCK_SIZE if self._capacity > _MANY_EVENTS else BLOCK_SIZE
+            wp.launch(
+                scan.sort_keys,
+                dim=(world_count, block),
+                block_dim=block,
+                inputs=[self._stack.counters, self._stack.keys],
+                device=self.device,
+            )
+            return
+        keys, counts = self._stack.keys.numpy(), self._stack.counters.numpy()[:, 0]
+
+        def sort(first: int, end: int) -> None:
+            for world in range(first, end):
+                keys[world, : counts[world]].sort()  # several times as fast as the network on a CPU
+
+        self._share(sort)
+
+    def _take_frames(self, frame_count: int, part: int, parity: int) -> None:
+        """Scan all pixels: on a CUDA device at once, on the CPU some worlds on each core."""
+
+        def take(first: int, end: int) -> None:
+            if self._screened:
+                tiles = -(-self._base.shape[1] // int(TILE_SIZE))
+                wp.launch(
+                    scan.screen,
+                    dim=(end - first, tiles),
+                    inputs=[
+                        self._thresholds,
+                        first,
+                        frame_count,
+                        self._stack,
+                        self._base,
+                        self._crossed[parity],
+                    ],
+                    outputs=[*self._quiet_range, self._lead],
+                    device=self.device,
+                )
+            block = BLOCK_SIZE if self.device.is_cuda else 1
+            own = [self._models] if self.terms else [self._thresholds]
+            lead = [] if self.terms else [self._lead]
+            memory = [[self._memories[slot]] if self.terms else [] for slot in (parity, 1 - parity)]
+            wp.launch(
+                self._scan,
+                dim=(end - first, -(-self._base.shape[1] // block) * block),  # whole blocks to a world
+                block_dim=BLOCK_SIZE,
+                inputs=[
+                    *own,
+                    self._width,
+                    self._row_shift,
+                    self._time_shift,
+                    first,
+                    frame_count,
+                    part,
+                    *lead,
+                    self._base,
+                    self._last[parity],
+                    self._crossed[parity],
+                    *memory[0],
+                    self._stack,
+                ],
+                outputs=[self._last[1 - parity], self._crossed[1 - parity], *memory[1]],
+                device=self.device,
+            )
+
+        self._share(take)
+
+    def _share(self, work: Callable[[int, int], None]) -> None:
+        """Do some worlds on each core of a CPU; on a CUDA device all at once."""
+        world_count = self._base.shape[0]
+        parts = min(core_count(), world_count) if self.device.is_cpu else 1
+        edges = [world_count * part // parts for part in range(parts + 1)]
+        if parts > 1 and self._pool is None:
+            self._pool = ThreadPoolExecutor(parts - 1, thread_name_prefix="world-events")
+        futures = [
+            self._pool.submit(work, first, end) for first, end in itertools.pairwise(edges[1:]) if self._pool
+        ]
+        work(edges[0], edges[1])
+        for future in futures:
+            future.result()
+
+    def _launch(self, kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _make_stack(self, frames: wp.array3d[wp.float32], frame_count: int) -> Any:
+        world_count = frames.shape[0]
+        stack = scan.Stack()
+        stack.log_radiance = frames
+        stack.stamps = self._zeros((world_count, frame_count + 1), wp.int64)
+        stack.origin_us = self._zeros(world_count, wp.int64)
+        stack.row_limit = wp.full(
+            (world_count, frame_count), self._height, dtype=wp.int32, device=self.device
+        )
+        stack.overflow = self._zeros(world_count, wp.int32)
+        stack.table = self._zeros((world_count, frame_count, self._height), wp.int32)
+        stack.keys = self._empty((world_count, self._capacity), wp.int64)
+        stack.counters = self._zeros((world_count, 3), wp.int64)
+        stack.dropped = self._zeros(world_count, wp.int32)
+        return stack
+
+    def _empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        return wp.empty(shape, dtype=dtype, device=self.device)
+
+    def _zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
+        return wp.zeros(shape, dtype=dtype, device=self.device)

@@ -1,0 +1,498 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
+# mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment,no-untyped-def,valid-type"
+"""Kernels of the events of many worlds: the scan of all their pixels, and their keys in order.
+
+The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise_scan`: their functions get the
+arrays of one world. Every world has keys and counters of its own, and no block of threads takes pixels of
+two, so a block finds room for its events in its world with one atomic operation. Nothing here depends on
+other worlds.
+
+Keys are sorted within each world, by one block each: how many there are is known only to the device, and a
+sort of all worlds together would have to be launched over all the room there is.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from neurosim_core.sensors.event_cut import take_apart
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel
+from neurosim_core.sensors.event_noise_scan import begin_pixel, make_pixel_scan
+from neurosim_core.sensors.event_scan import (
+    BLOCK_SIZE,
+    CLOSE,
+    LIMIT,
+    OPEN,
+    TILE_SIZE,
+    scan_pixel,
+    screen_tile,
+    write_key,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+ALL = wp.constant(0)
+COUNT = wp.constant(1)
+AGAIN = wp.constant(2)
+"""What a scan is for: all worlds; those with too many events, to count these by row; the same with fewer
+rows."""
+
+SECTION = wp.constant(64)
+"""Worlds whose events are added up first: of N worlds no thread reads more than N / 64 + 64 counts."""
+
+_US = wp.constant(wp.int64(1000))
+
+
+@wp.struct
+class Stack:
+    """What the pixels of one camera see in a step, and what comes of it. Shapes begin with [world]."""
+
+    log_radiance: wp.array3d[wp.float32]
+    """[world, frame, pixel]"""
+    stamps: wp.array2d[wp.int64]
+    """Of the state and of each frame, from the origin [ns], [world, frame + 1]."""
+    origin_us: wp.array[wp.int64]
+    """Origin of the keys' time since the reset of the world [us]."""
+    row_limit: wp.array2d[wp.int32]
+    """Rows whose events are kept, [world, frame]."""
+    overflow: wp.array[wp.int32]
+    """1: the world has more events than fit."""
+    table: wp.array3d[wp.int32]
+    """Events of the worlds that have too many, [world, frame, row]; zeros before."""
+    keys: wp.array2d[wp.int64]
+    """[world, capacity]"""
+    counters: wp.array2d[wp.int64]
+    """As in `event_scan.scan`, [world, 3]."""
+    dropped: wp.array[wp.int32]
+    """Events that were lost in the step."""
+
+
+@wp.kernel
+def begin_step(
+    # In:
+    clock_ns: wp.array[wp.int64],
+    offsets_ns: wp.array[wp.int64],
+    # In/out:
+    stack: Stack,
+) -> None:
+    """Set the stamps of a world, and forget the counts of the step before.
+
+    Args:
+        clock_ns: Time of each world at the begin of the step [ns].
+        offsets_ns: From there to the last frame that was seen (<= 0) and to each frame [ns].
+        stack: Its stamps, origins, counts and limits are overwritten.
+    """
+    world = wp.tid()
+    origin_us = (clock_ns[world] + offsets_ns[0]) // _US
+    stack.origin_us[world] = origin_us
+    for frame in range(offsets_ns.shape[0]):
+        stack.stamps[world, frame] = clock_ns[world] + offsets_ns[frame] - origin_us * _US
+    for counter in range(3):
+        stack.counters[world, counter] = wp.int64(0)
+    stack.dropped[world] = 0
+    if stack.overflow[world] != 0:
+        stack.overflow[world] = 0
+        for frame in range(stack.row_limit.shape[1]):
+            stack.row_limit[world, frame] = stack.table.shape[2]
+
+
+@wp.kernel
+def screen(
+    # Model:
+    thresholds: wp.array[wp.vec2d],
+    # In:
+    first_world: wp.int32,
+    frame_count: wp.int32,
+    stack: Stack,
+    base: wp.array2d[wp.float32],
+    crossed: wp.array2d[wp.vec2i],
+    # Out:
+    low_out: wp.array2d[wp.float32],
+    high_out: wp.array2d[wp.float32],
+    lead_out: wp.array2d[wp.int32],
+) -> None:
+    """Count the quiet frames at the start of each pixel; threads are [world, tile], see `event_scan`."""
+    index, tile = wp.tid()
+    world = first_world + index
+    begin = tile * TILE_SIZE
+    screen_tile(
+        thresholds[world][0],
+        thresholds[world][1],
+        begin,
+        wp.min(begin + TILE_SIZE, base.shape[1]),
+        stack.log_radiance[world],
+        frame_count,
+        base[world],
+        crossed[world],
+        low_out[world],
+        high_out[world],
+        lead_out[world],
+    )
+
+
+@wp.kernel
+def scan(
+    # Model:
+    thresholds: wp.array[wp.vec2d],
+    width: wp.int32,
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    # In:
+    first_world: wp.int32,
+    frame_count: wp.int32,
+    part: wp.int32,
+    lead: wp.array2d[wp.int32],
+    base: wp.array2d[wp.float32],
+    last: wp.array2d[wp.float32],
+    crossed: wp.array2d[wp.vec2i],
+    # In/out:
+    stack: Stack,
+    # Out:
+    last_out: wp.array2d[wp.float32],
+    crossed_out: wp.array2d[wp.vec2i],
+) -> None:
+    """Take ideal pixels over the frames of a step; threads are [world, pixel], whole blocks to a world.
+
+    Args:
+        thresholds: ON and OFF of each world.
+        width: Pixels per row.
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        first_world: World of the first threads.
+        frame_count: Frames to scan.
+        part: ALL, COUNT or AGAIN.
+        lead: Frames at the start that are known to be quiet, [world, pixel].
+        base: Log radiance of the reset, likewise.
+        last: Last sample.
+        crossed: Levels crossed upwards and downwards.
+        stack: Frames in; keys, counters or the table out.
+        last_out: `last` after the step.
+        crossed_out: `crossed` after the step.
+    """
+    index, pixel = wp.tid()
+    world = first_world + index
+    if part != ALL and stack.overflow[world] == 0:
+        return
+    scan_pixel(
+        thresholds[world][0],
+        thresholds[world][1],
+        width,
+        row_shift,
+        time_shift,
+        pixel,
+        base.shape[1],
+        pixel % BLOCK_SIZE,
+        stack.log_radiance[world],
+        stack.stamps[world],
+        frame_count,
+        lead[world],
+        stack.row_limit[world],
+        base[world],
+        last[world],
+        crossed[world],
+        part == COUNT,
+        last_out[world],
+        crossed_out[world],
+        stack.keys[world],
+        stack.counters[world],
+        stack.table[world],
+    )
+
+
+@functools.cache
+def make_noisy_scan(terms: frozenset[str]) -> Any:
+    """Return the kernel that does the same for pixels with the given `event_noise_model.TERMS`.
+
+    In place of thresholds it takes a `PixelModel` of each world, and a `Memory` of each before and after.
+    """
+    scan_noisy = make_pixel_scan(terms)
+
+    @wp.kernel(
+        module=wp.get_module("neurosim_core.sensors.event_worlds_scan." + "_".join(sorted(terms))),
+        enable_backward=False,
+    )
+    def scan(
+        # Model:
+        models: wp.array[PixelModel],
+        width: wp.int32,
+        row_shift: wp.int32,
+        time_shift: wp.int32,
+        # In:
+        first_world: wp.int32,
+        frame_count: wp.int32,
+        part: wp.int32,
+        base: wp.array2d[wp.float32],
+        last: wp.array2d[wp.float32],
+        crossed: wp.array2d[wp.vec2i],
+        before: wp.array[Memory],
+        # In/out:
+        stack: Stack,
+        # Out:
+        last_out: wp.array2d[wp.float32],
+        crossed_out: wp.array2d[wp.vec2i],
+        after: wp.array[Memory],
+    ):
+        index, pixel = wp.tid()
+        world = first_world + index
+        if part != ALL and stack.overflow[world] == 0:
+            return
+        keys = stack.keys[world]
+        counters = stack.counters[world]
+        write_key(OPEN, wp.int64(0), keys, counters)
+        if pixel < base.shape[1]:
+            scan_noisy(
+                models[world],
+                width,
+                row_shift,
+                time_shift,
+                pixel,
+                stack.log_radiance[world],
+                stack.stamps[world],
+                stack.origin_us[world] * wp.int64(1000),
+                frame_count,
+                stack.row_limit[world],
+                base[world],
+                last[world],
+                crossed[world],
+                before[world],
+                part == COUNT,
+                last_out[world],
+                crossed_out[world],
+                after[world],
+                keys,
+                counters,
+                stack.table[world],
+            )
+        write_key(CLOSE, wp.int64(0), keys, counters)
+
+    return scan
+
+
+@wp.kernel
+def begin_pixels(
+    # In:
+    mask: wp.array[wp.int32],
+    log_radiance: wp.array3d[wp.float32],
+    # Out:
+    base_out: wp.array2d[wp.float32],
+    last_out: wp.array2d[wp.float32],
+    crossed_out: wp.array2d[wp.vec2i],
+    # In/out:
+    counters: wp.array2d[wp.int64],
+) -> None:
+    """Let the pixels of some worlds take frame 0 as their reference; threads are [world, pixel].
+
+    A value that is not finite, or beyond +-1000, is counted, and 0 is the reference in its place; counters
+    are as those of a step with one frame.
+    """
+    world, pixel = wp.tid()
+    if mask[world] != 0:
+        value = log_radiance[world, 0, pixel]
+        if not wp.abs(value) <= LIMIT:
+            value = wp.float32(0.0)
+            wp.atomic_add(counters, world, 1, wp.int64(1))
+            wp.atomic_max(counters, world, 2, wp.int64(base_out.shape[1]) - wp.int64(pixel))
+        base_out[world, pixel] = value
+        last_out[world, pixel] = value
+        crossed_out[world, pixel] = wp.vec2i(0, 0)
+
+
+@wp.kernel
+def begin_noise(
+    # Model:
+    models: wp.array[PixelModel],
+    phase_stream: wp.uint32,
+    random_phase: wp.array[wp.bool],
+    # In:
+    mask: wp.array[wp.int32],
+    base: wp.array2d[wp.float32],
+    # Out:
+    memory_out: wp.array[Memory],
+) -> None:
+    """Let what pixels remember begin anew in some worlds; threads are [world, pixel]."""
+    world, pixel = wp.tid()
+    if mask[world] != 0:
+        begin_pixel(models[world], phase_stream, random_phase[world], base[world], pixel, memory_out[world])
+
+
+@wp.kernel
+def find_overflow(
+    # Model:
+    capacity: wp.int32,
+    event_count_max: wp.array[wp.int32],
+    # In/out:
+    stack: Stack,
+) -> None:
+    """Mark the worlds that have more events than may be in a step, and clear their table."""
+    world = wp.tid()
+    if stack.counters[world, 0] > wp.int64(wp.min(capacity, event_count_max[world])):
+        stack.overflow[world] = 1
+        for frame in range(stack.table.shape[1]):
+            for row in range(stack.table.shape[2]):
+                stack.table[world, frame, row] = 0
+
+
+@wp.kernel
+def limit_rows(
+    # Model:
+    frame_capacity: wp.int32,
+    event_count_max: wp.array[wp.int32],
+    # In/out:
+    stack: Stack,
+) -> None:
+    """Keep of each frame the rows from the top that fit, as `EventCamera` does; clear the counters."""
+    world = wp.tid()
+    if stack.overflow[world] == 0:
+        return
+    most = wp.min(frame_capacity, event_count_max[world])
+    lost = wp.int32(0)
+    for frame in range(stack.table.shape[1]):
+        kept = wp.int32(0)
+        limit = wp.int32(0)
+        full = wp.bool(False)
+        for row in range(stack.table.shape[2]):
+            count = stack.table[world, frame, row]
+            full = full or kept + count > most
+            if full:
+                lost += count
+            else:
+                kept += count
+                limit += 1
+        stack.row_limit[world, frame] = limit
+    stack.dropped[world] = lost
+    for counter in range(3):
+        stack.counters[world, counter] = wp.int64(0)
+
+
+@wp.kernel
+def add_up_sections(
+    # In:
+    counters: wp.array2d[wp.int64],
+    # Out:
+    sections_out: wp.array[wp.int64],
+) -> None:
+    """Add up the events of `SECTION` worlds; threads are the sections."""
+    section = wp.tid()
+    total = wp.int64(0)
+    for world in range(section * SECTION, wp.min((section + 1) * SECTION, counters.shape[0])):
+        total += counters[world, 0]
+    sections_out[section] = total
+
+
+@wp.kernel
+def add_up(
+    # In:
+    counters: wp.array2d[wp.int64],
+    sections: wp.array[wp.int64],
+    # Out:
+    offsets_out: wp.array[wp.int32],
+    counts_out: wp.array[wp.int32],
+) -> None:
+    """Write where each world begins among the events of all, and how many it has; thread N is the end."""
+    world = wp.tid()
+    before = wp.int64(0)
+    for section in range(world // SECTION):
+        before += sections[section]
+    for other in range(world // SECTION * SECTION, world):
+        before += counters[other, 0]
+    offsets_out[world] = wp.int32(before)
+    if world < counts_out.shape[0]:
+        counts_out[world] = wp.int32(counters[world, 0])
+
+
+@wp.func_native("""
+    // Bitonic, all comparators upwards, the first of each merge mirrored: keys beyond the end would be the
+    // largest and never move, so any number can be sorted in place.
+#if defined(__CUDA_ARCH__)
+    constexpr int SIZE = 4096;
+    __shared__ int64_t shared[SIZE];
+    const int lane = threadIdx.x, lanes = blockDim.x;
+    int64_t* key = keys.data;
+    if (count <= SIZE) {
+        key = shared;
+        for (int i = lane; i < count; i += lanes) key[i] = keys.data[i];
+    }
+#define NEUROSIM_BARRIER __syncthreads()
+#else
+    const int lane = 0, lanes = 1;
+    int64_t* key = keys.data;
+#define NEUROSIM_BARRIER
+#endif
+    for (int log_size = 1; (1 << (log_size - 1)) < count; ++log_size) {
+        const int size = 1 << log_size, half = size >> 1;
+        const int pair_count = ((count + size - 1) >> log_size) << (log_size - 1);
+        NEUROSIM_BARRIER;
+        for (int pair = lane; pair < pair_count; pair += lanes) {
+            const int begin = (pair >> (log_size - 1)) << log_size, place = pair & (half - 1);
+            const int low = begin + place, high = begin + size - 1 - place;
+            if (high < count && key[low] > key[high]) {
+                const int64_t larger = key[low];
+                key[low] = key[high];
+                key[high] = larger;
+            }
+        }
+        for (int log_stride = log_size - 2; log_stride >= 0; --log_stride) {
+            const int stride = 1 << log_stride;
+            NEUROSIM_BARRIER;
+            for (int pair = lane; pair < pair_count; pair += lanes) {
+                const int low = ((pair >> log_stride) << (log_stride + 1)) + (pair & (stride - 1));
+                const int high = low + stride;
+                if (high < count && key[low] > key[high]) {
+                    const int64_t larger = key[low];
+                    key[low] = key[high];
+                    key[high] = larger;
+                }
+            }
+        }
+    }
+    NEUROSIM_BARRIER;
+#undef NEUROSIM_BARRIER
+#if defined(__CUDA_ARCH__)
+    if (count <= SIZE) {
+        for (int i = lane; i < count; i += lanes) keys.data[i] = key[i];
+    }
+#endif
+""")
+def _sort_block(keys: wp.array[wp.int64], count: wp.int32) -> None:
+    """Sort the first `count` keys; all threads of a block come here together."""
+    ...
+
+
+@wp.kernel
+def sort_keys(
+    # In:
+    counters: wp.array2d[wp.int64],
+    # In/out:
+    keys: wp.array2d[wp.int64],
+) -> None:
+    """Sort the keys of each world; threads are [world, lane], one block to a world, on a CPU one thread."""
+    world, _lane = wp.tid()
+    _sort_block(keys[world], wp.int32(counters[world, 0]))
+
+
+@wp.kernel
+def decode(
+    # Model:
+    row_shift: wp.int32,
+    time_shift: wp.int32,
+    lane_count: wp.int32,
+    # In:
+    stack: Stack,
+    offsets: wp.array[wp.int32],
+    # Out:
+    t_out: wp.array[wp.int64],
+    x_out: wp.array[wp.uint16],
+    y_out: wp.array[wp.uint16],
+    polarity_out: wp.array[wp.uint8],
+) -> None:
+    """Take the keys of all worlds apart, world after world; threads are [world, lane]."""
+    world, lane = wp.tid()
+    count = wp.int32(stack.counters[world, 0])
+    for index in range(lane, count, lane_count):
+        event = offsets[world] + index
+        found = take_apart(stack.keys[world, index], row_shift, time_shift)
+        t_out[event] = stack.origin_us[world] + found.time_us
+        x_out[event] = found.x
+        y_out[event] = found.y
+        polarity_out[event] = found.polarity

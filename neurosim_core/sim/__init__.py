@@ -1,0 +1,67 @@
+"""The engine: what a run needs (`model`), what changes in it (`state`), and the data flow (`step`)."""
+
+from neurosim_core.sim.integrate import COLLISION
+from neurosim_core.sim.model import Model, find_device, load_scene, make_fleet, make_model, plan_paths, refit
+from neurosim_core.sim.observation import Observation, Samples
+from neurosim_core.sim.rollout import (
+    PendingStep,
+    acquire_rooms,
+    advance,
+    begin_step,
+    end_step,
+    finish,
+    free_lanes,
+    integrate_period,
+    observe,
+    prepare_step,
+    render_batch,
+    render_batch_by_group,
+    run,
+    run_model,
+    select_cameras,
+    settle,
+    skip_batch,
+    start,
+    step,
+    warm_up,
+)
+from neurosim_core.sim.simulation import Simulation
+from neurosim_core.sim.state import Batch, StartState, State, make_state
+
+__all__ = [
+    "COLLISION",
+    "Batch",
+    "Model",
+    "Observation",
+    "PendingStep",
+    "Samples",
+    "Simulation",
+    "StartState",
+    "State",
+    "acquire_rooms",
+    "advance",
+    "begin_step",
+    "end_step",
+    "find_device",
+    "finish",
+    "free_lanes",
+    "integrate_period",
+    "load_scene",
+    "make_fleet",
+    "make_model",
+    "make_state",
+    "observe",
+    "plan_paths",
+    "prepare_step",
+    "refit",
+    "render_batch",
+    "render_batch_by_group",
+    "run",
+    "run_model",
+    "select_cameras",
+    "settle",
+    "skip_batch",
+    "start",
+    "step",
+    "warm_up",
+]

@@ -1,0 +1,218 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""What the cameras see of one batch: which instants they render, in one launch each, and the packets."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Hashable, Sequence
+
+from neurosim_core.clock import Rate
+from neurosim_core.packets import Packet
+from neurosim_core.runtime.cuda import use_stream
+from neurosim_core.runtime.timing import timed
+from neurosim_core.sensors.base import FrameSensorConfig
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.render_group import (
+    RenderGroupState,
+    RenderJob,
+    acquire_room,
+    bring_images,
+    choose_ticks,
+    disable_frame_sensors,
+    is_due,
+    launch_key,
+    plan_render,
+    read_frames,
+    read_images,
+    scan_frames,
+)
+from neurosim_core.sim.state import Batch, State
+
+
+def launch_cameras(model: Model, state: State, batch: Batch, groups: Collection[int] | None = None) -> None:
+    """Let the cameras that are wanted see a batch, and launch the copies to the host.
+
+    Args:
+        model: What does not change.
+        state: What does.
+        batch: What was flown.
+        groups: Indices of those that render; None: all.
+    """
+    jobs = batch.jobs
+    due = choose(model, state, batch, groups) if jobs is None else ()
+    stream = state.render_streams[batch.number % len(state.batch_done)]
+    with timed(state.wall_s, "render"), use_stream(stream):
+        state.flown[batch.number % state.flight_lane_count].wait_on_stream()
+        if jobs is None:
+            jobs = plan_jobs(state, batch, due)
+        for job in jobs:
+            acquire_room(job)
+            if job.key is None:
+                job.render()
+            else:
+                state.graphs.run(launch_key(job), job.render)
+            bring_images(job.group, job.instants)
+        state.rendered.set()
+    with use_stream(state.event_stream):
+        state.rendered.wait_on_stream()
+        scan(state, batch, jobs)
+
+
+def choose(
+    model: Model, state: State, batch: Batch, groups: Collection[int] | None = None
+) -> list[list[int]]:
+    """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight.
+
+    Those that are not among `groups` have none.
+    """
+    chosen: list[list[int]] = []
+    choices = []
+    for index, group in enumerate(state.groups):
+        if groups is not None and index not in groups:
+            chosen.append([])
+            continue
+        disable_frame_sensors(group, batch.wanted)
+        always = bool(group.world_frames) or any(name in batch.wanted for name in group.frames)
+        due = [
+            place
+            for place, boundary in enumerate(batch.boundaries)
+            if index in boundary.groups and (always or is_due(group, boundary.stamp_ns, batch.wanted))
+        ]
+        if group.rule is not None:
+            with timed(state.wall_s, "choice of renders"), use_stream(state.choice_stream):
+                state.flown[batch.number % state.flight_lane_count].wait_on_stream()
+                choice = choose_ticks(
+                    group,
+                    state.trace,
+                    slots=[batch.slot + place for place in due],
+                    stamps_ns=[batch.boundaries[place].stamp_ns for place in due],
+                    end_ns=model.duration_ns,
+                    wanted=batch.wanted,
+                    required=_required_clocks(model, group),
+                )
+            choices.append(choice)
+            due = [due[place] for place in choice.places]
+        chosen.append(due)
+    batch.choices = choices
+    return chosen
+
+
+def _required_clocks(model: Model, group: RenderGroupState) -> dict[str, Rate]:
+    """Return the clocks whose ticks an adaptive group renders in any case, by frame sensor."""
+    configs = {name: model.config.sensors[name] for name in group.frames}
+    return {name: c.packet_clock() for name, c in configs.items() if isinstance(c, FrameSensorConfig)}
+
+
+def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> list[RenderJob]:
+    """Return what the groups have to render of a batch: at the boundaries chosen for each."""
+    return [
+        plan_render(
+            group,
+            state.trace,
+            slots=[batch.slot + place for place in places],
+            stamps_ns=[batch.boundaries[place].stamp_ns for place in places],
+            lane=batch.number % len(state.batch_done),
+            wanted=batch.wanted,
+            active=state.fleet.active if state.world_count > 1 else None,
+        )
+        for group, places in zip(state.groups, chosen, strict=True)
+        if places
+    ]
+
+
+def scan(state: State, batch: Batch, jobs: Sequence[RenderJob]) -> None:
+    """Let event cameras see what was rendered; that is the end of a batch on the device."""
+    with timed(state.wall_s, "events"):
+        for job in jobs:
+            scan_frames(job.group, job.instants)
+        state.batch_done[batch.number % len(state.batch_done)].set()
+    batch.seen = [(job.group, job.instants) for job in jobs]
+
+
+def plan_ahead(model: Model, state: State, batch: Batch) -> None:
+    """Plan what is rendered of a batch that is going to be flown, unless that depends on the flight."""
+    if model.schedule.sparse or any(group.frames for group in state.groups):
+        return
+    batch.jobs = plan_jobs(state, batch, choose(model, state, batch))
+
+
+def _is_late(batch: Batch) -> bool:
+    """Return whether all that cameras yield is pictures that go to room of the caller's, and all count."""
+    return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
+        not instants.frames and len(instants.rooms) == len(instants.pictures) for _, instants in batch.seen
+    )
+
+
+def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
+    """Wait until the cameras have seen a batch, and return what they yield.
+
+    Args:
+        state: Where it is in flight.
+        batch: What was flown.
+        borrow: Pictures are views of the buffers of the batch.
+    """
+    packets: list[Packet] = []
+    with timed(state.wall_s, "camera read-back"):
+        if not (state.late_pictures and _is_late(batch)):
+            state.batch_done[batch.number % len(state.batch_done)].wait()
+    state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
+    for choice in batch.choices:
+        state.counts["ticks left out"] += choice.left_out_count
+        state.counts["coarse ticks"] += choice.coarse_count
+    with timed(state.wall_s, "events"):
+        for group, instants in batch.seen:
+            events = read_frames(group, instants, until_ns=batch.until_ns)
+            state.counts["events dropped"] += sum(getattr(packet, "dropped_count", 0) for packet in events)
+            packets += events
+    with timed(state.wall_s, "camera read-back"):
+        for group, instants in batch.seen:
+            packets += read_images(group, instants, borrow=borrow)
+    return packets
+
+
+def find_in_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> list[object]:
+    """Let the frame sensors of many worlds see what was rendered; launches only.
+
+    Args:
+        state: The parity of a group that saw a frame turns.
+        batch: What was flown; the clocks of the worlds are at its end.
+        last_seen_ns: For each group, the instant before the batch, <= 0, from its begin [ns].
+
+    Returns:
+        What a graph of these launches has to keep.
+    """
+    held: list[object] = []
+    for group, offsets_ns, parity in _frames_of_worlds(state, batch, last_seen_ns):
+        for sensor in group.world_frames.values():
+            held.append(sensor.offsets(offsets_ns))
+            sensor.find(state.fleet.clock_ns, offsets_ns, parity)
+    return held
+
+
+def prepare_worlds(state: State, batch: Batch, last_seen_ns: Sequence[int]) -> Hashable:
+    """Allocate what `find_in_worlds` needs for a batch, and return what its launches depend on."""
+    frames = _frames_of_worlds(state, batch, last_seen_ns)
+    for group, offsets_ns, _ in frames:
+        for sensor in group.world_frames.values():
+            sensor.offsets(offsets_ns)
+    return tuple((offsets_ns, parity) for _, offsets_ns, parity in frames)
+
+
+def _frames_of_worlds(
+    state: State, batch: Batch, last_seen_ns: Sequence[int]
+) -> list[tuple[RenderGroupState, tuple[int, ...], int]]:
+    """Return for each group with frame sensors when they see a batch, from its end [ns], and the parity."""
+    begin_ns, end_ns = batch.until_ns - sum(batch.elapsed_ns), batch.until_ns
+    found = []
+    for index, group in enumerate(state.groups):
+        if group.world_frames:
+            seen = [b.stamp_ns - end_ns for b in batch.boundaries if index in b.groups]
+            last_ns = last_seen_ns[index] + begin_ns - end_ns
+            found.append((group, (last_ns, *seen), group.parity))
+    return found
+
+
+def turn_parities(state: State, batch: Batch) -> None:
+    """Note that groups which saw a frame are in the other of their two states."""
+    for index, group in enumerate(state.groups):
+        if any(index in boundary.groups for boundary in batch.boundaries):
+            group.parity = 1 - group.parity

@@ -1,0 +1,84 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""What users hand to many worlds: commands and seeds, from the host or on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from neurosim_core.runtime.cuda import Fence, HostInput
+
+
+class CommandBuffer:
+    """Commands of one mode on the device.
+
+    A step that waits for the one before it *stages* them: its launches begin with the `upload`. Steps that
+    run ahead of the device *write* them, through two buffers of the host in turn: the host waits only if the
+    device has not yet copied what it was given two steps ago.
+    """
+
+    def __init__(self, array: Any) -> None:
+        self.array = array
+        self._hosts = [HostInput(array)]
+        self._read = [Fence(array.device) for _ in range(2)]
+        self._turn = 0
+
+    def stage(self, rows: NDArray[np.float64]) -> None:
+        """Keep rows for the next `upload`; what was staged before has been copied."""
+        self._hosts[0].rows[:] = rows
+
+    def upload(self) -> None:
+        """Launch the copy of what was staged."""
+        self._hosts[0].upload()
+
+    def write(self, rows: NDArray[np.float64]) -> None:
+        """Launch the copy of rows to the device."""
+        if len(self._hosts) < 2:
+            self._hosts.append(HostInput(self.array))
+        turn, self._turn = self._turn, 1 - self._turn
+        self._read[turn].wait()
+        self._hosts[turn].rows[:] = rows
+        self._hosts[turn].upload()
+        self._read[turn].set()
+
+
+def make_seeds(seeds: int | ArrayLike, count: int) -> list[int]:
+    """Return a seed for each world.
+
+    Args:
+        seeds: That of world 0, which the others count on from, or one for each.
+        count: Number of worlds.
+
+    Raises:
+        ValueError: They are no integers in [0, 2^64), or of the wrong number.
+    """
+    given = np.asarray(seeds)
+    if not np.issubdtype(given.dtype, np.integer) or given.shape not in ((), (count,)):
+        raise ValueError(
+            f"seeds must be an integer or integers of shape [{count}], got {given.dtype} "
+            f"of shape {list(given.shape)}"
+        )
+    chosen = [int(s) for s in given] if given.ndim else [int(given) + world for world in range(count)]
+    if min(chosen) < 0 or max(chosen) >= 1 << 64:
+        raise ValueError(f"seeds must be in [0, 2^64), got {min(chosen)} to {max(chosen)}")
+    return chosen
+
+
+def as_device_array(value: Any, device: Any) -> Any:
+    """Return a Warp array of the device without a copy, or None: it is something of the host.
+
+    Raises:
+        ValueError: It is on another device, or a tensor through which gradients are to flow.
+    """
+    if isinstance(value, wp.array):
+        if value.device == device:
+            return value
+        raise ValueError(f"arrays must be on {device} or be NumPy arrays, got one on {value.device}")
+    if getattr(value, "requires_grad", False):
+        raise ValueError("gradients do not flow through worlds: give tensor.detach()")
+    if device.is_cuda and hasattr(value, "__cuda_array_interface__"):
+        return wp.from_dlpack(value)
+    return None

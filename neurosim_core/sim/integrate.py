@@ -1,0 +1,284 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""The flight of one batch: commands in, the motion from boundary to boundary, what was sampled there out."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import warp as wp
+from numpy.typing import ArrayLike
+
+from neurosim_core.control import CommandMode, make_controller
+from neurosim_core.frames import as_rows
+from neurosim_core.packets import Collision, Odometry, Packet
+from neurosim_core.runtime.cuda import use_stream
+from neurosim_core.runtime.timing import timed
+from neurosim_core.sim.inputs import CommandBuffer
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.reset import begin_batch, end_batch
+from neurosim_core.sim.schedule import Boundary
+from neurosim_core.sim.state import Batch, State
+from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
+from neurosim_core.vehicle import DynamicsError, Multirotor
+from neurosim_core.vehicle.status import STATUS_COLLISION
+
+logger = logging.getLogger(__name__)
+
+COLLISION = "collision"
+"""Name under which collisions are reported."""
+
+
+def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuffer:
+    """Return where the setpoints of a mode go; the first time, its controller is made.
+
+    Raises:
+        ValueError: The mode is unknown.
+    """
+    if mode not in state.commands:
+        if mode == "motor_speeds":
+            array = state.vehicle.arrays.rotor_speed_command
+        else:
+            state.controllers[mode] = make_controller(
+                mode,
+                model.airframe,
+                model.config.control.gains,
+                count=state.world_count,
+                device=model.device,
+            )
+            array = state.controllers[mode].setpoint
+        state.commands[mode] = CommandBuffer(array)
+    return state.commands[mode]
+
+
+def checked_command(model: Model, state: State, command: ArrayLike, mode: CommandMode) -> Any:
+    """Return setpoints of the host as rows of the mode, shape [N, width].
+
+    Raises:
+        ValueError: They are of a wrong shape or not finite.
+    """
+    command_buffer(model, state, mode)
+    if mode == "motor_speeds":
+        width = model.airframe.rotor_count
+        return as_rows(command, name="rotor_speed_command", count=state.world_count, width=width)
+    return state.controllers[mode].checked(command)
+
+
+def set_command(model: Model, state: State, command: ArrayLike | None, mode: CommandMode) -> None:
+    """Have the next batch begin with a setpoint, which becomes rotor speeds at the state of the vehicle then.
+
+    The batch before has been read: what it took from the host is free.
+    """
+    if command is None:
+        return
+    rows = checked_command(model, state, command, mode)
+    state.commands[mode].stage(rows)
+    state.command_mode = mode
+
+
+def plan_batch(
+    state: State, stretch: Sequence[Boundary], *, closed_loop: bool, begin_ns: int | None = None
+) -> Batch:
+    """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
+
+    Args:
+        state: As of the end of what was launched.
+        stretch: What comes next.
+        closed_loop: Let the path controller command; otherwise the last command is held.
+        begin_ns: Where it begins [ns]; None: at the end of what was launched.
+    """
+    number = state.launched_count
+    stamps_ns = [
+        state.launched_ns if begin_ns is None else begin_ns,
+        *(boundary.stamp_ns for boundary in stretch),
+    ]
+    elapsed_ns = [end - begin for begin, end in itertools.pairwise(stamps_ns)]
+    return Batch(
+        boundaries=stretch,
+        elapsed_ns=elapsed_ns,
+        pattern=tuple(
+            (span_ns, boundary.control, boundary.samplers)
+            for span_ns, boundary in zip(elapsed_ns, stretch, strict=True)
+        ),
+        closed_loop=closed_loop,
+        step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
+        command_count=sum(closed_loop and boundary.control for boundary in stretch),
+        number=number,
+        slot=number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count),
+        wanted=state.wanted,
+        until_ns=stamps_ns[-1],
+    )
+
+
+def plan_flight(state: State, batch: Batch) -> tuple[Hashable, Callable[[], object]]:
+    """Take the vehicle through a batch: return what launches that, with its key.
+
+    A controller may be replaced by another; a graph keeps the one that it was made with.
+    """
+    mode, state.command_mode = state.command_mode, None
+    controller = None if mode is None else state.controllers.get(mode)
+
+    def flight() -> object:
+        if mode is not None and state.on_host:
+            state.commands[mode].upload()
+        if controller is not None:
+            controller.update(state.vehicle.arrays)
+        integrate(state, batch)
+        _fetch(state, batch)
+        return controller
+
+    state.launched_count += 1
+    state.launched_ns = batch.until_ns
+    return (mode, id(controller), batch.slot, batch.closed_loop, batch.pattern), flight
+
+
+def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], object]) -> None:
+    """Launch a planned flight on its stream, and note its end."""
+    with timed(state.wall_s, "dynamics and control"), use_stream(state.flight_stream):
+        state.graphs.run(key, flight)
+        state.flown[batch.number % state.flight_lane_count].set()
+
+
+def integrate(state: State, batch: Batch) -> None:
+    """Move the vehicles of all worlds from boundary to boundary and sample what is due there; launches only."""
+    device, count = state.vehicle.device, state.world_count
+    wp.launch(begin_batch, dim=count, inputs=[state.fleet], device=device)
+    elapsed_ns = 0
+    samplers = list(state.samplers.values())
+    taken = [batch.slot] * len(samplers)
+    for slot, (boundary, span_ns) in enumerate(
+        zip(batch.boundaries, batch.elapsed_ns, strict=True), batch.slot
+    ):
+        if span_ns > 0:
+            state.vehicle.advance(span_ns)
+        elapsed_ns += span_ns
+        for index in boundary.samplers:
+            samplers[index].measure(taken[index])
+            taken[index] += 1
+        state.trace.record(state.surfaces, state.fleet, slot, elapsed_ns)
+        if batch.closed_loop and boundary.control:
+            state.path_controller.update(state.vehicle.arrays)
+    wp.launch(end_batch, dim=count, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
+
+
+def _fetch(state: State, batch: Batch) -> None:
+    """Launch the copy of what was flown and sampled to the host."""
+    state.trace.fetch(batch.slot, len(batch.boundaries))
+    for index, copies in enumerate(state.sampler_copies.values()):
+        sample_count = sum(index in boundary.samplers for boundary in batch.boundaries)
+        for copy in copies.values():
+            copy.fetch(batch.slot, sample_count)
+
+
+def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
+    """Return what was sampled in a batch that is flown, and collisions."""
+    with timed(state.wall_s, "read-back"):
+        rows = state.trace.numpy(batch.slot, len(batch.boundaries))
+    state.stamp_ns = batch.boundaries[-1].stamp_ns
+    state.counts["steps"] += batch.step_count
+    state.counts["commands"] += batch.command_count
+    _count_redone(state, sum(rows.redone[-1].tolist()))  # of few vehicles: ufuncs take ten times as long
+    if any(status not in (0, int(STATUS_COLLISION)) for status in rows.status[-1].tolist()):
+        state.failure = _failure(state.vehicle)
+        state.stamp_ns = min(state.stamp_ns, state.failure.stamp_ns)
+    with timed(state.wall_s, "collision check"):
+        packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
+    batch.until_ns = state.stamp_ns
+    with timed(state.wall_s, "read-back"):
+        packets += _read_samplers(state, batch)
+    reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
+    if reached:
+        row = rows.states[len(reached) - 1, 0]
+        state.last = odometry(row, stamp_ns=reached[-1], sequence=0, sensor="odometry")
+    return packets
+
+
+def _count_redone(state: State, redone_count: int) -> None:
+    if redone_count > 0 and not state.counts["redone intervals"]:
+        logger.info(
+            "vehicle: steps of %g ms are too long at times; such intervals are redone with adaptive steps",
+            1e-6 * state.vehicle.max_step_ns,
+        )
+    state.counts["redone intervals"] = redone_count
+
+
+def _failure(vehicle: Multirotor) -> DynamicsError:
+    """Return why a vehicle is held."""
+    try:
+        vehicle.check()
+    except DynamicsError as error:
+        return error
+    raise AssertionError("the status of a vehicle that is held does not change")
+
+
+def odometry(row: Any, *, stamp_ns: int, sequence: int, sensor: str) -> Odometry:
+    """Return a row of a trace as a packet."""
+    return Odometry(
+        stamp_ns=stamp_ns,
+        sequence=sequence,
+        sensor=sensor,
+        position=row[POSITION],
+        orientation=row[ORIENTATION],
+        velocity=row[VELOCITY],
+        body_rate=row[BODY_RATE],
+        rotor_speed=row[ROTOR_SPEED],
+    )
+
+
+def _read_samplers(state: State, batch: Batch) -> list[Packet]:
+    packets: list[Packet] = []
+    for index, (name, copies) in enumerate(state.sampler_copies.items()):
+        stamps = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.samplers]
+        columns = {field: copy.rows(batch.slot, len(stamps))[:, 0] for field, copy in copies.items()}
+        for sample, stamp_ns in enumerate(stamps):
+            packets.append(
+                state.samplers[name].packet(
+                    {field: column[sample] for field, column in columns.items()},
+                    stamp_ns=stamp_ns,
+                    sequence=state.sequence[name],
+                    sensor=name,
+                )
+            )
+            state.sequence[name] += 1
+    return packets
+
+
+def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
+    """Report each beginning of a touch; end the run at the first one if so configured."""
+    packets: list[Packet] = []
+    if not any(margin_m <= 0.0 for margin_m in rows.clearance[:, 0].tolist()):
+        state.touching = False
+        return packets
+    for boundary, row, margin_m in zip(
+        batch.boundaries, rows.states[:, 0], rows.clearance[:, 0], strict=True
+    ):
+        touching = bool(margin_m <= 0.0)
+        if touching and not state.touching:
+            packets.append(
+                Collision(
+                    stamp_ns=boundary.stamp_ns,
+                    sequence=state.sequence[COLLISION],
+                    sensor=COLLISION,
+                    position=row[POSITION],
+                    clearance_m=float(margin_m),
+                )
+            )
+            state.sequence[COLLISION] += 1
+            state.counts["collisions"] += 1
+            if model.config.vehicle.on_collision == "end":
+                state.ended = True
+                state.stamp_ns = boundary.stamp_ns
+                return packets
+        state.touching = touching
+    return packets
+
+
+def in_order(model: Model, packets: list[Packet], until_ns: int) -> list[Packet]:
+    """Return packets up to a stamp in the order of time, those of one stamp in that of the rig."""
+    kept = [packet for packet in packets if packet.stamp_ns <= until_ns]
+    if len(kept) < 2:
+        return kept
+    rank = {name: index for index, name in enumerate([*model.config.sensors, COLLISION])}
+    return sorted(kept, key=lambda packet: (packet.stamp_ns, rank[packet.sensor]))

@@ -1,0 +1,224 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""What does not change during a run: the scene, the path, and what has to be computed of them."""
+
+from __future__ import annotations
+
+import functools
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import warp as wp
+
+from neurosim_core.clock import Rate, to_ns
+from neurosim_core.config import SimulationConfig
+from neurosim_core.render.renderer import SceneOnDevice, upload_scene
+from neurosim_core.runtime.timing import timed
+from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
+from neurosim_core.scene.bodies import Body, make_bodies
+from neurosim_core.scene.freespace import FreeSpace, make_free_space
+from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
+from neurosim_core.scene.scene import Scene
+from neurosim_core.sensors.base import StateSensorConfig
+from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
+from neurosim_core.sim.schedule import Schedule
+from neurosim_core.trajectory import Path, make_path
+from neurosim_core.vehicle import MultirotorConfig
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """What does not change during a run."""
+
+    config: SimulationConfig
+    device: str
+    scene: Scene
+    bodies: tuple[Body, ...]
+    """What moves in the scene besides the vehicle; not loaded without cameras."""
+    free_space: FreeSpace
+    path: Path
+    airframe: MultirotorConfig
+    groups: tuple[RenderGroup, ...]
+    schedule: Schedule
+    samplers: tuple[str, ...]
+    """Names of the sensors behind `schedule.samplers`."""
+    scene_on_device: SceneOnDevice | None
+    """The scene as the renderer keeps it on the device; None without cameras."""
+    setup_s: Mapping[str, float]
+    """Wall-clock time that each part of the set-up took [s]."""
+
+    @functools.cached_property
+    def duration_ns(self) -> int:
+        """Length of the run [ns]."""
+        return to_ns(self.config.duration_s)
+
+
+def load_scene(config: ApartmentConfig | MeshSceneConfig, *, pictures: bool = True) -> Scene:
+    """Generate or read a scene.
+
+    Args:
+        config: Which one.
+        pictures: Decode the textures of a file now, or when they are first looked at, if ever.
+
+    Raises:
+        SceneError: A file cannot be used.
+    """
+    if isinstance(config, ApartmentConfig):
+        return make_apartment(config)
+    return load_mesh_scene(config, pictures=pictures)
+
+
+def make_model(
+    config: SimulationConfig,
+    *,
+    scene: Scene | None = None,
+    on_phase: Callable[[str], None] | None = None,
+) -> Model:
+    """Load or generate the scene, plan the path and decide what has to be computed.
+
+    Args:
+        config: What to fly; one vehicle.
+        scene: Where to fly, in place of what `config` says; None: as it says.
+        on_phase: Told the name of each part of the work when it begins.
+
+    Raises:
+        ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
+            not there.
+    """
+    if len(config.vehicles) > 1:
+        raise ValueError(
+            f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
+        )
+    return next(iter(make_fleet(config, scene=scene, on_phase=on_phase).values()))
+
+
+def refit(model: Model, config: SimulationConfig) -> Model:
+    """Return a model with other sensors, rates and launches on the same path in the same scene and light.
+
+    Args:
+        model: What was made before.
+        config: Its scene, path, vehicle, device and renderer are those of `model`, or are not looked at.
+    """
+    return _make_member(
+        config,
+        model.device,
+        model.scene,
+        model.bodies,
+        model.free_space,
+        model.path,
+        model.scene_on_device,
+        model.setup_s,
+    )
+
+
+def make_fleet(
+    config: SimulationConfig,
+    *,
+    scene: Scene | None = None,
+    on_phase: Callable[[str], None] | None = None,
+) -> dict[str, Model]:
+    """Return a model for each vehicle by name; they share the scene, its free space and its light.
+
+    Arguments and errors as for `make_model`.
+    """
+    setup_s: dict[str, float] = defaultdict(float)
+
+    def phase(name: str) -> AbstractContextManager[None]:
+        if on_phase is not None:
+            on_phase(name)
+        return timed(setup_s, name)
+
+    device = find_device(config.device)
+    with phase("scene"):
+        members = {name: config.of(name) for name in config.vehicles}
+        seeing = any(plan_render_groups(member.sensors) for member in members.values())
+        scene = load_scene(config.scene, pictures=seeing) if scene is None else scene
+        bodies = make_bodies(config.bodies) if seeing else ()
+    with phase("free space"):
+        free_space = make_free_space(scene, config.free_space, device=device)
+    with phase("path"):
+        paths = {name: _plan(member, free_space) for name, member in members.items()}
+    with phase("light"):
+        scene_on_device = (
+            upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)
+            if seeing
+            else None
+        )
+    return {
+        name: _make_member(member, device, scene, bodies, free_space, paths[name], scene_on_device, setup_s)
+        for name, member in members.items()
+    }
+
+
+def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
+    """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
+
+    Args:
+        config: What to fly.
+        vehicles: Names; None: all.
+
+    Raises:
+        KeyError: There is no such vehicle.
+        ValueError: The scene cannot be loaded, or no path exists.
+    """
+    members = {name: config.of(name) for name in (vehicles or config.vehicles)}
+    scene = load_scene(config.scene, pictures=False)
+    free_space = make_free_space(scene, config.free_space, device=find_device(config.device))
+    return {name: _plan(member, free_space) for name, member in members.items()}
+
+
+def _plan(config: SimulationConfig, free_space: FreeSpace) -> Path:
+    return make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
+
+
+def _make_member(
+    config: SimulationConfig,
+    device: str,
+    scene: Scene,
+    bodies: tuple[Body, ...],
+    free_space: FreeSpace,
+    path: Path,
+    scene_on_device: SceneOnDevice | None,
+    setup_s: Mapping[str, float],
+) -> Model:
+    """Return the model of one vehicle in a scene."""
+    groups = plan_render_groups(config.sensors)
+    samplers = {name: s for name, s in config.sensors.items() if isinstance(s, StateSensorConfig)}
+    return Model(
+        config=config,
+        device=device,
+        scene=scene,
+        bodies=bodies,
+        free_space=free_space,
+        path=path,
+        airframe=config.vehicle.airframe(),
+        groups=groups,
+        schedule=Schedule(
+            control=Rate(config.control.rate_hz),
+            samplers=tuple(sampler.clock for sampler in samplers.values()),
+            groups=tuple(group.rate for group in groups),
+            instants_per_launch=config.instants_per_launch,
+            sparse=frozenset(i for i, group in enumerate(groups) if group.max_displacement_px is not None),
+        ),
+        samplers=tuple(samplers),
+        scene_on_device=scene_on_device if groups else None,
+        setup_s=setup_s,
+    )
+
+
+def find_device(name: str) -> str:
+    """Return the device that is meant.
+
+    Raises:
+        ValueError: It is not on this machine.
+    """
+    wp.init()
+    known = [str(device) for device in wp.get_devices()]
+    if name == "auto":
+        return "cuda:0" if "cuda:0" in known else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    if name not in known:
+        raise ValueError(f"device {name!r} is not on this machine, known: {known}")
+    return name

@@ -1,0 +1,169 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
+# mypy: disable-error-code="no-untyped-call"
+"""Where vehicles begin, and the kernels that put them there and take masks and rows of any type."""
+
+# No `from __future__ import annotations`: Warp needs the annotations of structures as objects.
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.sim.scene_table import SceneTable
+from neurosim_core.sim.trace import Fleet
+from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Start:
+    """Where vehicles begin, one row for each world."""
+
+    position: wp.array2d[wp.float64]
+    """p_WB [m], [N, 3]."""
+    velocity: wp.array2d[wp.float64]
+    """v_WB in W [m/s], [N, 3]."""
+    orientation: wp.array2d[wp.float64]
+    """q_WB, xyzw, [N, 4], of unit length."""
+    body_rate: wp.array2d[wp.float64]
+    """w_WB in B [rad/s], [N, 3]."""
+
+
+def begin_of_paths(scenes: SceneTable) -> dict[str, NDArray[np.float64]]:
+    """Return where the vehicle of each world begins as configured, by name of the quantity, shape [N, ...]."""
+    begins = [model.path.evaluate([0]) for model in scenes.models]
+    half_yaw = [0.5 * begin.yaw[0] for begin in begins]
+    of_scene: dict[str, NDArray[np.float64]] = {
+        "position": np.array([np.ravel(begin.position) for begin in begins]),
+        "velocity": np.array([np.ravel(begin.velocity) for begin in begins]),
+        "orientation": np.array([[0.0, 0.0, np.sin(half), np.cos(half)] for half in half_yaw]),
+        "body_rate": np.zeros((len(begins), 3)),
+    }
+    rows = {name: values[list(scenes.scene_of_world)] for name, values in of_scene.items()}
+    rows["orientation"] = normalised(rows["orientation"])
+    return rows
+
+
+def normalised(orientation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quaternions of unit length.
+
+    Raises:
+        ValueError: One is 0, or too large to be normalised.
+    """
+    with np.errstate(over="ignore"):
+        norm: NDArray[np.float64] = np.linalg.norm(orientation, axis=1, keepdims=True)
+    if not ((norm > 1e-6) & (norm < np.inf)).all():
+        raise ValueError(
+            f"orientation must not be 0, nor too large to be normalised, got {orientation.tolist()}"
+        )
+    return orientation / norm
+
+
+@wp.func
+def _row3(rows: wp.array2d[wp.float64], row: int) -> wp.vec3d:
+    return wp.vec3d(rows[row, 0], rows[row, 1], rows[row, 2])
+
+
+@wp.kernel
+def restart(
+    # Model:
+    hover_rad_s: wp.float64,
+    # In:
+    mask: wp.array[wp.int32],
+    start: Start,
+    # Out:
+    fleet: Fleet,
+) -> None:
+    """Put the vehicles of some worlds where they begin, with rotors at hover, at time 0."""
+    world = wp.tid()
+    if mask[world] == 0:
+        return
+    fleet.position[world] = _row3(start.position, world)
+    fleet.velocity[world] = _row3(start.velocity, world)
+    fleet.orientation[world] = wp.quatd(
+        start.orientation[world, 0],
+        start.orientation[world, 1],
+        start.orientation[world, 2],
+        start.orientation[world, 3],
+    )
+    fleet.body_rate[world] = _row3(start.body_rate, world)
+    for rotor in range(fleet.rotor_speed.shape[1]):
+        fleet.rotor_speed[world, rotor] = hover_rad_s
+        fleet.rotor_speed_command[world, rotor] = hover_rad_s
+    fleet.stamp_ns[world] = wp.int64(0)
+    fleet.status[world] = STATUS_OK
+    fleet.redone_count[world] = wp.int64(0)
+    fleet.evaluation_count[world] = wp.int64(0)
+    fleet.clock_ns[world] = wp.int64(0)
+    fleet.collided[world] = 0
+
+
+@wp.kernel
+def normalise(
+    # In/out:
+    orientation: wp.array2d[wp.float64],
+) -> None:
+    """Give quaternions unit length."""
+    world = wp.tid()
+    total = wp.float64(0.0)
+    for part in range(4):
+        total += orientation[world, part] * orientation[world, part]
+    for part in range(4):
+        orientation[world, part] = orientation[world, part] / wp.sqrt(total)
+
+
+@wp.kernel
+def begin_batch(
+    # In/out:
+    fleet: Fleet,
+) -> None:
+    """Forget touches of the batch before, except of vehicles that are held because of one."""
+    world = wp.tid()
+    fleet.collided[world] = wp.where(fleet.status[world] == STATUS_COLLISION, 1, 0)
+
+
+@wp.kernel
+def end_batch(
+    # Model:
+    duration_ns: wp.int64,
+    # In/out:
+    clock_ns: wp.array[wp.int64],
+) -> None:
+    """Let time pass in all worlds."""
+    world = wp.tid()
+    clock_ns[world] += duration_ns
+
+
+@wp.kernel
+def take_rows(
+    # In:
+    rows: wp.array2d[Any],
+    # Out:
+    rows_out: wp.array2d[wp.float64],
+) -> None:
+    """Copy numbers of any floating type."""
+    row, column = wp.tid()
+    rows_out[row, column] = wp.float64(rows[row, column])
+
+
+wp.overload(take_rows, {"rows": wp.array2d[wp.float32]})
+wp.overload(take_rows, {"rows": wp.array2d[wp.float64]})
+
+
+@wp.kernel
+def take_mask(
+    # In:
+    mask: wp.array[Any],
+    # Out:
+    mask_out: wp.array[wp.int32],
+) -> None:
+    """Copy a mask: not 0 is 1."""
+    world = wp.tid()
+    mask_out[world] = wp.where(wp.int32(mask[world]) != 0, 1, 0)
+
+
+wp.overload(take_mask, {"mask": wp.array[wp.bool]})
+wp.overload(take_mask, {"mask": wp.array[wp.uint8]})
+wp.overload(take_mask, {"mask": wp.array[wp.int32]})

@@ -1,0 +1,352 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""A run, batch by batch: with the path controller on the device, or with a controller outside.
+
+On a CUDA device `run_model` launches the next batches before it reads one back, so the device always has
+work; what was launched beyond the end of a run is never read.
+
+An external controller steps one control period at a time: `step` flies one and returns its packets, or
+`begin_step` and `end_step` do, with time between them while a CUDA device is at work. `integrate_period`
+flies one and leaves the cameras to another thread, which calls `render_batch` or `skip_batch`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+
+from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.control import CommandMode
+from neurosim_core.packets import Odometry, Packet
+from neurosim_core.sim.cameras import launch_cameras, plan_ahead, read_cameras
+from neurosim_core.sim.integrate import (
+    in_order,
+    launch_flight,
+    plan_batch,
+    plan_flight,
+    read_flight,
+    set_command,
+)
+from neurosim_core.sim.model import Model, make_model
+from neurosim_core.sim.render_group import (
+    acquire_room,
+    disable_frame_sensors,
+    flush_frames,
+    is_due,
+    leave_out,
+)
+from neurosim_core.sim.schedule import Boundary, batch_end_ns, boundaries, everything
+from neurosim_core.sim.state import Batch, PlannedStep, State, make_state
+from neurosim_core.sim.step import launch, read
+
+
+def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = None) -> Iterator[Packet]:
+    """Yield every packet of a run in the order of time; packets with the same stamp come in the rig's order.
+
+    Args:
+        config: What `load_config` returns or accepts.
+
+    Raises:
+        DynamicsError: The integration failed; all packets before its stamp have been yielded.
+    """
+    model = make_model(config if isinstance(config, SimulationConfig) else load_config(config))
+    yield from run_model(model, make_state(model))
+
+
+def run_model(model: Model, state: State) -> Iterator[Packet]:
+    """Yield every packet from the state's present stamp to the end of the run; see `run`.
+
+    Where the state has several lanes, the vehicle is up to as many batches ahead of the packets.
+    """
+    if state.launched_count == 0:
+        yield from start(model, state)
+    while not state.ended:
+        while len(state.in_flight) < len(state.batch_done) and state.launched_ns < model.duration_ns:
+            launch_until(model, state, batch_end_ns(model.schedule, state.launched_ns, model.duration_ns))
+        if not state.in_flight:
+            break
+        yield from read(model, state)
+        if state.failure is not None:
+            raise state.failure
+    yield from finish(state)
+
+
+def step(
+    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+) -> list[Packet]:
+    """Hold a command of an outside controller until the next tick of the control clock.
+
+    Args:
+        model: What does not change.
+        state: Moved on by one control period.
+        command: Setpoint row of the mode (`control.modes.MODES`), by default rotor speeds [rad/s], shape [R].
+            Modes above it are turned into rotor speeds once, at the beginning of the period. None: the rotor
+            speeds that hold now.
+        mode: What the command is.
+
+    Returns:
+        What the sensors yield in (stamp, next stamp], in the order of time; the first call also yields stamp
+        0. Less where a collision ended the run (`state.ended`) or the integration failed (`state.failure`).
+
+    Raises:
+        ValueError: The command is of a wrong shape or not finite.
+        DynamicsError: The integration has failed before; what was measured until then has been returned.
+    """
+    return end_step(model, state, begin_step(model, state, command, mode=mode))
+
+
+class PendingStep(NamedTuple):
+    """A control period that has been launched as far as it can be."""
+
+    packets: list[Packet]
+    """What the sensors yield up to its beginning, if that has not been returned yet."""
+    end_ns: int
+    """Where it ends [ns]."""
+
+
+def begin_step(
+    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+) -> PendingStep:
+    """Begin a control period like `step`, without waiting for a CUDA device.
+
+    Returns:
+        What `end_step` needs, which has to come before anything else is done to the state. Arguments and
+        errors are those of `step`.
+    """
+    if state.failure is not None:
+        raise state.failure
+    _check_all_read(state)
+    packets = start(model, state) if state.launched_count == 0 else []
+    set_command(model, state, command, mode)
+    ahead, state.planned = state.planned, None
+    if ahead is None or (ahead.batch.number, ahead.batch.wanted) != (state.launched_count, state.wanted):
+        ahead = _plan_period(model, state)
+    launch(model, state, ahead.batch)
+    return PendingStep(packets, ahead.end_ns)
+
+
+def prepare_step(model: Model, state: State) -> None:
+    """Plan the next control period, for `begin_step` to launch it sooner; while a CUDA device is at work."""
+    state.planned = _plan_period(model, state)
+    plan_ahead(model, state, state.planned.batch)
+
+
+def acquire_rooms(state: State) -> None:
+    """Ask for room for the pictures of a control period that was prepared: `begin_step` is sooner then."""
+    if state.planned is not None:
+        for job in state.planned.batch.jobs or ():
+            acquire_room(job)
+
+
+def settle(state: State) -> None:
+    """Wait until the device has written all pictures that were handed out (`make_state`, `late_pictures`)."""
+    for lane in state.batch_done:
+        lane.wait()
+
+
+def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
+    """Wait for a control period that was pending, and return what `step` returns."""
+    packets = pending.packets + read(model, state, last=state.launched_ns >= pending.end_ns)
+    while state.launched_ns < pending.end_ns and not (state.ended or state.failure is not None):
+        part_ns = batch_end_ns(model.schedule, state.launched_ns, pending.end_ns)
+        launch_until(model, state, part_ns, closed_loop=False)
+        packets += read(model, state, last=part_ns >= pending.end_ns)
+    return packets
+
+
+def warm_up(model: Model) -> None:
+    """Compile and load the kernels of all sensors: fly one control period of an episode that nobody sees."""
+    step(model, make_state(model), None)
+
+
+def integrate_period(
+    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+) -> tuple[list[Packet], list[Batch]]:
+    """Fly one control period like `step`, and leave the cameras for later.
+
+    Returns:
+        Packets of the IMU and of odometry, and collisions, in the order of time; and what the cameras have to
+        look at: each batch goes to `render_batch` or `skip_batch`, in order, from one thread at a time.
+
+    Raises:
+        RuntimeError: More batches wait for the cameras than there are lanes: see `free_lanes`.
+        ValueError: The command is of a wrong shape or not finite.
+        DynamicsError: The integration has failed before; what was measured until then has been returned.
+    """
+    if state.failure is not None:
+        raise state.failure
+    packets: list[Packet] = []
+    batches: list[Batch] = []
+
+    def fly(stretch: Sequence[Boundary]) -> None:
+        if free_lanes(state) < 1:
+            raise RuntimeError(
+                f"{state.flight_lane_count} batches wait for render_batch() or skip_batch(): no lane is free"
+            )
+        batch = plan_batch(state, stretch, closed_loop=False)
+        launch_flight(state, batch, *plan_flight(state, batch))
+        batches.append(batch)
+        state.flown[batch.number % state.flight_lane_count].wait()
+        packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
+
+    if state.launched_count == 0:
+        fly([everything(model.schedule)])
+    set_command(model, state, command, mode)
+    for end_ns in _parts_of_period(model, state):
+        fly(boundaries(model.schedule, state.launched_ns, end_ns))
+        if state.ended or state.failure is not None:
+            break
+    return packets, batches
+
+
+def free_lanes(state: State) -> int:
+    """Return how many batches `integrate_period` can fly before one of those that wait was looked at."""
+    return state.flight_lane_count - (state.launched_count - state.rendered_count)
+
+
+def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
+    """Render what the cameras see in a batch; return their packets in the order of time.
+
+    Args:
+        model: What does not change.
+        state: Only what belongs to the cameras changes, so that another thread may fly on.
+        batch: The oldest that was flown and not looked at.
+    """
+    launch_cameras(model, state, batch)
+    packets = read_cameras(state, batch, borrow=state.borrow_pictures)
+    state.rendered_count += 1
+    return in_order(model, packets, batch.until_ns)
+
+
+def render_batch_by_group(model: Model, state: State, batch: Batch) -> Iterator[tuple[int, list[Packet]]]:
+    """Do what `render_batch` does, and yield each cast and its packets when it is done, the fastest first.
+
+    A picture does not wait for one that takes longer. For a CPU: a CUDA device would have less at a time.
+    All has to be taken; arguments as for `render_batch`.
+    """
+    for index in sorted(range(len(state.groups)), key=lambda index: -state.groups[index].rate.rate_hz):
+        launch_cameras(model, state, batch, {index})
+        yield index, in_order(model, read_cameras(state, batch, borrow=state.borrow_pictures), batch.until_ns)
+    state.rendered_count += 1
+
+
+def skip_batch(model: Model, state: State, batch: Batch) -> int:
+    """Render nothing of a batch, in place of `render_batch`.
+
+    The sequence of each image camera shows the gap; for an event camera log radiance is linear in time over
+    the gap, and a window of events that should have ended there is as much longer.
+
+    Returns:
+        How many instants of casts were left out.
+    """
+    count = 0
+    for index, group in enumerate(state.groups):
+        disable_frame_sensors(group, batch.wanted)
+        stamps = [b.stamp_ns for b in batch.boundaries if index in b.groups]
+        due = [stamp_ns for stamp_ns in stamps if is_due(group, stamp_ns, batch.wanted)]
+        leave_out(group, due, batch.wanted)
+        count += len(due)
+    state.rendered_count += 1
+    return count
+
+
+def select_cameras(model: Model, state: State, names: Collection[str]) -> None:
+    """Choose the cameras that look, from the next control period on; the others are not rendered.
+
+    An event camera that comes back takes the first instant that it sees as its reference, and its packets
+    count on.
+
+    Raises:
+        ValueError: There is no such camera.
+    """
+    known = {name for group in model.groups for name in group.names}
+    if not known.issuperset(names):
+        raise ValueError(f"unknown cameras {sorted(set(names) - known)}, known: {sorted(known)}")
+    state.wanted = frozenset(names)
+
+
+def observe(state: State) -> Odometry:
+    """Return the true state of the vehicle at the end of what was flown, as a packet named `odometry`."""
+    if state.last is None:
+        now = state.vehicle.state
+        state.last = Odometry(
+            sensor="odometry",
+            position=now.position[0],
+            orientation=now.orientation[0],
+            velocity=now.velocity[0],
+            body_rate=now.body_rate[0],
+            rotor_speed=now.rotor_speed[0],
+        )
+    return state.last
+
+
+def start(model: Model, state: State) -> list[Packet]:
+    """Sample every sensor at stamp 0; event cameras take it as their reference."""
+    launch(model, state, plan_batch(state, [everything(model.schedule)], closed_loop=True))
+    return read(model, state)
+
+
+def advance(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> list[Packet]:
+    """Fly one batch, at most to what `batch_end_ns` gives, and return what the sensors yield in it.
+
+    Args:
+        model: What does not change.
+        state: Moved on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
+            (`failure`).
+        end_ns: End of the batch [ns], after the state's stamp.
+        closed_loop: Let the path controller command; otherwise the last command is held.
+
+    Raises:
+        RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.
+    """
+    _check_all_read(state)
+    launch_until(model, state, end_ns, closed_loop=closed_loop)
+    return read(model, state)
+
+
+def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool = True) -> None:
+    """Launch one batch, at most to what `batch_end_ns` gives, without waiting for a CUDA device.
+
+    Args:
+        model: What does not change.
+        state: It has room for one more batch in flight.
+        end_ns: End of the batch [ns], after what was launched before.
+        closed_loop: Let the path controller command; otherwise the last command is held.
+    """
+    stretch = boundaries(model.schedule, state.launched_ns, end_ns)
+    launch(model, state, plan_batch(state, stretch, closed_loop=closed_loop))
+
+
+def finish(state: State) -> list[Packet]:
+    """Return the packets whose windows have pending and not ended; for the end of a run."""
+    return [packet for group in state.groups for packet in flush_frames(group, until_ns=state.stamp_ns)]
+
+
+def _check_all_read(state: State) -> None:
+    if state.in_flight:
+        raise RuntimeError(
+            "batches are under way: run_model() was broken off, and only it can go on, or end_step() is due"
+        )
+
+
+def _parts_of_period(model: Model, state: State) -> Iterator[int]:
+    """Yield the ends of the batches that a control period is cut into, each when the one before was flown."""
+    end_ns = _period_end_ns(model, state)
+    while state.launched_ns < end_ns:
+        yield batch_end_ns(model.schedule, state.launched_ns, end_ns)
+
+
+def _plan_period(model: Model, state: State) -> PlannedStep:
+    """Plan the first batch of the next control period."""
+    end_ns = _period_end_ns(model, state)
+    part_ns = batch_end_ns(model.schedule, state.launched_ns, end_ns)
+    stretch = boundaries(model.schedule, state.launched_ns, part_ns)
+    return PlannedStep(plan_batch(state, stretch, closed_loop=False), end_ns)
+
+
+def _period_end_ns(model: Model, state: State) -> int:
+    """Return the next tick of the control clock after what was launched [ns]."""
+    control = model.schedule.control
+    return control.stamp_ns(control.first_tick(state.launched_ns + 1))

@@ -1,0 +1,192 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+"""The scenes that worlds are in: one for all, or several, which kernels find by index."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.render.cast_terms import Terms
+from neurosim_core.render.config import WalkConfig
+from neurosim_core.render.scene_arrays import SceneArrays
+from neurosim_core.render.scene_data import SceneData
+from neurosim_core.scene.freespace import DistanceField
+from neurosim_core.sim.model import Model, find_device, make_model, refit
+
+_logger = logging.getLogger(__name__)
+
+SceneSource = str | Path | Mapping[str, Any]
+"""A settings file, of which the scene counts; a mesh file; or settings of a scene."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneTable:
+    """The scenes of all worlds, on the device."""
+
+    models: tuple[Model, ...]
+    """One for each scene: its free space, the path in it, its light."""
+    scene_of_world: tuple[int, ...]
+    """Which scene a world is in."""
+    fields: wp.array[Any]
+    """Distance to each scene, array of `DistanceField`, shape [scene]."""
+    scene: wp.array[int]
+    """`scene_of_world` on the device, shape [world]."""
+    data: wp.array[Any] | None
+    """`completed` on the device, array of `SceneData`, shape [scene]; None: there is one, or no camera."""
+    completed: tuple[SceneData, ...]
+    """Arrays of each scene, with all that a kernel for all scenes reads; empty: `data` is None."""
+    terms: Terms | None
+    """What some scene needs in the kernel of the renderer; None: there is no camera."""
+
+    @property
+    def model(self) -> Model:
+        """The model of the first scene; what does not depend on the scene is the same in all."""
+        return self.models[0]
+
+    @property
+    def first(self) -> SceneArrays | None:
+        """The first scene as the renderer has it; None: there is no camera."""
+        arrays = self.model.scene_on_device
+        return arrays if isinstance(arrays, SceneArrays) else None
+
+
+def make_scene_table(
+    config: SimulationConfig,
+    *,
+    count: int,
+    scenes: Sequence[SceneSource] | None = None,
+    models: Sequence[Model] | None = None,
+    scene_of_world: ArrayLike | None = None,
+    lenses_differ: bool = False,
+) -> SceneTable:
+    """Load the scenes and bring them to the device.
+
+    Args:
+        config: What to fly; its scene counts where no others are given.
+        count: Number of worlds.
+        scenes: The scenes.
+        models: Scenes that were loaded before, in place of `scenes`, each with its path and light.
+        scene_of_world: Index of the scene of each world, shape [N]; by default they take turns.
+        lenses_differ: Worlds look through different lenses.
+
+    Raises:
+        ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
+            move and there are several scenes; or models are on another device, have other bodies or were
+            lit or packed by other settings of the renderer than `config` says.
+    """
+    if config.renderer != "warp":
+        raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer!r}")
+    if scenes is not None and models is not None:
+        raise ValueError("give scenes or models, not both")
+    if any(given is not None and len(given) == 0 for given in (scenes, models)):
+        raise ValueError("scenes or models must name one scene at least, got none")
+    if len(scenes or models or ()) > 1 and config.bodies:
+        raise ValueError(
+            f"bodies move in one scene only, got {len(scenes or models or ())} scenes and "
+            f"{', '.join(config.bodies)}"
+        )
+    if models is not None:
+        _check_models(models, config)
+    asked = isinstance(config.render.shared_walk, WalkConfig)
+    if asked and (lenses_differ or len(scenes or models or ()) > 1):
+        _logger.info("render.shared_walk is left out: worlds differ in their scenes or lenses")
+        alone = config.render.model_copy(update={"shared_walk": None})  # Embree may do it on a CPU
+        config = config.model_copy(update={"render": alone})
+    if models is not None:
+        made = tuple(refit(model, config) for model in models)
+    else:
+        configs = [config] if scenes is None else [_in_scene(config, source) for source in scenes]
+        made = tuple(make_model(each) for each in configs)
+    turns = np.arange(count) % len(made)
+    chosen = np.asarray(turns if scene_of_world is None else scene_of_world)
+    if chosen.shape != (count,) or not np.issubdtype(chosen.dtype, np.integer):
+        raise ValueError(f"scene_of_world must be integers of shape [{count}], got {list(chosen.shape)}")
+    if chosen.min() < 0 or chosen.max() >= len(made):
+        raise ValueError(
+            f"scene_of_world must be in [0, {len(made) - 1}], got {chosen.min()} to {chosen.max()}"
+        )
+    device = made[0].device
+    arrays = [m.scene_on_device for m in made if isinstance(m.scene_on_device, SceneArrays)]
+    terms = None
+    if arrays:
+        terms = Terms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
+        terms = terms._replace(world_scenes=len(arrays) > 1)
+    completed = tuple(_completed(a) for a in arrays) if len(arrays) > 1 else ()
+    return SceneTable(
+        models=made,
+        scene_of_world=tuple(int(scene) for scene in chosen),
+        fields=wp.array([m.free_space.arrays for m in made], dtype=DistanceField, device=device),
+        scene=wp.array(chosen.astype(np.int32), dtype=int, device=device),
+        data=wp.array(list(completed), dtype=SceneData, device=device) if completed else None,
+        completed=completed,
+        terms=terms,
+    )
+
+
+def single_scene(model: Model) -> SceneTable:
+    """Return the table of one world in the scene of a model."""
+    arrays = model.scene_on_device
+    return SceneTable(
+        models=(model,),
+        scene_of_world=(0,),
+        fields=wp.array([model.free_space.arrays], dtype=DistanceField, device=model.device),
+        scene=wp.zeros(1, dtype=int, device=model.device),
+        data=None,
+        completed=(),
+        terms=arrays.terms if isinstance(arrays, SceneArrays) else None,
+    )
+
+
+def _check_models(models: Sequence[Model], config: SimulationConfig) -> None:
+    """Refuse models that hold something else than is asked for."""
+    wanted = find_device(config.device)
+    for index, model in enumerate(models):
+        if model.device != wanted:
+            raise ValueError(
+                f"models[{index}] is on {model.device}, and worlds are to be on {wanted}: make it there"
+            )
+        if model.config.bodies != config.bodies:
+            raise ValueError(
+                f"models[{index}] has the bodies {sorted(model.config.bodies)}, or moves them otherwise than "
+                f"the configuration, which has {sorted(config.bodies)}"
+            )
+        arrays = model.scene_on_device
+        if isinstance(arrays, SceneArrays) and arrays.config != config.render:
+            raise ValueError(f"models[{index}] was made with other settings of `render` than these worlds")
+
+
+def _in_scene(config: SimulationConfig, source: SceneSource) -> SimulationConfig:
+    if isinstance(source, Mapping):
+        scene = load_config({"scene": dict(source)}).scene
+    elif str(source).endswith((".yaml", ".yml")):
+        scene = load_config(source).scene
+    else:
+        scene = load_config({"scene": {"kind": "mesh", "file": str(Path(source).resolve())}}).scene
+    return config.model_copy(update={"scene": scene})
+
+
+def _completed(arrays: SceneArrays) -> SceneData:
+    """Return the arrays of a scene with what a kernel for textured scenes reads of one that is not.
+
+    On a CPU rays are shaded in packets without a branch (`packet_shading`): all of it is read, and not used.
+    """
+    if arrays.terms.textured:
+        return arrays.data
+    data = SceneData()  # that of the model stays as it is: others may look at it
+    for name in SceneData.vars:
+        setattr(data, name, getattr(arrays.data, name))
+    faces, materials, device = data.face_material.shape[0], data.base_color.shape[0], arrays.device
+    data.material_texture = wp.zeros(materials, dtype=wp.vec2i, device=device)
+    data.face_lod = wp.zeros(faces, dtype=float, device=device)
+    data.corner_uv = wp.zeros(3 * faces, dtype=wp.vec2, device=device)
+    data.levels = wp.array([(0, 1, 1)], dtype=wp.vec3i, device=device)
+    data.texels = wp.zeros(1, dtype=wp.uint32, device=device)
+    return data

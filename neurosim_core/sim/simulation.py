@@ -1,0 +1,435 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload,union-attr"
+"""N worlds, one vehicle each, stepped together; everything stays on the device.
+
+On a CUDA device a step is one graph: flight, poses, one render of all instants of all worlds, one scan of all
+their pixels. It allocates nothing and waits for nothing; results are arrays on the device that the next step
+overwrites.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from neurosim_core.clock import Rate
+from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.control import CommandMode
+from neurosim_core.frames import as_rows
+from neurosim_core.sim.inputs import as_device_array, make_seeds
+from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.observation import Observation, Samples, VehicleStates
+from neurosim_core.sim.parameters import lenses_differ, vary_sensors
+from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows
+from neurosim_core.sim.scene_table import SceneSource, make_scene_table
+from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
+from neurosim_core.sim.state import State, WorldSettings, make_state, reset_vehicles
+from neurosim_core.sim.step import launch, launch_first
+
+_logger = logging.getLogger(__name__)
+
+WORLD_COUNT_MAX = 4096
+"""Most worlds."""
+
+
+class Simulation:
+    """N worlds that are stepped together; results are arrays on the device.
+
+    All worlds share the clocks of the rig. World i gives what `step` of a single run gives with the same
+    settings, its seed and its commands: the same bytes on a CPU.
+
+    A vehicle that touches the scene, where `vehicle.on_collision` is `end`, or whose motion cannot be
+    integrated, is held where it is until its world is reset; its cameras look on from there, and time passes.
+
+    Args:
+        config: What `load_config` returns or accepts: scene, vehicle, sensors, control; one vehicle.
+        worlds: Number of worlds N, 1 to 4096.
+        device: Where to compute; None: as configured.
+        seeds: Of world 0 (of the others: the next integers) or of each, shape [N]; None: as configured.
+        parameters: What differs from world to world, one number for each, shape [N]: thresholds, noise and
+            dead time of event cameras ("front.threshold_on", "front.shot_noise.rate_hz") and lenses
+            ("front.lens.horizontal_fov_rad").
+        scenes: Scenes to be in: settings files, mesh files or settings; None: the configured one.
+        models: What `make_model` returned for each scene, in place of `scenes`: nothing is loaded twice. They
+            must be on the same device, and have the bodies and `render` of `config`.
+        scene_of_world: Which of them each world is in, shape [N]; by default they take turns.
+        event_capacity: Room for the events of one world and camera in one step; by default two for each
+            pixel. What does not fit is counted (`WorldEvents.dropped`).
+        sorted: Sort events by (t, y, x, polarity) within each world; else those of one world come in an order
+            that on a CUDA device differs from run to run.
+
+    Attributes:
+        count: Number of worlds N.
+        device: Where everything is.
+        seeds: Seed of each world.
+        duration_ns: How long the last step was [ns].
+
+    Raises:
+        ValueError: A setting is not for worlds, out of range, or of the wrong shape; see the message.
+    """
+
+    def __init__(
+        self,
+        config: SimulationConfig | Mapping[str, Any] | str | Path | None = None,
+        *,
+        worlds: int = 1,
+        device: str | None = None,
+        seeds: int | ArrayLike | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        scenes: Sequence[SceneSource] | None = None,
+        models: Sequence[Model] | None = None,
+        scene_of_world: ArrayLike | None = None,
+        event_capacity: int | None = None,
+        sorted: bool = True,
+    ) -> None:
+        if not 1 <= worlds <= WORLD_COUNT_MAX:
+            raise ValueError(f"worlds must be in [1, {WORLD_COUNT_MAX}], got {worlds}")
+        if event_capacity is not None and event_capacity < 1:
+            raise ValueError(f"event_capacity must be 1 at least, got {event_capacity}")
+        chosen = _one_vehicle(config, device)
+        rigs = vary_sensors(chosen.sensors, parameters or {}, worlds)
+        self.count = worlds
+        self.seeds = make_seeds(chosen.seed if seeds is None else seeds, worlds)
+        self._scenes = make_scene_table(
+            chosen,
+            count=worlds,
+            scenes=scenes,
+            models=models,
+            scene_of_world=scene_of_world,
+            lenses_differ=lenses_differ(rigs),
+        )
+        self._model = model = self._scenes.model
+        self.device = wp.get_device(model.device)
+        images = tuple({n: chosen.sensors[n].clock for n in g.image_sensors} for g in model.groups)
+        _check_image_rates(images, model.schedule.control)
+        self._timetable = Timetable(model.schedule, images)
+        self._state = make_state(
+            model,
+            worlds=WorldSettings(
+                scenes=self._scenes,
+                seeds=self.seeds,
+                rigs=rigs,
+                instant_count=self._timetable.instant_count_max(),
+                slot_count=self._timetable.boundary_count_max(),
+                event_capacity=event_capacity,
+                ordered=sorted,
+            ),
+        )
+        self._mask = wp.ones(worlds, dtype=wp.int32, device=self.device)
+        self._begin = begin_of_paths(self._scenes)
+        self._as_configured = set(self._begin)
+        self._warned = False
+        self._observations: dict[Period, Observation] = {}
+        self._now_ns: int | None = None
+        self.duration_ns = 0
+
+    @property
+    def model(self) -> Model:
+        """What does not change, of the first scene."""
+        return self._model
+
+    @property
+    def command_width(self) -> Mapping[str, int]:
+        """Numbers in a command of each mode that was used; of `motor_speeds`, rotors."""
+        return {mode: int(buffer.array.shape[1]) for mode, buffer in self._state.commands.items()}
+
+    @property
+    def common_ns(self) -> int:
+        """Some worlds can be reset when all of them have flown for a multiple of this [ns]; 0: never."""
+        return self._timetable.common_ns
+
+    def reset(
+        self,
+        *,
+        mask: Any = None,
+        seed: int | ArrayLike | None = None,
+        position: Any = None,
+        velocity: Any = None,
+        orientation: Any = None,
+        body_rate: Any = None,
+    ) -> Observation:
+        """Begin anew, in all worlds or in some, with rotors at hover; sample all sensors at stamp 0.
+
+        Event cameras take what they see as their reference; the events of the observation are none, in all
+        worlds. Rows of worlds that are not reset do not count. With arrays of a CUDA device nothing waits for
+        it.
+
+        Args:
+            mask: Which worlds, shape [N], of bool, uint8 or int32, on host or device; None: all.
+            seed: New seeds, of world 0 (of the others: the next integers) or of each, shape [N]; None: the
+                same. For all worlds only.
+            position: p_WB [m], shape [N, 3] or [3]; None: where the configured path begins.
+            velocity: v_WB in W [m/s], likewise.
+            orientation: q_WB, xyzw, shape [N, 4] or [4]; normalised here.
+            body_rate: w_WB in B [rad/s], shape [N, 3] or [3]; None: 0.
+
+        Raises:
+            ValueError: A shape is wrong or a number not finite; or only some worlds are to be reset, and
+                clocks of the rig, which all worlds share, do not tick together now (see `common_ns`).
+        """
+        if mask is not None:
+            self._check_partial(seed)
+        seeds = None if seed is None else make_seeds(seed, self.count)
+        chosen = None if mask is None else self._checked_mask(mask)
+        start = self._checked_start(
+            position=position, velocity=velocity, orientation=orientation, body_rate=body_rate
+        )
+        if seeds is not None:  # all is checked: nothing is half done
+            self._reseed(seeds)
+        self._take_mask(chosen)
+        self._take_start(start)
+        state, period = self._state, self._timetable.first()
+        reset_vehicles(self._model, state, self._mask)
+        wp.copy(state.fleet.active, self._mask)  # sensors of the others do not see this
+        now_ns = state.launched_ns
+        self._launch_reset(state, period)
+        state.launched_ns = 0 if mask is None else now_ns
+        if mask is None:
+            self._now_ns = 0
+        self.duration_ns = 0
+        return self._observe(period)
+
+    def step(self, commands: Any = None, mode: CommandMode = "rates") -> Observation:
+        """Hold a command in each world until the next tick of the control clock.
+
+        On a CUDA device this only queues work. Commands on the device must come from the stream of Warp or
+        from CUDA's default stream, which PyTorch uses unless told otherwise.
+
+        Args:
+            commands: Setpoints of the mode (`control.modes.MODES`), shape [N, width] or, on the host, one row
+                for all. NumPy, PyTorch, Warp or what else has DLPack, float32 or float64. They are copied.
+                None: the rotor speeds that hold now.
+            mode: What they are; turned into rotor speeds once, at the begin of the step.
+
+        Returns:
+            What the sensors yield in (begin, end] of the step; overwritten by the next.
+
+        Raises:
+            RuntimeError: The worlds were not reset.
+            ValueError: Commands on the host are of a wrong shape or not finite. Those on the device are not
+                looked at: a vehicle whose command is not finite is held (`Observation.status`).
+        """
+        self._require_reset()
+        if commands is not None:
+            self._take_commands(commands, mode)
+        return self._advance(closed_loop=False)
+
+    def rollout(self, periods: int) -> Observation:
+        """Follow the configured path for some control periods, with the controller on the device.
+
+        Args:
+            periods: How many, at least 1.
+
+        Returns:
+            What the sensors yield in the last of them.
+
+        Raises:
+            RuntimeError: The worlds were not reset.
+            ValueError: `periods` is less than 1.
+        """
+        self._require_reset()
+        if periods < 1:
+            raise ValueError(f"periods must be 1 at least, got {periods}")
+        for _ in range(periods):
+            observation = self._advance(closed_loop=True)
+        return observation
+
+    def _require_reset(self) -> int:
+        if self._now_ns is None:
+            raise RuntimeError("reset() must be called before step()")
+        return self._now_ns
+
+    def _advance(self, *, closed_loop: bool) -> Observation:
+        """Fly one control period."""
+        now_ns = self._require_reset()
+        period = self._timetable.at(now_ns)
+        state = self._state
+        stretch = [b._replace(stamp_ns=b.stamp_ns + now_ns) for b in period.boundaries]
+        batch = plan_batch(state, stretch, closed_loop=closed_loop, begin_ns=now_ns)
+        launch(self._model, state, batch, last_seen_ns=period.last_seen_ns)
+        self._now_ns = now_ns + period.duration_ns
+        self.duration_ns = period.duration_ns
+        if state.graphs.dropped_count > 0 and not self._warned:
+            self._warned = True
+            _logger.warning(
+                "steps of these worlds come in more patterns than there is room for graphs, and are launched "
+                "one by one, which is slower: give sensors rates that are simple fractions of "
+                "control.rate_hz = %g or multiples of it",
+                self._model.config.control.rate_hz,
+            )
+        return self._observe(period)
+
+    def _launch_reset(self, state: State, period: Period) -> None:
+        """Sample all sensors at stamp 0 in the worlds of the mask."""
+        batch = plan_batch(state, period.boundaries, closed_loop=False, begin_ns=0)
+        launch_first(self._model, state, batch)
+        for group in state.groups:
+            for sensor in group.world_frames.values():
+                sensor.begin(self._mask, group.parity)
+        state.fleet.active.fill_(1)
+
+    def _observe(self, period: Period) -> Observation:
+        """Return the views of what a period yields: the same arrays each time."""
+        if period not in self._observations:
+            if len(self._observations) >= PERIOD_COUNT_MAX:
+                self._observations.clear()
+            self._observations[period] = self._make_observation(period)
+        return self._observations[period]
+
+    def _make_observation(self, period: Period) -> Observation:
+        state, arrays = self._state, self._state.vehicle.arrays
+        samples = {}
+        for index, (name, sampler) in enumerate(state.samplers.items()):
+            offsets_ns = period.sample_offsets_ns(index)
+            samples[name] = Samples(
+                arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
+                offsets_ns=offsets_ns,
+            )
+        return Observation(
+            state=VehicleStates(
+                position=arrays.position,
+                velocity=arrays.velocity,
+                orientation=arrays.orientation,
+                body_rate=arrays.body_rate,
+                rotor_speed=arrays.rotor_speed,
+                stamp_ns=arrays.stamp_ns,
+            ),
+            clock_ns=state.fleet.clock_ns,
+            frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
+            images={name: picture for group in state.groups for name, picture in group.pictures.items()},
+            fresh=frozenset(name for names in period.pictures for name in names),
+            samples=samples,
+            collided=state.fleet.collided,
+            status=arrays.status,
+        )
+
+    def _take_commands(self, commands: Any, mode: CommandMode) -> None:
+        """Copy commands into the fixed buffer that the graph reads."""
+        buffer = command_buffer(self._model, self._state, mode)
+        on_device = as_device_array(commands, self.device)
+        if on_device is not None:
+            self._take_rows(on_device, buffer.array, "commands")
+        else:
+            buffer.write(checked_command(self._model, self._state, commands, mode))
+        self._state.command_mode = mode
+
+    def _take_rows(self, rows: Any, out: Any, name: str) -> None:
+        _check_rows(rows, out, name)
+        wp.launch(take_rows, dim=out.shape, inputs=[rows], outputs=[out], device=self.device)
+
+    def _checked_mask(self, mask: Any) -> Any:
+        """Return a mask of the right shape and type: an array of the device, or int32 on the host."""
+        given = as_device_array(mask, self.device)
+        kinds: tuple[Any, ...] = (wp.bool, wp.uint8, wp.int32)
+        if given is None:
+            given = np.asarray(mask)
+            kinds = (np.bool_, np.uint8, np.int32)
+        if given.shape != (self.count,) or given.dtype not in kinds:
+            raise ValueError(
+                f"mask must be bool, uint8 or int32 of shape [{self.count}], "
+                f"got {getattr(given.dtype, '__name__', given.dtype)} of shape {list(given.shape)}"
+            )
+        return (given != 0).astype(np.int32) if isinstance(given, np.ndarray) else given
+
+    def _take_mask(self, mask: Any) -> None:
+        if mask is None:
+            self._mask.fill_(1)
+        elif isinstance(mask, np.ndarray):
+            self._mask.assign(mask)
+        else:
+            self._launch(take_mask, [mask], [self._mask])
+
+    def _checked_start(self, **given: Any) -> dict[str, Any]:
+        """Return where vehicles are to begin: arrays of the device, rows on the host, None: by default."""
+        checked: dict[str, Any] = {}
+        for name, value in given.items():
+            array = getattr(self._state.start, name)
+            if (on_device := as_device_array(value, self.device)) is not None:
+                _check_rows(on_device, array, name)
+                checked[name] = on_device
+            elif value is None:
+                checked[name] = None
+            else:
+                rows = as_rows(value, name=name, count=self.count, width=array.shape[1])
+                checked[name] = normalised(rows) if name == "orientation" else rows
+        return checked
+
+    def _take_start(self, checked: Mapping[str, Any]) -> None:
+        for name, value in checked.items():
+            array = getattr(self._state.start, name)
+            if value is None:
+                if name not in self._as_configured:
+                    array.assign(self._begin[name])
+                    self._as_configured.add(name)
+                continue
+            self._as_configured.discard(name)
+            if isinstance(value, np.ndarray):
+                array.assign(value)
+                continue
+            self._take_rows(value, array, name)
+            if name == "orientation":
+                self._launch(normalise, [], [array])
+
+    def _check_partial(self, seed: Any) -> None:
+        if self._now_ns is None:
+            raise ValueError("mask: the first reset is of all worlds")
+        if seed is not None:
+            raise ValueError("seed: new seeds are for a reset of all worlds")
+        common_ns = self._timetable.common_ns
+        if common_ns == 0 or self._now_ns % common_ns != 0:
+            when = f"every {common_ns} ns" if common_ns else "never"
+            raise ValueError(
+                "mask: a world that begins now would not be in step with the clocks of the rig, which tick "
+                f"together {when}, and it is {self._now_ns} ns: give all sensors rates that are multiples of "
+                f"control.rate_hz = {self._model.config.control.rate_hz:g}, or reset some worlds only then"
+            )
+
+    def _reseed(self, seeds: list[int]) -> None:
+        self.seeds = seeds
+        self._state.seeds.assign(np.array(seeds, dtype=np.uint64))
+        for group in self._state.groups:
+            for sensor in group.world_frames.values():
+                sensor.seed(seeds)
+
+    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _one_vehicle(
+    config: SimulationConfig | Mapping[str, Any] | str | Path | None, device: str | None
+) -> SimulationConfig:
+    chosen = config if isinstance(config, SimulationConfig) else load_config(config)
+    if len(chosen.vehicles) > 1:
+        raise ValueError(f"a world holds one vehicle, got {', '.join(chosen.vehicles)}")
+    chosen = chosen.of(next(iter(chosen.vehicles)))
+    return chosen if device is None else chosen.model_copy(update={"device": device})
+
+
+def _check_image_rates(images: Sequence[Mapping[str, Rate]], control: Rate) -> None:
+    for name, rate in (item for cameras in images for item in cameras.items()):
+        if not control.contains(rate):
+            raise ValueError(
+                f"sensors.{name}.rate_hz must divide control.rate_hz = {control.rate_hz:g} in worlds, where "
+                f"pictures are taken at the end of steps, got {rate.rate_hz:g}"
+            )
+
+
+def _check_rows(rows: Any, out: Any, name: str) -> None:
+    """Refuse an array of the device that cannot be copied to another."""
+    if rows.ndim != 2 or tuple(rows.shape) != tuple(out.shape):
+        raise ValueError(f"{name} must have shape {list(out.shape)}, got {list(rows.shape)}")
+    if rows.dtype not in (wp.float32, wp.float64):
+        raise ValueError(f"{name} must be float32 or float64, got {rows.dtype.__name__}")
+
+
+def _first(rows: Any, count: int) -> Any:
+    """Return the first rows; Warp refuses an empty slice."""
+    if count == 0:
+        return wp.empty((0, *rows.shape[1:]), dtype=rows.dtype, device=rows.device)
+    return rows[:count]

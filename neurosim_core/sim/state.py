@@ -1,0 +1,442 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
+"""What changes during a run: the vehicles of all worlds, the buffers of their sensors, how far both have come."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from neurosim_core.clock import to_ns
+from neurosim_core.control import CommandMode, Controller, make_controller
+from neurosim_core.frames import as_rows
+from neurosim_core.packets import Odometry
+from neurosim_core.render.renderer import RenderWorlds
+from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy, make_stream
+from neurosim_core.sensors.base import (
+    FrameSensorConfig,
+    Sampler,
+    SamplerContext,
+    StateSensorConfig,
+    WorldFrameContext,
+)
+from neurosim_core.sensors.render_plan import RenderGroup
+from neurosim_core.sim.inputs import CommandBuffer
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.parameters import Rig, lens_tables
+from neurosim_core.sim.render_group import (
+    Choice,
+    Instants,
+    MakeRoom,
+    RenderGroupState,
+    RenderJob,
+    make_render_group,
+)
+from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
+from neurosim_core.sim.scene_table import SceneTable, single_scene
+from neurosim_core.sim.schedule import Boundary, boundary_count_max
+from neurosim_core.sim.trace import Fleet, Trace, make_surfaces
+from neurosim_core.vehicle import DynamicsError, Multirotor
+
+_IN_FLIGHT_ON_CUDA = 3
+"""With three, one batch is flown and one rendered while the host reads a third."""
+_FLEET_ARRAYS = (
+    "position", "velocity", "orientation", "body_rate", "rotor_speed", "rotor_speed_command", "stamp_ns",
+    "status", "redone_count", "evaluation_count",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartState:
+    """Where an episode starts, with rotors at hover; what is None is as configured: the start of the path."""
+
+    position: ArrayLike | None = None
+    """p_WB [m], shape [3]."""
+    orientation: ArrayLike | None = None
+    """q_WB, xyzw, shape [4]."""
+    velocity: ArrayLike | None = None
+    """v_WB in W [m/s], shape [3]."""
+    body_rate: ArrayLike | None = None
+    """w_WB in B [rad/s], shape [3]."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Batch:
+    """A stretch of a run that was flown, and that cameras may have to render."""
+
+    boundaries: Sequence[Boundary]
+    elapsed_ns: Sequence[int]
+    """From each boundary's predecessor to it [ns]."""
+    pattern: Hashable
+    """Same pattern, same flight: spans, and what is due at their ends."""
+    closed_loop: bool
+    """The path controller commands."""
+    step_count: int
+    """Steps of the integration."""
+    command_count: int
+    number: int
+    """Counts the batches of a state."""
+    slot: int
+    """Slot of the first boundary in the trace, and of its first sample in the arrays of each sampler."""
+    wanted: frozenset[str]
+    """Cameras that look."""
+    until_ns: int
+    """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
+    jobs: Sequence[RenderJob] | None = None
+    """What groups render of it, if that was planned ahead."""
+    seen: Sequence[tuple[RenderGroupState, Instants]] = ()
+    choices: Sequence[Choice] = ()
+    """What adaptive groups render of it."""
+
+
+class PlannedStep(NamedTuple):
+    """A control period that was planned."""
+
+    batch: Batch
+    """The first of it."""
+    end_ns: int
+    """Where it ends [ns]."""
+
+
+@dataclass(kw_only=True, eq=False)
+class State:
+    """What changes during a run."""
+
+    world_count: int
+    on_host: bool
+    """Packets go to the host; else results stay on the device."""
+    vehicle: Multirotor
+    fleet: Any
+    """The vehicles and the clocks of their worlds as kernels see them (`trace.Fleet`)."""
+    surfaces: Any
+    """What they can touch (`trace.Surfaces`)."""
+    start: Any
+    """Where vehicles begin, one row for each world (`integrate.Start`)."""
+    path_controller: Controller
+    trace: Trace
+    groups: list[RenderGroupState]
+    samplers: dict[str, Sampler]
+    sampler_copies: dict[str, dict[str, HostCopy]]
+    """What each sampler measures on the host, in the slots of the trace; empty: it stays on the device."""
+    seeds: Any
+    """Seed of each world, device array of uint64."""
+    batch_done: Sequence[Fence]
+    """For each batch that cameras may render, the point where the device has finished it."""
+    flight_lane_count: int
+    """The most batches that may be flown and not rendered."""
+    borrow_pictures: bool
+    """Pictures are views that the next batch with the same buffers overwrites."""
+    late_pictures: bool
+    """Pictures for which the caller has room are handed out before the device has finished them."""
+    wanted: frozenset[str]
+    """Cameras that look, from the next batch on."""
+    flight_stream: wp.Stream | None
+    """Where the vehicle moves, ahead of the renderers; with one batch in flight nothing overlaps."""
+    render_streams: Sequence[wp.Stream | None]
+    """For each batch in flight: the last rays of one and the first of the next fill the device together."""
+    event_stream: wp.Stream | None
+    """Where events are found, while the next batch is rendered."""
+    choice_stream: wp.Stream | None
+    """Where adaptive groups choose what to render, ahead of the renderers."""
+    overlaps: bool
+    """Parts of a batch are launched on their own; on a CUDA device with one batch in flight, all as one
+    graph, unless an adaptive group or the host has to wait for the flight."""
+    flown: Sequence[Fence]
+    """For each batch that may be flown and not rendered, its end on `flight_stream`."""
+    rendered: Fence
+    """End of the batch whose rendering was launched last."""
+    graphs: GraphCache
+    stamp_ns: int = 0
+    """How far packets have been returned [ns]."""
+    launched_ns: int = 0
+    """How far the device has been told to go [ns]."""
+    launched_count: int = 0
+    """Batches flown so far."""
+    rendered_count: int = 0
+    """Batches that cameras have rendered, or left out; written by the thread that does."""
+    last: Odometry | None = None
+    """The state at the end of what was flown and read."""
+    controllers: dict[str, Controller] = field(default_factory=dict)
+    """Who turns setpoints into rotor speeds, in the command modes that were used."""
+    commands: dict[str, CommandBuffer] = field(default_factory=dict)
+    """The setpoints of each mode that was used."""
+    command_mode: CommandMode | None = None
+    """Mode of the setpoint that the next batch begins with."""
+    in_flight: deque[Batch] = field(default_factory=deque)
+    planned: PlannedStep | None = None
+    """The next control period, if it was planned while the device was at work."""
+    sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    touching: bool = False
+    """The vehicle touched the scene at the last boundary."""
+    ended: bool = False
+    """A collision ended the run."""
+    failure: DynamicsError | None = None
+    """The integration failed; packets up to its stamp have been returned."""
+    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    """steps, commands, redone intervals (of the dynamics, in adaptive steps), renders, ticks left out, coarse
+    ticks, events dropped, collisions."""
+    wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    """Wall-clock time by phase [s]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorldSettings:
+    """How worlds that are stepped together differ, and what their results are."""
+
+    scenes: SceneTable
+    seeds: Sequence[int]
+    """Of each world."""
+    rigs: Sequence[Rig]
+    """The sensors of each world."""
+    instant_count: int
+    """The most instants of a group in one step."""
+    slot_count: int
+    """The most boundaries of one step."""
+    event_capacity: int | None = None
+    """Room for the events of one world and camera in one step."""
+    ordered: bool = True
+    """Sort events."""
+
+
+def make_state(
+    model: Model,
+    *,
+    in_flight: int | None = None,
+    flight_lane_count: int | None = None,
+    borrow_pictures: bool = False,
+    late_pictures: bool = False,
+    make_room: MakeRoom | None = None,
+    seed: int | None = None,
+    start: StartState | None = None,
+    worlds: WorldSettings | None = None,
+) -> State:
+    """Allocate everything an episode needs, in one world whose packets go to the host, or in many.
+
+    Args:
+        model: What does not change.
+        in_flight: How many batches `run_model` keeps in flight. By default 3 on a CUDA device, and 1 where a
+            launch returns when it has finished. It changes no packet.
+        flight_lane_count: How many batches of `integrate_period` may wait for `render_batch`; by default
+            `in_flight`.
+        borrow_pictures: Do not copy pictures: with one batch in flight, each is valid until the next `step`
+            or `render_batch`; those that a step would overwrite itself are copied.
+        late_pictures: Ask for room before pictures are rendered, and do not wait for those that a device
+            copies there: they are there after `settle`.
+        make_room: Gives memory to copy a picture to, where the caller has a place for it; called by the
+            thread that reads the cameras; with `late_pictures` by the one that launches.
+        seed: Seed of the sensor noise and of turbulence; None: as configured.
+        start: Where the vehicle starts; None: as configured.
+        worlds: Many worlds whose results stay on the device, in place of one with packets.
+
+    Raises:
+        ValueError: The start is of a wrong shape or not finite.
+    """
+    config, device = model.config, model.device
+    is_cuda = wp.get_device(device).is_cuda
+    on_host = worlds is None
+    if worlds is None:
+        worlds = WorldSettings(
+            scenes=single_scene(model),
+            seeds=[config.seed if seed is None else seed],
+            rigs=[config.sensors],
+            instant_count=0,
+            slot_count=boundary_count_max(model.schedule),
+        )
+    if in_flight is None:
+        in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer != "pyrender" else 1
+    count = len(worlds.seeds)
+    flight_lane_count = max(in_flight, flight_lane_count or 0)
+    slot_count = flight_lane_count * worlds.slot_count
+    seeds: Any = wp.array(np.array(worlds.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
+    vehicle = Multirotor(
+        model.airframe,
+        count=count,
+        device=device,
+        max_step_ns=to_ns(config.vehicle.max_step_s),
+        integrator=config.vehicle.integrator,
+        seeds=seeds,
+    )
+    fleet = _make_fleet(vehicle)
+    samplers = {
+        name: sensor.make(
+            SamplerContext(
+                name=name, vehicle=vehicle, slot_count=slot_count, seeds=seeds, active=fleet.active
+            )
+        )
+        for name, sensor in config.sensors.items()
+        if isinstance(sensor, StateSensorConfig)
+    }
+    trace = Trace(
+        capacity=slot_count, world_count=count, rotor_count=model.airframe.rotor_count, device=device
+    )
+    if on_host:
+        trace.bring_to_host()
+    ground = model.airframe.ground
+    paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
+    state = State(
+        world_count=count,
+        on_host=on_host,
+        vehicle=vehicle,
+        fleet=fleet,
+        surfaces=make_surfaces(
+            worlds.scenes.fields,
+            worlds.scenes.scene,
+            radius_m=config.vehicle.collision_radius_m,
+            ground_height_m=None if ground is None else ground.height_m,
+            holds=config.vehicle.on_collision == "end",
+        ),
+        start=_make_start(worlds, start, device),
+        path_controller=make_controller(
+            "path",
+            model.airframe,
+            config.control.gains,
+            count=count,
+            device=device,
+            paths=paths[0] if all(path is paths[0] for path in paths) else paths,
+        ),
+        trace=trace,
+        groups=_make_groups(
+            model, worlds, in_flight=in_flight, on_host=on_host, make_room=make_room, late=late_pictures
+        ),
+        samplers=samplers,
+        sampler_copies={
+            name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
+            for name, sampler in samplers.items()
+            if on_host
+        },
+        seeds=seeds,
+        overlaps=on_host and (in_flight > 1 or late_pictures or not is_cuda or bool(model.schedule.sparse)),
+        batch_done=[Fence(device) for _ in range(in_flight)],
+        flight_lane_count=flight_lane_count,
+        borrow_pictures=borrow_pictures,
+        late_pictures=late_pictures,
+        wanted=frozenset(name for group in model.groups for name in group.names),
+        flight_stream=make_stream(device, high_priority=True) if in_flight > 1 else None,
+        render_streams=[make_stream(device) if in_flight > 1 else None for _ in range(in_flight)],
+        event_stream=make_stream(device, high_priority=True) if in_flight > 1 else None,
+        choice_stream=make_stream(device, high_priority=True)
+        if in_flight > 1 and model.schedule.sparse
+        else None,
+        flown=[Fence(device) for _ in range(flight_lane_count)],
+        rendered=Fence(device),
+        graphs=GraphCache(device),
+    )
+    reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
+    return state
+
+
+def _make_groups(
+    model: Model,
+    worlds: WorldSettings,
+    *,
+    in_flight: int,
+    on_host: bool,
+    make_room: MakeRoom | None,
+    late: bool,
+) -> list[RenderGroupState]:
+    """Return the render groups; none where the scene is not on the device."""
+    config, scenes = model.config, worlds.scenes
+    groups: list[RenderGroupState] = []
+    for index, group in enumerate(model.groups if model.scene_on_device is not None else ()):
+        if not on_host and group.max_displacement_px is not None:
+            raise ValueError(
+                f"max_displacement_px of {', '.join(group.frame_sensors)} is for single runs: it chooses what "
+                "to render for one vehicle, on the host"
+            )
+        lenses, lens_of_world = lens_tables(group, worlds.rigs)
+        rooms = {} if on_host else _frame_capacities(group, worlds)
+
+        def world_context(name: str, frames: Any, rooms: Mapping[str, int] = rooms) -> WorldFrameContext:
+            return WorldFrameContext(
+                name=name,
+                configs=[rig[name] for rig in worlds.rigs],
+                frames=frames,
+                capacity=rooms[name],
+                seeds=worlds.seeds,
+                ordered=worlds.ordered,
+            )
+
+        groups.append(
+            make_render_group(
+                group,
+                config.sensors,
+                model.scene_on_device,  # type: ignore[arg-type]
+                capacity=model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count,
+                in_flight=in_flight,
+                device=model.device,
+                seed=worlds.seeds[0],
+                bodies=config.bodies,
+                worlds=RenderWorlds(
+                    count=len(worlds.seeds),
+                    lenses=lenses,
+                    lens_of_world=lens_of_world,
+                    scenes=scenes.data,
+                    scene_of_world=scenes.scene,
+                    terms=scenes.terms,
+                ),
+                on_host=on_host,
+                make_room=make_room,
+                late=late,
+                world_context=None if on_host else world_context,
+            )
+        )
+    return groups
+
+
+def _frame_capacities(group: RenderGroup, worlds: WorldSettings) -> dict[str, int]:
+    """Return for how many results of each frame sensor there is room, before anything is allocated."""
+    configs = {name: worlds.rigs[0][name] for name in group.frame_sensors}
+    return {
+        name: config.world_capacity(len(worlds.seeds), worlds.event_capacity)
+        for name, config in configs.items()
+        if isinstance(config, FrameSensorConfig)
+    }
+
+
+def _make_start(worlds: WorldSettings, chosen: StartState | None, device: str) -> Any:
+    """Allocate what says where vehicles begin."""
+    rows: Mapping[str, Any] = begin_of_paths(worlds.scenes)
+    start = Start()
+    for name, configured in rows.items():
+        given = None if chosen is None else getattr(chosen, name)
+        value = configured
+        if given is not None:
+            value = as_rows(given, name=name, count=len(configured), width=configured.shape[1])
+            value = normalised(value) if name == "orientation" else value
+        setattr(start, name, wp.array(value, dtype=wp.float64, device=device))
+    return start
+
+
+def _make_fleet(vehicle: Multirotor) -> Any:
+    fleet = Fleet()
+    for name in _FLEET_ARRAYS:
+        setattr(fleet, name, getattr(vehicle.arrays, name))
+    fleet.clock_ns = wp.zeros(vehicle.count, dtype=wp.int64, device=vehicle.device)
+    fleet.collided = wp.zeros(vehicle.count, dtype=wp.int32, device=vehicle.device)
+    fleet.active = wp.ones(vehicle.count, dtype=wp.int32, device=vehicle.device)
+    return fleet
+
+
+def reset_vehicles(model: Model, state: State, mask: Any) -> None:
+    """Put the vehicles of some worlds where they begin, with rotors at hover, at time 0; launches only.
+
+    Args:
+        model: What does not change.
+        state: `start` says where they begin.
+        mask: Not 0 where a world begins anew, device array of int32, shape [N].
+    """
+    wp.launch(
+        restart,
+        dim=state.world_count,
+        inputs=[model.airframe.hover_rotor_speed_rad_s, mask, state.start],
+        outputs=[state.fleet],
+        device=model.device,
+    )
+    state.vehicle.begin(mask)
+    for sampler in state.samplers.values():
+        sampler.reset(mask)

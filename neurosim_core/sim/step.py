@@ -1,0 +1,99 @@
+# mypy: disable-error-code="no-untyped-call"
+"""The data flow of the simulator, in one function: read `launch` first.
+
+    commands -> integrate -> sample the state -> pose cameras -> render -> scan events -> packets
+
+What does not change is in `model.py`, what does in `state.py`: arrays with a leading axis of worlds, of which
+a single run has one. A run is cut into batches (`schedule.py`). Within a batch the vehicles are integrated
+from boundary to boundary, and their states stay on the device (`integrate.py`, `trace.py`). Then every render
+group renders all its instants in one launch, every frame sensor scans them in one launch (`cameras.py`,
+`render_group.py`), and what goes to the host is read back once.
+
+How parts of a batch share a device (streams, graphs, several batches in flight) is in `runtime/cuda.py`; it
+changes no result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from neurosim_core.packets import Packet
+from neurosim_core.runtime.timing import timed
+from neurosim_core.sim.cameras import (
+    choose,
+    find_in_worlds,
+    launch_cameras,
+    plan_jobs,
+    prepare_worlds,
+    read_cameras,
+    scan,
+    turn_parities,
+)
+from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, read_flight
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.render_group import acquire_room, bring_images, launch_key
+from neurosim_core.sim.state import Batch, State
+
+
+def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[int] = ()) -> None:
+    """Launch one batch, from the command to the events, without waiting for a device.
+
+    Args:
+        model: What does not change.
+        state: Everything else, of all worlds.
+        batch: Where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
+        last_seen_ns: Of many worlds, for each group: the instant before the batch, from its begin [ns], <= 0.
+    """
+    # commands -> motor speeds -> motion, from boundary to boundary; state sensors measure on the way
+    flight_key, flight = plan_flight(state, batch)
+    if state.overlaps:  # each part on a stream of its own, while other batches are in flight
+        launch_flight(state, batch, flight_key, flight)
+        launch_cameras(model, state, batch)
+    else:
+        # poses of the cameras -> one render of all their instants
+        jobs = batch.jobs
+        if jobs is None:
+            jobs = plan_jobs(state, batch, choose(model, state, batch))
+        for job in jobs:
+            acquire_room(job)
+        worlds_key = prepare_worlds(state, batch, last_seen_ns)
+
+        def everything() -> tuple[object, ...]:
+            held = flight(), *(job.render() for job in jobs)
+            return *held, find_in_worlds(state, batch, last_seen_ns)  # log radiance -> events, in many worlds
+
+        with timed(state.wall_s, "flight and render"):
+            state.graphs.run((flight_key, worlds_key, *map(launch_key, jobs)), everything)
+            for job in jobs:
+                bring_images(job.group, job.instants)
+        turn_parities(state, batch)
+        scan(state, batch, jobs)  # log radiance -> events, in a world whose packets go to the host
+    if state.on_host:
+        state.in_flight.append(batch)
+
+
+def launch_first(model: Model, state: State, batch: Batch) -> None:
+    """Launch the batch at stamp 0 of many worlds: sensors sample, pictures are taken; nothing moves."""
+    _, flight = plan_flight(state, batch)
+    flight()
+    for job in plan_jobs(state, batch, choose(model, state, batch)):
+        job.render()
+
+
+def read(model: Model, state: State, *, last: bool = False) -> list[Packet]:
+    """Wait for the oldest batch in flight and return what the sensors yield in it, in the order of time.
+
+    Args:
+        model: What does not change.
+        state: `stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or
+            the integration failed (`failure`).
+        last: Nothing is launched before the pictures have been used: they may be borrowed, if that is wanted.
+    """
+    batch = state.in_flight.popleft()
+    with timed(state.wall_s, "read-back"):
+        flown = state.flown if state.overlaps else state.batch_done  # one graph has one end
+        flown[batch.number % len(flown)].wait()
+    packets = read_flight(model, state, batch)  # may end the run before the end of the batch
+    packets += read_cameras(state, batch, borrow=last and state.borrow_pictures)
+    state.rendered_count += 1
+    return in_order(model, packets, batch.until_ns)

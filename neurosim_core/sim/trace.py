@@ -1,0 +1,305 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,valid-type"
+"""The states of the vehicles of all worlds at the boundaries of batches, on the device until they are read."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.runtime.cuda import HostCopy
+from neurosim_core.scene.freespace import DistanceField, room_around
+from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
+
+wp.set_module_options({"enable_backward": False})
+
+POSITION = slice(0, 3)
+ORIENTATION = slice(3, 7)
+VELOCITY = slice(7, 10)
+BODY_RATE = slice(10, 13)
+ROTOR_SPEED = slice(13, None)
+"""Where each part of a state stands in a row of a `Trace`."""
+_SLOT_PARAMETER = 3
+_ELAPSED_PARAMETER = 4
+_LAUNCHES_MAX = 256
+
+
+@wp.struct
+class Surfaces:
+    """What vehicles can touch: the scene that each world is in, and the ground."""
+
+    fields: wp.array[DistanceField]
+    """Distance to each scene, shape [scene]."""
+    scene: wp.array[int]
+    """Which of them a world is in, shape [world]."""
+    radius_m: float
+    """Radius of the vehicle [m]."""
+    ground_height_m: wp.float64
+    """z of the plane that it may land on [m]; -inf: there is none."""
+    holds: int
+    """1: a vehicle that touches something is held until its world is reset."""
+
+
+@wp.struct
+class Fleet:
+    """The state of the vehicles (`MultirotorArrays`) and of their worlds; all of shape [world, ...]."""
+
+    position: wp.array[wp.vec3d]
+    velocity: wp.array[wp.vec3d]
+    orientation: wp.array[wp.quatd]
+    body_rate: wp.array[wp.vec3d]
+    rotor_speed: wp.array2d[wp.float64]
+    rotor_speed_command: wp.array2d[wp.float64]
+    stamp_ns: wp.array[wp.int64]
+    status: wp.array[wp.int32]
+    redone_count: wp.array[wp.int64]
+    evaluation_count: wp.array[wp.int64]
+    clock_ns: wp.array[wp.int64]
+    """Time of the world at the beginning of the batch [ns]."""
+    collided: wp.array[wp.int32]
+    """1: the vehicle has touched something in this batch, or is held because it did."""
+    active: wp.array[wp.int32]
+    """0: the world is left alone by samplers and collisions."""
+
+
+@wp.struct
+class Rows:
+    """The slots of a trace."""
+
+    states: wp.array3d[wp.float64]
+    status: wp.array2d[wp.int32]
+    clearance: wp.array2d[wp.float32]
+    redone: wp.array2d[wp.int64]
+    stamps: wp.array2d[wp.int64]
+
+
+@wp.kernel
+def _record(
+    # Model:
+    surfaces: Surfaces,
+    # In/out:
+    fleet: Fleet,
+    # Out:
+    rows_out: Rows,
+    # In:
+    slot: int,
+    elapsed_ns: wp.int64,
+) -> None:
+    world = wp.tid()
+    position = fleet.position[world]
+    for axis in range(3):
+        rows_out.states[slot, world, axis] = position[axis]
+        rows_out.states[slot, world, 7 + axis] = fleet.velocity[world][axis]
+        rows_out.states[slot, world, 10 + axis] = fleet.body_rate[world][axis]
+    for part in range(4):
+        rows_out.states[slot, world, 3 + part] = fleet.orientation[world][part]
+    for rotor in range(fleet.rotor_speed.shape[1]):
+        rows_out.states[slot, world, 13 + rotor] = fleet.rotor_speed[world, rotor]
+    rows_out.status[slot, world] = fleet.status[world]
+    rows_out.stamps[slot, world] = fleet.clock_ns[world] + elapsed_ns
+    rows_out.redone[slot, world] = fleet.redone_count[world]
+    field = surfaces.fields[surfaces.scene[world]]
+    room = room_around(
+        field, surfaces.radius_m, surfaces.radius_m + field.voxel, surfaces.ground_height_m, position
+    )
+    rows_out.clearance[slot, world] = room
+    if room <= 0.0 and fleet.active[world] != 0 and fleet.status[world] == STATUS_OK:
+        fleet.collided[world] = 1
+        if surfaces.holds != 0:
+            fleet.status[world] = STATUS_COLLISION
+
+
+@wp.kernel
+def _camera_poses(
+    # Model:
+    p_BC: wp.vec3d,
+    q_BC: wp.quatd,
+    stride: int,
+    # In:
+    states: wp.array3d[wp.float64],
+    stamps: wp.array2d[wp.int64],
+    slots: wp.array[int],
+    # Out:
+    p_WC_out: wp.array[wp.vec3],
+    q_WC_out: wp.array[wp.quat],
+    stamps_out: wp.array2d[wp.int64],
+) -> None:
+    world, instant = wp.tid()
+    slot = slots[instant]
+    row = world * stride + instant
+    p_WB = wp.vec3d(states[slot, world, 0], states[slot, world, 1], states[slot, world, 2])
+    q_WB = wp.quatd(
+        states[slot, world, 3], states[slot, world, 4], states[slot, world, 5], states[slot, world, 6]
+    )
+    p_WC = p_WB + wp.quat_rotate(q_WB, p_BC)
+    q_WC = q_WB * q_BC
+    p_WC_out[row] = wp.vec3(p_WC)
+    q_WC_out[row] = wp.quat(q_WC)
+    if stamps_out.shape[0] > 0:
+        stamps_out[row, 0] = stamps[slot, world]
+
+
+@wp.kernel
+def _copy_rows(
+    # In:
+    first: int,
+    rows: Rows,
+    # Out:
+    rows_out: Rows,
+) -> None:
+    place, world, part = wp.tid()
+    slot = first + place
+    rows_out.states[slot, world, part] = rows.states[slot, world, part]
+    if part == 0:
+        rows_out.status[slot, world] = rows.status[slot, world]
+        rows_out.redone[slot, world] = rows.redone[slot, world]
+        rows_out.clearance[slot, world] = rows.clearance[slot, world]
+
+
+class TraceRows(NamedTuple):
+    """Slots of a `Trace` on the host."""
+
+    states: NDArray[np.float64]
+    """Shape [slot, world, 13 + R]."""
+    status: NDArray[np.int32]
+    """Shape [slot, world]."""
+    clearance: NDArray[np.float32]
+    """[m], shape [slot, world]."""
+    redone: NDArray[np.int64]
+    """Shape [slot, world]."""
+
+
+class Trace:
+    """Device buffers with one slot for each boundary of the batches in flight, and their copies on the host.
+
+    Attributes:
+        states: States, float64, shape [slot, world, 13 + R].
+        status: Why a vehicle is held (`MultirotorArrays.status`), shape [slot, world].
+        stamps: Time of each slot since the reset of the world [ns], int64, shape [slot, world].
+        redone: Intervals redone so far (`MultirotorArrays.redone_count`), shape [slot, world].
+        clearance: Distance from the vehicle to the nearest surface [m], <= 0 where it touches, float32, shape
+            [slot, world].
+    """
+
+    def __init__(self, *, capacity: int, world_count: int, rotor_count: int, device: str) -> None:
+        shape = (capacity, world_count)
+
+        def zeros(shape: Any, dtype: Any) -> Any:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self._rows = Rows()
+        self._rows.states = self.states = zeros((*shape, 13 + rotor_count), wp.float64)
+        self._rows.status = self.status = zeros(shape, wp.int32)
+        self._rows.clearance = self.clearance = zeros(shape, wp.float32)
+        self._rows.redone = self.redone = zeros(shape, wp.int64)
+        self._rows.stamps = self.stamps = zeros(shape, wp.int64)
+        self._is_cuda = wp.get_device(device).is_cuda
+        self._copies: list[HostCopy] = []
+        self._rows_on_host = Rows()
+        self._recording: tuple[Any, Any] = (None, None)
+        self._pose_launches: dict[tuple[int, int, int], tuple[Any, wp.Launch]] = {}
+
+    def record(self, surfaces: Any, fleet: Any, slot: int, elapsed_ns: int) -> None:
+        """Copy the present state, status and time of all vehicles into a slot, and note who touches what.
+
+        Args:
+            surfaces: `Surfaces`.
+            fleet: `Fleet`; vehicles that touch something are marked in it, and held if so configured.
+            slot: Where to write, in [0, capacity).
+            elapsed_ns: Time since the beginning of the batch [ns].
+        """
+        if self._recording[0] is not fleet:
+            launch = wp.launch(
+                _record,
+                dim=self.states.shape[1],
+                inputs=[surfaces, fleet, self._rows, slot, elapsed_ns],
+                device=self.states.device,
+                record_cmd=True,
+            )
+            self._recording = (fleet, launch)
+        launch = self._recording[1]
+        launch.set_param_at_index(_SLOT_PARAMETER, slot)
+        launch.set_param_at_index(_ELAPSED_PARAMETER, elapsed_ns)
+        launch.launch()
+
+    def camera_poses(
+        self,
+        slots: wp.array[int],
+        *,
+        count: int,
+        p_BC: wp.vec3d,
+        q_BC: wp.quatd,
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        stamps: Any,
+    ) -> None:
+        """Write the poses T_WC = T_WB T_BC of a camera at the first `count` of the given slots, in float32.
+
+        Args:
+            slots: Slots of the instants, shape [K].
+            count: How many of them to use.
+            p_BC: Position of the camera on the body [m].
+            q_BC: Orientation of the camera against the body, xyzw.
+            p_WC: Positions, shape [world K]; overwritten.
+            q_WC: Orientations, shape [world K]; overwritten.
+            stamps: Times of the instants [ns], int64, shape [world K, 1]; overwritten unless it is empty.
+        """
+        key = (slots.ptr, count, p_WC.ptr)
+        # another list of slots may have the memory of one that is gone
+        if key not in self._pose_launches or self._pose_launches[key][0] is not slots:
+            world_count = self.states.shape[1]
+            launch = wp.launch(
+                _camera_poses,
+                dim=(world_count, count),
+                inputs=[p_BC, q_BC, p_WC.shape[0] // world_count, self.states, self.stamps, slots],
+                outputs=[p_WC, q_WC, stamps],
+                device=self.states.device,
+                record_cmd=True,
+            )
+            if len(self._pose_launches) >= _LAUNCHES_MAX:
+                self._pose_launches.clear()
+            self._pose_launches[key] = (slots, launch)
+        self._pose_launches[key][1].launch()
+
+    def bring_to_host(self) -> None:
+        """Allocate the copies on the host that `fetch` writes to."""
+        arrays = {name: getattr(self._rows, name) for name in TraceRows._fields}
+        self._copies = [HostCopy(array) for array in arrays.values()]
+        for name, copy in zip(arrays, self._copies, strict=True):
+            setattr(self._rows_on_host, name, copy.mapped())
+
+    def fetch(self, first: int, count: int) -> None:
+        """Launch the copy of some slots to the host: by one kernel, three times as fast as four copies."""
+        if self._is_cuda:
+            wp.launch(
+                _copy_rows,
+                dim=(count, *self.states.shape[1:]),
+                inputs=[first, self._rows],
+                outputs=[self._rows_on_host],
+                device=self.states.device,
+            )
+
+    def numpy(self, first: int, count: int) -> TraceRows:
+        """Return some slots that were fetched, and that the device has finished with."""
+        return TraceRows(*(copy.rows(first, count) for copy in self._copies))
+
+
+def make_surfaces(
+    fields: Any, scene: Any, *, radius_m: float, ground_height_m: float | None, holds: bool
+) -> Surfaces:
+    """Return what vehicles can touch.
+
+    Args:
+        fields: Distance to each scene, device array of `DistanceField`.
+        scene: Index of the scene of each world, device array of int32.
+        radius_m: Radius of the vehicle [m].
+        ground_height_m: z of the plane that it may land on [m]; None: there is none.
+        holds: A vehicle that touches something is held.
+    """
+    surfaces = Surfaces()
+    surfaces.fields, surfaces.scene = fields, scene
+    surfaces.radius_m = radius_m
+    surfaces.ground_height_m = -math.inf if ground_height_m is None else ground_height_m
+    surfaces.holds = int(holds)
+    return surfaces

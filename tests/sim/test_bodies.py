@@ -1,0 +1,192 @@
+"""Moving bodies in a run: events where and when outlines pass, the same bits however a run is cut."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import neurosim_core as ns
+from neurosim_core import sim
+from neurosim_core.packets import Events, Image, Packet
+
+LENS = {"width": 64, "height": 48, "horizontal_fov_rad": 1.2}
+RATE_HZ = 400.0
+WALL_M = 4.0
+"""Distance of the wall in front of the camera [m]."""
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """An empty room of 10 x 10 x 6 m of one light colour, its middle at (-1, 0, 0)."""
+    walls = trimesh.creation.box(extents=[10.0, 10.0, 6.0])
+    walls.invert()
+    walls.apply_translation([WALL_M - 5.0, 0.0, 0.0])
+    path = tmp_path_factory.mktemp("scene") / "room.glb"
+    trimesh.Scene(walls).export(path)
+    return path
+
+
+def settings(room: Path, device: str, bodies: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """A vehicle that hovers in the origin and looks along +x."""
+    lamps = {"kind": "mesh", "file": str(room), "up_axis": "z", "unit_m": 1.0, "inside_m": [0.0, 0.0, 0.0]}
+    return {
+        "duration_s": 0.25,
+        "device": device,
+        "scene": lamps,
+        "render": {"lighting": {"mode": "unshadowed"}},
+        "path": {"kind": "hover", "position_m": [0.0, 0.0, 0.0]},
+        "bodies": bodies,
+        "sensors": {
+            "events": {
+                "kind": "event_camera",
+                "lens": LENS,
+                "mount": {"position_m": [0.0, 0.0, 0.0]},
+                "sampling_rate_hz": RATE_HZ,
+                "packet_rate_hz": 40,
+            },
+            "rgb": {"kind": "rgb", "lens": LENS, "mount": {"position_m": [0.0, 0.0, 0.0]}, "rate_hz": 40},
+            "depth": {"kind": "depth", "lens": LENS, "rate_hz": 50},
+            "odometry": {"kind": "odometry", "rate_hz": 100},
+        },
+        **changes,
+    }
+
+
+BLACK = {"kind": "plain", "color": [0.0, 0.0, 0.0]}
+SLIDING = {
+    "shape": {"kind": "box", "size_m": [0.001, 0.4, 0.5]},
+    "surface": BLACK,
+    "motion": {"position_m": [2.0, 0.9, 0.0], "velocity_m_s": [0.0, -7.2, 0.0]},
+}
+"""A thin black board that crosses the view from left to right."""
+BUSY = {
+    "ball": {
+        "shape": {"kind": "sphere", "radius_m": 0.3},
+        "surface": {"kind": "checker", "square_m": 0.1},
+        "motion": {
+            "position_m": [2.0, 0.0, 0.0],
+            "orbit": {"radius_m": 0.6, "rate_hz": 2.0, "axis": [1.0, 0.0, 0.0]},
+            "spin_rad_s": [1.0, 5.0, 9.0],
+        },
+    },
+    "board": SLIDING,
+}
+
+
+def events_of(packets: list[Packet]) -> np.ndarray:
+    """Stamp [us], column, row, polarity of all events, in the order of time."""
+    arrays = [packet.numpy() for packet in packets if isinstance(packet, Events)]
+    return np.concatenate([np.stack([a.t, a.x, a.y, a.polarity], axis=1).astype(np.int64) for a in arrays])
+
+
+def content(packets: list[Packet]) -> list[tuple[Any, ...]]:
+    """All bytes of the packets, sensor by sensor."""
+
+    def plain(value: Any) -> Any:
+        return (value.dtype.str, value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
+
+    rows = [(p.sensor, p.sequence, *((k, plain(v)) for k, v in sorted(vars(p).items()))) for p in packets]
+    return sorted(rows, key=lambda row: row[:2])
+
+
+def test_edges_of_a_board_give_events_when_they_pass(room, device):
+    """Pixels fire between renders around the analytic instant: dark, then bright as the board leaves.
+
+    A step between two renders is taken as linear in log radiance, so events lie in the interval of the step.
+    """
+    packets = list(ns.run(settings(room, device, {"board": SLIDING})))
+    fired = events_of(packets)
+    fx = 0.5 * LENS["width"] / math.tan(0.5 * LENS["horizontal_fov_rad"])
+    tick_us = 1e6 / RATE_HZ
+    row = 24
+    columns = np.arange(8, 56)
+    y = 2.0 * (0.5 * LENS["width"] - (columns + 0.5)) / fx  # where a pixel's ray meets the plane of the board
+    for column, y_m in zip(columns, y, strict=True):
+        at = fired[(fired[:, 1] == column) & (fired[:, 2] == row)]
+        for polarity, edge_m in ((0, -0.2), (1, 0.2)):  # its right edge comes first, the left one last
+            crossing_us = 1e6 * (0.9 + edge_m - y_m) / 7.2
+            stamps = at[at[:, 3] == polarity, 0]
+            if not 0.0 < crossing_us < 0.25e6 - tick_us:
+                assert not len(stamps)
+                continue
+            first = math.floor(crossing_us / tick_us) * tick_us
+            assert len(stamps) > 5  # from white to black: many thresholds
+            assert stamps.min() >= first - 1  # stamps are whole microseconds
+            assert stamps.max() <= first + tick_us + 1
+    # Nothing fires where the board is not: the vehicle hovers on the spot.
+    rows = fired[:, 2] + 0.5 - 24.0
+    assert np.abs(rows).max() <= 0.25 * fx / 2.0 + 0.5
+    assert len(np.unique(fired[:, 1])) > 45
+
+
+def test_pictures_show_bodies_where_they_are_at_the_stamp(room, device):
+    """The middle of the black board in each picture, against its motion."""
+    packets = list(ns.run(settings(room, device, {"board": SLIDING})))
+    pictures = [p for p in packets if isinstance(p, Image) and p.sensor == "rgb"]
+    assert len(pictures) == 11
+    fx = 0.5 * LENS["width"] / math.tan(0.5 * LENS["horizontal_fov_rad"])
+    seen = 0
+    for picture in pictures:
+        columns = np.nonzero(picture.data[24].max(axis=-1) == 0)[0]
+        y_m = 0.9 - 7.2e-9 * picture.stamp_ns
+        expected = 0.5 * LENS["width"] - fx * y_m / 2.0
+        if 6.0 < expected < 58.0:
+            assert np.mean(columns + 0.5) == pytest.approx(expected, abs=0.51)
+            seen += 1
+    assert seen > 8
+
+
+@pytest.mark.parametrize("instants", [1, 64])
+def test_batches_change_no_bit(room, device, instants):
+    expected = list(ns.run(settings(room, device, BUSY)))
+    cut = list(ns.run(settings(room, device, BUSY, instants_per_launch=instants)))
+    assert content(cut) == content(expected)
+    assert len(events_of(cut)) > 10_000
+
+
+def test_lanes_and_graphs_change_no_bit(room, device):
+    """On CUDA the second batch of a lane is recorded and replayed from then on: bodies move on in it."""
+    model = sim.make_model(ns.load_config(settings(room, device, BUSY, instants_per_launch=5)))
+    one, two = (list(sim.run_model(model, sim.make_state(model, in_flight=lanes))) for lanes in (1, 2))
+    assert content(one) == content(two)
+    pictures = [p.data.tobytes() for p in one if isinstance(p, Image) and p.sensor == "depth"]
+    assert len(set(pictures)) == len(pictures) == 13
+
+
+def test_a_second_episode_begins_with_bodies_where_they_were(room, device):
+    model = sim.make_model(ns.load_config(settings(room, device, BUSY)))
+    first, second = (list(sim.run_model(model, sim.make_state(model))) for _ in range(2))
+    assert content(first) == content(second)
+
+
+def test_steps_from_outside_see_the_same_bodies(room, device):
+    """Control periods of 5 ms, held rotor speeds: pictures are those of a run at the same states."""
+    config = ns.load_config(settings(room, device, BUSY, duration_s=0.1))
+    model = sim.make_model(config)
+    state = sim.make_state(model)
+    packets: list[Packet] = []
+    while state.launched_ns < model.duration_ns:
+        packets += sim.step(model, state, None)
+    packets += sim.finish(state)
+    expected = list(ns.run(config))
+    # The vehicle hovers with or without a controller, to 1e-9 m: compared are pictures, not its state.
+    for name in ("depth", "rgb"):
+        stepped = [p for p in packets if p.sensor == name]
+        flown = [p for p in expected if p.sensor == name]
+        assert [p.stamp_ns for p in stepped] == [p.stamp_ns for p in flown]
+        for a, b in zip(stepped, flown, strict=True):
+            assert (np.abs(a.data.astype(float) - b.data) < 1e-3).mean() > 0.999
+
+
+def test_a_run_without_cameras_loads_no_body(room):
+    lost = {"lost": {"shape": {"kind": "mesh", "file": "/nowhere/lost.glb"}}}
+    imu = {"imu": {"kind": "imu"}}
+    model = sim.make_model(ns.load_config(settings(room, "cpu", lost, sensors=imu)))
+    assert model.bodies == ()
+    with pytest.raises(ValueError, match=r"lost.glb: no such file"):
+        sim.make_model(ns.load_config(settings(room, "cpu", lost)))
