@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
+from neurosim_core.install import install_hint
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
@@ -332,6 +333,6 @@ def _view(arguments: argparse.Namespace) -> int:
     beside = str(Path(sys.executable).parent)  # a virtual environment need not be active
     viewer = shutil.which("rerun", path=os.pathsep.join([beside, *os.get_exec_path()]))
     if viewer is None:
-        raise ImportError("the Rerun viewer is not installed: pip install 'neurosim[view]'")
+        raise ImportError(f"the Rerun viewer is not installed: {install_hint('view')}")
     options = ["--web-viewer", "--bind", "127.0.0.1"] if arguments.web else []
     return subprocess.run([viewer, str(file), *options], check=False).returncode

@@ -21,6 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from neurosim_core.install import install_hint
 from neurosim_core.view.rerun_sdk import import_rerun, open_recording
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def _executable() -> str:
         return given
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
-        raise ImportError("this Rerun has no viewer: pip install 'neurosim[view]'")
+        raise ImportError(f"this Rerun has no viewer: {install_hint('view')}")
     folder = Path(found.origin).parent
     bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
     return str(bundled if bundled.exists() else folder / "rerun")

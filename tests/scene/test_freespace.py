@@ -257,7 +257,7 @@ def test_a_room_of_any_size_at_any_place_is_free_up_to_its_walls(size, low, voxe
     sheet_m = low[0] + wall * size[0]
     corners = np.array([[sheet_m, y, z] for y in (low[1], high[1]) for z in (low[2], high[2])])
     sheet = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
-    seed = tuple((low + [0.5 * wall * size[0], 1.2, 1.2]).tolist())
+    seed = (float(low[0] + 0.5 * wall * size[0]), float(low[1]) + 1.2, float(low[2]) + 1.2)
     half = make_free_space(as_scene(box(low, high), sheet), FreeSpaceConfig(voxel_m=voxel_m, seed_m=seed))
     reached = half.centers(np.argwhere(half.reachable(0.0)))
     assert len(reached) > 0
