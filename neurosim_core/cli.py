@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -32,7 +31,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     arguments = _parser().parse_args(argv)
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
-        _start_warp()
+        from neurosim_core.warp_start import start_warp
+
+        start_warp()
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         try:
             return int(arguments.command(arguments))
@@ -42,29 +43,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print(INTERRUPTED_LINE, file=sys.stderr)
             return 130
-
-
-def _start_warp() -> None:
-    """Start Warp without its lines about modules, and about a GPU on a machine that has none.
-
-    The latter is written by native code straight to the standard error stream: the stream is held back while
-    Warp starts, and what else was written to it is written again.
-    """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
-    sys.stderr.flush()
-    stderr = os.dup(2)
-    with tempfile.TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
-        try:
-            wp.init()  # type: ignore[no-untyped-call]
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-        held.seek(0)
-        lines = held.read().decode(errors="replace").splitlines(keepends=True)
-    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
 
 
 def _parser() -> argparse.ArgumentParser:

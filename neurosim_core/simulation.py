@@ -49,6 +49,7 @@ from neurosim_core.sensors.cast import (
     launch_key,
     leave_out,
 )
+from neurosim_core.warp_start import refuse_forked_process
 
 __all__ = [
     "COLLISION",
@@ -427,6 +428,7 @@ def _period_end_ns(model: Model, state: State) -> int:
 
 def _launch(model: Model, state: State, batch: Batch) -> None:
     """Fly a batch, let the cameras see it, and launch the copies to the host."""
+    refuse_forked_process()
     key, flight = plan_flight(model, state, batch)
     if state.overlaps:
         launch_flight(state, batch, key, flight)
