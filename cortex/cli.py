@@ -110,7 +110,7 @@ class _Version(argparse.Action):
         from importlib.metadata import PackageNotFoundError, version
 
         try:
-            found = version("neurosim")
+            found = version("neurosim-core")
         except PackageNotFoundError:
             found = "of unknown version: the package is not installed"
         print(f"cortex {found}")

@@ -118,7 +118,7 @@ def _config(options: argparse.Namespace) -> BridgeConfig:
 
 def _version() -> str:
     try:
-        return importlib.metadata.version("neurosim")
+        return importlib.metadata.version("neurosim-core")
     except importlib.metadata.PackageNotFoundError:  # a source tree on PYTHONPATH
         return "of a source tree"
 

@@ -6,12 +6,8 @@ import argparse
 import atexit
 import gc
 import logging
-import os
-import shutil
 import signal
-import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -31,7 +27,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
     arguments = _parser().parse_args(argv)
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
-        _start_warp()
+        from neurosim_core.warp_start import start_warp
+
+        start_warp()
         logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
         try:
             return int(arguments.command(arguments))
@@ -41,29 +39,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print(INTERRUPTED_LINE, file=sys.stderr)
             return 130
-
-
-def _start_warp() -> None:
-    """Start Warp without its lines about modules, and about a GPU on a machine that has none.
-
-    The latter is written by native code straight to the standard error stream: the stream is held back while
-    Warp starts, and what else was written to it is written again.
-    """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
-    sys.stderr.flush()
-    stderr = os.dup(2)
-    with tempfile.TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
-        try:
-            wp.init()  # type: ignore[no-untyped-call]
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-        held.seek(0)
-        lines = held.read().decode(errors="replace").splitlines(keepends=True)
-    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -184,8 +159,8 @@ def _add_view(commands: _Commands) -> None:
         metavar="HZ",
         help="live: most images a second [Hz]; events have a limit of their own",
     )
-    view.add_argument("--port", type=int, default=0, help="live, --web: port of the page (default: any)")
-    view.add_argument("--no-browser", action="store_true", help="live, --web: print the address only")
+    view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
+    view.add_argument("--no-browser", action="store_true", help="--web: print the address only")
     view.set_defaults(command=_view)
 
 
@@ -329,9 +304,6 @@ def _view(arguments: argparse.Namespace) -> int:
     if arguments.save is not None:
         print(f"wrote {file}")
         return 0
-    beside = str(Path(sys.executable).parent)  # a virtual environment need not be active
-    viewer = shutil.which("rerun", path=os.pathsep.join([beside, *os.get_exec_path()]))
-    if viewer is None:
-        raise ImportError("the Rerun viewer is not installed: pip install 'neurosim[view]'")
-    options = ["--web-viewer", "--bind", "127.0.0.1"] if arguments.web else []
-    return subprocess.run([viewer, str(file), *options], check=False).returncode
+    from neurosim_core.view.rerun_viewer import show_file
+
+    return show_file(file, web=arguments.web, port=arguments.port, open_browser=not arguments.no_browser)

@@ -20,6 +20,7 @@ from rich.table import Table
 from neurosim_core import __version__
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
+from neurosim_core.install import install_hint
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
@@ -257,7 +258,7 @@ def _planned_track(model: Model, end_ns: int) -> Track:
 def _has(library: str, console: Console, product: str) -> bool:
     if importlib.util.find_spec(library) is not None:
         return True
-    console.print(f"[yellow]{product} is left out: pip install 'neurosim\\[{_LIBRARIES[library]}]'[/]")
+    console.print(f"{product} is left out: {install_hint(_LIBRARIES[library])}", style="yellow", markup=False)
     return False
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -112,16 +114,23 @@ def test_a_rerun_file_can_be_made_from_the_recording(flown, tmp_path):
     assert (tmp_path / "again.rrd").stat().st_size > 100_000
 
 
-@pytest.mark.parametrize(("options", "passed"), [([], ""), (["--web"], " --web-viewer --bind 127.0.0.1")])
-def test_view_opens_the_viewer(flown, tmp_path, options, passed, monkeypatch, capfd):
-    """A stand-in for the viewer tells what it is started with."""
+def test_view_serves_a_flight_at_the_port_until_it_is_ended(flown):
+    """SIGTERM ends Rerun, too; its page is where `--port` says."""
     folder, _ = flown
-    viewer = tmp_path / "rerun"
-    viewer.write_text('#!/bin/sh\necho "viewer $*"\n')
-    viewer.chmod(0o755)
-    monkeypatch.setattr(cli.shutil, "which", lambda *_, **__: str(viewer))
-    assert cli.main(["view", str(folder), *options]) == 0
-    assert f"viewer {folder / 'flight.rrd'}{passed}" in capfd.readouterr().out
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "neurosim_core", "view", str(folder), "--web", "--no-browser"]
+    with subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True) as view:
+        assert view.stdout is not None
+        assert view.stdout.readline().startswith(f"open http://127.0.0.1:{port}/?url=")
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60.0) as page:
+            assert b"wasm" in page.read()
+        (viewer,) = Path(f"/proc/{view.pid}/task/{view.pid}/children").read_text().split()
+        assert str(folder / "flight.rrd") in Path(f"/proc/{viewer}/cmdline").read_text()
+        view.terminate()
+        assert view.wait(60.0) == 130
+    assert not Path(f"/proc/{viewer}").exists()
 
 
 def test_a_run_without_sensors_is_a_run(tmp_path):

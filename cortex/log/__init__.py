@@ -11,7 +11,7 @@
         Player(node, log).run(rate=0.5)
 
 A file explains itself: every channel has the structure of its type. It needs the library `mcap`
-(`pip install 'neurosim[record]'`).
+(`pip install mcap`).
 """
 
 from cortex.log.format import LogError

@@ -32,5 +32,5 @@ def require_mcap() -> None:
         import mcap  # noqa: F401
     except ImportError as error:
         raise ImportError(
-            "recordings need the library mcap, which is not installed: pip install 'neurosim[record]'"
+            "recordings need the library mcap, which is not installed: pip install mcap"
         ) from error

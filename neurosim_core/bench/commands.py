@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from neurosim_core.install import install_hint
 from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.signals import handle_signals
 
@@ -476,7 +477,7 @@ def _write(chapters: Sequence[Chapter], folder: Path, console: Console) -> None:
 
     page = write_report(chapters, folder)
     if not can_draw():
-        console.print("plots are left out: pip install 'neurosim[view]'", style="yellow", markup=False)
+        console.print(f"plots are left out: {install_hint('view')}", style="yellow", markup=False)
     console.print(f"left in {folder}: {page.name}, report.md, tables and plots", markup=False, soft_wrap=True)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurosim_core.bench.chapter import Plot
+from neurosim_core.install import install_hint
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
@@ -74,7 +75,7 @@ def draw_plot(plot: Plot, *, notes: Sequence[str] = ()) -> bytes:
         ImportError: The library that draws is not installed.
     """
     if not can_draw():
-        raise ImportError("plots need matplotlib: pip install 'neurosim[view]'")
+        raise ImportError(f"plots need matplotlib: {install_hint('view')}")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -21,6 +21,7 @@ from neurosim_core.bench.chapter import (
 from neurosim_core.bench.figures import can_draw, draw_plot, save_plot
 from neurosim_core.bench.machine import accelerators, command_line, hardware, now, versions
 from neurosim_core.bench.page import html_page
+from neurosim_core.install import install_hint
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -90,7 +91,7 @@ def save_files(
         if can_draw():
             made.append(save_plot(plot, folder, notes=notes))
         else:
-            missing = f"{plot.name}.png is left out: pip install 'neurosim[view]'"
+            missing = f"{plot.name}.png is left out: {install_hint('view')}"
             console.print(missing, style="yellow", markup=False)
     console.print(f"left in {', '.join(map(str, made))}", markup=False, highlight=False, soft_wrap=True)
 

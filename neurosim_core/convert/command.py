@@ -39,7 +39,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "convert",
         help="turn a video or a folder of pictures into events",
-        description="Let a simulated event camera look at a video (needs neurosim[video]) or at the pictures "
+        description="Let a simulated event camera look at a video (needs PyAV) or at the pictures "
         "of a folder, and write its events as `neurosim run` does. Log radiance is taken as linear between "
         "frames.",
     )

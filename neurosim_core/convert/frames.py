@@ -18,6 +18,7 @@ from PIL import Image, ImageOps
 from neurosim_core.clock import Rate
 from neurosim_core.convert.light import BT2020_PRIMARIES, TRANSFERS, transfer_of
 from neurosim_core.convert.luminance import LightTables, LumaDecoder, matrix_of
+from neurosim_core.install import install_hint
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Names of pictures in a folder end so, in lower or upper case."""
@@ -342,7 +343,7 @@ def _import_av() -> ModuleType:
     try:
         import av
     except ImportError as error:
-        raise ImportError("videos need PyAV: pip install 'neurosim[video]'") from error
+        raise ImportError(f"videos need PyAV: {install_hint('video')}") from error
     return av
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.flight import new_folder
+from neurosim_core.install import install_hint
 from neurosim_core.nodes.channel import payload_bytes
 from neurosim_core.packets import Packet
 from neurosim_core.record import FlightHeader, FlightWriter, describe_sensors
@@ -85,7 +86,7 @@ class Recorder:
             ImportError: h5py is not installed.
         """
         if importlib.util.find_spec("h5py") is None:
-            raise ImportError("h5py is not installed: pip install 'neurosim[record]'")
+            raise ImportError(f"h5py is not installed: {install_hint('record')}")
         self._models = models
         self._folders = folders
         for name, folder in folders.items():

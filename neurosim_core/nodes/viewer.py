@@ -29,7 +29,7 @@ from neurosim_core.nodes.show import Show
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
-from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
+from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded, without_display
 
 POLL_S = 0.01
 SEND_S = 0.1
@@ -90,7 +90,7 @@ def view(
             outlet = ViewerOutlet(viewer)
             if how == "web":
                 say(f"open {viewer.page_url}")
-                if open_browser and not _without_display():
+                if open_browser and not without_display():
                     webbrowser.open(viewer.page_url)
         node = stack.enter_context(Node("viewer"))
         try:
@@ -139,7 +139,7 @@ def _check(
         raise ValueError(f"the image rate must be above 0, at most 1000 Hz, got {image_rate_hz}")
     if not 0 <= port <= 65535:
         raise ValueError(f"a port is 0 to 65535, got {port}")
-    if how == "native" and _without_display():
+    if how == "native" and without_display():
         raise ValueError(f"there is no display to open a window on: {_WITHOUT_WINDOW}")
 
 
@@ -238,7 +238,3 @@ def _announced(
         say(f"a simulator of another version, which cannot be shown:\n{error}")
         return None
     return simulation, info.source
-
-
-def _without_display() -> bool:
-    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

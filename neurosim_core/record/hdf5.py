@@ -47,6 +47,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from neurosim_core.install import install_hint
 from neurosim_core.packets import (
     Collision,
     Delivery,
@@ -619,5 +620,5 @@ def _import_h5py() -> ModuleType:
     try:
         import h5py
     except ImportError as error:
-        raise ImportError("recordings need h5py: pip install 'neurosim[record]'") from error
+        raise ImportError(f"recordings need h5py: {install_hint('record')}") from error
     return h5py  # type: ignore[no-any-return]

@@ -16,6 +16,7 @@ import warp as wp
 
 from neurosim_core.cores import all_cores, following
 from neurosim_core.priority import niceness, spared_count
+from neurosim_core.warp_start import refuse_forked_process
 
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
@@ -52,7 +53,11 @@ def launch_split(
         outputs: Parameters after the inputs.
         device: Where to launch.
         thread_count: Threads of the pool; all cores if None, less those that `priority.sparing` leaves.
+
+    Raises:
+        RuntimeError: This process was forked from one that had used a device.
     """
+    refuse_forked_process()
     threads = thread_count or max(1, core_count() - spared_count())
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64
     if not wp.get_device(device).is_cpu or threads == 1 or slice_size >= dim:

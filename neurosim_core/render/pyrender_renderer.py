@@ -19,6 +19,7 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from neurosim_core.install import install_hint
 from neurosim_core.render.body_arrays import join_bodies
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
@@ -67,7 +68,7 @@ def _import_pyrender() -> Any:
             warnings.simplefilter("ignore")  # of libraries that pyrender brings
             import pyrender
     except ImportError as error:
-        raise PyrenderError(f"pyrender cannot be used ({error}): pip install 'neurosim[render]'") from error
+        raise PyrenderError(f"pyrender cannot be used ({error}): {install_hint('render')}") from error
     return pyrender
 
 

@@ -302,11 +302,20 @@ class FreeSpace:
         return np.minimum(self.distance, wall.astype(np.float32))
 
     @functools.cached_property
+    def occupied(self) -> NDArray[np.bool_]:
+        """Voxels that a surface passes through: no flood fill crosses a surface between two of the others.
+
+        A surface that lies midway between two layers of centres is half a voxel from both. The slack makes it
+        occupy both, although float32 rounds positions and distances at the size of the coordinates.
+        """
+        rounding = 8.0 * np.spacing(np.float32(np.abs(self.bounds_m).max()))
+        return np.asarray(self.distance <= 0.5 * self.voxel_m * (1.0 + 1e-5) + rounding)
+
+    @functools.cached_property
     def height(self) -> NDArray[np.float32]:
         """Height of voxel centres above the surface below them, to a voxel [m]; inf where there is none."""
-        occupied = self.distance <= 0.5 * self.voxel_m
         layer = np.arange(self.distance.shape[2], dtype=np.float32)
-        below = np.maximum.accumulate(np.where(occupied, layer, -np.inf), axis=2)
+        below = np.maximum.accumulate(np.where(self.occupied, layer, -np.inf), axis=2)
         return np.asarray((layer - below) * self.voxel_m, dtype=np.float32)
 
     def voxel_of(self, point_m: ArrayLike) -> tuple[int, int, int]:
@@ -438,7 +447,7 @@ def _launch_fill(mesh: wp.Mesh, origin: Array, voxel: float, distance: Any) -> N
 
 
 def _find_seed(space: FreeSpace) -> _Seed:
-    occupied = space.distance <= 0.5 * space.voxel_m
+    occupied = space.occupied
     labels, count = ndimage.label(~occupied)
     if count == 0:
         raise ValueError(
@@ -485,7 +494,7 @@ def _reachable(space: FreeSpace, clearance_m: float) -> NDArray[np.bool_]:
     if free[seed]:
         return np.asarray(labels == labels[seed])
     # the seed is too near something: stay in the region that it belongs to at the least clearance
-    loose, _ = ndimage.label(room > 0.5 * space.voxel_m)
+    loose, _ = ndimage.label(~space.occupied & (room > 0.0))
     if not loose[seed]:
         return np.zeros_like(free)
     sizes = np.bincount(labels[(loose == loose[seed]) & free], minlength=count + 1)

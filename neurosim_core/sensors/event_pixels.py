@@ -25,6 +25,7 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
+from neurosim_core.warp_start import refuse_forked_process
 
 _PIXELS_PER_THREAD_MIN = 16_384
 _KEYS_PER_PIXEL = 4
@@ -295,6 +296,7 @@ class Pixels:
 
     def _share(self, launch: Callable[[Chunk], None], chunks: list[Chunk]) -> None:
         """Launch for all chunks; there are several on a CPU, which go to its cores."""
+        refuse_forked_process()
         if len(chunks) > 1 and self._pool is None:
             self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
         own = 1 + spared_count()  # chunks that this thread does one after the other

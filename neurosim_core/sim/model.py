@@ -25,6 +25,7 @@ from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
 from neurosim_core.sim.schedule import Schedule
 from neurosim_core.trajectory import Path, make_path
 from neurosim_core.vehicle import MultirotorConfig
+from neurosim_core.warp_start import start_warp
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -212,8 +213,9 @@ def find_device(name: str) -> str:
 
     Raises:
         ValueError: It is not on this machine.
+        RuntimeError: This process was forked from one that had used a device.
     """
-    wp.init()
+    start_warp()
     known = [str(device) for device in wp.get_devices()]
     if name == "auto":
         return "cuda:0" if "cuda:0" in known else "cpu"

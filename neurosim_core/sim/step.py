@@ -33,6 +33,7 @@ from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, re
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import acquire_room, bring_images, launch_key
 from neurosim_core.sim.state import Batch, State
+from neurosim_core.warp_start import refuse_forked_process
 
 
 def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[int] = ()) -> None:
@@ -44,6 +45,7 @@ def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[i
         batch: Where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
         last_seen_ns: Of many worlds, for each group: the instant before the batch, from its begin [ns], <= 0.
     """
+    refuse_forked_process()
     # commands -> motor speeds -> motion, from boundary to boundary; state sensors measure on the way
     flight_key, flight = plan_flight(state, batch)
     if state.overlaps:  # each part on a stream of its own, while other batches are in flight

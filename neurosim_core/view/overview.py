@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from neurosim_core.install import install_hint
 from neurosim_core.packets import EventArrays, Events, Image, Odometry, Packet
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.scene import Scene
@@ -505,5 +506,5 @@ def _import_matplotlib() -> ModuleType:
         import matplotlib
         import matplotlib.figure
     except ImportError as error:
-        raise ImportError("the overview picture needs matplotlib: pip install 'neurosim[view]'") from error
+        raise ImportError(f"the overview picture needs matplotlib: {install_hint('view')}") from error
     return matplotlib

@@ -8,6 +8,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from neurosim_core.install import install_hint
+
 if TYPE_CHECKING:
     import rerun as rr
 
@@ -30,7 +32,7 @@ def import_rerun() -> ModuleType:
         import rerun
         import rerun.blueprint
     except ImportError as error:
-        raise ImportError("the viewer needs Rerun: pip install 'neurosim[view]'") from error
+        raise ImportError(f"the viewer needs Rerun: {install_hint('view')}") from error
     finally:
         if quiet:
             del os.environ["RUST_LOG"]

@@ -14,13 +14,17 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.parse
+import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from neurosim_core.install import install_hint
+from neurosim_core.signals import stop_at_signals
 from neurosim_core.view.rerun_sdk import import_rerun, open_recording
 
 if TYPE_CHECKING:
@@ -31,6 +35,9 @@ _START_S = 20.0
 _END_S = 0.5
 _WINDOW_MEMORY = "2GB"
 _SERVER_MEMORY = "1GB"
+_FILE_MEMORY = "75%"
+_SHOW_S = 0.2
+"""How often a viewer of a file is looked after [s]."""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -41,12 +48,20 @@ class ViewerEnded(RuntimeError):
 class RerunViewer:
     """A viewer that recordings can be opened in. A context manager that ends it."""
 
-    def __init__(self, *, web: bool, port: int = 0, waiting: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        *,
+        web: bool,
+        port: int = 0,
+        file: Path | None = None,
+        waiting: Callable[[], bool] = lambda: True,
+    ) -> None:
         """Start the viewer and wait until it listens.
 
         Args:
             web: Serve a page instead of opening a window.
             port: Port of the page; 0: any that is free.
+            file: A recording to show, all of it; None: what `open` is given, the newest of it.
             waiting: Asked now and then whether to go on waiting.
 
         Raises:
@@ -56,11 +71,13 @@ class RerunViewer:
         """
         import_rerun()
         page_port, data_port = _free_ports(port if web else 0, 0)
-        options = ["--bind", HOST, "--port", str(data_port), "--server-memory-limit", _SERVER_MEMORY]
+        options = ["--bind", HOST, "--port", str(data_port)]
+        options += ["--server-memory-limit", _SERVER_MEMORY if file is None else _FILE_MEMORY]
         if web:
             options += ["--serve-web", "--web-viewer-port", str(page_port)]
         else:
-            options += ["--memory-limit", _WINDOW_MEMORY, "--hide-welcome-screen", "--expect-data-soon"]
+            options += ["--memory-limit", _WINDOW_MEMORY if file is None else _FILE_MEMORY]
+            options += ["--hide-welcome-screen", "--expect-data-soon"]
         self.data_url = f"rerun+http://{HOST}:{data_port}/proxy"
         """Where recordings are sent to."""
         self.page_url = ""
@@ -70,7 +87,7 @@ class RerunViewer:
             self.page_url = f"http://{HOST}:{page_port}/?{query}"
         self._words = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
         self._process = subprocess.Popen(
-            [_executable(), *options],
+            [_executable(), *([] if file is None else [str(file)]), *options],
             stdin=subprocess.DEVNULL,
             stdout=self._words,
             stderr=self._words,
@@ -79,7 +96,8 @@ class RerunViewer:
             preexec_fn=_end_with_parent(),
         )
         try:
-            self._wait_for(data_port, waiting)
+            if web or file is None:
+                self._wait_for(data_port, waiting)
             if web:
                 self._wait_for(page_port, waiting)
         except BaseException:
@@ -147,6 +165,46 @@ class RerunViewer:
         return "\n".join(lines[-5:])
 
 
+def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True) -> int:
+    """Show a file of Rerun until the window is closed or a signal comes; the viewer ends with this process.
+
+    Args:
+        file: What to show.
+        web: Serve a page instead of opening a window.
+        port: Port of the page; 0: any that is free.
+        open_browser: Open the page, where there is a display.
+
+    Returns:
+        0 if the window was closed, 130 if interrupted.
+
+    Raises:
+        ValueError: There is no display for a window.
+        ImportError, OSError, ViewerEnded: As `RerunViewer`.
+    """
+    if not web and without_display():
+        raise ValueError(
+            "there is no display to open a window on: --web serves a page"
+        )
+    stop = threading.Event()
+    with (
+        stop_at_signals(stop),
+        RerunViewer(web=web, port=port, file=file, waiting=lambda: not stop.is_set()) as viewer,
+    ):
+        if web:
+            print(f"open {viewer.page_url}", flush=True)
+            if open_browser and not without_display():
+                webbrowser.open(viewer.page_url)
+        while not stop.wait(_SHOW_S) and not viewer.ended:
+            pass
+        viewer.check()
+    return 130 if stop.is_set() else 0
+
+
+def without_display() -> bool:
+    """Return whether no window can be opened here."""
+    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def _executable() -> str:
     """The viewer itself; the script `rerun` would start it as a process of its own."""
     given = os.environ.get("RERUN_CLI_PATH")
@@ -154,7 +212,7 @@ def _executable() -> str:
         return given
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
-        raise ImportError("this Rerun has no viewer: pip install 'neurosim[view]'")
+        raise ImportError(f"this Rerun has no viewer: {install_hint('view')}")
     folder = Path(found.origin).parent
     bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
     return str(bundled if bundled.exists() else folder / "rerun")

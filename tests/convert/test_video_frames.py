@@ -211,4 +211,4 @@ def test_without_pyav_the_line_to_install_it_is_said(tmp_path):
         f"open_source(Path({str(tmp_path / 'v.mp4')!r}))"
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "ImportError: videos need PyAV: pip install 'neurosim[video]'" in ran.stderr
+    assert "ImportError: videos need PyAV: pip install -e '.[video]'" in ran.stderr

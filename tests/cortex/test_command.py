@@ -563,7 +563,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     with pytest.raises(SystemExit) as end:
         main(["--version"])
     assert end.value.code == 0
-    assert capsys.readouterr().out == f"cortex {version('neurosim')}\n"
+    assert capsys.readouterr().out == f"cortex {version('neurosim-core')}\n"
 
 
 def test_help_loads_no_sockets() -> None:

@@ -502,5 +502,5 @@ def test_unknown_names_list_the_known_ones(tmp_path):
 def test_missing_h5py_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     for open_file in (lambda: FlightWriter(tmp_path / "f.h5", HEADER), lambda: Flight(tmp_path / "f.h5")):
-        with pytest.raises(ImportError, match=r"pip install 'neurosim\[record\]'"):
+        with pytest.raises(ImportError, match=r"pip install -e '\.\[record\]'"):
             open_file()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.scene import freespace
@@ -230,6 +230,38 @@ def test_a_scene_that_is_wrong_about_its_inside_is_corrected():
     space = make_free_space(scene, FreeSpaceConfig())
     assert space.clearance(space.seed_m)[0] > 1.0
     assert "names (0.0, 1.0, 1.0) as inside" in space.notes[0]
+
+
+GRID_M = st.integers(-8000, 8000).map(lambda n: n * 0.05)  # sizes and places that people choose
+ANYWHERE_M = GRID_M | st.floats(-2000.0, 2000.0)
+LENGTH_M = st.integers(12, 40).map(lambda n: n * 0.2) | st.floats(2.4, 8.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    size=st.tuples(LENGTH_M, LENGTH_M, st.sampled_from([2.4, 2.5, 2.7, 3.0])),
+    low=st.tuples(ANYWHERE_M, ANYWHERE_M, ANYWHERE_M),
+    voxel_m=st.sampled_from([0.1, 0.13, 0.15, 0.2]),
+    wall=st.floats(0.3, 0.7) | st.sampled_from([0.25, 0.5, 0.75]),
+)
+@example(size=(6.0, 5.0, 2.7), low=(0.0, 0.0, 0.0), voxel_m=0.1, wall=0.5)
+def test_a_room_of_any_size_at_any_place_is_free_up_to_its_walls(size, low, voxel_m, wall):
+    """A plain box: exactly the centres that keep the clearance are free; a sheet across it ends the room."""
+    low, high = np.array(low), np.array(low) + size
+    space = make_free_space(as_scene(box(low, high)), FreeSpaceConfig(voxel_m=voxel_m))
+    centers = grid(space)
+    spare = np.minimum(centers - low, high - centers).min(axis=1) - np.sqrt(0.2**2 + 0.75 * voxel_m**2)
+    sure = np.abs(spare) > 2e-3  # float32 at 2 km: 0.12 mm a rounding
+    assert (space.reachable(0.2).reshape(-1) == (spare > 0.0))[sure].all()
+
+    sheet_m = low[0] + wall * size[0]
+    corners = np.array([[sheet_m, y, z] for y in (low[1], high[1]) for z in (low[2], high[2])])
+    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False)
+    seed = (float(low[0] + 0.5 * wall * size[0]), float(low[1]) + 1.2, float(low[2]) + 1.2)
+    half = make_free_space(as_scene(box(low, high), sheet), FreeSpaceConfig(voxel_m=voxel_m, seed_m=seed))
+    reached = half.centers(np.argwhere(half.reachable(0.0)))
+    assert len(reached) > 0
+    assert (reached[:, 0] < sheet_m).all()
 
 
 def test_a_huge_scene_gets_coarser_voxels_and_says_so():

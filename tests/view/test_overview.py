@@ -216,5 +216,5 @@ def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
         velocity=np.zeros((0, 3)),
         heading=np.zeros((0, 2)),
     )
-    with pytest.raises(ImportError, match=r"pip install 'neurosim\[view\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
         save_overview(tmp_path / "o.png", scene=make_scene(room()), track=none, snapshot=None)

@@ -394,7 +394,7 @@ def test_wrong_input_is_refused(tmp_path):
 def test_missing_rerun_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     for call in (open_recording, lambda: encode_events(make_events(0).numpy(), width=32, height=24)):
-        with pytest.raises(ImportError, match=r"pip install 'neurosim\[view\]'"):
+        with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
             call()
 
 

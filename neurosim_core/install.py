@@ -1,0 +1,26 @@
+"""How to install optional libraries: the one place that writes the command for error messages."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+
+def install_hint(extra: str) -> str:
+    """Return the command that installs the libraries of an extra of pyproject.toml."""
+    return f"pip install -e '.[{extra}]' in the folder of Neurosim"
+
+
+def check_cortex() -> None:
+    """Refuse another package called `cortex`: the package index has one, which is unrelated.
+
+    Raises:
+        ImportError: `import cortex` would not find the package that comes with the simulator.
+    """
+    found = importlib.util.find_spec("cortex")
+    place = Path(found.origin).resolve().parent if found and found.origin else None
+    if place != Path(__file__).resolve().parents[1] / "cortex":
+        raise ImportError(
+            f"`import cortex` finds {place or 'nothing'}, which is not the Cortex that comes with Neurosim: "
+            "pip uninstall cortex, then pip install -e . in the folder of Neurosim"
+        )

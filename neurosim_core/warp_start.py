@@ -1,0 +1,57 @@
+"""Starts Warp, once for each process: quietly, and not in a process that was forked after it had started."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+
+import warp as wp
+
+_owner: int | None = None
+"""Process that was the first to compute."""
+
+
+def start_warp() -> None:
+    """Start Warp without its lines about devices and modules; set `wp.config.log_level` later to see them.
+
+    The line about a missing CUDA driver is written by native code straight to the standard error stream: the
+    stream is held back while Warp starts, and what else was written to it is written again.
+
+    Raises:
+        RuntimeError: This process was forked from one that had computed.
+    """
+    started = _owner is not None
+    refuse_forked_process()
+    if started:
+        return
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            wp.init()  # type: ignore[no-untyped-call]
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+        held.seek(0)
+        lines = held.read().decode(errors="replace").splitlines(keepends=True)
+    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
+
+
+def refuse_forked_process() -> None:
+    """Refuse to compute in a process that was forked after Warp had started: it would wait forever.
+
+    Raises:
+        RuntimeError: It was; threads and CUDA contexts of the parent do not exist in it.
+    """
+    global _owner
+    if _owner is None:
+        _owner = os.getpid()
+    elif _owner != os.getpid():
+        raise RuntimeError(
+            "this process was forked from one that had started the simulator, whose threads and CUDA context "
+            "do not survive a fork: start workers by multiprocessing_context='spawn' (torch's DataLoader) or "
+            "multiprocessing.get_context('spawn')"
+        )
