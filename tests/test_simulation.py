@@ -129,7 +129,7 @@ def test_terms_are_those_that_the_kernels_have(settings):
     """Walks are shared or not by the lens, the launch and the device, not by the scene alone."""
     found = {}
     for walk in (None, {"instants": 4}):
-        render = {**settings["render"], "cpu_traversal": "warp", "shared_walk": walk}
+        render = {**settings["render"], "cpu_traversal": "warp", "candidate_lists": walk}
         model = simulation.make_model(ns.load_config({**settings, "render": render}))
         (cast,) = simulation.make_state(model).casts
         found[walk is None] = set(cast_module.render_terms(cast))

@@ -14,18 +14,18 @@ from neurosim_core.render.body_arrays import (
     place_camera,
 )
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.cast_terms import group_of, with_walks
+from neurosim_core.render.candidate_data import TILE, CandidateListData
+from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
 from neurosim_core.render.embree import PACKET
-from neurosim_core.render.film import OUTPUTS, make_film
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import (
     spread_order,
 )
-from neurosim_core.render.raycast import asking_kernel, raycast_kernel
+from neurosim_core.render.outputs import OUTPUTS, make_render_outputs
+from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
+from neurosim_core.render.render_terms import instants_per_thread, with_candidate_lists
 from neurosim_core.render.scene_arrays import SceneArrays
-from neurosim_core.render.tile_walk import TileWalk, shared_walk
 from neurosim_core.render.view_data import WorldData, make_view
-from neurosim_core.render.walk_data import TILE, WalkData
 from neurosim_core.scene.bodies import BodyPoses
 
 _THREAD_COUNT_MAX = 2**31 - 1
@@ -52,7 +52,7 @@ def ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
 class WarpRenderer:
     """Renders K instants of one lens per launch. `render` neither allocates nor waits for a CUDA device.
 
-    Outputs that were not asked for are None. See `film.FilmData` for what they are.
+    Outputs that are not requested are None. See `outputs.RenderOutputs` for what they are.
 
     Attributes:
         log_radiance: float32, shape [K, H, W].
@@ -61,7 +61,7 @@ class WarpRenderer:
         normal: vec3, shape [M, H, W].
         instance: int32, shape [M, H, W].
         rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W].
-        walk: What the rays of a tile share; None: each walks by itself.
+        candidates: Candidate lists of tiles; None: rays traverse the tree.
         terms: What its kernels compute because of the scene, the settings, and the lens.
     """
 
@@ -86,8 +86,9 @@ class WarpRenderer:
             thread_count: Threads on a CPU device; all cores if None.
 
         Raises:
-            ValueError: If an output is unknown or none is asked for, the instants have more than 2^31 - 1
-                rays of a layer together, or rays that share a walk do not look forward or are too many.
+            ValueError: An output is unknown, none is requested, the instants have more than 2^31 - 1 rays of
+            a
+                layer together, or the lens does not suit candidate lists.
         """
         tiles = -(-lens.width // TILE) * -(-lens.height // TILE)
         most = _THREAD_COUNT_MAX // (tiles * TILE * TILE)
@@ -98,17 +99,17 @@ class WarpRenderer:
             )
         rays = ray_layers(lens, arrays.config.samples_per_pixel)
         is_cuda = wp.get_device(arrays.device).is_cuda
-        shared = shared_walk(
-            arrays.config.shared_walk,
+        shared = choose_candidate_lists(
+            arrays.config.candidate_lists,
             rays,
             instant_count=instant_count,
             face_count=arrays.face_origin.shape[0],
             is_cuda=is_cuda,
         )
-        self.terms = terms = with_walks(arrays.terms, shared)
+        self.terms = terms = with_candidate_lists(arrays.terms, shared)
         self._kernel = raycast_kernel(outputs, terms)
-        self._asking = asking_kernel(outputs, terms)
-        self._group = group_of(terms)
+        self._fallback = fallback_kernel(outputs, terms)
+        self._group = instants_per_thread(terms)
         self._arrays = arrays
         self._thread_count = thread_count
         rays_together = TILE * TILE if terms.by_tile else PACKET if terms.embree else 1
@@ -118,9 +119,9 @@ class WarpRenderer:
         self._view = make_view(self.rays, lens.width, lens.height)
         self._body_data = make_body_data(arrays.bodies, instant_count, device)
         self._world_data = WorldData()
-        self.walk = None
+        self.candidates = None
         if shared is not None:
-            self.walk = TileWalk(
+            self.candidates = CandidateLists(
                 arrays.data.tree,
                 rays,
                 width=lens.width,
@@ -128,10 +129,10 @@ class WarpRenderer:
                 extent_m=float(np.abs(arrays.scene.bounds_m).max()),
                 config=shared,
                 instant_count=instant_count,
-                leaves=self._asking is not None,
+                has_fallback=self._fallback is not None,
                 thread_count=thread_count,
             )
-        self._walk_data = WalkData() if self.walk is None else self.walk.data
+        self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
@@ -142,7 +143,7 @@ class WarpRenderer:
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
-        self._film = make_film(**{name: getattr(self, name) for name in OUTPUTS})
+        self._render_outputs = make_render_outputs(**{name: getattr(self, name) for name in OUTPUTS})
 
     def render(
         self,
@@ -172,12 +173,12 @@ class WarpRenderer:
             place_camera(
                 self._arrays.bodies, bodies, p_WC, q_WC, instant_count=instant_count, data=self._body_data
             )
-        if self.walk is not None:
-            self.walk.launch(self.rays, p_WC, q_WC, instant_count=instant_count)
+        if self.candidates is not None:
+            self.candidates.update(self.rays, p_WC, q_WC, instant_count=instant_count)
         view = self._view
         view.instant_count, view.p_WC, view.q_WC, view.image_slot = instant_count, p_WC, q_WC, image_slot
-        inputs = [self._arrays.data, view, self._body_data, self._world_data, self._walk_data]
-        outputs = [self._film]
+        inputs = [self._arrays.data, view, self._body_data, self._world_data, self._candidate_data]
+        outputs = [self._render_outputs]
         device = self._arrays.device
         launch_split(
             self._kernel,
@@ -187,7 +188,11 @@ class WarpRenderer:
             device=device,
             thread_count=self._thread_count,
         )
-        if self._asking is not None and self.walk is not None:
+        if self._fallback is not None and self.candidates is not None:
             launch_split(
-                self._asking, dim=self.walk.data.left_threads, inputs=inputs, outputs=outputs, device=device
+                self._fallback,
+                dim=self.candidates.data.fallback_threads,
+                inputs=inputs,
+                outputs=outputs,
+                device=device,
             )

@@ -11,16 +11,16 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.body_arrays import make_body_data, place_camera
-from neurosim_core.render.cast_terms import group_of, with_walks
-from neurosim_core.render.config import WalkConfig
+from neurosim_core.render.candidate_data import TILE, CandidateListData
+from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
+from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
-from neurosim_core.render.film import make_film
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.raycast import asking_kernel, raycast_kernel
+from neurosim_core.render.outputs import make_render_outputs
+from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
+from neurosim_core.render.render_terms import instants_per_thread, with_candidate_lists
 from neurosim_core.render.scene_arrays import SceneArrays
-from neurosim_core.render.tile_walk import TileWalk, shared_walk
 from neurosim_core.render.view_data import WorldData, make_view
-from neurosim_core.render.walk_data import TILE, WalkData
 from neurosim_core.render.warp_renderer import ray_layers
 from neurosim_core.scene.bodies import BodyConfig, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.sensors.rig import Cast, EventSensorConfig, ImageSensorConfig
@@ -85,16 +85,16 @@ class WorldCast:
         rays = np.concatenate([ray_layers(lens, arrays.config.samples_per_pixel) for lens in lenses], axis=1)
         walk = None
         if not (terms.world_scenes or terms.world_lenses):  # walks change nothing but the speed
-            walk = shared_walk(
-                arrays.config.shared_walk,
+            walk = choose_candidate_lists(
+                arrays.config.candidate_lists,
                 rays,
                 instant_count=instant_count,
                 face_count=arrays.face_origin.shape[0],
                 is_cuda=wp.get_device(device).is_cuda,
             )
         # groups end with the instants of a world
-        terms = with_walks(terms, walk, group=1 << min(2, instant_count.bit_length() - 1))
-        self._group = group_of(terms)
+        terms = with_candidate_lists(terms, walk, group=1 << min(2, instant_count.bit_length() - 1))
+        self._group = instants_per_thread(terms)
         room = capacity or max(1024, 2 * cast.lens.width * cast.lens.height)
         if cast.event_cameras and world_count * room > _INDEX_MAX:
             raise ValueError(
@@ -110,11 +110,11 @@ class WorldCast:
                 "are more than 2^31 rays a step: take fewer worlds, or commands more often"
             )
         self._kernel = raycast_kernel(cast.outputs, terms)
-        self._asking = asking_kernel(cast.outputs, terms)
+        self._fallback = fallback_kernel(cast.outputs, terms)
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
         self._scene = arrays.data
         self._walk = None if walk is None else self._make_walk(arrays, rays, walk)
-        self._walk_data = WalkData() if self._walk is None else self._walk.data
+        self._candidate_data = CandidateListData() if self._walk is None else self._walk.data
         self._worlds = self._make_worlds(scenes, chosen if len(lenses) > 1 else None)
         self._p_BC = wp.vec3d(*cast.mount.position_m)
         self._q_BC = wp.quatd(*cast.mount.optical_quaternion())
@@ -137,7 +137,7 @@ class WorldCast:
             name: wp.zeros(size, dtype=dtype, device=device) if name in cast.outputs else None
             for name, (size, dtype) in made.items()
         }
-        self._film = make_film(**self._outputs)
+        self._render_outputs = make_render_outputs(**self._outputs)
         self.pictures: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
         """Of image cameras that look less often than another of their kind in the cast, or than the cast."""
@@ -208,17 +208,17 @@ class WorldCast:
                 data=self._body_data,
             )
         if self._walk is not None:
-            self._walk.launch(self._rays, self._p_WC, self._q_WC, instant_count=self._count * self._stride)
+            self._walk.update(self._rays, self._p_WC, self._q_WC, instant_count=self._count * self._stride)
         self._worlds.active = active
         self._view.instant_count = instant_count
         self._view.image_slot = self._slots_of(instant_count, bool(names))
-        inputs = [self._scene, self._view, self._body_data, self._worlds, self._walk_data]
-        outputs = [self._film]
+        inputs = [self._scene, self._view, self._body_data, self._worlds, self._candidate_data]
+        outputs = [self._render_outputs]
         dim = self._count * -(-instant_count // self._group) * self._instant_threads
         launch_split(self._kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
-        if self._asking is not None and self._walk is not None:
-            dim = self._walk.data.left_threads
-            launch_split(self._asking, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
+        if self._fallback is not None and self._walk is not None:
+            dim = self._walk.data.fallback_threads
+            launch_split(self._fallback, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
         for name in names:
             if name in self._own:
                 wp.copy(self.pictures[name], self._own[name])
@@ -233,13 +233,15 @@ class WorldCast:
             worlds.lens = wp.array(lens, dtype=int, device=self._device)
         return worlds
 
-    def _make_walk(self, arrays: SceneArrays, rays: NDArray[np.float32], config: WalkConfig) -> TileWalk:
+    def _make_walk(
+        self, arrays: SceneArrays, rays: NDArray[np.float32], config: CandidateListConfig
+    ) -> CandidateLists:
         """Return walks that the instants of a tile share in each world."""
         changes = {"instants": self._stride}
-        if arrays.config.shared_walk == "auto":  # lists are counted in 32 bits
+        if arrays.config.candidate_lists == "auto":  # lists are counted in 32 bits
             tiles = -(-self._size[0] // TILE) * -(-self._size[1] // TILE)
             changes["face_count_max"] = min(config.face_count_max, _INDEX_MAX // (self._count * tiles))
-        return TileWalk(
+        return CandidateLists(
             arrays.data.tree,
             rays,
             width=self._size[0],
@@ -247,7 +249,7 @@ class WorldCast:
             extent_m=float(np.abs(arrays.scene.bounds_m).max()),
             config=config.model_copy(update=changes),
             instant_count=self._count * self._stride,
-            leaves=self._asking is not None,
+            has_fallback=self._fallback is not None,
         )
 
     def _make_bodies(self, bodies: Mapping[str, BodyConfig]) -> None:
