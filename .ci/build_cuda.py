@@ -20,11 +20,11 @@ import warp as wp
 import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
-from neurosim_core.render.cast_terms import Terms
-from neurosim_core.render.film import OUTPUTS
-from neurosim_core.render.frustum_walk import walk_kernel
-from neurosim_core.render.raycast import asking_kernel, raycast_kernel
-from neurosim_core.render.walk_data import BLOCK
+from neurosim_core.render.candidate_data import BLOCK
+from neurosim_core.render.frustum_search import frustum_search_kernel
+from neurosim_core.render.outputs import OUTPUTS
+from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import make_scan
 from neurosim_core.sensors.event_noise_model import TERMS
@@ -64,7 +64,7 @@ def make_kernels() -> None:
         for _ in run({"duration_s": 0.02, "device": "cpu", "scene": scene, "sensors": SENSORS,
                       "render": {"lighting": {"mode": lighting}}}):  # fmt: skip
             pass
-    everything = Terms(textured=True, emissive=True, baked=True, supersampled=True)
+    everything = RenderTerms(textured=True, emissive=True, baked=True, supersampled=True)
     for terms in (
         everything,
         everything._replace(finest_level=True),
@@ -73,12 +73,12 @@ def make_kernels() -> None:
         everything._replace(bodies=True, baked=False),
         everything._replace(worlds=True, bodies=True),
         everything._replace(worlds=True, world_scenes=True, world_lenses=True),
-        everything._replace(walked=4, bodies=True),
-        everything._replace(walked=4, worlds=True, supersampled=False),
+        everything._replace(candidate_group=4, bodies=True),
+        everything._replace(candidate_group=4, worlds=True, supersampled=False),
     ):
         raycast_kernel(OUTPUTS, terms)
-        asking_kernel(OUTPUTS, terms)
-    walk_kernel(BLOCK)
+        fallback_kernel(OUTPUTS, terms)
+    frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):

@@ -25,12 +25,12 @@ from neurosim_core.clock import Rate
 from neurosim_core.config import load_config
 from neurosim_core.packets import EventArrays
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.config import LightingConfig, RenderConfig, WalkConfig
+from neurosim_core.render.candidate_data import UNRESOLVED, CandidateListData
+from neurosim_core.render.candidate_intersection import candidate_intersector
+from neurosim_core.render.config import CandidateListConfig, LightingConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError
-from neurosim_core.render.list_search import together_finder
-from neurosim_core.render.ray_hit import FAR_M
+from neurosim_core.render.ray_intersection import FAR_M
 from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
-from neurosim_core.render.walk_data import ASK, WalkData
 from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
 from neurosim_core.sensors.rig import EventSensorConfig
@@ -87,7 +87,7 @@ class WalkResult:
     costs: tuple[WalkCost, ...]
 
 
-_find_face = together_finder(1)
+_find_face = candidate_intersector(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -101,7 +101,7 @@ def _count_asked(
     instant_count: int,
     p_WC: wp.array[wp.vec3],
     q_WC: wp.array[wp.quat],
-    data: WalkData,
+    data: CandidateListData,
     # Out:
     asked_out: wp.array[int],
 ) -> None:
@@ -129,7 +129,7 @@ def _count_asked(
         1,
         wp.vec3(ray_C[0], ray_C[1], ray_C[2]),
     )
-    if found[0] == wp.static(ASK) and not outside:
+    if found[0] == wp.static(UNRESOLVED) and not outside:
         wp.atomic_add(asked_out, instant, 1)
 
 
@@ -237,10 +237,10 @@ def _eyes(flown: Flown, lens: PinholeConfig, instants: tuple[int, ...], quick: b
     """Return renderers: alone, by Embree if it is there, and of so many instants to a walk."""
     light = LightingConfig(mode="unshadowed" if quick else "baked", ambient_ray_count=4, shadow_ray_count=1)
     plain = RenderConfig(lighting=light, exposure=1.0)
-    configs: dict[str | int, dict[str, Any]] = {"alone": {"cpu_traversal": "warp", "shared_walk": None}}
+    configs: dict[str | int, dict[str, Any]] = {"alone": {"cpu_traversal": "warp", "candidate_lists": None}}
     if wp.get_device(flown.model.device).is_cpu:
         configs["embree"] = {"cpu_traversal": "embree"}
-    configs |= {count: {"shared_walk": WalkConfig(instants=count)} for count in instants}
+    configs |= {count: {"candidate_lists": CandidateListConfig(instants=count)} for count in instants}
     eyes: dict[str | int, _Eye] = {}
     for name, changes in configs.items():
         try:
@@ -279,9 +279,9 @@ def _look(flown: Flown, eye: _Eye, begins: Sequence[int]) -> _Seen:
         if seen:
             camera.reset(frames[0][0], stamps_ns[0])
         packets.append(camera.feed(frames[-1][seen:], stamps_ns[seen:]).numpy())
-        if eye.renderer.walk is not None:
-            lengths.append(eye.renderer.walk.data.count.numpy().reshape(-1).copy())
-            asked.append(_asked(eye, eye.renderer.walk.data))
+        if eye.renderer.candidates is not None:
+            lengths.append(eye.renderer.candidates.data.count.numpy().reshape(-1).copy())
+            asked.append(_asked(eye, eye.renderer.candidates.data))
             walk_s.append(_time_walk(eye))
     events = EventArrays(*(np.concatenate(column) for column in zip(*packets, strict=True)))
     known = np.concatenate([np.zeros(0, np.int32), *lengths])
@@ -318,7 +318,7 @@ def _measure(
     )
 
 
-def _asked(eye: _Eye, data: WalkData) -> float:
+def _asked(eye: _Eye, data: CandidateListData) -> float:
     """Return the share of the rays of the last look whose lists do not tell."""
     _, height, width = eye.renderer.log_radiance.shape
     counts = wp.zeros(_K, dtype=int, device=eye.device)
@@ -344,7 +344,7 @@ def _asked(eye: _Eye, data: WalkData) -> float:
 
 def _time_walk(eye: _Eye) -> float:
     """Return the time of the walk, per render [s]."""
-    launch = eye.renderer.walk.launch
+    launch = eye.renderer.candidates.update
     return eye.seconds(lambda: launch(eye.renderer.rays, eye.p_WC, eye.q_WC, instant_count=_K)) / _K
 
 

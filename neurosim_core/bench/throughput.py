@@ -313,7 +313,7 @@ class _Study:
 
     def _without_walks(self, size: tuple[int, int]) -> Model:
         """Return the model whose rays share no walks; light stays as it is."""
-        config = load_config(self._settings(size, self._plan.instants, render={"shared_walk": None}))
+        config = load_config(self._settings(size, self._plan.instants, render={"candidate_lists": None}))
         arrays = cast(SceneArrays, self._base.scene_on_device)
         lit = dataclasses.replace(arrays, config=config.render)
         return refit(dataclasses.replace(self._base, config=config, scene_on_device=lit), config)

@@ -23,7 +23,7 @@ class StepRow:
 
     study: Study
     mode: str
-    """`EXACT`: a render at every step; `RAYS_ALONE`: the same with `RenderConfig.shared_walk` null;
+    """`EXACT`: a render at every step; `RAYS_ALONE`: the same with `RenderConfig.candidate_lists` null;
     `ADAPTIVE`."""
     scene: str
     width: int

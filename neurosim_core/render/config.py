@@ -33,29 +33,29 @@ class LightingConfig(Settings):
     """Radius of the lights [m]: softens shadows, and distances are taken as at least this."""
 
 
-class WalkConfig(Settings):
-    """How rays of a tile of 8 x 8 pixels share their walks through the tree; changes speed, not results."""
+class CandidateListConfig(Settings):
+    """Candidate lists of tiles of 8 x 8 pixels; they change speed, not results."""
 
     instants: int = Field(default=32, ge=1, le=256)
-    """Consecutive instants of a launch that share a walk. More are cheaper as long as the camera turns by
+    """Consecutive instants of a launch that share a list. More are cheaper as long as the camera turns by
     less than a few tiles within them."""
     face_count_max: int = Field(default=384, ge=1, le=4096)
-    """The most triangles that a walk may list: of a tile with more each ray walks by itself."""
+    """Capacity of a list: the rays of a tile with more triangles traverse the tree."""
 
 
 class RenderConfig(Settings):
     """How pictures are computed, the same for all cameras of a run."""
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
-    """Who finds what rays hit on a CPU device. `embree`: Embree, in packets of rays, several times faster.
-    `warp`: a kernel of ours in Warp, as on CUDA. `auto`: Embree where it can be loaded, and Warp where a
-    `shared_walk` is asked for."""
-    shared_walk: WalkConfig | Literal["auto"] | None = "auto"
-    """The rays of a tile of pixels share one walk through the tree over several instants, instead of one
-    for each ray: the same pictures and events to the last bit, sooner. `auto`: on CUDA, where a launch has 8
-    instants or more of pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of
-    3.2 mrad, the lens looks forward, and lists do not get long: the square of a pixel's width [rad] times the
-    triangles of the scene, as cut for baked light, is at most 2.2. null: each ray walks by itself."""
+    """Library that intersects rays on a CPU device. `embree`: Embree, in packets of rays, several times
+    faster. `warp`: Warp kernels, as on CUDA. `auto`: Embree where it can be loaded, and Warp with explicit
+    `candidate_lists`."""
+    candidate_lists: CandidateListConfig | Literal["auto"] | None = "auto"
+    """The rays of a tile of pixels share one search of the tree over several instants: the same pictures and
+    events to the last bit, sooner. `auto`: lists are used on CUDA, where a launch has 8 instants or more of
+    pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of 3.2 mrad, the lens
+    looks forward, and lists stay short: the square of a pixel's width [rad] times the triangles of the scene,
+    as cut for baked light, is at most 2.2. null: each ray traverses the tree."""
     lighting: LightingConfig = LightingConfig()
     """How surfaces are lit."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
@@ -75,11 +75,9 @@ class RenderConfig(Settings):
     two alias, which event cameras see as events that no sensor gives."""
 
     @model_validator(mode="after")
-    def _walks_are_of_rays_that_warp_casts(self) -> RenderConfig:
-        if isinstance(self.shared_walk, WalkConfig) and self.cpu_traversal == "embree":
-            raise ValueError(
-                "shared_walk is for rays that Warp casts: cpu_traversal must be auto or warp, got embree"
-            )
+    def _candidate_lists_need_warp(self) -> RenderConfig:
+        if isinstance(self.candidate_lists, CandidateListConfig) and self.cpu_traversal == "embree":
+            raise ValueError("candidate_lists need cpu_traversal auto or warp, got embree")
         return self
 
     @model_validator(mode="after")

@@ -17,6 +17,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.native_code import read_native
+
 PACKET = 16
 """Rays that a kernel casts together."""
 
@@ -127,71 +129,6 @@ class EmbreeTree:
         library.check()
 
 
-# Fills RTCRayHit4, 8 or 16 and calls rtcIntersect4, 8 or 16.
-INTERSECT = """
-    alignas(64) float ts[16], us[16], vs[16], normal[3][16];
-    alignas(64) int faces[16];
-    for (int begin = 0; begin < 16; begin += WIDTH) {
-        struct alignas(4 * WIDTH) {
-            float origin[3][WIDTH], near_t[WIDTH], ray[3][WIDTH], time[WIDTH], far_t[WIDTH];
-            int mask[WIDTH], id[WIDTH], flags[WIDTH];
-            float normal[3][WIDTH], u[WIDTH], v[WIDTH];
-            int face[WIDTH], geometry[WIDTH], instance[2][WIDTH];
-        } packet;
-        alignas(4 * WIDTH) int valid[WIDTH];
-        struct {
-            int flags, features;
-            void *context, *filter, *intersect;
-        } arguments = {1 << 16, -1, nullptr, nullptr, nullptr};  // coherent, all features
-        for (int lane = 0; lane < WIDTH; ++lane) {
-            const int from = begin + lane;
-            valid[lane] = ray[0][from] != 0.0f || ray[1][from] != 0.0f || ray[2][from] != 0.0f ? -1 : 0;
-            for (int axis = 0; axis < 3; ++axis) {
-                packet.origin[axis][lane] = origin[axis];
-                packet.ray[axis][lane] = ray[axis][from];
-            }
-            packet.near_t[lane] = packet.time[lane] = 0.0f;
-            packet.far_t[lane] = far_m;
-            packet.mask[lane] = -1;
-            packet.id[lane] = packet.flags[lane] = 0;
-            packet.face[lane] = packet.geometry[lane] = -1;
-            packet.instance[0][lane] = packet.instance[1][lane] = -1;
-        }
-        ((void (*)(const int*, void*, void*, void*))EMBREE_INTERSECT)(
-            valid, (void*)EMBREE_SCENE, &packet, &arguments);
-        for (int lane = 0; lane < WIDTH; ++lane) {
-            faces[begin + lane] = packet.face[lane];
-            ts[begin + lane] = packet.far_t[lane];
-            us[begin + lane] = 1.0f - packet.u[lane] - packet.v[lane];
-            vs[begin + lane] = packet.u[lane];
-            for (int axis = 0; axis < 3; ++axis) normal[axis][begin + lane] = packet.normal[axis][lane];
-        }
-    }
-"""
-"""C++ that casts 16 rays from one origin: `ray` [3][16], of which those of zero length are not cast, `origin`
-and `far_m` become `faces`, `ts`, `us`, `vs` [16] and `normal` [3][16], as `packet_caster` says. In place of
-WIDTH, EMBREE_INTERSECT and EMBREE_SCENE stands what its parameters say. Corners: Embree's u and v weigh the
-second and the third, Warp's the first and the second."""
-
-_CAST = (
-    """
-    alignas(64) float ray[3][16];
-    for (int axis = 0; axis < 3; ++axis)
-        for (int lane = 0; lane < 16; ++lane) ray[axis][lane] = rays.data[lane][axis];
-"""
-    + INTERSECT.replace("EMBREE_INTERSECT", "intersect").replace("EMBREE_SCENE", "scene")
-    + """
-    for (int lane = 0; lane < 16; ++lane) {
-        face_out.data[lane] = faces[lane];
-        t_out.data[lane] = ts[lane];
-        u_out.data[lane] = us[lane];
-        v_out.data[lane] = vs[lane];
-        normal_out.data[lane] = wp::vec3(normal[0][lane], normal[1][lane], normal[2][lane]);
-    }
-"""
-)
-
-
 @cache
 def packet_caster(width: int) -> Any:
     """Return the Warp function, for CPU kernels only, that casts 16 rays from one origin.
@@ -207,7 +144,7 @@ def packet_caster(width: int) -> Any:
         width: `packet_width()`.
     """
 
-    @wp.func_native(_CAST.replace("WIDTH", str(width)))
+    @wp.func_native(read_native(__file__, "cast_packet", WIDTH=width))
     def cast_packet(
         intersect: wp.uint64,
         scene: wp.uint64,

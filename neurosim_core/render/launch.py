@@ -1,12 +1,12 @@
 """Launches of kernels that use all cores of a CPU.
 
-Warp runs a CPU kernel on the calling thread. The call lets go of the interpreter, so slices of one launch
-run on a pool of threads. A kernel that is launched this way takes the index of its first thread as its first
-parameter.
+Warp runs a CPU kernel on the calling thread. The call releases the interpreter lock, so a pool of threads
+runs slices of one launch. The first parameter of such a kernel is the index of its first thread.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -14,21 +14,18 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.cores import all_cores, following
-from neurosim_core.priority import niceness, spared_count
-from neurosim_core.warp_start import refuse_forked_process
-
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
 
 def core_count() -> int:
     """Return how many cores this process may use."""
-    return len(all_cores())
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @cache
-def _pool(thread_count: int, niceness: int) -> ThreadPoolExecutor:
-    """Return the threads for those who launch at a priority: threads inherit it from who starts them."""
+def _pool(thread_count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
 
 
@@ -41,10 +38,10 @@ def launch_split(
     device: str,
     thread_count: int | None = None,
 ) -> None:
-    """Launch a kernel of one dimension: on CUDA at once, on the CPU in slices on all cores.
+    """Launch a kernel of one dimension: on CUDA as one launch, on the CPU in slices on all cores.
 
-    Returns when a CPU has finished; does not wait for a CUDA device. Threads of the kernel must not depend
-    on each other. Slices begin at multiples of 64.
+    The call returns when a CPU has finished; it does not wait for a CUDA device. Threads of the kernel must
+    not depend on each other. Slices begin at multiples of 64.
 
     Args:
         kernel: Its first parameter is the index of its first thread, an int.
@@ -52,13 +49,9 @@ def launch_split(
         inputs: Parameters after the first.
         outputs: Parameters after the inputs.
         device: Where to launch.
-        thread_count: Threads of the pool; all cores if None, less those that `priority.sparing` leaves.
-
-    Raises:
-        RuntimeError: This process was forked from one that had used a device.
+        thread_count: Threads of the pool; all cores if None.
     """
-    refuse_forked_process()
-    threads = thread_count or max(1, core_count() - spared_count())
+    threads = thread_count or core_count()
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64
     if not wp.get_device(device).is_cpu or threads == 1 or slice_size >= dim:
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=64)
@@ -71,5 +64,5 @@ def launch_split(
             kernel, dim=size, inputs=[first, *inputs], outputs=list(outputs), device=device, block_dim=64
         )
 
-    for _ in _pool(threads, niceness()).map(following(run), range(0, dim, slice_size)):
+    for _ in _pool(threads).map(run, range(0, dim, slice_size)):
         pass

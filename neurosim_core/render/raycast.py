@@ -1,8 +1,8 @@
-"""The ray caster: one kernel factory, specialised on the outputs asked for and the terms of the scene.
+"""The ray caster: one kernel factory, specialised on the requested outputs and the terms of the scene.
 
 One traversal per ray answers everything. A thread is a pixel (`raycast_pixels.py`), or on a CPU a packet of
-pixels with Embree and a tile with shared walks (`raycast_packets.py`). What a specialisation does not need is
-not in its code.
+pixels with Embree and a tile with candidate lists (`raycast_packets.py`). A specialisation contains only the
+code that it needs.
 """
 
 from __future__ import annotations
@@ -12,24 +12,25 @@ from functools import cache
 
 import warp as wp
 
-from neurosim_core.render.cast_terms import Terms
-from neurosim_core.render.film import OUTPUTS
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast_packets import packet_kernel
 from neurosim_core.render.raycast_pixels import pixel_kernel
+from neurosim_core.render.render_terms import RenderTerms
 
 
-def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
+def raycast_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel that casts rays for `outputs` in a scene with `terms`; made once per combination.
 
     Its parameters: the index of the first thread; `SceneData`, `ViewData`, `BodyData`, `WorldData` and
-    `WalkData`, of which it reads what the terms say. It writes `FilmData`.
+    `CandidateListData`, of which it reads what the terms say. It writes `RenderOutputs`.
 
     Raises:
-        ValueError: If an output is unknown or none is asked for, or unlike worlds are to share walks.
+        ValueError: An output is unknown, none is requested, or worlds with different scenes or lenses are to
+            use candidate lists.
     """
-    if terms.walked and (terms.world_scenes or terms.world_lenses):
-        raise ValueError("rays share walks where worlds have one scene and one lens")
-    if not terms.walked:
+    if terms.candidate_group and (terms.world_scenes or terms.world_lenses):
+        raise ValueError("candidate lists need worlds with one scene and one lens")
+    if not terms.candidate_group:
         terms = terms._replace(by_tile=False)
     unknown = sorted(set(outputs) - set(OUTPUTS))
     if unknown or not outputs:
@@ -37,16 +38,17 @@ def raycast_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel:
     return _kernel(tuple(name for name in OUTPUTS if name in outputs), terms)
 
 
-def asking_kernel(outputs: Collection[str], terms: Terms) -> wp.Kernel | None:
-    """Return the kernel that renders the pixels that `raycast_kernel` leaves; None: it leaves none.
+def fallback_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel | None:
+    """Return the kernel that renders the unresolved pixels of `raycast_kernel`; None: there are none.
 
-    It is launched after the other, with the same arguments and `WalkData.left_threads` threads.
+    It is launched after `raycast_kernel`, with the same arguments and `CandidateListData.fallback_threads`
+    threads.
     """
-    if not terms.walked or terms.by_tile:
+    if not terms.candidate_group or terms.by_tile:
         return None
-    return raycast_kernel(outputs, terms._replace(walked=0, asking=True))
+    return raycast_kernel(outputs, terms._replace(candidate_group=0, fallback=True))
 
 
 @cache
-def _kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
+def _kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     return (packet_kernel if terms.embree or terms.by_tile else pixel_kernel)(outputs, terms)

@@ -3,7 +3,7 @@
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
 """The ray caster of a CPU: a thread is a packet of pixels, of which four are a tile, or a tile.
 
-With Embree a thread is a packet of 4 x 4 pixels, with shared walks (`tile_walk.py`) a whole tile.
+With Embree a thread is a packet of 4 x 4 pixels, with candidate lists (`candidate_lists.py`) a whole tile.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -11,22 +11,29 @@ With Embree a thread is a packet of 4 x 4 pixels, with shared walks (`tile_walk.
 import warp as wp
 
 from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.cast_terms import Terms
+from neurosim_core.render.candidate_data import TILE, UNRESOLVED, CandidateListData
+from neurosim_core.render.candidate_intersection import intersect_tile
 from neurosim_core.render.embree import packet_caster
-from neurosim_core.render.film import FilmData, asked_for, geometry_writer, radiance_writer
-from neurosim_core.render.list_search import find_faces
-from neurosim_core.render.packet_shading import packet_eye, packet_shader
-from neurosim_core.render.ray_hit import FAR_M, UNFUSED, Hit, meet_bodies, meet_listed, meet_scene
+from neurosim_core.render.outputs import RenderOutputs, geometry_writer, radiance_writer, requested_outputs
+from neurosim_core.render.packet_shading import packet_program, packet_shader
+from neurosim_core.render.ray_intersection import (
+    FAR_M,
+    UNFUSED,
+    Hit,
+    intersect_bodies,
+    intersect_candidate,
+    intersect_scene,
+)
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
-from neurosim_core.render.walk_data import ASK, TILE, WalkData
 
 
-def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
-    """Return the kernel, made anew; see `raycast.raycast_kernel`."""
-    asked = asked_for(outputs)
-    walked = terms.walked > 0
+def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
+    """Build the kernel; see `raycast.raycast_kernel`."""
+    requested = requested_outputs(outputs)
+    listed = terms.candidate_group > 0
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
     write_geometry = geometry_writer(outputs)
@@ -36,12 +43,12 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
     packets = (TILE // side) ** 2  # of a tile
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
-    together = asked.radiance and terms.baked and not terms.bodies and not terms.finest_level
-    each_lane = asked.geometry or walked or not together
-    shade_packet = packet_shader(lanes, textured=terms.textured, emissive=terms.emissive, unit_normals=walked)
-    at_once = asked.log and together and not walked  # where no picture is asked for
-    see_packet = (
-        packet_eye(terms.embree, textured=terms.textured, emissive=terms.emissive) if at_once else None
+    packed = requested.radiance and terms.baked and not terms.bodies and not terms.finest_level
+    each_lane = requested.geometry or listed or not packed
+    shade_packet = packet_shader(lanes, textured=terms.textured, emissive=terms.emissive, unit_normals=listed)
+    fused = requested.log and packed and not listed  # for instants without an image slot
+    render_packet = (
+        packet_program(terms.embree, textured=terms.textured, emissive=terms.emissive) if fused else None
     )
 
     @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else UNFUSED)
@@ -52,9 +59,9 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         view: ViewData,
         bodies: BodyData,
         worlds: WorldData,
-        walks: WalkData,
+        candidates: CandidateListData,
         # Out:
-        film: FilmData,
+        out: RenderOutputs,
     ) -> None:
         # A packet is the same pixels in every launch: the last bit of a hit may depend on the other rays.
         index = first + wp.tid()
@@ -77,18 +84,18 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         if left >= view.width or top >= view.height:
             return
         slot = int(-1)
-        if wp.static(asked.images):
+        if wp.static(requested.images):
             slot = view.image_slot[instant]
-            if wp.static(not asked.log):
+            if wp.static(not requested.log):
                 if slot < 0:
                     return
         origin = view.p_WC[instant]
         q = view.q_WC[instant]
         columns = wp.min(view.width - left, side)
         rows = wp.min(view.height - top, side)
-        if wp.static(at_once):
+        if wp.static(fused):
             if slot < 0:
-                see_packet(
+                render_packet(
                     scene,
                     view.rays,
                     first_ray + top * view.width + left,
@@ -101,7 +108,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     left,
                     rows,
                     columns,
-                    film.log_radiance,
+                    out.log_radiance,
                 )
                 return
         ray = wp.zeros(shape=(lanes,), dtype=wp.vec3)
@@ -111,27 +118,27 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
         v = wp.zeros(shape=(lanes,), dtype=float)
         normal = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
-        spread_rad = wp.zeros(shape=(lanes if together else 1,), dtype=float)
+        spread_rad = wp.zeros(shape=(lanes if packed else 1,), dtype=float)
         for layer in range(view.rays.shape[0]):
             if wp.static(terms.supersampled):
-                if layer == 0 and (slot < 0 or wp.static(not asked.geometry)):
+                if layer == 0 and (slot < 0 or wp.static(not requested.geometry)):
                     continue
             for y in range(rows):
                 for x in range(columns):
                     ray_C = view.rays[layer, first_ray + (top + y) * view.width + left + x]
                     ray[side * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
-                    if wp.static(together):
+                    if wp.static(packed):
                         spread_rad[side * y + x] = ray_C[3]
-            if wp.static(walked):
-                walk = instant // walks.instants
-                find_faces(
+            if wp.static(listed):
+                group = instant // candidates.instants
+                intersect_tile(
                     scene.mesh,
-                    walks.faces,
-                    (walk * walks.bounds.shape[0] + tile) * walks.limit,
-                    walks.count[walk, tile],
-                    walks.reach[walk, tile],
+                    candidates.faces,
+                    (group * candidates.bounds.shape[0] + tile) * candidates.limit,
+                    candidates.count[group, tile],
+                    candidates.reach[group, tile],
                     FAR_M,
-                    walks.bounds[tile],
+                    candidates.bounds[tile],
                     q,
                     origin,
                     ray,
@@ -146,10 +153,10 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                     for x in range(columns):
                         lane = side * y + x
                         ray_C = view.rays[layer, first_ray + (top + y) * view.width + left + x]
-                        if wp.static(walked):
-                            hit = meet_listed(scene, origin, ray[lane], face[lane])
-                            if hit.face == ASK:
-                                hit = meet_scene(scene, origin, ray[lane])
+                        if wp.static(listed):
+                            hit = intersect_candidate(scene, origin, ray[lane], face[lane])
+                            if hit.face == UNRESOLVED:
+                                hit = intersect_scene(scene, origin, ray[lane])
                         else:
                             hit = Hit()
                             hit.face = face[lane]
@@ -159,21 +166,21 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                             hit.normal = wp.normalize(normal[lane])
                         body = int(-1)
                         if wp.static(terms.bodies):
-                            hit, body = meet_bodies(
+                            hit, body = intersect_bodies(
                                 bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
                             )
-                        if wp.static(walked and together):
+                        if wp.static(listed and packed):
                             face[lane] = hit.face
                             t[lane] = hit.t
                             u[lane] = hit.u
                             v[lane] = hit.v
                             normal[lane] = hit.normal
-                        if wp.static(asked.radiance and not together):
+                        if wp.static(requested.radiance and not packed):
                             if wp.static(not terms.supersampled) or layer > 0:
                                 radiance[lane] += radiance_of(
                                     scene, bodies, instant, body, q, ray[lane], origin, ray_C[3], hit
                                 )
-                        if wp.static(asked.geometry):
+                        if wp.static(requested.geometry):
                             if slot >= 0 and layer == 0:
                                 write_geometry(
                                     scene,
@@ -183,9 +190,9 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                                     slot,
                                     top + y,
                                     left + x,
-                                    film,
+                                    out,
                                 )
-            if wp.static(together):
+            if wp.static(packed):
                 if wp.static(not terms.supersampled) or layer > 0:
                     shade_packet(
                         scene,
@@ -198,7 +205,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                         normal,
                         radiance,
                     )
-        if wp.static(asked.radiance):
+        if wp.static(requested.radiance):
             for y in range(rows):
                 for x in range(columns):
                     write_radiance(
@@ -209,7 +216,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: Terms) -> wp.Kernel:
                         slot,
                         top + y,
                         left + x,
-                        film,
+                        out,
                     )
 
     return raycast_packets

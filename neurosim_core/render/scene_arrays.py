@@ -13,12 +13,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.body_arrays import BodyArrays, JoinedBodies, join_bodies, upload_bodies
-from neurosim_core.render.cast_terms import Terms
-from neurosim_core.render.config import RenderConfig, WalkConfig
+from neurosim_core.render.config import CandidateListConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, EmbreeTree, packet_width
 from neurosim_core.render.lighting import RefinedMesh, bake_light, corner_normals, refine, shading_mesh
-from neurosim_core.render.ray_hit import face_normals
+from neurosim_core.render.ray_intersection import face_normals
 from neurosim_core.render.ray_tree import make_ray_tree
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.bodies import Body
 from neurosim_core.scene.materials import PackedTextures, mean_albedo, pack_textures
@@ -48,7 +48,7 @@ class SceneArrays:
     """What moves in the scene; None: nothing does."""
     instance_names: tuple[str, ...]
     """Names of the instances: those of the scene, then of the bodies."""
-    terms: Terms
+    terms: RenderTerms
     data: SceneData
     exposure: float
     """Factor from linear radiance to the linear value 1.0 of an 8-bit picture."""
@@ -145,10 +145,10 @@ def upload_scene(
 
 def _terms_of(
     materials: Sequence[Material], packed: PackedTextures, config: RenderConfig, device: str, *, bodies: bool
-) -> Terms:
+) -> RenderTerms:
     """Return what a scene of these materials and its settings need of the ray caster."""
     textured = bool((packed.material_texture[:, 1] > 0).any())
-    return Terms(
+    return RenderTerms(
         textured=textured,
         emissive=any(max(m.emission) > 0.0 for m in materials),
         baked=config.lighting.mode == "baked",
@@ -167,7 +167,7 @@ def _upload_surfaces(
     mesh: RefinedMesh,
     joined: JoinedBodies,
     packed: PackedTextures,
-    terms: Terms,
+    terms: RenderTerms,
     device: str,
 ) -> None:
     """Write what faces are made of: those of the scene, then those of the bodies."""
@@ -217,7 +217,7 @@ def _upload_light(
 
 def _embree_width(config: RenderConfig, device: str) -> int:
     """Return how many rays Embree casts at once, 0 if Warp casts them."""
-    asked = isinstance(config.shared_walk, WalkConfig)
+    asked = isinstance(config.candidate_lists, CandidateListConfig)
     if config.cpu_traversal == "warp" or asked or not wp.get_device(device).is_cpu:
         return 0
     try:

@@ -16,15 +16,15 @@ class SceneData:
 
     mesh: wp.uint64
     tree: RayTree
-    """What rays walk through; not filled if Embree finds what they hit."""
+    """The hierarchy that rays traverse; not filled if Embree intersects them."""
     embree_scene: wp.uint64
-    """`EmbreeTree.scene`; 0 if Warp finds what rays hit."""
+    """`EmbreeTree.scene`; 0 if Warp intersects rays."""
     embree_intersect: wp.uint64
     """`EmbreeTree.intersect`, likewise."""
     face_material: wp.array[int]
     face_instance: wp.array[int]
     face_normal: wp.array[wp.vec3]
-    """Unit normal of each face's front; not filled if Embree finds what rays hit."""
+    """Unit normal of each face's front; not filled if Embree intersects rays."""
     face_lod: wp.array[float]
     """log2 of texels per metre on each face."""
     corner_uv: wp.array[wp.vec2]

@@ -10,9 +10,9 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.cast_terms import Terms
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
-from neurosim_core.render.ray_hit import Hit
+from neurosim_core.render.ray_intersection import Hit
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
@@ -21,7 +21,7 @@ _OFFSET_M = wp.constant(1.0e-3)
 
 
 @cache
-def pixel_shader(terms: Terms) -> wp.Function:
+def pixel_shader(terms: RenderTerms) -> wp.Function:
     """Return the function that says what light a pixel receives along a ray.
 
     Its parameters: the scene and its bodies; the instant; the body that the ray hits, -1: none; orientation
@@ -51,7 +51,7 @@ def pixel_shader(terms: Terms) -> wp.Function:
 
 
 @cache
-def _scene_shader(terms: Terms) -> wp.Function:
+def _scene_shader(terms: RenderTerms) -> wp.Function:
     """Return the function that says what light comes from what stands still, or from the sky."""
     surface_albedo, emitted = _albedo(terms), _emission(terms)
 
@@ -96,7 +96,7 @@ def _scene_shader(terms: Terms) -> wp.Function:
 
 
 @cache
-def _body_shader(terms: Terms) -> wp.Function:
+def _body_shader(terms: RenderTerms) -> wp.Function:
     """Return the function that finds the light of a body for each pixel.
 
     It is ambient light, and that of the lamps that no part of the scene hides (all lamps, where the scene
@@ -148,7 +148,7 @@ def _body_shader(terms: Terms) -> wp.Function:
 
 
 @cache
-def _albedo(terms: Terms) -> wp.Function:
+def _albedo(terms: RenderTerms) -> wp.Function:
     """Return the function that reads the base colour and the texture of what is hit.
 
     The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long
@@ -184,7 +184,7 @@ def _albedo(terms: Terms) -> wp.Function:
 
 
 @cache
-def _emission(terms: Terms) -> wp.Function:
+def _emission(terms: RenderTerms) -> wp.Function:
     @wp.func
     def emitted(scene: SceneData, hit: Hit) -> wp.vec3:
         emission = wp.vec3(0.0)

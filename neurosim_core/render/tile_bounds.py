@@ -7,7 +7,7 @@ together, wherever in the picture, because all of it is measured as angles. Boun
 and a slope is an angle only short of 90 degrees from the axis: lenses are taken up to a slope of 100 (89.4
 degrees), where the 1e-5 rad move a bound by two thousandths of itself at most, and are refused beyond. A
 triangle whose plane contains the ray to within rounding is the one exception: Woop's test can hit it outside
-of its edges, and where that is outside of the frustum, too, the tree may see it and a list not.
+of its edges, and where that is outside of the frustum, too, the tree finds it and a list does not.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.render.walk_data import TILE
+from neurosim_core.render.candidate_data import TILE
 
 _BORDER_RAD = 1.0e-5
 """By how much the rays of a tile are taken to reach beyond their border [rad]."""
@@ -51,14 +51,14 @@ def tile_bounds(rays: NDArray[np.float32], width: int, height: int) -> NDArray[n
     """
     directions = rays[..., :3].astype(np.float64).reshape(-1, height, width, 3)
     if not (directions[..., 2] > 0.0).all():
-        raise ValueError("rays that share a walk must look forward, and some of this lens do not (z <= 0)")
+        raise ValueError("candidate lists need rays that look forward, and some of this lens do not (z <= 0)")
     slopes = directions[..., :2] / directions[..., 2:]
     steepest = float(np.abs(slopes).max())
     if steepest > _SLOPE_MAX:
         raise ValueError(
-            f"rays that share a walk must have |x / z| and |y / z| up to {_SLOPE_MAX:g} "
+            f"candidate lists need rays with |x / z| and |y / z| up to {_SLOPE_MAX:g} "
             f"({math.degrees(math.atan(_SLOPE_MAX)):.1f} deg from the axis), and this lens has "
-            f"{steepest:.4g}: take a narrower lens, or set render.shared_walk to null"
+            f"{steepest:.4g}: take a narrower lens, or set render.candidate_lists to null"
         )
     length = np.sqrt(1.0 + (slopes**2).sum(axis=-1, keepdims=True))
     widened = _BORDER_RAD * length * np.sqrt(1.0 + slopes**2)

@@ -1,7 +1,7 @@
 # mypy: disable-error-code="no-untyped-def,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
-"""Who looks: the rays and poses of a launch, its worlds, and where its tiles of 8 x 8 pixels are."""
+"""The camera of a launch: rays, poses and worlds, and the layout of tiles of 8 x 8 pixels."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
@@ -10,16 +10,16 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.render.cast_terms import Terms
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 
 
 @wp.struct
 class ViewData:
-    """What a launch looks at: along the rays of a lens, from the poses of its instants."""
+    """The rays of a lens, and the poses of the instants of a launch."""
 
     rays: wp.array2d[wp.vec4]
-    """Direction in C and spread [rad], shape [layer, H * W]: one layer, or that of the centres and then the
+    """Direction in C and spread [rad], shape [layer, H * W]: the centres of pixels; further layers are the
     samples whose mean is the radiance."""
     width: int
     """Columns of a picture [px]."""
@@ -36,7 +36,7 @@ class ViewData:
 
 
 def make_view(rays: Any, width: int, height: int) -> ViewData:
-    """Return a view along rays, vec4, shape [layer, H * W]; without instants."""
+    """Return the view of a lens with rays vec4, shape [layer, H * W]; without instants."""
     view = ViewData()
     view.rays, view.width, view.height = rays, width, height
     return view
@@ -44,26 +44,27 @@ def make_view(rays: Any, width: int, height: int) -> ViewData:
 
 @wp.struct
 class WorldData:
-    """Who looks, where worlds are rendered together; instants are [world, K], in this order in all arrays."""
+    """Worlds that are rendered together; arrays of instants have the shape [world, K], flattened."""
 
     stride: int
-    """K: room for instants of each world."""
+    """K: capacity for instants of each world."""
     active: wp.array[int]
-    """1: this world is rendered, 0: its pictures stay as they are, shape [world]."""
+    """1: the world is rendered; 0: its outputs are left unchanged, shape [world]."""
     scenes: wp.array[SceneData]
-    """`Terms.world_scenes`: all scenes there are."""
+    """With `RenderTerms.world_scenes`: all scenes."""
     scene: wp.array[int]
-    """`Terms.world_scenes`: which of them a world is in, shape [world]."""
+    """With `RenderTerms.world_scenes`: index of the scene of each world, shape [world]."""
     lens: wp.array[int]
-    """`Terms.world_lenses`: rays of which lens, of those that follow each other in a layer, shape [world]."""
+    """With `RenderTerms.world_lenses`: index of the lens of each world, shape [world]; a layer of rays holds
+    the lenses one after another."""
 
 
 @cache
-def tile_finder(terms: Terms) -> wp.Function:
-    """Return the function that says where a tile is: all tiles of a world, row by row, then the next world.
+def tile_finder(terms: RenderTerms) -> wp.Function:
+    """Return the Warp function that locates a tile; tiles are numbered row by row, then world by world.
 
-    Its parameters: the tile; width and height of the picture [px]. It returns the world; the tile among those
-    of this world; the column and the row of its first pixel.
+    Its parameters: the tile; width and height of the picture [px]. It returns the world; the index of the
+    tile in that world; the column and the row of its first pixel.
     """
 
     @wp.func

@@ -16,19 +16,19 @@ from neurosim_core.render.body_arrays import (
     place_camera,
 )
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.cast_terms import Terms, group_of, with_walks
-from neurosim_core.render.config import WalkConfig
+from neurosim_core.render.candidate_data import TILE, CandidateListData
+from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
+from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
-from neurosim_core.render.film import OUTPUTS, make_film
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import (
     spread_order,
 )
-from neurosim_core.render.raycast import asking_kernel, raycast_kernel
+from neurosim_core.render.outputs import OUTPUTS, make_render_outputs
+from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
+from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists
 from neurosim_core.render.scene_arrays import SceneArrays
-from neurosim_core.render.tile_walk import TileWalk, shared_walk
 from neurosim_core.render.view_data import WorldData, make_view
-from neurosim_core.render.walk_data import TILE, WalkData
 from neurosim_core.scene.bodies import BodyPoses
 
 _THREAD_COUNT_MAX = 2**31 - 1
@@ -66,7 +66,7 @@ class RenderWorlds:
     """All scenes, device array of `SceneData`; None: every world is in the scene of the renderer."""
     scene_of_world: Any = None
     """Index into `scenes` of each world, device array of int32, shape [N]."""
-    terms: Terms | None = None
+    terms: RenderTerms | None = None
     """What some scene needs in the kernel; None: as the scene of the renderer says."""
 
 
@@ -79,8 +79,7 @@ class WarpRenderer:
 
     Instants are [world, K] in this order in all arrays: instant k of world n is row n K + k. On a device they
     are launched in the order world, tile, instant, pixel: the instants of a tile, which see the same
-    triangles, run side by side. Outputs that were not asked for are None. See `film.FilmData` for what they
-    are.
+    triangles, run side by side. Outputs that are not requested are None. See `outputs.RenderOutputs` for what they are.
 
     Attributes:
         log_radiance: float32, shape [N K, H, W].
@@ -90,7 +89,7 @@ class WarpRenderer:
         instance: int32, shape [M, H, W].
         rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W]; of several
             lenses, one after the other.
-        walk: What the rays of a tile share; None: each walks by itself.
+        candidates: Candidate lists of tiles; None: rays traverse the tree.
         terms: What its kernels compute because of the scene, the settings, and the lens.
     """
 
@@ -117,8 +116,8 @@ class WarpRenderer:
             worlds: Who is rendered together.
 
         Raises:
-            ValueError: If an output is unknown or none is asked for, the instants have more than 2^31 - 1
-                rays of a layer together, or rays that share a walk do not look forward or are too many.
+            ValueError: An output is unknown, none is requested, the instants have more than 2^31 - 1 rays of
+                a layer together, or the lens does not suit candidate lists.
         """
         self._worlds = worlds
         self._tile_count = -(-lens.width // TILE) * -(-lens.height // TILE)
@@ -131,16 +130,16 @@ class WarpRenderer:
         rays = np.concatenate([ray_layers(each, arrays.config.samples_per_pixel) for each in lenses], axis=1)
         shared = self._choose_terms(rays, several=worlds.count > 1)
         self._kernel = raycast_kernel(outputs, self.terms)
-        self._asking = asking_kernel(outputs, self.terms)
-        self._group = group_of(self.terms)
+        self._fallback = fallback_kernel(outputs, self.terms)
+        self._group = instants_per_thread(self.terms)
         rays_together = TILE * TILE if self.terms.by_tile else PACKET if self.terms.embree else 1
         self._instant_threads = self._tile_count * TILE * TILE // rays_together
         self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
         self._view = make_view(self.rays, lens.width, lens.height)
         self._body_data = make_body_data(arrays.bodies, worlds.count * instant_count, device)
         self._world_data = self._make_world_data()
-        self.walk = None if shared is None else self._make_walk(lens, rays, shared)
-        self._walk_data = WalkData() if self.walk is None else self.walk.data
+        self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
+        self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
         images = (image_count, lens.height, lens.width)
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
@@ -151,7 +150,7 @@ class WarpRenderer:
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
-        self._film = make_film(**{name: getattr(self, name) for name in OUTPUTS})
+        self._render_outputs = make_render_outputs(**{name: getattr(self, name) for name in OUTPUTS})
 
     def render(
         self,
@@ -185,14 +184,14 @@ class WarpRenderer:
             place_camera(
                 self._arrays.bodies, bodies, p_WC, q_WC, instant_count=pose_count, data=self._body_data
             )
-        if self.walk is not None:
-            self.walk.launch(self.rays, p_WC, q_WC, instant_count=pose_count)
+        if self.candidates is not None:
+            self.candidates.update(self.rays, p_WC, q_WC, instant_count=pose_count)
         if active is not None:
             self._world_data.active = active
         view = self._view
         view.instant_count, view.p_WC, view.q_WC, view.image_slot = instant_count, p_WC, q_WC, image_slot
-        inputs = [self._arrays.data, view, self._body_data, self._world_data, self._walk_data]
-        outputs = [self._film]
+        inputs = [self._arrays.data, view, self._body_data, self._world_data, self._candidate_data]
+        outputs = [self._render_outputs]
         device = self._arrays.device
         launch_split(
             self._kernel,
@@ -202,19 +201,23 @@ class WarpRenderer:
             device=device,
             thread_count=self._thread_count,
         )
-        if self._asking is not None and self.walk is not None:
+        if self._fallback is not None and self.candidates is not None:
             launch_split(
-                self._asking, dim=self.walk.data.left_threads, inputs=inputs, outputs=outputs, device=device
+                self._fallback,
+                dim=self.candidates.data.fallback_threads,
+                inputs=inputs,
+                outputs=outputs,
+                device=device,
             )
 
-    def _choose_terms(self, rays: NDArray[np.float32], *, several: bool) -> WalkConfig | None:
-        """Set `terms`, and return how rays share walks, if they do."""
+    def _choose_terms(self, rays: NDArray[np.float32], *, several: bool) -> CandidateListConfig | None:
+        """Set `terms`, and return how tiles share candidate lists, if they do."""
         arrays, worlds = self._arrays, self._worlds
         terms = (worlds.terms or arrays.terms)._replace(worlds=several, world_lenses=len(worlds.lenses) > 1)
         shared = None
-        if not (terms.world_scenes or terms.world_lenses):  # walks change nothing but the speed
-            shared = shared_walk(
-                arrays.config.shared_walk,
+        if not (terms.world_scenes or terms.world_lenses):  # lists change nothing but the speed
+            shared = choose_candidate_lists(
+                arrays.config.candidate_lists,
                 rays,
                 instant_count=self._stride,
                 face_count=arrays.face_origin.shape[0],
@@ -222,7 +225,7 @@ class WarpRenderer:
             )
         # with several worlds, groups end with the instants of a world
         group = 1 << min(2, self._stride.bit_length() - 1) if several else None
-        self.terms = with_walks(terms, shared, group=group)
+        self.terms = with_candidate_lists(terms, shared, group=group)
         return shared
 
     def _make_world_data(self) -> WorldData:
@@ -234,16 +237,18 @@ class WarpRenderer:
             data.lens = wp.array(list(worlds.lens_of_world), dtype=int, device=self._arrays.device)
         return data
 
-    def _make_walk(self, lens: Lens, rays: NDArray[np.float32], config: WalkConfig) -> TileWalk:
-        """Return the walks that the instants of a tile share in each world."""
+    def _make_candidates(
+        self, lens: Lens, rays: NDArray[np.float32], config: CandidateListConfig
+    ) -> CandidateLists:
+        """Return the lists that the instants of a tile share in each world."""
         arrays, count = self._arrays, self._worlds.count
         if count > 1:
             changes = {"instants": self._stride}
-            if arrays.config.shared_walk == "auto":  # lists are counted in 32 bits
+            if arrays.config.candidate_lists == "auto":  # lists are counted in 32 bits
                 most = _THREAD_COUNT_MAX // (count * self._tile_count)
                 changes["face_count_max"] = min(config.face_count_max, most)
             config = config.model_copy(update=changes)
-        return TileWalk(
+        return CandidateLists(
             arrays.data.tree,
             rays,
             width=lens.width,
@@ -251,7 +256,7 @@ class WarpRenderer:
             extent_m=float(np.abs(arrays.scene.bounds_m).max()),
             config=config,
             instant_count=count * self._stride,
-            leaves=self._asking is not None,
+            has_fallback=self._fallback is not None,
             thread_count=self._thread_count,
         )
 

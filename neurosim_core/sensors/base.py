@@ -31,7 +31,7 @@ class RenderRequest(NamedTuple):
     """What a camera asks of the renderer."""
 
     outputs: frozenset[str]
-    """Some of `render.film.OUTPUTS`."""
+    """Some of `render.outputs.OUTPUTS`."""
     rate_hz: float
     """How often [Hz]."""
     every_instant: bool = False
@@ -123,7 +123,7 @@ class ImageSensorConfig(CameraConfig):
     """Pictures a second [Hz]."""
 
     output: ClassVar[str]
-    """What it takes pictures of, one of `render.film.OUTPUTS`."""
+    """What it takes pictures of, one of `render.outputs.OUTPUTS`."""
     encoding: ClassVar[ImageEncoding]
     """What a pixel of its pictures is."""
 

@@ -23,6 +23,8 @@ a window's end but come after it, so that windows are contiguous in the sorted k
 
 import warp as wp
 
+from neurosim_core.native_code import read_native
+
 wp.set_module_options({"enable_backward": False})
 
 SUB_BITS = 11
@@ -39,13 +41,7 @@ _TICKS_PER_NS = wp.constant(wp.float64(1024.0))
 _US = wp.constant(wp.int64(1000))
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __dmul_rn(a, b);
-#else
-    return a * b;
-#endif
-""")
+@wp.func_native(read_native(__file__, "product"))
 def _product(a: wp.float64, b: wp.float64) -> wp.float64:
     """Return a product, on CUDA not joined with a sum: a level has the same bits wherever it is asked."""
     ...

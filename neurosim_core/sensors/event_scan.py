@@ -10,6 +10,7 @@ Pixels that are not ideal have a scan of their own, made to measure, in `event_n
 
 import warp as wp
 
+from neurosim_core.native_code import read_native
 from neurosim_core.sensors.event_levels import (
     fall,
     key_of_level,
@@ -37,43 +38,7 @@ READ = wp.constant(3)
 START = wp.constant(4)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    // keys gather in shared memory, and one atomic per block finds their place; what does not fit goes alone
-    constexpr unsigned SIZE = 1536;
-    __shared__ int64_t gathered[SIZE];
-    __shared__ unsigned gathered_count;
-    __shared__ unsigned long long block_start;
-    unsigned long long* total = (unsigned long long*)counters.data;
-    if (step == 1) {
-        const unsigned place = atomicAdd(&gathered_count, 1u);
-        if (place < SIZE) {
-            gathered[place] = key;
-        } else {
-            const unsigned long long slot = atomicAdd(total, 1ull);
-            if (slot < (unsigned long long)keys.shape[0]) keys.data[slot] = key;
-        }
-        return;
-    }
-    if (step == 0) {
-        if (threadIdx.x == 0) gathered_count = 0;
-        __syncthreads();
-        return;
-    }
-    __syncthreads();
-    const unsigned count = gathered_count < SIZE ? gathered_count : SIZE;
-    if (threadIdx.x == 0 && count > 0) block_start = atomicAdd(total, (unsigned long long)count);
-    __syncthreads();
-    for (unsigned place = threadIdx.x; place < count; place += blockDim.x) {
-        const unsigned long long slot = block_start + place;
-        if (slot < (unsigned long long)keys.shape[0]) keys.data[slot] = gathered[place];
-    }
-#else
-    if (step != 1) return;
-    const int64_t slot = counters.data[0]++;
-    if (slot < (int64_t)keys.shape[0]) keys.data[slot] = key;
-#endif
-""")
+@wp.func_native(read_native(__file__, "write_key"))
 def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
     """Append a key (step PUT) and count it, also where there is no room for it.
 
@@ -82,46 +47,13 @@ def write_key(step: wp.int32, key: wp.int64, keys: wp.array[wp.int64], counters:
     ...
 
 
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-    const int64_t slot = counters.data[0]++;
-    if (slot < (int64_t)keys.shape[0]) keys.data[slot] = key;
-#endif
-""")
+@wp.func_native(read_native(__file__, "append"))
 def _append(key: wp.int64, keys: wp.array[wp.int64], counters: wp.array[wp.int64]) -> None:
     """Append a key and count it, on a CPU, where a thread has keys for itself."""
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    constexpr int SIZE = 2048;  // a crossing for each thread and each of 8 frames
-    __shared__ int words[5][SIZE];
-    __shared__ unsigned kept_count, total;  // of 64 bits together they would be added in a loop
-    __shared__ unsigned long long start;
-    if (step == 1) {
-        const unsigned index = atomicAdd(&kept_count, 1u);
-        words[0][index] = (event_count << 11) | ((frame & 7) << 8) | threadIdx.x;
-        words[1][index] = __float_as_int(last);
-        words[2][index] = up;
-        words[3][index] = down;
-        words[4][index] = (int)atomicAdd(&total, (unsigned)event_count);
-        return 1;
-    }
-    if (step == 3) return words[place][index];
-    if (step == 4) return (int64_t)start;
-    __syncthreads();
-    if (step == 0) {
-        if (threadIdx.x == 0) kept_count = total = 0;
-    } else if (threadIdx.x == 0 && total > 0) {
-        start = atomicAdd((unsigned long long*)counters.data, (unsigned long long)total);
-    }
-    __syncthreads();
-    return (int64_t)kept_count;
-#else
-    return 0;
-#endif
-""")
+@wp.func_native(read_native(__file__, "keep_crossing"))
 def keep_crossing(
     step: wp.int32,
     frame: wp.int32,
@@ -151,40 +83,7 @@ def _read_word(place: wp.int32, index: wp.int32, counters: wp.array[wp.int64]) -
     return wp.int32(keep_crossing(READ, 0, 0, wp.float32(0.0), 0, 0, place, index, counters))
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    // not used there, and arrays on the stack take the compiler two seconds
-    for (int pixel = begin; pixel < end; ++pixel) {
-        const float* sample = log_radiance.data + pixel;
-        int lead = 0;
-        while (lead < frame_count && *sample > low_32.data[pixel] && *sample < high_32.data[pixel]) {
-            ++lead;
-            sample += log_radiance.shape[1];
-        }
-        lead_out.data[pixel] = lead;
-    }
-#else
-    // frame by frame, so that memory is read in order and the inner loop becomes vector instructions
-    constexpr int SIZE = 256;
-    const int count = end - begin < SIZE ? end - begin : SIZE;
-    int alive[SIZE];
-    int lead[SIZE];
-    for (int i = 0; i < count; ++i) { alive[i] = 1; lead[i] = 0; }
-    const float* __restrict__ low = low_32.data + begin;
-    const float* __restrict__ high = high_32.data + begin;
-    for (int frame = 0; frame < frame_count; ++frame) {
-        const float* __restrict__ sample = log_radiance.data + (size_t)frame * log_radiance.shape[1] + begin;
-        int any = 0;
-        for (int i = 0; i < count; ++i) {
-            alive[i] &= (sample[i] > low[i]) & (sample[i] < high[i]);
-            lead[i] += alive[i];
-            any |= alive[i];
-        }
-        if (!any) break;
-    }
-    for (int i = 0; i < count; ++i) lead_out.data[begin + i] = lead[i];
-#endif
-""")
+@wp.func_native(read_native(__file__, "count_lead"))
 def _count_lead(
     begin: wp.int32,
     end: wp.int32,
@@ -198,44 +97,13 @@ def _count_lead(
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return first + 8 < frame_count ? first + 8 : frame_count;
-#else
-    return frame_count;
-#endif
-""")
+@wp.func_native(read_native(__file__, "end_of_round"))
 def _end_of_round(first: wp.int32, frame_count: wp.int32) -> wp.int32:
     """Return where the frames end that a block scans before it writes their events; 8 on CUDA."""
     ...
 
 
-@wp.func_native("""
-    const float* sample = log_radiance.data + pixel;
-    const size_t stride = log_radiance.shape[1];
-#if defined(__CUDA_ARCH__)
-    // the loads of all frames of a round are under way together; beyond the end the last frame stands in
-    constexpr int SIZE = 8;
-    if (first >= end) return end;
-    const int begin = first / SIZE * SIZE;
-    float value[SIZE];
-    const float* at = sample + begin * stride;
-#pragma unroll
-    for (int i = 0; i < SIZE; ++i) {
-        value[i] = *at;
-        if (begin + i + 1 < end) at += stride;
-    }
-    unsigned loud = 0;
-#pragma unroll
-    for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
-    loud &= ~0u << (first - begin);
-    return loud != 0 && begin + __ffs(loud) - 1 < end ? begin + __ffs(loud) - 1 : end;
-#else
-    int frame = first;
-    while (frame < end && sample[frame * stride] > low && sample[frame * stride] < high) ++frame;
-    return frame;
-#endif
-""")
+@wp.func_native(read_native(__file__, "next_loud"))
 def _next_loud(
     log_radiance: wp.array2d[wp.float32],
     pixel: wp.int32,
@@ -248,14 +116,7 @@ def _next_loud(
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int frame = 0; frame < frame_count; ++frame) {
-        const float* sample = log_radiance.data + (size_t)frame * log_radiance.shape[1] + pixel;
-        asm volatile("prefetch.global.L1 [%0];" :: "l"(sample));
-    }
-#endif
-""")
+@wp.func_native(read_native(__file__, "call_up"))
 def call_up(log_radiance: wp.array2d[wp.float32], pixel: wp.int32, frame_count: wp.int32) -> None:
     """Have the samples of a pixel come near, on CUDA, before they are read one after the other."""
     ...

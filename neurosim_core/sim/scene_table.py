@@ -14,8 +14,8 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from neurosim_core.config import SimulationConfig, load_config
-from neurosim_core.render.cast_terms import Terms
-from neurosim_core.render.config import WalkConfig
+from neurosim_core.render.config import CandidateListConfig
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.scene.freespace import DistanceField
@@ -43,7 +43,7 @@ class SceneTable:
     """`completed` on the device, array of `SceneData`, shape [scene]; None: there is one, or no camera."""
     completed: tuple[SceneData, ...]
     """Arrays of each scene, with all that a kernel for all scenes reads; empty: `data` is None."""
-    terms: Terms | None
+    terms: RenderTerms | None
     """What some scene needs in the kernel of the renderer; None: there is no camera."""
 
     @property
@@ -95,10 +95,10 @@ def make_scene_table(
         )
     if models is not None:
         _check_models(models, config)
-    asked = isinstance(config.render.shared_walk, WalkConfig)
+    asked = isinstance(config.render.candidate_lists, CandidateListConfig)
     if asked and (lenses_differ or len(scenes or models or ()) > 1):
-        _logger.info("render.shared_walk is left out: worlds differ in their scenes or lenses")
-        alone = config.render.model_copy(update={"shared_walk": None})  # Embree may do it on a CPU
+        _logger.info("render.candidate_lists is left out: worlds differ in their scenes or lenses")
+        alone = config.render.model_copy(update={"candidate_lists": None})  # Embree may do it on a CPU
         config = config.model_copy(update={"render": alone})
     if models is not None:
         made = tuple(refit(model, config) for model in models)
@@ -117,7 +117,7 @@ def make_scene_table(
     arrays = [m.scene_on_device for m in made if isinstance(m.scene_on_device, SceneArrays)]
     terms = None
     if arrays:
-        terms = Terms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
+        terms = RenderTerms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
         terms = terms._replace(world_scenes=len(arrays) > 1)
     completed = tuple(_completed(a) for a in arrays) if len(arrays) > 1 else ()
     return SceneTable(

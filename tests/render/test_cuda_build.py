@@ -5,19 +5,19 @@ from __future__ import annotations
 import warp as wp
 
 from neurosim_core.render import lighting
-from neurosim_core.render.cast_terms import Terms
-from neurosim_core.render.film import OUTPUTS
-from neurosim_core.render.frustum_walk import walk_kernel
+from neurosim_core.render.candidate_data import BLOCK
+from neurosim_core.render.frustum_search import frustum_search_kernel
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import raycast_kernel
-from neurosim_core.render.walk_data import BLOCK
+from neurosim_core.render.render_terms import RenderTerms
 
 
 def test_kernels_build_for_sm_90(tmp_path):
-    everything = Terms(textured=True, emissive=True, baked=True, supersampled=False, bodies=True)
+    everything = RenderTerms(textured=True, emissive=True, baked=True, supersampled=False, bodies=True)
     kernels = (
         raycast_kernel(OUTPUTS, everything),
-        raycast_kernel(("log_radiance",), everything._replace(walked=4)),
-        walk_kernel(BLOCK),
+        raycast_kernel(("log_radiance",), everything._replace(candidate_group=4)),
+        frustum_search_kernel(BLOCK),
     )
     for module in (*(kernel.module for kernel in kernels), lighting):
         wp.compile_aot_module(module, module_dir=str(tmp_path), arch=90)

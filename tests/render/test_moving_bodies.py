@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Q_FORWARD_OPTICAL
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.cast_terms import Terms
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.embree import EmbreeError, packet_width
-from neurosim_core.render.film import OUTPUTS
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.pyrender_renderer import PyrenderError
 from neurosim_core.render.raycast import raycast_kernel
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.renderer import make_renderer, upload_scene
 from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.bodies import (
@@ -212,8 +212,8 @@ def test_scenes_without_bodies_are_compiled_without_them(device):
     arrays = upload_scene(wall(), UNSHADOWED, device=device)
     assert not arrays.terms.bodies
     assert arrays.bodies is None
-    assert raycast_kernel(("depth",), Terms(False, False, False, False, 0)) is not raycast_kernel(
-        ("depth",), Terms(False, False, False, False, 0, bodies=True)
+    assert raycast_kernel(("depth",), RenderTerms(False, False, False, False, 0)) is not raycast_kernel(
+        ("depth",), RenderTerms(False, False, False, False, 0, bodies=True)
     )
 
 

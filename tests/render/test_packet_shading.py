@@ -1,6 +1,6 @@
 """Shading of packets against shading ray by ray: the same bytes.
 
-A shared walk finds the same hits as Warp's rays to the last bit, and shades them in packets, so that pictures
+Candidate lists give the hits of Warp's rays to the last bit, and shades them in packets, so that pictures
 of both differ only if the shading does.
 """
 
@@ -78,7 +78,7 @@ KINDS = pytest.mark.parametrize(
 def test_packets_are_shaded_like_single_rays(kind, settings):
     scene = scene_of(kind)
     alone = pictures(scene, cpu_traversal="warp", **settings)
-    packets = pictures(scene, shared_walk={}, **settings)
+    packets = pictures(scene, candidate_lists={}, **settings)
     assert packets.tobytes() == alone.tobytes()
     sky = np.log(np.float32(0.2126 * 0.55 + 0.7152 * 0.7 + 0.0722 * 0.95 + 1e-3))
     seen = np.abs(alone - sky) > 1e-3

@@ -8,8 +8,8 @@ import trimesh
 import warp as wp
 from render_scenes import UNSHADOWED, plane, scene_of
 
-from neurosim_core.render.ray_hit import UNFUSED, meet_face
-from neurosim_core.render.ray_tree import RayTree, make_ray_tree, walk_tree
+from neurosim_core.render.ray_intersection import UNFUSED, intersect_face
+from neurosim_core.render.ray_tree import RayTree, intersect_tree, make_ray_tree
 from neurosim_core.render.scene_arrays import upload_scene
 
 FAR = 1.0e9
@@ -28,7 +28,7 @@ def walk_both(
     their_face_out: wp.array[int],
 ):
     k = wp.tid()
-    met = walk_tree(tree, origin[k], ray[k], far_m)
+    met = intersect_tree(tree, origin[k], ray[k], far_m)
     ours_out[k] = wp.vec3(met[0], met[1], met[2])
     our_face_out[k] = wp.cast(met[3], int)
     query = wp.mesh_query_ray(mesh, origin[k], ray[k], far_m)
@@ -49,7 +49,7 @@ def every_triangle(
     nearest = wp.vec3(1.0e9, 0.0, 0.0)
     nearest_face = int(-1)  # noqa: UP018, RUF046
     for face in range(face_count):
-        met = meet_face(mesh, face, origin[k], ray[k])
+        met = intersect_face(mesh, face, origin[k], ray[k])
         if met[0] >= 0.0 and met[0] < nearest[0]:
             nearest = met
             nearest_face = face

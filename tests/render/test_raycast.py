@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.film import OUTPUTS
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import raycast_kernel
 from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.scene.materials import encode_texels
@@ -296,7 +296,7 @@ def test_instants_and_threads_do_not_change_a_bit(device):
 
 
 def test_images_are_written_for_the_instants_that_have_a_slot(device):
-    """Cameras that share a cast: log radiance of all instants, images only where asked."""
+    """Cameras that share a cast: log radiance of all instants, images only where requested."""
     arrays = upload_scene(room(), BAKED, device)
     alone = render(arrays, LENS, POSES, outputs=("log_radiance", "rgb", "depth"), device=device)
     for outputs in (("log_radiance", "rgb", "depth"), ("rgb", "depth")):

@@ -1,4 +1,4 @@
-"""The threads that share what shared walks have left take each pixel once."""
+"""The threads of the fallback kernel take each unresolved pixel once."""
 
 from __future__ import annotations
 

@@ -130,12 +130,12 @@ def test_terms_are_those_that_the_kernels_have(settings):
     """Walks are shared or not by the lens, the launch and the device, not by the scene alone."""
     found = {}
     for walk in (None, {"instants": 4}):
-        render = {**settings["render"], "cpu_traversal": "warp", "shared_walk": walk}
+        render = {**settings["render"], "cpu_traversal": "warp", "candidate_lists": walk}
         model = sim.make_model(ns.load_config({**settings, "render": render}))
         (cast,) = sim.make_state(model).groups
         found[walk is None] = set(render_group.render_terms(cast))
-    assert found[False] - found[True] == {"walked"} | ({"by_tile"} if settings["device"] == "cpu" else set())
-    assert not found[True] & {"walked", "by_tile", "asking"}
+    assert found[False] - found[True] == {"candidate_group"} | ({"by_tile"} if settings["device"] == "cpu" else set())
+    assert not found[True] & {"candidate_group", "by_tile", "fallback"}
 
 
 def test_lanes_share_no_list_of_slots(settings):

@@ -140,19 +140,19 @@ def test_walks_that_rays_share(textured, monkeypatch, form):
     Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel.
     """
     if form != "tiles":
-        ours = warp_renderer.with_walks
+        ours = warp_renderer.with_candidate_lists
         monkeypatch.setattr(
-            warp_renderer, "with_walks", lambda *a, **k: ours(*a, **k)._replace(by_tile=False)
+            warp_renderer, "with_candidate_lists", lambda *a, **k: ours(*a, **k)._replace(by_tile=False)
         )
     front = {**RIG["front"], "sampling_rate_hz": 600}  # 6 instants: 4 together, then 2
     rig = {"front": front, "rgb": RIG["rgb"]}
     limit = 2 if "too much" in form else 256
-    walking = {"lighting": {"mode": "unshadowed"}, "shared_walk": {"face_count_max": limit}}
+    walking = {"lighting": {"mode": "unshadowed"}, "candidate_lists": {"face_count_max": limit}}
     commands = commands_of("rates", 4, 2)
     worlds = Simulation(settings(textured, sensors=rig, render=walking), worlds=2)
     seen = record(worlds, commands)
-    walk = worlds._state.groups[0].renderers[0].walk
-    left, left_room = int(walk.data.left_count.numpy()[0]), walk.data.left.shape[0]
+    walk = worlds._state.groups[0].renderers[0].candidates
+    left, left_room = int(walk.data.unresolved_count.numpy()[0]), walk.data.unresolved.shape[0]
     assert (left > 0, left > left_room) == (form != "tiles", "too much" in form)
     for world in range(2):
         for render in (walking, {"lighting": {"mode": "unshadowed"}, "cpu_traversal": "warp"}):
@@ -203,9 +203,9 @@ def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
             worlds=2,
             **given,
         )
-        for walk in ({}, {"shared_walk": {}})
+        for walk in ({}, {"candidate_lists": {}})
     ]
-    assert caplog.text.count("render.shared_walk is left out") == 1
+    assert caplog.text.count("render.candidate_lists is left out") == 1
     assert made[0]._scenes.terms == made[1]._scenes.terms
     commands = commands_of("rates", 3, 2)
     plainly, walking = (record(worlds, commands) for worlds in made)
@@ -583,9 +583,9 @@ def test_more_than_32_bits_can_count(plain):
     rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
     with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):
         Simulation(settings(plain, sensors=rig, control={"rate_hz": 100}), worlds=4096)
-    walking = {"lighting": {"mode": "unshadowed"}, "shared_walk": {"face_count_max": 4096}}
+    walking = {"lighting": {"mode": "unshadowed"}, "candidate_lists": {"face_count_max": 4096}}
     rig["front"]["lens"] = {**lens, "width": 128, "height": 128}
-    with pytest.raises(ValueError, match=r"shared walks of 256 tiles .* are more than 2.31"):
+    with pytest.raises(ValueError, match=r"groups of instants of 256 tiles .* are more than 2.31"):
         Simulation(settings(plain, sensors=rig, render=walking), worlds=4096)
 
 

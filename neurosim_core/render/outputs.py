@@ -1,7 +1,7 @@
 # mypy: disable-error-code="index,assignment,return-value"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
-"""What is kept of a pixel: the outputs of a cast, and how they are written."""
+"""Render outputs: their arrays, and the functions that write a pixel of them."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
 
@@ -11,29 +11,29 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neurosim_core.render.ray_hit import Hit
+from neurosim_core.render.ray_intersection import Hit
 from neurosim_core.render.scene_data import SceneData
 
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
-"""Everything that a cast can answer."""
+"""The outputs of the ray caster."""
 
 
-class Asked(NamedTuple):
-    """What some outputs have in common."""
+class RequestedOutputs(NamedTuple):
+    """What a set of outputs requires."""
 
     log: bool
-    """Log radiance is asked for, which all instants have."""
+    """Log radiance, which all instants have, is requested."""
     images: bool
-    """Something else is asked for, which instants with an image slot have."""
+    """Another output, which instants with an image slot have, is requested."""
     radiance: bool
-    """Light is needed: for log radiance or for RGB."""
+    """Log radiance or RGB is requested."""
     geometry: bool
-    """Depth, normal or instance is asked for."""
+    """Depth, normal or instance is requested."""
 
 
-def asked_for(outputs: Collection[str]) -> Asked:
-    """Return what kernels have to do for `outputs`."""
-    return Asked(
+def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
+    """Return what `outputs` require of a kernel."""
+    return RequestedOutputs(
         log="log_radiance" in outputs,
         images=any(name != "log_radiance" for name in outputs),
         radiance="log_radiance" in outputs or "rgb" in outputs,
@@ -42,8 +42,8 @@ def asked_for(outputs: Collection[str]) -> Asked:
 
 
 @wp.struct
-class FilmData:
-    """The outputs of a cast; what is not asked for is empty. All but the first are of image slots."""
+class RenderOutputs:
+    """The arrays of outputs; those not requested are empty. All but the first have image slots."""
 
     log_radiance: wp.array3d[float]
     """log(Rec. 709 luma + dark floor) of each instant, shape [K, H, W]."""
@@ -57,12 +57,12 @@ class FilmData:
     """-1 where nothing is hit, shape [M, H, W]."""
 
 
-def make_film(**outputs: Any) -> FilmData:
-    """Return the arrays of outputs, by name, as kernels take them; None: it is not asked for."""
-    film = FilmData()
+def make_render_outputs(**outputs: Any) -> RenderOutputs:
+    """Return the structure of outputs given by name; None: not requested."""
+    out = RenderOutputs()
     for name, array in outputs.items():
-        setattr(film, name, array)
-    return film
+        setattr(out, name, array)
+    return out
 
 
 @wp.func
@@ -86,20 +86,20 @@ def geometry_writer(outputs: tuple[str, ...]) -> wp.Function:
         slot: int,
         row: int,
         col: int,
-        film: FilmData,
+        out: RenderOutputs,
     ) -> None:
         if wp.static("depth" in outputs):
-            film.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
+            out.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
         if wp.static("normal" in outputs):
             normal = wp.vec3(0.0)
             if hit.face >= 0:
                 normal = wp.where(wp.dot(hit.normal, ray) > 0.0, -hit.normal, hit.normal)
-            film.normal[slot, row, col] = normal
+            out.normal[slot, row, col] = normal
         if wp.static("instance" in outputs):
             name = int(-1)
             if hit.face >= 0:
                 name = scene.face_instance[hit.face]
-            film.instance[slot, row, col] = name
+            out.instance[slot, row, col] = name
 
     return write_geometry
 
@@ -120,18 +120,18 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
         slot: int,
         row: int,
         col: int,
-        film: FilmData,
+        out: RenderOutputs,
     ) -> None:
         radiance = total
         if wp.static(supersampled):
             radiance = (1.0 / float(layer_count - 1)) * radiance
         if wp.static("log_radiance" in outputs):
             luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
-            film.log_radiance[instant, row, col] = wp.log(luma + scene.dark_floor)
+            out.log_radiance[instant, row, col] = wp.log(luma + scene.dark_floor)
         if wp.static("rgb" in outputs):
             if slot >= 0:
-                film.rgb[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
-                film.rgb[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
-                film.rgb[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
+                out.rgb[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])
+                out.rgb[slot, row, col, 1] = _to_srgb(scene.exposure * radiance[1])
+                out.rgb[slot, row, col, 2] = _to_srgb(scene.exposure * radiance[2])
 
     return write_radiance

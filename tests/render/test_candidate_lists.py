@@ -1,4 +1,4 @@
-"""Rays that share a walk see what each ray sees that walks by itself, to the last bit."""
+"""Rays with candidate lists give the outputs of rays that traverse the tree, to the last bit."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from scipy.spatial.transform import Rotation
 
 from neurosim_core import run
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.cast_terms import Terms
-from neurosim_core.render.config import RenderConfig, WalkConfig
-from neurosim_core.render.film import OUTPUTS
+from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
+from neurosim_core.render.config import CandidateListConfig, RenderConfig
+from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import raycast_kernel
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_arrays import upload_scene
 from neurosim_core.render.tile_bounds import tile_bounds
-from neurosim_core.render.tile_walk import TileWalk, shared_walk
 from neurosim_core.render.warp_renderer import WarpRenderer, ray_layers
 from neurosim_core.scene.bodies import BodyConfig, body_poses, make_bodies, make_body_poses
 from neurosim_core.scene.scene import Material
 
 LENS = PinholeConfig(width=45, height=34, fx=40.0, fy=38.0, cx=21.0, cy=18.5)  # no multiples of a tile
-ALONE = UNSHADOWED.model_copy(update={"cpu_traversal": "warp", "shared_walk": None})
+ALONE = UNSHADOWED.model_copy(update={"cpu_traversal": "warp", "candidate_lists": None})
 
 
-def together(config=UNSHADOWED, **walk) -> RenderConfig:
-    return config.model_copy(update={"shared_walk": WalkConfig(**walk)})
+def with_lists(config=UNSHADOWED, **lists) -> RenderConfig:
+    return config.model_copy(update={"candidate_lists": CandidateListConfig(**lists)})
 
 
 def by_block(arrays):
@@ -59,19 +59,19 @@ def assert_same(got, expected):
         np.testing.assert_array_equal(got[name], image, err_msg=name)
 
 
-def compare(scene, poses, device, *, config=UNSHADOWED, **walk):
-    """Render with and without shared walks, in both forms; return the former."""
-    alone = config.model_copy(update={"cpu_traversal": "warp", "shared_walk": None})
+def compare(scene, poses, device, *, config=UNSHADOWED, **lists):
+    """Render with and without candidate lists, in both forms; return the former."""
+    alone = config.model_copy(update={"cpu_traversal": "warp", "candidate_lists": None})
     expected = render(scene, LENS, poses, outputs=OUTPUTS, config=alone, device=device)
-    arrays = upload_scene(scene, together(config, **walk), device)
+    arrays = upload_scene(scene, with_lists(config, **lists), device)
     for form in (arrays, by_block(arrays)):
         assert_same(render(form, LENS, poses, outputs=OUTPUTS, device=device), expected)
     return expected
 
 
-def lists_of(scene, poses, device, lens=LENS, **walk):
+def lists_of(scene, poses, device, lens=LENS, **lists):
     """A renderer that has seen the poses: its lists."""
-    arrays = upload_scene(scene, together(**walk), device)
+    arrays = upload_scene(scene, with_lists(**lists), device)
     renderer = WarpRenderer(arrays, lens, outputs=("log_radiance",), instant_count=len(poses))
     arguments = [
         wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device),
@@ -84,8 +84,8 @@ def lists_of(scene, poses, device, lens=LENS, **walk):
 
 @pytest.mark.parametrize("instants", [1, 3, 16])
 @pytest.mark.parametrize("limit", [1, 12, 256])
-def test_same_bits_whatever_the_walks(device, instants, limit):
-    """Eleven instants, of which the last walk has what is left; lists that are long enough, and too long."""
+def test_same_bits_whatever_the_lists(device, instants, limit):
+    """Eleven instants, of which the last list has the remainder; lists that are long enough, and too long."""
     compare(scene_of(plane(6.0), soup(120, 1)), path(11), device, instants=instants, face_count_max=limit)
 
 
@@ -135,7 +135,7 @@ def test_same_bits_where_rounding_decides(device):
     ):
         poses += [((0.0, -1.5, 0.25), q_WC), ((5e-4, -1.5, 1.0), q_WC)]
     alone = upload_scene(scene, ALONE, device)
-    arrays = upload_scene(scene, together(instants=1), device)
+    arrays = upload_scene(scene, with_lists(instants=1), device)
     expected = render(alone, lens, poses, outputs=OUTPUTS, device=device)
     np.testing.assert_array_equal(np.unique(expected["instance"][0]), [0, 2])
     for form in (arrays, by_block(arrays)):
@@ -184,7 +184,7 @@ def test_same_bits_where_silhouettes_run_along_tiles(device, fov_deg, behind):
         poses = [(tuple(place), tuple(turn.as_quat()))] * 2
         scene = scene_of(*parts)
         expected = render(scene, lens, poses, outputs=("instance", "depth"), config=ALONE, device=device)
-        arrays = upload_scene(scene, together(), device)
+        arrays = upload_scene(scene, with_lists(), device)
         for form in (arrays, by_block(arrays)):
             assert_same(render(form, lens, poses, outputs=("instance", "depth"), device=device), expected)
         hits += (expected["instance"] == 0).sum()
@@ -215,8 +215,8 @@ def test_same_bits_through_a_slit_that_no_probe_finds(device):
     assert (expected["instance"][0, :, 3] == 3).all()
     assert (np.delete(expected["instance"][0], 3, axis=1) < 2).all()
     renderer, _ = lists_of(scene, pose, device, lens=lens)
-    assert renderer.walk.data.reach.numpy().max() < 2.0
-    arrays = upload_scene(scene, together(), device)
+    assert renderer.candidates.data.reach.numpy().max() < 2.0
+    arrays = upload_scene(scene, with_lists(), device)
     for form in (arrays, by_block(arrays)):
         assert_same(render(form, lens, pose, outputs=("instance", "depth"), device=device), expected)
 
@@ -226,7 +226,7 @@ def test_same_bits_when_the_camera_whirls(device):
     scene, poses = scene_of(soup(200, 5)), path(4, 0.0, 1.0, start=(0.0, 0.0, 0.0))
     compare(scene, poses, device)
     renderer, _ = lists_of(scene, poses, device)
-    assert (renderer.walk.data.count.numpy() == -1).all()
+    assert (renderer.candidates.data.count.numpy() == -1).all()
 
 
 def test_same_bits_with_moving_bodies(device):
@@ -240,7 +240,7 @@ def test_same_bits_with_moving_bodies(device):
     where.p_WO.assign(p_WO)
     where.q_WO.assign(q_WO)
     seen = []
-    for config in (ALONE, together()):
+    for config in (ALONE, with_lists()):
         arrays = upload_scene(scene_of(plane(6.0), soup(60, 3)), config, device, bodies=bodies)
         renderer = WarpRenderer(arrays, LENS, outputs=OUTPUTS, instant_count=5, image_count=5)
         renderer.render(
@@ -256,7 +256,7 @@ def test_same_bits_with_moving_bodies(device):
 
 
 def test_threads_do_not_change_a_bit():
-    arrays = upload_scene(scene_of(plane(6.0), soup(120, 4)), together(instants=4), "cpu")
+    arrays = upload_scene(scene_of(plane(6.0), soup(120, 4)), with_lists(instants=4), "cpu")
     expected = render(arrays, LENS, path(6), outputs=OUTPUTS, thread_count=1)
     for threads in (2, 3):
         assert_same(render(arrays, LENS, path(6), outputs=OUTPUTS, thread_count=threads), expected)
@@ -267,7 +267,7 @@ def test_lists_hold_what_rays_hit(device):
     part = soup(60, 6)
     poses = path(6, 0.03, 0.02)
     renderer, _ = lists_of(scene_of(part), poses, device, instants=6, face_count_max=64)
-    data = renderer.walk.data
+    data = renderer.candidates.data
     count, reach = data.count.numpy()[0], data.reach.numpy()[0]
     lists = data.faces.numpy().reshape(len(count), 64)
     a, b, c = np.moveaxis(part.triangles.astype(np.float32).astype(np.float64), 1, 0)
@@ -296,17 +296,17 @@ def test_lists_are_short_and_used(device):
     scene = scene_of(plane(30.0), soup(40, 7, size_m=0.2))
     renderer, arguments = lists_of(scene, path(8, 0.005, 0.002), device, lens=lens)
     seen = renderer.log_radiance.numpy().copy()
-    data = renderer.walk.data
+    data = renderer.candidates.data
     count = data.count.numpy()
     assert (count >= 0).all()
     assert count.mean() < 15.0  # of 42 triangles
     true_reach = data.reach.numpy().copy()
 
     def look(reach):
-        """Render with what the lists are replaced by, not walking again."""
+        """Render with what the lists are replaced by, without a search."""
         data.count.zero_()
         data.reach.assign(np.broadcast_to(np.asarray(reach, np.float32), true_reach.shape))
-        renderer.walk.launch = lambda *_, **__: data.left_count.zero_()
+        renderer.candidates.update = lambda *_, **__: data.unresolved_count.zero_()
         renderer.render(*arguments, instant_count=8)
         return renderer.log_radiance.numpy().copy()
 
@@ -325,7 +325,7 @@ def test_bounds_hold_the_rays_of_a_tile():
     for low, high, axis in ((low_x, high_x, 0), (low_y, high_y, 1)):
         assert low < part[..., axis].min() < low + 5e-5
         assert high - 5e-5 < part[..., axis].max() < high
-    with pytest.raises(ValueError, match="must look forward"):
+    with pytest.raises(ValueError, match="need rays that look forward"):
         tile_bounds(-rays, 45, 34)
 
 
@@ -346,31 +346,33 @@ def test_rays_are_inside_of_bounds_by_an_angle(fov_deg):
 
 def test_a_lens_that_is_too_wide_is_refused():
     lens = PinholeConfig(width=40, height=32, horizontal_fov_rad=np.radians(179.5))
-    with pytest.raises(ValueError, match=r"up to 100 \(89.4 deg .* has 223[.].*render.shared_walk to null"):
+    with pytest.raises(
+        ValueError, match=r"up to 100 \(89.4 deg .* has 223[.].*render.candidate_lists to null"
+    ):
         tile_bounds(lens.ray_table().reshape(1, -1, 3), 40, 32)
 
 
 def test_what_kernels_cannot_count_is_refused():
     rays = np.tile(np.array([0.0, 0.0, 1.0, 0.01], np.float32), (1, 128 * 128, 1))
 
-    def walks(count, face_count_max):
-        return TileWalk(
+    def lists(count, face_count_max):
+        return CandidateLists(
             upload_scene(scene_of(plane(1.0)), ALONE, "cpu").data.tree,
             rays,
             width=128,
             height=128,
             extent_m=1.0,
-            config=WalkConfig(instants=1, face_count_max=face_count_max),
+            config=CandidateListConfig(instants=1, face_count_max=face_count_max),
             instant_count=count,
-            leaves=False,
+            has_fallback=False,
         )
 
     with pytest.raises(
-        ValueError, match=r"4096 shared walks of 256 tiles .*_max = 4096 .*: at most 2047 here"
+        ValueError, match=r"4096 groups of instants of 256 tiles .*_max = 4096 .*: at most 2047 here"
     ):
-        walks(4096, 4096)
+        lists(4096, 4096)
     with pytest.raises(ValueError, match="no value is small enough here"):
-        walks(200_000, 1)
+        lists(200_000, 1)
     lens = PinholeConfig(width=16384, height=16384, horizontal_fov_rad=1.0)
     arrays = upload_scene(scene_of(plane(1.0)), ALONE, "cpu")
     with pytest.raises(ValueError, match=r"8 instants of 16384 x 16384 px .* at most 7 instants"):
@@ -392,7 +394,11 @@ def test_events_of_a_flight_are_the_same():
         },
     }
     streams = []
-    for traversal in ({"cpu_traversal": "warp"}, {"shared_walk": {}}, {"shared_walk": {"instants": 5}}):
+    for traversal in (
+        {"cpu_traversal": "warp"},
+        {"candidate_lists": {}},
+        {"candidate_lists": {"instants": 5}},
+    ):
         light = {"mode": "unshadowed"}
         packets = list(run({**settings, "render": {"lighting": light, "exposure": 1.0, **traversal}}))
         streams.append([np.concatenate(column) for column in zip(*(p.numpy() for p in packets), strict=True)])
@@ -403,17 +409,19 @@ def test_events_of_a_flight_are_the_same():
 
 
 def test_what_does_not_go_together_is_refused():
-    with pytest.raises(ValueError, match="cpu_traversal must be auto or warp, got embree"):
-        RenderConfig(cpu_traversal="embree", shared_walk=WalkConfig())
-    terms = Terms(textured=False, emissive=False, baked=False, supersampled=False, walked=1, worlds=True)
+    with pytest.raises(ValueError, match="need cpu_traversal auto or warp, got embree"):
+        RenderConfig(cpu_traversal="embree", candidate_lists=CandidateListConfig())
+    terms = RenderTerms(
+        textured=False, emissive=False, baked=False, supersampled=False, candidate_group=1, worlds=True
+    )
     for term in ("world_scenes", "world_lenses"):
-        with pytest.raises(ValueError, match="share walks where worlds have one scene and one lens"):
+        with pytest.raises(ValueError, match="candidate lists need worlds with one scene and one lens"):
             raycast_kernel(("log_radiance",), terms._replace(**{term: True}))
 
 
-def test_there_are_no_walks_unless_asked_for(device):
+def test_there_are_no_lists_unless_requested(device):
     arrays = upload_scene(scene_of(plane(1.0)), ALONE, device)
-    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=8).walk is None
+    assert WarpRenderer(arrays, LENS, outputs=("depth",), instant_count=8).candidates is None
 
 
 @pytest.mark.parametrize(
@@ -424,10 +432,10 @@ def test_the_default_is_for_many_instants_of_small_pixels(pixel_rad, least, samp
     lens = PinholeConfig(width=16, height=16, fx=1.0 / pixel_rad, fy=1.0 / pixel_rad, cx=8.0, cy=8.0)
     rays = ray_layers(lens, samples)
     for count in (1, 7, 8, 15, 16, 31, 32, 1000):
-        walk = shared_walk("auto", rays, instant_count=count, face_count=1000, is_cuda=True)
-        assert (walk is not None) is (least is not None and count >= least)
-    assert shared_walk("auto", rays, instant_count=1000, face_count=1000, is_cuda=False) is None
-    assert shared_walk("auto", -rays, instant_count=1000, face_count=1000, is_cuda=True) is None
+        chosen = choose_candidate_lists("auto", rays, instant_count=count, face_count=1000, is_cuda=True)
+        assert (chosen is not None) is (least is not None and count >= least)
+    assert choose_candidate_lists("auto", rays, instant_count=1000, face_count=1000, is_cuda=False) is None
+    assert choose_candidate_lists("auto", -rays, instant_count=1000, face_count=1000, is_cuda=True) is None
 
 
 @pytest.mark.parametrize(("pixel_rad", "most"), [(1.2e-3, 1_528_000), (2.24e-3, 438_000)])
@@ -435,18 +443,18 @@ def test_the_default_is_not_for_lists_that_are_long(pixel_rad, most):
     lens = PinholeConfig(width=16, height=16, fx=1.0 / pixel_rad, fy=1.0 / pixel_rad, cx=8.0, cy=8.0)
     rays = ray_layers(lens, 1)
     for face_count, shared in ((int(0.98 * most), True), (int(1.02 * most), False)):
-        walk = shared_walk("auto", rays, instant_count=64, face_count=face_count, is_cuda=True)
-        assert (walk is not None) is shared
+        chosen = choose_candidate_lists("auto", rays, instant_count=64, face_count=face_count, is_cuda=True)
+        assert (chosen is not None) is shared
 
 
-def test_walks_are_the_default_on_cuda_alone(device):
+def test_lists_are_the_default_on_cuda_alone(device):
     arrays = upload_scene(scene_of(plane(1.0)), UNSHADOWED, device)
     is_cuda = wp.get_device(device).is_cuda
     narrow = PinholeConfig(width=45, height=34, fx=800.0, fy=760.0, cx=21.0, cy=18.5)
     for lens, count, shared in ((narrow, 7, False), (narrow, 8, is_cuda), (LENS, 8, False)):
         renderer = WarpRenderer(arrays, lens, outputs=("depth",), instant_count=count)
-        assert (renderer.walk is not None) is shared
-    shared = upload_scene(scene_of(plane(1.0)), together(instants=2, face_count_max=8), device)
-    walk = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5).walk
-    assert isinstance(walk, TileWalk)
-    assert walk.data.faces.shape == (3 * 30 * 8,)
+        assert (renderer.candidates is not None) is shared
+    shared = upload_scene(scene_of(plane(1.0)), with_lists(instants=2, face_count_max=8), device)
+    lists = WarpRenderer(shared, LENS, outputs=("depth",), instant_count=5).candidates
+    assert isinstance(lists, CandidateLists)
+    assert lists.data.faces.shape == (3 * 30 * 8,)

@@ -2,7 +2,7 @@
 # mypy: disable-error-code="no-untyped-def,empty-body"
 # mypy: allow-untyped-calls, allow-untyped-decorators
 # ruff: noqa: UP018, RUF046  (typed literals have a meaning in kernels)
-"""What a ray hits first: of the scene, of the triangles of a list, of the bodies that move through it."""
+"""Intersection of a ray with the scene, with a face of a candidate list, and with moving bodies."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
@@ -10,10 +10,11 @@ from functools import cache
 
 import warp as wp
 
+from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.ray_tree import walk_tree
+from neurosim_core.render.candidate_data import UNRESOLVED
+from neurosim_core.render.ray_tree import intersect_tree
 from neurosim_core.render.scene_data import SceneData
-from neurosim_core.render.walk_data import ASK
 
 FAR_M = wp.constant(1.0e9)
 """Beyond this distance rays hit nothing [m]."""
@@ -23,10 +24,10 @@ UNFUSED = {"fuse_fp": False}
 
 @wp.struct
 class Hit:
-    """What a ray hits first."""
+    """The first intersection of a ray."""
 
     face: int
-    """-1: nothing, and the rest has no meaning."""
+    """-1: the ray hits nothing, and the other fields have no meaning."""
     t: float
     """Distance along the ray [m]."""
     u: float
@@ -37,25 +38,16 @@ class Hit:
     """Unit normal of the face's front."""
 
 
-@wp.func_native("""
-    using namespace wp;
-    const Mesh mesh = mesh_get(id);
-    const vec3 a = mesh.points[mesh.indices[3 * face]], b = mesh.points[mesh.indices[3 * face + 1]],
-               c = mesh.points[mesh.indices[3 * face + 2]];
-    float t, u, v, sign;
-    if (intersect_ray_tri_woop(origin, ray, a, b, c, t, u, v, sign, (vec3*)nullptr) && t >= 0.0f)
-        return vec3(t, u, v);
-    return vec3(-1.0f, 0.0f, 0.0f);
-""")
-def meet_face(id: wp.uint64, face: int, origin: wp.vec3, ray: wp.vec3) -> wp.vec3:
-    """Return t [m], u and v where a ray meets a triangle, as `wp.mesh_query_ray` does; t = -1: nowhere."""
+@wp.func_native(read_native(__file__, "intersect_face"))
+def intersect_face(id: wp.uint64, face: int, origin: wp.vec3, ray: wp.vec3) -> wp.vec3:
+    """Return t [m], u and v of a ray and a triangle, with the bits of `wp.mesh_query_ray`; t = -1: no hit."""
     ...
 
 
 @wp.func
-def meet_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
-    """Return what a ray hits first that stands still; it walks through the tree by itself."""
-    met = walk_tree(scene.tree, origin, ray, FAR_M)
+def intersect_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
+    """Return the first hit of a ray with what stands still; the ray traverses the tree."""
+    met = intersect_tree(scene.tree, origin, ray, FAR_M)
     hit = Hit()
     hit.face = wp.cast(met[3], int)
     if hit.face >= 0:
@@ -67,28 +59,28 @@ def meet_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
 
 
 @wp.func
-def meet_listed(scene: SceneData, origin: wp.vec3, ray: wp.vec3, face: int) -> Hit:
-    """Return where a ray hits the face that a walk found, -1: nothing; ASK, also as the answer: who knows."""
+def intersect_candidate(scene: SceneData, origin: wp.vec3, ray: wp.vec3, face: int) -> Hit:
+    """Return the hit of a ray with the face that a candidate list gives; -1 and UNRESOLVED are passed on."""
     hit = Hit()
     hit.face = face
     if face >= 0:
-        met = meet_face(scene.mesh, face, origin, ray)
+        met = intersect_face(scene.mesh, face, origin, ray)
         if met[0] >= 0.0:
             hit.t = met[0]
             hit.u = met[1]
             hit.v = met[2]
             hit.normal = scene.face_normal[face]
         else:
-            hit.face = ASK
+            hit.face = UNRESOLVED
     return hit
 
 
 @wp.func
-def meet_bodies(bodies: BodyData, instant: int, ray_C: wp.vec3, q_WC: wp.quat, hit: Hit):
-    """Return what a ray hits first, `hit` or a point of a body, and which body, -1: none.
+def intersect_bodies(bodies: BodyData, instant: int, ray_C: wp.vec3, q_WC: wp.quat, hit: Hit):
+    """Return the nearer of `hit` and the first hit with a body, and the index of that body, -1: none.
 
-    Of each body whose sphere the ray passes, the tree is asked in the frame of the body, no further than the
-    nearest hit so far.
+    The ray traverses the tree of each body whose bounding sphere it passes, in the frame of the body and no
+    further than the nearest hit so far.
     """
     nearest = Hit()
     nearest.face = hit.face
@@ -96,7 +88,7 @@ def meet_bodies(bodies: BodyData, instant: int, ray_C: wp.vec3, q_WC: wp.quat, h
     nearest.u = hit.u
     nearest.v = hit.v
     nearest.normal = hit.normal
-    met = int(-1)
+    nearest_body = int(-1)
     for body in range(bodies.mesh.shape[0]):
         sphere = bodies.sphere_C[instant, body]
         center = wp.vec3(sphere[0], sphere[1], sphere[2])
@@ -113,8 +105,8 @@ def meet_bodies(bodies: BodyData, instant: int, ray_C: wp.vec3, q_WC: wp.quat, h
                 nearest.u = query.u
                 nearest.v = query.v
                 nearest.normal = wp.quat_rotate(q_WC, wp.quat_rotate_inv(q_OC, query.normal))
-                met = body
-    return nearest, met
+                nearest_body = body
+    return nearest, nearest_body
 
 
 @cache
@@ -128,7 +120,7 @@ def _normal_kernel() -> wp.Kernel:
 
 
 def face_normals(mesh: wp.Mesh) -> wp.array[wp.vec3]:
-    """Return the unit normal of each face's front, with the bits that `wp.mesh_query_ray` gives."""
+    """Return the unit normal of each face's front, with the bits of `wp.mesh_query_ray`."""
     normals = wp.empty(mesh.indices.shape[0] // 3, dtype=wp.vec3, device=mesh.device)
     wp.launch(_normal_kernel(), dim=normals.shape[0], inputs=[mesh.id], outputs=[normals], device=mesh.device)
     return normals

@@ -1,0 +1,165 @@
+// Radiance of N lanes: from `ray`, `spread`, `faces`, `ts`, `us`, `vs` and `normal` to `radiance`.
+constexpr float COSINE_MIN = 0.05f, SCALE_RG = (float)(1.0 / 2047), SCALE_B = (float)(1.0 / 1023);
+alignas(64) float facing[N], red[N], green[N], blue[N], w[N];
+alignas(64) float light[3][3][N];
+alignas(64) int face[N], material[N];
+for (int lane = 0; lane < N; ++lane) {
+    const float x = normal[0][lane], y = normal[1][lane], z = normal[2][lane];
+    const float square = x * x + y * y + z * z;
+#ifdef __CUDA_ARCH__
+    const float root = sqrtf(square);
+#else
+    const float root = __builtin_elementwise_sqrt(square); // a vector instruction without a branch
+#endif
+    const float length = UNIT ? 1.0f : root;
+    const float cosine =
+        ray[0][lane] * (x / length) + ray[1][lane] * (y / length) + ray[2][lane] * (z / length);
+    facing[lane] = length > 0.0f ? cosine : 0.0f;
+    face[lane] = faces[lane] < 0 ? 0 : faces[lane]; // of a miss, any: the sky takes its place
+    w[lane] = 1.0f - us[lane] - vs[lane];
+}
+int others = 0;
+for (int lane = 0; lane < N; ++lane)
+    others |= (face[lane] ^ face[0]) | ((facing[lane] > 0.0f) ^ (facing[0] > 0.0f));
+const int different = others ? N : 1; // lanes that are loaded for
+auto repeat = [](auto& values) {
+    for (int lane = 1; lane < N; ++lane) values[lane] = values[0];
+};
+for (int lane = 0; lane < different; ++lane) {
+    material[lane] = scene.face_material.data[face[lane]];
+    const wp::vec3& base = scene.base_color.data[material[lane]];
+    red[lane] = base[0];
+    green[lane] = base[1];
+    blue[lane] = base[2];
+    const wp::vec3* corner = scene.corner_light.data
+                             + (size_t)(facing[lane] > 0.0f ? scene.corner_light.shape[1] : 0)
+                             + 3 * (size_t)face[lane];
+    for (int tip = 0; tip < 3; ++tip)
+        for (int channel = 0; channel < 3; ++channel) light[channel][tip][lane] = corner[tip][channel];
+}
+if (different == 1) {
+    repeat(material);
+    repeat(red);
+    repeat(green);
+    repeat(blue);
+    for (int tip = 0; tip < 3; ++tip)
+        for (int channel = 0; channel < 3; ++channel) repeat(light[channel][tip]);
+}
+if constexpr (TEXTURED) {
+    alignas(64) float x[N], y[N], blend[N], lod[N];
+    alignas(64) int first[N], finer[N];
+    alignas(64) float uv[2][3][N];
+    alignas(64) float face_lods[N];
+    alignas(64) int level_count[N];
+    for (int lane = 0; lane < different; ++lane) {
+        const wp::vec2i& texture = scene.material_texture.data[material[lane]];
+        first[lane] = texture[0];
+        level_count[lane] = texture[1];
+        face_lods[lane] = scene.face_lod.data[face[lane]];
+        const wp::vec2* corner = scene.corner_uv.data + 3 * (size_t)face[lane];
+        for (int tip = 0; tip < 3; ++tip)
+            for (int axis = 0; axis < 2; ++axis) uv[axis][tip][lane] = corner[tip][axis];
+    }
+    if (different == 1) {
+        repeat(first);
+        repeat(level_count);
+        repeat(face_lods);
+        for (int tip = 0; tip < 3; ++tip)
+            for (int axis = 0; axis < 2; ++axis) repeat(uv[axis][tip]);
+    }
+    for (int lane = 0; lane < N; ++lane)
+        lod[lane] = spread[lane] * ts[lane] / wp::max(wp::abs(facing[lane]), COSINE_MIN);
+    for (int lane = 0; lane < N; ++lane) lod[lane] = wp::log2(lod[lane]);
+    for (int lane = 0; lane < N; ++lane) {
+        const float wanted = lod[lane] + face_lods[lane] + scene.mip_bias;
+        x[lane] = us[lane] * uv[0][0][lane] + vs[lane] * uv[0][1][lane] + w[lane] * uv[0][2][lane];
+        y[lane] = us[lane] * uv[1][0][lane] + vs[lane] * uv[1][1][lane] + w[lane] * uv[1][2][lane];
+        x[lane] = x[lane] - wp::floor(x[lane]);
+        y[lane] = 1.0f - (y[lane] - wp::floor(y[lane]));
+        const float clamped = wp::clamp(wanted, 0.0f, (float)(level_count[lane] - 1));
+        finer[lane] = (int)(clamped);
+        blend[lane] = clamped - (float)(finer[lane]);
+    }
+    int mixed = 0;
+    for (int lane = 0; lane < N; ++lane) {
+        const bool textured = level_count[lane] > 0 && faces[lane] >= 0;
+        if (!textured) first[lane] = finer[lane] = 0; // read something, and use nothing of it
+        if (!textured) blend[lane] = x[lane] = y[lane] = 0.0f;
+        level_count[lane] = textured;
+        mixed |= blend[lane] > 0.0f;
+    }
+    alignas(64) float color[2][3][N];
+    for (int coarser = 0; coarser <= mixed; ++coarser) {
+        alignas(64) float blend_x[N], blend_y[N];
+        alignas(64) int origin[N], width[N], height[N], place[4][N];
+        alignas(64) uint32_t code[4][N];
+        for (int lane = 0; lane < N; ++lane) {
+            const int index = first[lane] + finer[lane] + (blend[lane] > 0.0f ? coarser : 0);
+            const wp::vec3i& level = scene.levels.data[index];
+            origin[lane] = level[0];
+            width[lane] = level[1];
+            height[lane] = level[2];
+        }
+        for (int lane = 0; lane < N; ++lane) {
+            const float column = x[lane] * (float)(width[lane]) - 0.5f;
+            const float row = y[lane] * (float)(height[lane]) - 0.5f;
+            const float column_floor = wp::floor(column);
+            const float row_floor = wp::floor(row);
+            blend_x[lane] = column - column_floor;
+            blend_y[lane] = row - row_floor;
+            int left = (int)(column_floor);
+            int top = (int)(row_floor);
+            const int right = left + 1 < width[lane] ? left + 1 : 0;
+            const int bottom = top + 1 < height[lane] ? top + 1 : 0;
+            left = left < 0 ? width[lane] - 1 : left;
+            top = top < 0 ? height[lane] - 1 : top;
+            const int upper = origin[lane] + top * width[lane];
+            const int lower = origin[lane] + bottom * width[lane];
+            place[0][lane] = upper + left;
+            place[1][lane] = upper + right;
+            place[2][lane] = lower + left;
+            place[3][lane] = lower + right;
+        }
+        for (int corner = 0; corner < 4; ++corner)
+            for (int lane = 0; lane < N; ++lane) code[corner][lane] = scene.texels.data[place[corner][lane]];
+        for (int lane = 0; lane < N; ++lane) {
+            for (int channel = 0; channel < 3; ++channel) {
+                float texel[4];
+                for (int corner = 0; corner < 4; ++corner) {
+                    const uint32_t bits = channel == 2 ? code[corner][lane] >> 22
+                                                       : (code[corner][lane] >> (11 * channel)) & 2047u;
+                    const float root = (float)((int)(bits)) * (channel == 2 ? SCALE_B : SCALE_RG);
+                    texel[corner] = root * root;
+                }
+                const float above = texel[0] * (1.0f - blend_x[lane]) + texel[1] * blend_x[lane];
+                const float below = texel[2] * (1.0f - blend_x[lane]) + texel[3] * blend_x[lane];
+                color[coarser][channel][lane] = above * (1.0f - blend_y[lane]) + below * blend_y[lane];
+            }
+        }
+    }
+    if (mixed)
+        for (int channel = 0; channel < 3; ++channel)
+            for (int lane = 0; lane < N; ++lane)
+                color[0][channel][lane] = blend[lane] > 0.0f ? color[0][channel][lane] * (1.0f - blend[lane])
+                                                                   + color[1][channel][lane] * blend[lane]
+                                                             : color[0][channel][lane];
+    for (int lane = 0; lane < N; ++lane) {
+        red[lane] = level_count[lane] ? red[lane] * color[0][0][lane] : red[lane];
+        green[lane] = level_count[lane] ? green[lane] * color[0][1][lane] : green[lane];
+        blue[lane] = level_count[lane] ? blue[lane] * color[0][2][lane] : blue[lane];
+    }
+}
+alignas(64) float radiance[3][N], emitted[3][N];
+for (int channel = 0; channel < 3; ++channel)
+    for (int lane = 0; lane < N; ++lane)
+        emitted[channel][lane] =
+            EMISSIVE ? scene.emission.data[EMISSIVE ? material[lane] : 0][channel] : 0.0f;
+for (int channel = 0; channel < 3; ++channel) {
+    const float* albedo = channel == 0 ? red : channel == 1 ? green : blue;
+    for (int lane = 0; lane < N; ++lane) {
+        const float lit = us[lane] * light[channel][0][lane] + vs[lane] * light[channel][1][lane]
+                          + w[lane] * light[channel][2][lane];
+        const float lit_and_own = albedo[lane] * lit + emitted[channel][lane];
+        radiance[channel][lane] = faces[lane] < 0 ? scene.sky[channel] : lit_and_own;
+    }
+}

@@ -1,0 +1,24 @@
+const float* sample = log_radiance.data + pixel;
+const size_t stride = log_radiance.shape[1];
+#if defined(__CUDA_ARCH__)
+// the loads of all frames of a round are under way together; beyond the end the last frame stands in
+constexpr int SIZE = 8;
+if (first >= end) return end;
+const int begin = first / SIZE * SIZE;
+float value[SIZE];
+const float* at = sample + begin * stride;
+#pragma unroll
+for (int i = 0; i < SIZE; ++i) {
+    value[i] = *at;
+    if (begin + i + 1 < end) at += stride;
+}
+unsigned loud = 0;
+#pragma unroll
+for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
+loud &= ~0u << (first - begin);
+return loud != 0 && begin + __ffs(loud) - 1 < end ? begin + __ffs(loud) - 1 : end;
+#else
+int frame = first;
+while (frame < end && sample[frame * stride] > low && sample[frame * stride] < high) ++frame;
+return frame;
+#endif
