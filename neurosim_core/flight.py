@@ -22,7 +22,7 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.install import install_hint
 from neurosim_core.packets import Collision, Odometry, Packet
-from neurosim_core.record import Flight, FlightHeader, FlightWriter, describe_sensors
+from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.event_camera import EventSensorConfig
@@ -35,7 +35,7 @@ from neurosim_core.sim.state import State, make_state
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.view.overview import FlightSummary, Track, save_overview
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_recording
+from neurosim_core.view.rerun_sdk import open_rerun
 from neurosim_core.view.rerun_shapes import scene_shapes
 
 _LIBRARIES = {"h5py": "record", "rerun": "view", "matplotlib": "view"}
@@ -184,10 +184,10 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
         return made
     if not recorded.exists() or recorded.suffix != ".h5":
         raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {flight}` makes one")
-    with Flight(recorded) as source:
+    with Recording(recorded) as source:
         header = source.header
         settings = yaml.safe_load(header.config_yaml)
-        recording = open_recording(save or made)
+        recording = open_rerun(save or made)
         if "conversion" in settings:  # of a video, which has neither vehicle nor scene
             logger = RerunLogger(recording, vehicles={"video": header.sensors})
         else:
@@ -216,7 +216,7 @@ def _sinks(
         stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
         path_position = model.path.evaluate(stamps).position
         if _has("h5py", console, "flight.h5"):
-            header = FlightHeader(
+            header = RecordingHeader(
                 config_yaml=to_yaml(config),
                 seed=config.seed,
                 version=__version__,
@@ -225,10 +225,10 @@ def _sinks(
                 path_stamp_ns=stamps,
                 path_position=path_position,
             )
-            sinks.append(stack.enter_context(FlightWriter(folder / "flight.h5", header)).write)
+            sinks.append(stack.enter_context(RecordingWriter(folder / "flight.h5", header)).write)
         if rerun and _has("rerun", console, "flight.rrd"):
             logger = RerunLogger(
-                open_recording(folder / "flight.rrd"),
+                open_rerun(folder / "flight.rrd"),
                 vehicles={next(iter(config.vehicles)): describe_sensors(config.sensors)},
                 scene=scene_shapes(model.scene, model.bodies),
             )

@@ -1,17 +1,123 @@
-"""What a run yields: one frozen record per measurement, stamped in integer simulation time."""
+"""What a run yields: one frozen record per measurement, stamped in integer simulation time.
+
+A sensor declares its packet as a frozen dataclass. The annotations are its schema, from which recordings,
+pictures, plots and messages are derived, so that no other file has to know the class:
+
+    @dataclass(frozen=True, kw_only=True, eq=False)
+    class Ranges(Packet):
+        display: ClassVar[str] = "points"
+        hits: Annotated[NDArray[np.float32], FieldSpec("n", 3, unit="m")]
+        range_max_m: float
+"""
 
 from __future__ import annotations
 
+import ast
+import dataclasses
+import functools
+import inspect
+import json
+import re
+import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
+_UNITS = ("ns", "us", "s", "m", "px", "hz", "rad", "rad_s", "m_s", "m_s2", "n", "kg", "bytes")
+_SCALARS: dict[Any, str] = {int: "int64", float: "float64", bool: "bool", str: "str"}
+_classes: dict[str, type[Packet]] = {}
+
+PACKET_CLASSES: Mapping[str, type[Packet]] = MappingProxyType(_classes)
+"""The known packet classes by name. A class is known as soon as its module is imported."""
+
+
+def _name(cls: type) -> str:
+    own = cls.__module__.partition(".")[0] == __name__.partition(".")[0]
+    return cls.__qualname__ if own else f"{cls.__module__}.{cls.__qualname__}"
+
+
+@dataclass(frozen=True)
+class FieldSpec:
+    """What a field of a packet holds; part of its annotation."""
+
+    shape: tuple[int | str, ...] = ()
+    """Lengths of the axes. A number is fixed. An upper-case name, such as "H", is a length that the first
+    packet of a sensor fixes. A lower-case name, such as "n", is a length that differs from packet to packet;
+    only the first axis may have one. "..." stands for any axes that the first packet fixes."""
+    unit: str = ""
+    dtype: str = ""
+    """Type of the items; empty: that of the annotation."""
+    constant: bool = False
+    """Every packet of a sensor has the same value."""
+
+    def __init__(self, *shape: int | str, unit: str = "", dtype: str = "", constant: bool = False) -> None:
+        for name, value in (("shape", shape), ("unit", unit), ("dtype", dtype), ("constant", constant)):
+            object.__setattr__(self, name, value)
+
+
+class FieldSchema(NamedTuple):
+    """One field of a packet class."""
+
+    name: str
+    dtype: str
+    """Name of a NumPy type, "str", or "any": that of the first packet of a sensor."""
+    shape: tuple[int | str, ...] = ()
+    """As in `FieldSpec`; empty for a scalar or a string."""
+    unit: str = ""
+    constant: bool = False
+    doc: str = ""
+
+    @property
+    def varying(self) -> str:
+        """Name of the length that differs from packet to packet; empty if none does."""
+        return str(self.shape[0]) if self.shape and str(self.shape[0])[0].islower() else ""
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the field is a number, or an array of them of rank 1 and fixed length."""
+        return self.dtype != "str" and not self.constant and not self.varying and len(self.shape) <= 1
+
+
+class PacketSchema(NamedTuple):
+    """The structure of a packet class."""
+
+    name: str
+    """Name of the class; with its module if that is not part of Neurosim."""
+    display: str
+    """How packets are shown: a key of `view.rerun_log.DISPLAYS`."""
+    fields: tuple[FieldSchema, ...]
+    """The fields after the header (stamp_ns, sequence, sensor)."""
+    doc: str = ""
+
+    def field(self, name: str) -> FieldSchema:
+        """Return a field by its name."""
+        return next(field for field in self.fields if field.name == name)
+
+    def to_json(self) -> str:
+        """Return the schema as JSON."""
+        fields = [field._asdict() for field in self.fields]
+        return json.dumps({"name": self.name, "display": self.display, "doc": self.doc, "fields": fields})
+
+    @classmethod
+    def from_json(cls, text: str) -> PacketSchema:
+        """Return the schema of a text that `to_json` made."""
+        values = json.loads(text)
+        fields = (FieldSchema(**{**field, "shape": tuple(field["shape"])}) for field in values["fields"])
+        return cls(values["name"], values["display"], tuple(fields), values["doc"])
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Packet:
-    """The header that every packet carries."""
+    """The header that every packet carries. Defining a subclass makes it known by its name."""
+
+    display: ClassVar[str] = ""
+    """How packets are shown in Rerun and in the overview: "image", "depth", "segmentation", "normals",
+    "flow", "events", "points", "time series", "bars", "text", "pose", "contact", "delay" or "none"; empty:
+    what suits the schema."""
 
     stamp_ns: int = 0
     """Simulation time of the measurement [ns]."""
@@ -19,6 +125,125 @@ class Packet:
     """Counts the packets of one sensor from 0; a gap is a loss."""
     sensor: str = ""
     """Name of the sensor in the configuration."""
+
+    def __init_subclass__(cls, *, known: bool = True) -> None:
+        if known:
+            _classes[_name(cls)] = cls
+
+
+class GenericPacket(Packet, known=False):
+    """A packet of a recording whose class is not known here: the same fields, without methods."""
+
+    _schema: ClassVar[PacketSchema]
+
+    def __init_subclass__(cls) -> None:
+        """Leave the table of known classes as it is."""
+
+
+def packet_class(schema: PacketSchema) -> type[Packet]:
+    """Return the known class of a schema, or a new subclass of `GenericPacket` if there is none.
+
+    A known class whose fields differ from the schema, as in another version of a plug-in, does not count.
+    """
+    known = _classes.get(schema.name)
+    if known is not None and _structure(schema_of(known)) == _structure(schema):
+        return known
+    return _generic_class(schema)
+
+
+def schema_of(cls: type[Packet]) -> PacketSchema:
+    """Return the schema of a packet class.
+
+    Raises:
+        TypeError: A field has an annotation that no recording can hold; the message names it.
+    """
+    return cls._schema if issubclass(cls, GenericPacket) else _derived_schema(cls)
+
+
+@functools.cache
+def _derived_schema(cls: type[Packet]) -> PacketSchema:
+    header = {field.name for field in dataclasses.fields(Packet)}
+    hints = get_type_hints(cls, include_extras=True)
+    docs = _field_docs(cls)
+    fields = tuple(
+        _field_schema(cls, field.name, hints[field.name], docs.get(field.name, ""))
+        for field in dataclasses.fields(cls)
+        if field.name not in header
+    )
+    return PacketSchema(_name(cls), cls.display or _display(fields), fields, inspect.getdoc(cls) or "")
+
+
+def as_numpy(value: Any) -> NDArray[Any]:
+    """Return a field of a packet as a NumPy array; what is on a device is copied to the host."""
+    return np.asarray(
+        value if isinstance(value, np.ndarray) or not hasattr(value, "numpy") else value.numpy()
+    )
+
+
+def _structure(schema: PacketSchema) -> list[tuple[Any, ...]]:
+    return [field[:5] for field in schema.fields]
+
+
+@functools.cache
+def _generic_class(schema: PacketSchema) -> type[Packet]:
+    annotations = [(field.name, Any) for field in schema.fields]
+    namespace = {"_schema": schema, "display": schema.display, "__doc__": schema.doc}
+    name = schema.name.rpartition(".")[2]
+    return dataclasses.make_dataclass(
+        name, annotations, bases=(GenericPacket,), namespace=namespace, frozen=True, kw_only=True, eq=False
+    )
+
+
+def _field_schema(cls: type, name: str, hint: Any, doc: str) -> FieldSchema:
+    spec, kind = None, hint
+    if get_origin(hint) is Annotated:
+        kind, *extras = get_args(hint)
+        spec = next((extra for extra in extras if isinstance(extra, FieldSpec)), None)
+    if get_origin(kind) is Literal:
+        kind = type(get_args(kind)[0])
+    dtype = spec.dtype if spec is not None else ""
+    is_array = get_origin(kind) is np.ndarray
+    if not dtype and is_array:
+        items = get_args(get_args(kind)[1])[0]
+        dtype = "any" if items is Any else np.dtype(items).name
+    dtype = dtype or _SCALARS.get(kind, "")
+    if not dtype:
+        raise TypeError(
+            f"field {name!r} of packet {cls.__name__} is annotated {hint}; allowed are int, float, bool, "
+            "str, NDArray[...], and Annotated with a FieldSpec that has a dtype"
+        )
+    spec = spec or FieldSpec(*(("...",) if is_array else ()))
+    unit = spec.unit
+    if not unit and (ending := re.search(r"_(rad_s|m_s2|m_s|[a-z]+)$", name)) and ending[1] in _UNITS:
+        unit = {"hz": "Hz", "n": "N"}.get(ending[1], ending[1].replace("_s2", "/s^2").replace("_s", "/s"))
+    return FieldSchema(name, dtype, spec.shape, unit, spec.constant, doc)
+
+
+def _display(fields: tuple[FieldSchema, ...]) -> str:
+    """Return how packets of a class that does not say it are shown."""
+    if any(len(f.shape) >= 2 and {str} == {type(n) for n in f.shape[:2]} and not f.varying for f in fields):
+        return "image"
+    if any(f.varying and f.shape[1:] == (3,) for f in fields):
+        return "points"
+    if any(f.is_number for f in fields):
+        return "time series"
+    if any(f.varying and len(f.shape) == 1 for f in fields):
+        return "bars"
+    return "text" if any(f.dtype == "str" for f in fields) else "none"
+
+
+def _field_docs(cls: type) -> dict[str, str]:
+    """Return the docstrings on the lines after the fields of a class; none if its source is not there."""
+    docs: dict[str, str] = {}
+    for base in reversed(cls.__mro__[:-1]):
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        except (OSError, TypeError, SyntaxError):
+            continue
+        for field, text in zip(body.body, body.body[1:], strict=False):  # type: ignore[attr-defined]
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                docs[ast.unparse(field.target)] = inspect.cleandoc(str(ast.literal_eval(text.value)))
+    return docs
 
 
 class EventArrays(NamedTuple):
@@ -43,17 +268,19 @@ class Events(Packet):
     NumPy arrays in all cases.
     """
 
-    t: Any
+    display: ClassVar[str] = "events"
+
+    t: Annotated[Any, FieldSpec("event", unit="us", dtype="int64")]
     """Time since the start of the episode, floored to the microsecond [us], int64."""
-    x: Any
+    x: Annotated[Any, FieldSpec("event", unit="px", dtype="uint16")]
     """Column [px], uint16."""
-    y: Any
+    y: Annotated[Any, FieldSpec("event", unit="px", dtype="uint16")]
     """Row [px], uint16."""
-    polarity: Any
+    polarity: Annotated[Any, FieldSpec("event", dtype="uint8")]
     """1: brighter, 0: darker, uint8."""
-    width: int
+    width: Annotated[int, FieldSpec(unit="px", constant=True)]
     """Width of the sensor [px]."""
-    height: int
+    height: Annotated[int, FieldSpec(unit="px", constant=True)]
     """Height of the sensor [px]."""
     start_ns: int = 0
     """Start of the window, not part of it [ns]."""
@@ -66,27 +293,29 @@ class Events(Packet):
 
     def numpy(self) -> EventArrays:
         """Return the events as NumPy arrays on the host."""
-        arrays = (
-            a if isinstance(a, np.ndarray) else a.numpy() for a in (self.t, self.x, self.y, self.polarity)
-        )
-        return EventArrays(*arrays)
+        return EventArrays(*(as_numpy(values) for values in (self.t, self.x, self.y, self.polarity)))
 
 
-ImageEncoding = Literal["rgb8", "mono8", "32FC1", "32FC2", "32SC1"]
-"""Names of ROS image encodings; what each sensor uses is in its docstring."""
+ImageEncoding = Literal["rgb8", "mono8", "32FC1", "32FC2", "32FC3", "32SC1"]
+"""Names of ROS image encodings; `Image` says what they hold."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Image(Packet):
     """One picture.
 
-    rgb8 is uint8 [H, W, 3] in sRGB. 32FC1 is float32 [H, W]; for depth it is planar z [m], inf where nothing
-    was hit.
+    | encoding | data | content |
+    | --- | --- | --- |
+    | rgb8, mono8 | uint8 [H, W, 3], [H, W] | colour or grey in sRGB |
+    | 32FC1 | float32 [H, W] | depth: planar z [m], inf where nothing was hit |
+    | 32FC2 | float32 [H, W, 2] | optical flow (x, y) [px] |
+    | 32FC3 | float32 [H, W, 3] | surface normals, unit vectors, 0 where nothing was hit |
+    | 32SC1 | int32 [H, W] | labels of instances, below 0 where nothing was hit |
     """
 
-    data: NDArray[Any]
+    data: Annotated[NDArray[Any], FieldSpec("H", "W", "...")]
     """Pixels, row-major, shape [H, W] or [H, W, C]."""
-    encoding: ImageEncoding
+    encoding: Annotated[ImageEncoding, FieldSpec(constant=True)]
     """What a pixel is."""
 
 
@@ -94,9 +323,9 @@ class Image(Packet):
 class ImuSample(Packet):
     """What an inertial measurement unit reads at its stamp, in its own frame S."""
 
-    specific_force: NDArray[np.float64]
+    specific_force: Annotated[NDArray[np.float64], FieldSpec(3, unit="m/s^2")]
     """Acceleration minus gravity at the mount, in S [m/s^2], shape [3]; at rest it points up with 9.81."""
-    angular_rate: NDArray[np.float64]
+    angular_rate: Annotated[NDArray[np.float64], FieldSpec(3, unit="rad/s")]
     """Angular velocity of S against W, in S [rad/s], shape [3]."""
 
 
@@ -104,15 +333,17 @@ class ImuSample(Packet):
 class Odometry(Packet):
     """The true state of the vehicle."""
 
-    position: NDArray[np.float64]
+    display: ClassVar[str] = "pose"
+
+    position: Annotated[NDArray[np.float64], FieldSpec(3, unit="m")]
     """p_WB [m], shape [3]."""
-    orientation: NDArray[np.float64]
+    orientation: Annotated[NDArray[np.float64], FieldSpec(4)]
     """q_WB, xyzw, shape [4]."""
-    velocity: NDArray[np.float64]
+    velocity: Annotated[NDArray[np.float64], FieldSpec(3, unit="m/s")]
     """v_WB in W [m/s], shape [3]."""
-    body_rate: NDArray[np.float64]
+    body_rate: Annotated[NDArray[np.float64], FieldSpec(3, unit="rad/s")]
     """w_WB in B [rad/s], shape [3]."""
-    rotor_speed: NDArray[np.float64]
+    rotor_speed: Annotated[NDArray[np.float64], FieldSpec("R", unit="rad/s")]
     """Speed of each rotor [rad/s], shape [R]."""
 
 
@@ -120,7 +351,9 @@ class Odometry(Packet):
 class Collision(Packet):
     """The vehicle touches the scene: its centre is closer to a surface than its radius."""
 
-    position: NDArray[np.float64]
+    display: ClassVar[str] = "contact"
+
+    position: Annotated[NDArray[np.float64], FieldSpec(3, unit="m")]
     """p_WB at the stamp [m], shape [3]."""
     clearance_m: float
     """Distance from the vehicle's centre to the nearest surface, minus its radius [m]; <= 0."""
@@ -129,6 +362,8 @@ class Collision(Packet):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delivery(Packet):
     """What a simulated link did to one message; `sensor` is "<link>_link", `stamp_ns` when it was sent."""
+
+    display: ClassVar[str] = "delay"
 
     delivered_ns: int
     """When it arrives [ns]; -1: never."""

@@ -19,7 +19,7 @@ from neurosim_core import cli
 from neurosim_core.config import load_config
 from neurosim_core.flight import new_folder
 from neurosim_core.packets import Events
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
 SETTINGS = {
@@ -60,7 +60,7 @@ def test_run_leaves_a_flight_that_can_be_read_back(flown):
     assert {p.name for p in folder.iterdir()} == {"config.yaml", "flight.h5", "flight.rrd", "overview.png"}
     config = load_config(folder / "config.yaml")
     assert (config.duration_s, config.seed) == (0.3, 3)
-    with Flight(folder / "flight.h5") as flight:
+    with Recording(folder / "flight.h5") as flight:
         packets = list(flight.packets())
     assert {p.sensor for p in packets} == set(SETTINGS["sensors"])
     assert sum(p.sensor == "rgb" for p in packets) == 7
@@ -70,7 +70,7 @@ def test_run_leaves_a_flight_that_can_be_read_back(flown):
 
 def test_the_report_says_what_was_flown(flown):
     folder, said = flown
-    with Flight(folder / "flight.h5") as flight:
+    with Recording(folder / "flight.h5") as flight:
         events = sum(len(p) for p in flight.packets() if isinstance(p, Events))
     for part in (
         "real-time factor",
@@ -100,7 +100,7 @@ def test_a_recording_gives_back_what_the_run_yields(flown):
     import neurosim_core as ns
 
     folder, _ = flown
-    with Flight(folder / "flight.h5") as flight:
+    with Recording(folder / "flight.h5") as flight:
         for read, made in zip(flight.packets(), ns.run(folder / "config.yaml"), strict=True):
             assert type(read) is type(made)
             for name, value in vars(made).items():
@@ -170,7 +170,7 @@ def test_an_interrupted_run_is_kept_whole(tmp_path):
     assert run.returncode == 130, errors
     assert "interrupted" in said
     assert (tmp_path / "cut" / "overview.png").exists()
-    with Flight(file) as flight:
+    with Recording(file) as flight:
         assert flight.clean
         assert flight.packet_count("imu") > 10
 

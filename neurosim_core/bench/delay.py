@@ -23,7 +23,7 @@ from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.overrides import set_options
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 
 TRANSPORT_S = 5e-4
 """What a command and its odometry are on their way, and a sleep takes longer than it should [wall-clock s].
@@ -224,7 +224,7 @@ def _fly(config: SimulationConfig, folder: Path, mode: str, sleep_s: float) -> t
 
 def _read(recording: Path) -> tuple[float, float]:
     """Return the distance from the path [m] and the time between commands [s] of a recording."""
-    with Flight(recording) as flight:
+    with Recording(recording) as flight:
         stamps_ns = flight.column("odometry", "stamp_ns")
         position = flight.column("odometry", "position")
         sent_ns = flight.column("command_link", "stamp_ns")

@@ -33,7 +33,7 @@ from neurosim_core.convert.frames import Description, Frame, Source, open_source
 from neurosim_core.convert.geometry import Crop, Reducer, largest_crop, read_crop, read_size, require_inside
 from neurosim_core.convert.light import TRANSFERS
 from neurosim_core.packets import Events
-from neurosim_core.record import FlightHeader, FlightWriter, SensorDescription
+from neurosim_core.record import RecordingHeader, RecordingWriter, SensorDescription
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_presets import PRESETS
@@ -216,7 +216,7 @@ def convert_video(
     first = next(stacks)
     tally = _Tally()
     _require_near(camera, source.description, tally, first)
-    writer = FlightWriter(out, _header(source.description, config, plan, first))
+    writer = RecordingWriter(out, _header(source.description, config, plan, first))
     complete = closed = False
     try:
         for stack in itertools.chain([first], stacks):
@@ -503,7 +503,7 @@ class _Tally:
         )
 
 
-def _header(source: Description, config: ConversionConfig, plan: _Plan, first: _Stack) -> FlightHeader:
+def _header(source: Description, config: ConversionConfig, plan: _Plan, first: _Stack) -> RecordingHeader:
     """Return what goes with the events: what was converted, and how."""
     seen = {
         "source": source.name,
@@ -515,7 +515,7 @@ def _header(source: Description, config: ConversionConfig, plan: _Plan, first: _
     }
     settings = {"kind": "event_camera", "pixel": config.pixel.model_dump(mode="json")}
     rate_hz = (len(first.stamps_ns) - 1) * NS_PER_S / int(first.stamps_ns[-1])
-    return FlightHeader(
+    return RecordingHeader(
         config_yaml=yaml.safe_dump(
             {"conversion": {**config.model_dump(mode="json"), **seen}}, sort_keys=False
         ),

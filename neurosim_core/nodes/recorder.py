@@ -20,7 +20,7 @@ from neurosim_core.flight import new_folder
 from neurosim_core.install import install_hint
 from neurosim_core.nodes.channel import payload_bytes
 from neurosim_core.packets import Packet
-from neurosim_core.record import FlightHeader, FlightWriter, describe_sensors
+from neurosim_core.record import RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.simulation import Model
 
 QUEUE_BYTES = 16_000_000
@@ -214,7 +214,7 @@ class Recorder:
         """Write until closed; for the thread."""
         try:
             with contextlib.ExitStack() as files:
-                writers: dict[str, tuple[int, FlightWriter]] = {}
+                writers: dict[str, tuple[int, RecordingWriter]] = {}
                 while (entry := self._next()) is not None:
                     run, writer = writers.get(entry.vehicle, (0, None))
                     if writer is None or run != entry.run:
@@ -243,10 +243,10 @@ class Recorder:
             self._changed.notify_all()
             return entry
 
-    def _open(self, entry: _Entry) -> FlightWriter:
+    def _open(self, entry: _Entry) -> RecordingWriter:
         model, config = self._models[entry.vehicle], entry.config
         stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
-        header = FlightHeader(
+        header = RecordingHeader(
             config_yaml=to_yaml(config),
             seed=config.seed,
             version=__version__,
@@ -255,7 +255,7 @@ class Recorder:
             path_stamp_ns=stamps,
             path_position=model.path.evaluate(stamps).position,
         )
-        return FlightWriter(self._folders[entry.vehicle] / entry.name, header)
+        return RecordingWriter(self._folders[entry.vehicle] / entry.name, header)
 
     def _file_name(self) -> str:
         return "flight.h5" if self._file_count <= 1 else f"flight-{self._file_count}.h5"

@@ -22,8 +22,8 @@ from neurosim_core.nodes.translate import message_type, setpoint_of, to_packet
 from neurosim_core.packets import Delivery
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_outlet import Outlet
 from neurosim_core.view.rerun_shapes import SceneShapes
+from neurosim_core.view.rerun_targets import RerunTarget
 
 DRAIN_MAX = 1000
 """Messages of one stream that are taken before the next one has its turn."""
@@ -61,7 +61,7 @@ class Show:
         node: Node,
         simulation: msg.Simulation,
         source: int,
-        outlet: Outlet,
+        outlet: RerunTarget,
         *,
         number: Iterator[int],
         only: Sequence[str] | None,
@@ -177,7 +177,6 @@ class Show:
             scene=self._shapes,
             event_window_ns=self._window_ns,
             image_rate_max_hz=self._image_rate_hz,
-            links=bool(self._links),
             compress=self._outlet.compress,
             live=True,
             keep_layout=number > 1,

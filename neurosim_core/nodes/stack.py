@@ -12,7 +12,7 @@ from rich.console import Console
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.nodes.supervisor import Part, run_together
 from neurosim_core.scene.mesh import MeshSceneConfig
-from neurosim_core.view.rerun_outlet import check_new_file
+from neurosim_core.view.rerun_targets import check_new_file
 
 
 def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite: bool) -> int:

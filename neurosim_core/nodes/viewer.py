@@ -27,8 +27,8 @@ from neurosim_core.nodes import topics
 from neurosim_core.nodes.scene_loader import SceneLoader
 from neurosim_core.nodes.show import Show
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
+from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded, without_display
 
 POLL_S = 0.01
@@ -80,14 +80,14 @@ def view(
 
     stop, scene = threading.Event(), SceneLoader(say)
     with stop_at_signals(stop), contextlib.ExitStack() as stack:
-        outlet: Outlet
+        outlet: RerunTarget
         if save is not None:
-            outlet = FileOutlet(save, say)
+            outlet = FileTarget(save, say)
         else:
             viewer = stack.enter_context(
                 RerunViewer(web=how == "web", port=port, waiting=lambda: not stop.is_set())
             )
-            outlet = ViewerOutlet(viewer)
+            outlet = ViewerTarget(viewer)
             if how == "web":
                 say(f"open {viewer.page_url}")
                 if open_browser and not without_display():
@@ -145,7 +145,7 @@ def _check(
 
 def watch(
     node: Node,
-    outlet: Outlet,
+    outlet: RerunTarget,
     scene: SceneLoader,
     *,
     stop: threading.Event,

@@ -1,26 +1,25 @@
-"""Flights as HDF5 files: a writer with bounded memory, and a reader that gives back the same packets.
+"""The writer of recordings: HDF5 files with bounded memory, laid out by the schemas of the packets.
 
-Layout (format version 1). Every array can be read with plain h5py or any other HDF5 program: only gzip
+Layout (format version 2). Every array can be read with plain h5py or any other HDF5 program: only gzip
 and shuffle are used, which are part of HDF5 itself.
 
     /                        attributes: format, format_version, version, seed, scene, clean
     /config_yaml             the resolved configuration
     /path/{stamp_ns,position}
-    /sensors/<name>          attributes: packet (type), kind, rate_hz, p_BS, q_BS_xyzw,
-                             intrinsics (fx fy cx cy), resolution (width height), settings (JSON)
+    /sensors/<name>          attributes: packet (name of the packet class), schema (JSON of its
+                             `packets.PacketSchema`), each constant field of the packet; for sensors in the
+                             header kind, rate_hz, p_BS, q_BS_xyzw, settings (JSON), and for cameras
+                             intrinsics (fx fy cx cy), resolution (width height)
         packet_count         how many packets are complete
         stamp_ns, sequence   one row per packet
         order                counts the packets of the whole file, as written
-      event cameras
-        events/{x,y,t,p}     one row per event: column, row, microseconds, 1 brighter | 0 darker
+        <field>              one row per packet for each field of the packet, of the field's type and shape
+        <field>              arrays of varying length [n, ...]: the arrays of all packets, one after the other
+        <n>_end              one row per packet: where its part of the arrays of length n ends
+      event cameras, besides
+        events/{x,y,t,p}     column, row, microseconds, 1 brighter | 0 darker; event_end is the index
         ms_to_idx            t[ms_to_idx[ms]] >= 1000 ms and t[ms_to_idx[ms] - 1] < 1000 ms
         t_offset             0: t counts from the start of the episode, as all stamps do
-        event_end            one row per packet: index of its last event + 1
-        start_ns, dropped_count    one row per packet: start of its window, events that were lost
-      cameras
-        data                 one row per picture, one picture per chunk; attribute encoding
-      all others             one array per field of the packet, one row per packet; float64, and int64 for
-                             the whole numbers of what a simulated link did (sensor "<link>_link")
     /events /ms_to_idx /t_offset    the same arrays (hard links) of the first event camera, so that readers
                                     of DSEC files work; they take the group of any other camera just as well
 
@@ -35,53 +34,37 @@ Reference: DSEC, Gehrig et al. (2021), https://dsec.ifi.uzh.ch/data-format, for 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import heapq
-import logging
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from neurosim_core.install import install_hint
-from neurosim_core.packets import (
-    Collision,
-    Delivery,
-    EventArrays,
-    Events,
-    Image,
-    ImuSample,
-    Odometry,
-    Packet,
-)
+from neurosim_core.packets import Events, FieldSchema, Packet, as_numpy, schema_of
 from neurosim_core.record.disk import Disk
-from neurosim_core.record.header import FlightHeader, Intrinsics, SensorDescription
-
-log = logging.getLogger(__name__)
+from neurosim_core.record.header import RecordingHeader
 
 FORMAT = "neurosim.flight"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+HEADER_COLUMNS = ("stamp_ns", "sequence", "order")
+DSEC_NAMES = {"t": "events/t", "x": "events/x", "y": "events/y", "polarity": "events/p"}
+"""Where the fields of packets of events are stored."""
+LARGE_ROW_BYTES = 4096
+"""Rows of at least this size, such as pictures, are stored and read one at a time."""
 
-_PACKET_TYPES: dict[str, type[Packet]] = {
-    t.__name__: t for t in (Events, Image, ImuSample, Odometry, Collision, Delivery)
-}
-_HEADER_FIELDS = tuple(f.name for f in dataclasses.fields(Packet))
-_WHOLE_FIELDS = ("delivered_ns", "size_bytes")
-_EVENT_DTYPES = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}
-_EVENT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache, so appending never reads back
+_FLAT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache, so appending never reads back
 _ROW_CHUNK = 1024
-_READ_ROWS = 4096
+_FIRST_FLUSH_BYTES = 65536
 
 
-class FlightWriter:
-    """Writes the packets of a flight to a file while it happens.
+class RecordingWriter:
+    """Writes packets to a file while they are measured. A context manager.
 
-    A context manager. Packets of one sensor must come in the order of their stamps. Arrays are copied, so a
-    caller may reuse its buffers.
+    Packets of one sensor must come in the order of their stamps. Arrays are copied, so a caller may reuse its
+    buffers. The first flushes come early, so that a disk that is full soon still holds most of what came.
 
     Compression is gzip level 1 with shuffle: 80 MB/s for RGB (62 % left), 280 MB/s for smooth depth (10 %
     left), 12 M events/s (3.1 of 13 bytes left). Blosc with zstd is 3-5 times faster at the same size, but
@@ -92,7 +75,7 @@ class FlightWriter:
     def __init__(
         self,
         path: str | Path,
-        header: FlightHeader,
+        header: RecordingHeader,
         *,
         flush_interval_s: float = 1.0,
         buffer_bytes: int = 8_000_000,
@@ -109,13 +92,14 @@ class FlightWriter:
             OSError: The file cannot be created.
             ImportError: h5py is not installed.
         """
-        h5py = _import_h5py()
+        h5py = import_h5py()
         self._path = Path(path)
         self._flush_interval_s = flush_interval_s
         self._buffer_bytes = buffer_bytes
         self._streams: dict[str, _Stream] = {}
         self._order = 0
         self._pending_bytes = 0
+        self._flushed_bytes = _FIRST_FLUSH_BYTES
         self._flushed_s = time.monotonic()
         try:
             self._disk = Disk(self._path)
@@ -124,9 +108,14 @@ class FlightWriter:
         # The oldest format: many programs read it, and no mark "open for writing" bars a killed file. Freed
         # space is never reused: what is on disk stays valid until the next flush is complete.
         self._file = h5py.File(self._disk, "w", libver=("earliest", "v110"), fs_strategy="none")
-        self._described = _write_header(self._file, header)
-        self._file.flush()
-        self._disk.seal()
+        try:
+            self._described = _write_header(self._file, header)
+            self._file.flush()
+            self._disk.seal()
+        except BaseException:
+            self._file.close()
+            self._disk.close()
+            raise
         cameras = [s.name for s in header.sensors if s.kind == "event_camera"]
         self._root_camera = cameras[0] if cameras else None
 
@@ -140,14 +129,15 @@ class FlightWriter:
 
         Raises:
             OSError: The disk is full or gone.
-            ValueError: The packet does not continue its stream: stamp earlier than the one before, other
-                resolution, other type; or it has no sensor name.
+            ValueError: The packet does not continue its stream: its stamp is earlier than the one before, its
+                class, a constant or a fixed shape has changed; or it has no sensor name.
+            TypeError: A field of the packet's class is of a type that cannot be recorded.
         """
         stream = self._streams.get(packet.sensor) or self._open_stream(packet)
         self._pending_bytes += stream.append(packet, self._order)
         self._order += 1
         due = time.monotonic() - self._flushed_s >= self._flush_interval_s
-        if due or self._pending_bytes >= self._buffer_bytes:
+        if due or self._pending_bytes >= min(self._buffer_bytes, self._flushed_bytes):
             self.flush()
 
     def flush(self) -> None:
@@ -164,6 +154,7 @@ class FlightWriter:
             stream.commit()
         self._file.flush()
         self._disk.seal()
+        self._flushed_bytes += self._pending_bytes
         self._pending_bytes = 0
         self._flushed_s = time.monotonic()
 
@@ -190,7 +181,7 @@ class FlightWriter:
             self._file.close()
             self._disk.close()
 
-    def __enter__(self) -> FlightWriter:
+    def __enter__(self) -> RecordingWriter:
         return self
 
     def __exit__(
@@ -206,13 +197,8 @@ class FlightWriter:
         name = packet.sensor
         if not name or "/" in name:
             raise ValueError(f"a packet needs a sensor name without '/', got {name!r}")
-        if type(packet).__name__ not in _PACKET_TYPES:
-            raise ValueError(
-                f"cannot record a packet of type {type(packet).__name__!r}, known: {sorted(_PACKET_TYPES)}"
-            )
         group = self._described.get(name) or self._file["sensors"].create_group(name)
-        stream = _Stream(group, packet)
-        self._streams[name] = stream
+        stream = self._streams[name] = _Stream(group, packet)
         if isinstance(packet, Events) and self._root_camera in (None, name):
             self._root_camera = name
             for key in ("events", "ms_to_idx", "t_offset"):
@@ -224,7 +210,7 @@ class _Column:
     """One array of the file that grows by rows, with the rows that are not yet in it."""
 
     def __init__(
-        self, group: Any, name: str, shape: tuple[int, ...], dtype: DTypeLike, *, chunk: int, compressed: bool
+        self, group: Any, name: str, shape: tuple[int, ...], dtype: Any, *, chunk: int, compressed: bool
     ) -> None:
         # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
         filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
@@ -232,7 +218,7 @@ class _Column:
             name, shape=(0, *shape), maxshape=(None, *shape), dtype=dtype, chunks=(chunk, *shape), **filters
         )
         self._shape = shape
-        self._dtype = self._dataset.dtype
+        self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
         self._rows: list[NDArray[Any]] = []
 
     def append(self, rows: Any) -> int:
@@ -260,46 +246,30 @@ class _Stream:
         self._columns: dict[str, _Column] = {}
         self._last_ns: int | None = None
         self._written = 0
-        self._event_count = 0
-        self._ms_count = 0
-        group.attrs["packet"] = self._type.__name__
+        schema = schema_of(self._type)
+        self._fields = schema.fields
+        for name in (field.name for field in schema.fields):
+            if name in (*HEADER_COLUMNS, "packet_count") or name.endswith("_end"):
+                raise ValueError(f"a field of a packet cannot be called {name!r}: recordings use this name")
+        values = self._values(first)
+        self._fixed = self._fixed_part(values)
+        group.attrs["packet"], group.attrs["schema"] = schema.name, schema.to_json()
         self._packet_count = group.create_dataset("packet_count", data=np.int64(0))
-        for name in ("stamp_ns", "sequence", "order"):
-            self._add(name, (), np.int64)
-        self._append_body: Callable[[Any], int]
-        self._constant: dict[str, object]
-        if isinstance(first, Events):
-            self._append_body = self._append_events
-            self._constant = {"width": first.width, "height": first.height}
+        for name in HEADER_COLUMNS:
+            self._add_rows(name, np.int64)
+        for field in self._fields:
+            if field.constant:
+                group.attrs[field.name] = self._fixed[field.name]
+            else:
+                self._add_field(field, values[field.name])
+        self._ends = {field.varying: 0 for field in self._fields if field.varying}
+        for name in self._ends:
+            self._add_rows(f"{name}_end", np.int64)
+        self._ms_count = 0
+        self._is_events = isinstance(first, Events)
+        if self._is_events:
             group.create_dataset("t_offset", data=np.int64(0))
-            events = group.create_group("events")
-            for name, dtype in _EVENT_DTYPES.items():
-                self._columns[name] = _Column(events, name, (), dtype, chunk=_EVENT_CHUNK, compressed=True)
-            self._add("ms_to_idx", (), np.uint64)
-            for name in ("event_end", "start_ns", "dropped_count"):
-                self._add(name, (), np.int64)
-        elif isinstance(first, Image):
-            self._append_body = self._append_image
-            self._constant = {
-                "encoding": first.encoding,
-                "shape": first.data.shape,
-                "dtype": first.data.dtype.str,
-            }
-            self._columns["data"] = _Column(
-                group, "data", first.data.shape, first.data.dtype, chunk=1, compressed=True
-            )
-        else:
-            self._append_body = self._append_fields
-            shapes = {name: np.shape(getattr(first, name)) for name in _body_fields(self._type)}
-            self._constant = dict(shapes)
-            for name, shape in shapes.items():
-                self._add(name, shape, np.int64 if name in _WHOLE_FIELDS else np.float64)
-        for name in ("width", "height", "encoding"):
-            if name in self._constant:
-                group.attrs[name] = self._constant[name]
-
-    def _add(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> None:
-        self._columns[name] = _Column(self._group, name, shape, dtype, chunk=_ROW_CHUNK, compressed=False)
+            self._add_rows("ms_to_idx", np.uint64)
 
     def append(self, packet: Packet, order: int) -> int:
         """Keep a packet for the next flush; return its size [bytes]."""
@@ -311,9 +281,23 @@ class _Stream:
             raise ValueError(
                 f"sensor {packet.sensor!r}: stamp {packet.stamp_ns} ns comes after {self._last_ns} ns"
             )
-        size = self._append_body(packet)
-        for name, value in (("stamp_ns", packet.stamp_ns), ("sequence", packet.sequence), ("order", order)):
-            size += self._columns[name].append(value)
+        values = self._values(packet)
+        fixed = self._fixed_part(values)
+        if fixed != self._fixed:
+            raise ValueError(f"sensor {packet.sensor!r} was {self._fixed} before, got {fixed}")
+        size = 0
+        if self._is_events:
+            size += self._append_index(values["t"], packet.stamp_ns)
+        for field in self._fields:
+            if not field.constant:
+                value = values[field.name]
+                size += self._columns[field.name].append(value if field.varying else value[None])
+        lengths = {field.varying: len(values[field.name]) for field in self._fields if field.varying}
+        for name, length in lengths.items():
+            self._ends[name] += length
+            size += self._columns[f"{name}_end"].append(self._ends[name])
+        for name, number in zip(HEADER_COLUMNS, (packet.stamp_ns, packet.sequence, order), strict=True):
+            size += self._columns[name].append(number)
         self._last_ns = packet.stamp_ns
         self._written += 1
         return size
@@ -328,227 +312,67 @@ class _Stream:
 
     def finish(self) -> None:
         """End the millisecond index one entry after the last event: windows up to the end can be read."""
-        if self._type is Events:
-            self._columns["ms_to_idx"].append(np.array([self._event_count], dtype=np.uint64))
+        if self._is_events:
+            self._columns["ms_to_idx"].append(np.array([self._ends["event"]], dtype=np.uint64))
 
-    def _require(self, packet: Packet, **found: object) -> None:
-        if found != self._constant:
-            raise ValueError(f"sensor {packet.sensor!r} was {self._constant} before, got {found}")
+    def _add_rows(self, name: str, dtype: Any) -> None:
+        self._columns[name] = _Column(self._group, name, (), dtype, chunk=_ROW_CHUNK, compressed=False)
 
-    def _append_events(self, packet: Events) -> int:
-        self._require(packet, width=packet.width, height=packet.height)
-        t, x, y, polarity = packet.numpy()
-        size = 0
-        for name, values in (("t", t), ("x", x), ("y", y), ("p", polarity)):
-            size += self._columns[name].append(values)
-        # Events of later packets are not older than this packet's stamp: the index is final up to there.
-        milliseconds = np.arange(self._ms_count, packet.stamp_ns // 1_000_000 + 1)
-        first = np.searchsorted(t, milliseconds * 1000) + self._event_count
-        size += self._columns["ms_to_idx"].append(first.astype(np.uint64))
+    def _add_field(self, field: FieldSchema, value: NDArray[Any]) -> None:
+        path = DSEC_NAMES.get(field.name, field.name) if issubclass(self._type, Events) else field.name
+        dtype: Any = value.dtype if field.dtype == "any" else field.dtype
+        if dtype == "str":
+            dtype = import_h5py().string_dtype()
+        shape = value.shape[1:] if field.varying else value.shape
+        count = max(1, int(np.prod(shape)))
+        chunk, compressed = _ROW_CHUNK, False
+        if field.varying:
+            chunk, compressed = max(1, _FLAT_CHUNK // count), True
+        elif count * value.dtype.itemsize >= LARGE_ROW_BYTES:
+            chunk, compressed = 1, True
+        self._columns[field.name] = _Column(
+            self._group, path, shape, dtype, chunk=chunk, compressed=compressed
+        )
+
+    def _values(self, packet: Packet) -> dict[str, NDArray[Any]]:
+        """Return the fields of a packet as arrays; refuse shapes that the schema does not allow."""
+        values = {field.name: as_numpy(getattr(packet, field.name)) for field in self._fields}
+        lengths: dict[str, int] = {}
+        for field in self._fields:
+            found, wanted = values[field.name].shape, field.shape
+            if field.varying and found:
+                lengths.setdefault(field.varying, found[0])
+                wanted = (lengths[field.varying], *wanted[1:])
+            fits = len(found) == len(wanted) or "..." in wanted
+            if not fits or any(isinstance(n, int) and n != m for n, m in zip(wanted, found, strict=False)):
+                raise ValueError(
+                    f"sensor {packet.sensor!r}: {field.name} must have shape {list(wanted)}, "
+                    f"got {list(found)}"
+                )
+        return values
+
+    def _fixed_part(self, values: dict[str, NDArray[Any]]) -> dict[str, Any]:
+        """Return what all packets of the sensor have in common."""
+        fixed: dict[str, Any] = {}
+        for field in self._fields:
+            value = values[field.name]
+            if field.constant:
+                fixed[field.name] = value.item()
+            elif field.shape:
+                fixed[field.name] = value.shape[1:] if field.varying else value.shape
+                if field.dtype == "any":
+                    fixed[field.name] = (*fixed[field.name], value.dtype.name)
+        return fixed
+
+    def _append_index(self, t: NDArray[np.int64], stamp_ns: int) -> int:
+        """Add the milliseconds up to a packet's stamp: events of later packets are not older than that."""
+        milliseconds = np.arange(self._ms_count, stamp_ns // 1_000_000 + 1)
+        first = np.searchsorted(t, milliseconds * 1000) + self._ends["event"]
         self._ms_count += len(milliseconds)
-        self._event_count += len(t)
-        for name, value in (
-            ("event_end", self._event_count),
-            ("start_ns", packet.start_ns),
-            ("dropped_count", packet.dropped_count),
-        ):
-            size += self._columns[name].append(value)
-        return size
-
-    def _append_image(self, packet: Image) -> int:
-        self._require(packet, encoding=packet.encoding, shape=packet.data.shape, dtype=packet.data.dtype.str)
-        return self._columns["data"].append(packet.data[None])
-
-    def _append_fields(self, packet: Packet) -> int:
-        values = {name: np.asarray(getattr(packet, name)) for name in self._constant}
-        self._require(packet, **{name: value.shape for name, value in values.items()})
-        return sum(self._columns[name].append(value[None]) for name, value in values.items())
+        return self._columns["ms_to_idx"].append(first.astype(np.uint64))
 
 
-class Flight:
-    """Reads a flight from a file. A context manager.
-
-    Attributes:
-        header: What goes with the packets.
-        clean: Whether the run ended properly. If not, what came after its last flush is missing.
-        notes: What a user should know about this file, one sentence each; also logged.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        """Open a file.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: The file is not a flight, or of a later format version.
-            ImportError: h5py is not installed.
-        """
-        h5py = _import_h5py()
-        self._path = Path(path)
-        if not self._path.is_file():
-            raise FileNotFoundError(f"no file {self._path}")
-        try:
-            self._file = h5py.File(self._path, "r")
-        except OSError as error:
-            raise ValueError(f"{self._path} is not a readable HDF5 file: {error}") from error
-        try:
-            self.header = _read_header(self._file, self._path)
-        except Exception:
-            self._file.close()
-            raise
-        self.clean = bool(self._file.attrs["clean"])
-        self._sensors: dict[str, Any] = {
-            name: group for name, group in self._file["sensors"].items() if "packet_count" in group
-        }
-        self.notes: tuple[str, ...] = ()
-        if not self.clean:
-            self.notes = (f"{self._path} was not closed properly: packets at its end are missing",)
-            log.warning(self.notes[0])
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def __enter__(self) -> Flight:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors that have packets, in alphabetical order."""
-        return tuple(sorted(self._sensors))
-
-    def packet_count(self, sensor: str) -> int:
-        """Return the number of packets of a sensor.
-
-        Raises:
-            ValueError: No such sensor.
-        """
-        return int(self._group(sensor)["packet_count"][()])
-
-    def column(self, sensor: str, field: str) -> NDArray[Any]:
-        """Return one field of all packets of a sensor as one array, shape [packets, ...].
-
-        Such as ("odometry", "position"). The fields are those of the packet; for pictures `data`, whole, in
-        memory. For events use `events`.
-
-        Raises:
-            ValueError: No such sensor or field.
-        """
-        group = self._group(sensor)
-        known = [key for key, item in group.items() if key not in _NOT_COLUMNS and item.ndim > 0]
-        if field not in known:
-            raise ValueError(f"unknown field {field!r} of sensor {sensor!r}, known: {known}")
-        return np.asarray(group[field][: self.packet_count(sensor)])
-
-    def packets(
-        self, *sensors: str, start_s: float | None = None, end_s: float | None = None
-    ) -> Iterator[Packet]:
-        """Yield packets in the order of their stamps; those of equal stamp as they were written.
-
-        Args:
-            sensors: Names; all if none is given.
-            start_s: Leave out packets with an earlier stamp [s].
-            end_s: Leave out packets with this stamp or a later one [s].
-
-        Raises:
-            ValueError: No such sensor.
-        """
-        groups = {name: self._group(name) for name in (sensors or self.sensors)}
-        streams = [self._stream(name, group, start_s, end_s) for name, group in groups.items()]
-        for _, _, packet in heapq.merge(*streams, key=lambda item: item[:2]):
-            yield packet
-
-    def events(self, sensor: str, start_s: float, end_s: float) -> EventArrays:
-        """Return the events of a camera with start_s <= t < end_s.
-
-        Only the milliseconds that are asked for are read.
-
-        Raises:
-            ValueError: No such sensor, or not an event camera.
-        """
-        group = self._group(sensor)
-        if group.attrs["packet"] != "Events":
-            raise ValueError(f"sensor {sensor!r} sends {group.attrs['packet']}, not Events")
-        count = self.packet_count(sensor)
-        total = int(group["event_end"][count - 1]) if count else 0
-        start_us, end_us = (-(-round(s * 1e9) // 1000) for s in (start_s, end_s))  # first whole microsecond
-        index = group["ms_to_idx"]
-
-        def first_at(millisecond: int) -> int:
-            return min(int(index[millisecond]), total) if millisecond < len(index) else total
-
-        low = first_at(max(start_us // 1000, 0))
-        high = first_at(max(end_us // 1000 + 1, 0))
-        events = {name: group["events"][name][low:high] for name in _EVENT_DTYPES}
-        begin, end = np.searchsorted(events["t"], [start_us, end_us])
-        end = max(begin, end)
-        return EventArrays(*(events[name][begin:end] for name in ("t", "x", "y", "p")))
-
-    def _group(self, sensor: str) -> Any:
-        if sensor not in self._sensors:
-            raise ValueError(f"unknown sensor {sensor!r}, known: {list(self.sensors)}")
-        return self._sensors[sensor]
-
-    def _stream(
-        self, name: str, group: Any, start_s: float | None, end_s: float | None
-    ) -> Iterator[tuple[int, int, Packet]]:
-        count = int(group["packet_count"][()])
-        stamps = group["stamp_ns"][:count]
-        begin = 0 if start_s is None else int(np.searchsorted(stamps, round(start_s * 1e9)))
-        end = count if end_s is None else int(np.searchsorted(stamps, round(end_s * 1e9)))
-        kind = str(group.attrs["packet"])
-        for low in range(begin, end, _READ_ROWS):
-            rows = slice(low, min(low + _READ_ROWS, end))
-            block = {
-                key: item[rows]
-                for key, item in group.items()
-                if key not in _NOT_COLUMNS and key != "data" and item.ndim > 0
-            }
-            previous = int(group["event_end"][low - 1]) if kind == "Events" and low else 0
-            for row in range(rows.stop - low):
-                header: dict[str, Any] = {
-                    "stamp_ns": int(block["stamp_ns"][row]),
-                    "sequence": int(block["sequence"][row]),
-                    "sensor": name,
-                }
-                packet: Packet
-                if kind == "Events":
-                    event_end = int(block["event_end"][row])
-                    span = slice(previous, event_end)
-                    previous = event_end
-                    packet = Events(
-                        **header,
-                        t=group["events"]["t"][span],
-                        x=group["events"]["x"][span],
-                        y=group["events"]["y"][span],
-                        polarity=group["events"]["p"][span],
-                        width=int(group.attrs["width"]),
-                        height=int(group.attrs["height"]),
-                        start_ns=int(block["start_ns"][row]),
-                        dropped_count=int(block["dropped_count"][row]),
-                    )
-                elif kind == "Image":
-                    packet = Image(**header, data=group["data"][low + row], encoding=group.attrs["encoding"])
-                else:
-                    packet_type = _PACKET_TYPES[kind]
-                    values = {key: block[key][row] for key in _body_fields(packet_type)}
-                    header |= {k: v.item() if v.ndim == 0 else v.copy() for k, v in values.items()}
-                    packet = packet_type(**header)
-                yield packet.stamp_ns, int(block["order"][row]), packet
-
-
-_NOT_COLUMNS = ("events", "ms_to_idx")
-
-
-def _body_fields(packet_type: type[Packet]) -> list[str]:
-    return [f.name for f in dataclasses.fields(packet_type) if f.name not in _HEADER_FIELDS]
-
-
-def _write_header(file: Any, header: FlightHeader) -> dict[str, Any]:
+def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
     """Write what is known before the flight; return the group of each described sensor."""
     file.attrs["format"] = FORMAT
     file.attrs["format_version"] = FORMAT_VERSION
@@ -562,8 +386,7 @@ def _write_header(file: Any, header: FlightHeader) -> dict[str, Any]:
     groups: dict[str, Any] = {}
     file.create_group("sensors")
     for index, sensor in enumerate(header.sensors):
-        group = file.create_group(f"sensors/{sensor.name}")
-        groups[sensor.name] = group
+        group = groups[sensor.name] = file.create_group(f"sensors/{sensor.name}")
         group.attrs["index"] = index
         group.attrs["kind"] = sensor.kind
         group.attrs["rate_hz"] = sensor.rate_hz
@@ -577,46 +400,12 @@ def _write_header(file: Any, header: FlightHeader) -> dict[str, Any]:
     return groups
 
 
-def _read_header(file: Any, path: Path) -> FlightHeader:
-    if file.attrs.get("format") != FORMAT:
-        raise ValueError(f"{path} is an HDF5 file but not a flight: its attribute 'format' is not {FORMAT!r}")
-    version = int(file.attrs["format_version"])
-    if version > FORMAT_VERSION:
-        raise ValueError(
-            f"{path} has format version {version}; this version of Neurosim reads up to {FORMAT_VERSION}"
-        )
-    described = [group for group in file["sensors"].values() if "index" in group.attrs]
-    return FlightHeader(
-        config_yaml=file["config_yaml"].asstr()[()],
-        seed=int(file.attrs["seed"]),
-        version=str(file.attrs["version"]),
-        scene=str(file.attrs["scene"]),
-        sensors=tuple(
-            _read_sensor(group) for group in sorted(described, key=lambda g: int(g.attrs["index"]))
-        ),
-        path_stamp_ns=file["path/stamp_ns"][:],
-        path_position=file["path/position"][:],
-    )
+def import_h5py() -> ModuleType:
+    """Return the module `h5py`.
 
-
-def _read_sensor(group: Any) -> SensorDescription:
-    intrinsics = None
-    if "intrinsics" in group.attrs:
-        fx, fy, cx, cy = (float(v) for v in group.attrs["intrinsics"])
-        width, height = (int(v) for v in group.attrs["resolution"])
-        intrinsics = Intrinsics(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
-    return SensorDescription(
-        name=group.name.rsplit("/", 1)[1],
-        kind=str(group.attrs["kind"]),
-        rate_hz=float(group.attrs["rate_hz"]),
-        position=np.asarray(group.attrs["p_BS"]),
-        orientation=np.asarray(group.attrs["q_BS_xyzw"]),
-        intrinsics=intrinsics,
-        settings=str(group.attrs["settings"]),
-    )
-
-
-def _import_h5py() -> ModuleType:
+    Raises:
+        ImportError: It is not installed; the message says what to install.
+    """
     try:
         import h5py
     except ImportError as error:

@@ -1,13 +1,10 @@
-"""What goes with the packets of a flight: settings, seed, calibration, scene, path.
-
-The same description heads a recording and tells a live viewer where the cameras sit.
-"""
+"""The header of a recording: settings, seed, calibration, scene, path; also what a live viewer is told."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +38,7 @@ class SensorDescription:
     name: str
     """Name in the configuration; the `sensor` of its packets."""
     kind: str
-    """event_camera, rgb, depth, imu or odometry."""
+    """Kind of the sensor, such as event_camera, rgb or imu."""
     rate_hz: float
     """Packets a second [Hz]."""
     position: NDArray[np.float64]
@@ -54,61 +51,49 @@ class SensorDescription:
     """All settings of the sensor (thresholds, noise, ...), as JSON."""
 
 
-def _no_times() -> NDArray[np.int64]:
-    return np.zeros(0, dtype=np.int64)
-
-
-def _no_points() -> NDArray[np.float64]:
-    return np.zeros((0, 3), dtype=np.float64)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FlightHeader:
-    """Everything about a flight that does not change during it."""
+class RecordingHeader:
+    """What is recorded of a flight besides its packets."""
 
     config_yaml: str
     """The resolved configuration; `load_config` reads it back."""
     seed: int
     """Seed of the sensor noise."""
     version: str
-    """Version of Neurosim that flew it."""
+    """Version of Neurosim that wrote the recording."""
     scene: str = ""
     """Name of the scene."""
     sensors: tuple[SensorDescription, ...] = ()
     """The sensors, in the order of the configuration."""
-    path_stamp_ns: NDArray[np.int64] = field(default_factory=_no_times)
+    path_stamp_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Times at which the planned path is sampled [ns], shape [n]."""
-    path_position: NDArray[np.float64] = field(default_factory=_no_points)
+    path_position: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     """Planned p_WB at these times [m], shape [n, 3]."""
 
 
 def describe_sensors(sensors: Mapping[str, SensorConfig]) -> tuple[SensorDescription, ...]:
-    """Describe the sensors of a configuration, in its order."""
+    """Describe the sensors of a configuration, in its order.
+
+    A sensor without a mount is at the origin of the body. One with a lens is a camera.
+    """
     return tuple(_describe(name, sensor) for name, sensor in sensors.items())
 
 
-def _describe(name: str, sensor: SensorConfig) -> SensorDescription:
-    position = np.zeros(3)
-    orientation = np.array([0.0, 0.0, 0.0, 1.0])
+def _describe(name: str, sensor: Any) -> SensorDescription:
+    rate: Any = getattr(sensor, "packets", sensor)  # an event camera has a clock of its own for packets
+    mount, lens = getattr(sensor, "mount", None), getattr(sensor, "lens", None)
+    position, orientation = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    if mount is not None:
+        position = np.array(mount.position_m)
+        orientation = mount.rotation().as_quat() if lens is None else mount.optical_quaternion()
     intrinsics = None
-    if sensor.kind == "odometry":
-        rate_hz = sensor.rate_hz
-    elif sensor.kind == "imu":
-        rate_hz = sensor.rate_hz
-        position = np.array(sensor.mount.position_m)
-        orientation = sensor.mount.rotation().as_quat()
-    else:
-        rate_hz = sensor.packets.rate_hz if sensor.kind == "event_camera" else sensor.rate_hz
-        position = np.array(sensor.mount.position_m)
-        orientation = sensor.mount.optical_quaternion()
-        K = sensor.lens.intrinsics()
-        intrinsics = Intrinsics(
-            width=sensor.lens.width, height=sensor.lens.height, fx=K.fx, fy=K.fy, cx=K.cx, cy=K.cy
-        )
+    if lens is not None:
+        K = lens.intrinsics()
+        intrinsics = Intrinsics(width=lens.width, height=lens.height, fx=K.fx, fy=K.fy, cx=K.cx, cy=K.cy)
     return SensorDescription(
         name=name,
         kind=sensor.kind,
-        rate_hz=rate_hz,
+        rate_hz=rate.rate_hz,
         position=position,
         orientation=orientation,
         intrinsics=intrinsics,

@@ -19,7 +19,7 @@ from neurosim_core.install import install_hint
 from neurosim_core.packets import EventArrays, Events, Image, Odometry, Packet
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.scene import Scene
-from neurosim_core.view.event_picture import OFF_SRGB, ON_SRGB, cut_events, event_picture, join_events
+from neurosim_core.view.pictures import OFF_SRGB, ON_SRGB, cut_events, event_picture, join_events
 from neurosim_core.view.plan import cut_plan
 
 WIDTH_PX, HEIGHT_PX = 1600, 900

@@ -1,22 +1,24 @@
-"""How the viewer is laid out: the scene large, pictures at its right, plots below."""
+"""The layout of the Rerun viewer: the scene large, pictures at its right, plots below."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.record.header import SensorDescription
+from neurosim_core.packets import FieldSchema, PacketSchema
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
 
 ROLLING_PLOT_S = 10.0
 """How much time rolling plots show [s]."""
 ROLLING_TRAIL_S = 30.0
 """How much of its way a vehicle then draws behind it [s]."""
-_PICTURES = ("rgb", "event_camera", "depth")
+PICTURES = ("colour", "image", "events", "depth", "values", "segmentation", "normals", "flow")
+"""Displays that have a picture, in the order in which they are laid out."""
+
 _LOOK = np.array([0.2, 0.62, -0.76]) / np.linalg.norm([0.2, 0.62, -0.76])
 """From where the scene is seen at first: direction of the view in W."""
 _FIELD_OF_VIEW_RAD = 0.9
@@ -24,50 +26,114 @@ _FIELD_OF_VIEW_RAD = 0.9
 _ASPECT = 1.6
 
 
+class Panel(NamedTuple):
+    """One view of the layout."""
+
+    kind: Literal["picture", "plot", "bars", "text"]
+    name: str
+    """Its title."""
+    origin: str
+    """Entity that it shows, with all below."""
+    contents: tuple[str, ...] = ("$origin/**",)
+    """Entities that it shows, if not those."""
+    rank: int = 0
+    """Pictures are laid out by rising rank."""
+
+
+def body(vehicle: str) -> str:
+    """Return the entity of a vehicle's body frame."""
+    return f"world/vehicles/{vehicle}"
+
+
+def picture_panel(vehicle: str, sensor: str, kind: str = "") -> Panel:
+    """Return the panel of a camera; `kind` is what it shows, a key of `PICTURES`, if that is known."""
+    rank = PICTURES.index(kind) if kind else len(PICTURES)
+    return Panel("picture", sensor, f"{body(vehicle)}/{sensor}", ("$origin/image",), rank)
+
+
+def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *, live: bool) -> list[Panel]:
+    """Return the panels in which the packets of a sensor are shown.
+
+    Args:
+        vehicle: Name of the vehicle.
+        sensor: Name of the sensor.
+        schema: Schema of its packets.
+        kind: The display, or what a picture shows.
+        live: The clearance, which only a flight in this process knows, is not plotted.
+    """
+    at = f"plots/{vehicle}/{sensor}"
+    numbers = [field for field in schema.fields if field.is_number]
+    if kind in PICTURES:
+        return [picture_panel(vehicle, sensor, kind)]
+    if kind == "time series":
+        return [Panel("plot", f"{sensor}: {title(field)}", f"{at}/{field.name}") for field in numbers]
+    if kind == "bars":
+        return [Panel("bars", f"{sensor}: {title(f)}", f"{at}/{f.name}") for f in schema.fields if f.varying]
+    if kind == "text":
+        return [Panel("text", sensor, at)]
+    if kind == "delay":
+        return [Panel("plot", "link delay [ms]", f"plots/{vehicle}/links")]
+    if kind == "pose":
+        motion = (f"/{at}/speed", f"/{at}/height") + (() if live else (f"/plots/{vehicle}/clearance",))
+        name = "speed [m/s], height" + (" [m]" if live else ", clearance [m]")
+        return [
+            Panel("plot", name, at, motion),
+            Panel("plot", "rotor speed [rad/s]", f"{at}/rotor_speed"),
+        ]
+    return []
+
+
+def title(field: FieldSchema) -> str:
+    """Return what a field of a packet is called on a plot, with its unit."""
+    unit = field.unit.replace("^2", "²")
+    name = field.name.removesuffix("_" + field.unit.replace("/", "_").replace("^", "")).replace("_", " ")
+    return f"{name} [{unit}]" if unit else name
+
+
 def make_blueprint(
-    vehicles: Mapping[str, tuple[SensorDescription, ...]],
+    panels: Mapping[str, Sequence[Panel]],
     bounds_m: NDArray[np.float64] | None = None,
     *,
     live: bool = False,
-    links: bool = False,
     rolling: bool = False,
 ) -> Any:
     """Lay the viewer out; see `rerun_log` for the entities.
 
     Args:
-        vehicles: Sensors of each vehicle.
+        panels: What is shown of each vehicle.
         bounds_m: Lowest and highest corner of the scene [m], shape [2, 3]; None: there is none.
         live: The plots of commands and of the simulator are there, and its status.
-        links: The plot of link delays is there.
         rolling: Follow the newest data; plots show the last seconds only.
     """
     rrb = import_rerun().blueprint
-    many = len(vehicles) > 1
+    many = len(panels) > 1
+    timing = Panel("plot", "loop timing [ms]", "simulator/timing")
     pictures: list[Any] = []
     plots: list[Any] = []
-    camera_count = 0
-    for name, sensors in vehicles.items():
-        views = [
-            rrb.Spatial2DView(
-                origin=f"world/vehicles/{name}/{camera.name}", contents="$origin/image", name=camera.name
-            )
-            for camera in _cameras(sensors)
-        ]
-        camera_count = max(camera_count, len(views))
-        if views and many:
-            pictures.append(rrb.Vertical(*views, name=name))
-        elif views:
-            pictures = views
-        views = _plots(name, sensors, live=live, links=links, rolling=rolling)
+    shares: list[int] = []
+    cameras: dict[str, list[Panel]] = {}
+    for name, shown in panels.items():
+        cameras[name] = sorted((p for p in shown if p.kind == "picture"), key=lambda p: p.rank)
+        others = [panel for panel in shown if panel.kind != "picture"]
+        if live:
+            others += [Panel("plot", "command", f"plots/{name}/command"), timing]
+        views = [_view(panel, rolling=rolling) for panel in cameras[name]]
+        if views:
+            pictures += [rrb.Vertical(*views, name=name)] if many else views
+        views = [_view(panel, rolling=rolling) for panel in others]
         if views:
             plots.append(rrb.Grid(*views, grid_columns=_columns(len(views)), name=name))
-    if live:
-        plots.append(rrb.Horizontal(*_simulator_plots(rolling=rolling), name="simulator"))
+    if pictures:
+        shares = [3 * max(map(len, cameras.values()))] if many else [3] * len(pictures)
     right = [rrb.Tabs(*pictures)] if many and pictures else pictures
-    shares = [3 * camera_count] if many and pictures else [3] * len(right)
     if live:
-        right, shares = [*right, rrb.TextDocumentView(origin="status", name="status")], [*shares, 4]
-    space = _space(vehicles, bounds_m, rolling=rolling)
+        factor = Panel("plot", "real-time factor", "simulator/real_time_factor")
+        losses = Panel("plot", "lost messages", "simulator/losses")
+        views = [_view(panel, rolling=rolling) for panel in (timing, factor, losses)]
+        plots.append(rrb.Horizontal(*views, name="simulator"))
+        right = [*right, rrb.TextDocumentView(origin="status", name="status")]
+        shares = [*shares, 4]
+    space = _space(cameras, bounds_m, rolling=rolling)
     below = rrb.Tabs(*plots) if len(plots) > 1 else plots[0] if plots else None
     left = space if below is None else rrb.Vertical(space, below, row_shares=[5, 4] if live else [5, 3])
     layout = (
@@ -87,16 +153,21 @@ def _columns(count: int) -> int:
     return 2 if count == 4 else 3 if count <= 6 else 4
 
 
-def _cameras(sensors: tuple[SensorDescription, ...]) -> list[SensorDescription]:
-    cameras = [sensor for sensor in sensors if sensor.intrinsics is not None]
-    return sorted(cameras, key=lambda sensor: _PICTURES.index(sensor.kind))
+def _view(panel: Panel, *, rolling: bool) -> Any:
+    rrb = import_rerun().blueprint
+    kinds = {"picture": rrb.Spatial2DView, "bars": rrb.BarChartView, "text": rrb.TextLogView}
+    options: dict[str, Any] = {"origin": panel.origin, "contents": list(panel.contents), "name": panel.name}
+    if panel.kind != "plot":
+        return kinds[panel.kind](**options)
+    return rrb.TimeSeriesView(
+        **options,
+        time_ranges=_last_seconds(ROLLING_PLOT_S) if rolling else None,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+    )
 
 
 def _space(
-    vehicles: Mapping[str, tuple[SensorDescription, ...]],
-    bounds_m: NDArray[np.float64] | None,
-    *,
-    rolling: bool,
+    cameras: Mapping[str, Iterable[Panel]], bounds_m: NDArray[np.float64] | None, *, rolling: bool
 ) -> Any:
     rrb = import_rerun().blueprint
     eye = None
@@ -106,18 +177,14 @@ def _space(
         eye = rrb.EyeControls3D(position=position, look_target=center, eye_up=(0.0, 0.0, 1.0))
     until_now = _last_seconds(ROLLING_TRAIL_S if rolling else None)
     # One frustum is enough where cameras share a place; the others' pictures are at the right.
-    hidden = [
-        f"- /world/vehicles/{name}/{camera.name}/**"
-        for name, sensors in vehicles.items()
-        for camera in _cameras(sensors)[1:]
-    ]
+    hidden = [f"- /{camera.origin}/**" for shown in cameras.values() for camera in list(shown)[1:]]
     return rrb.Spatial3DView(
         origin="world",
         name="scene",
         contents=["$origin/**", *hidden],
         overrides={
-            **{f"world/trails/{name}": until_now for name in vehicles},
-            **{f"world/collisions/{name}": until_now for name in vehicles},
+            **{f"world/trails/{name}": until_now for name in cameras},
+            **{f"world/collisions/{name}": until_now for name in cameras},
             "world/scene/ceiling": rrb.EntityBehavior(visible=False),
         },
         eye_controls=eye,
@@ -140,55 +207,3 @@ def _last_seconds(seconds: float | None) -> Any:
     boundary = rrb.TimeRangeBoundary
     start = boundary.infinite() if seconds is None else boundary.cursor_relative(seconds=-seconds)
     return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=start, end=boundary.cursor_relative()))
-
-
-def _plot(name: str, origin: str, contents: list[str] | None = None, *, rolling: bool) -> Any:
-    rrb = import_rerun().blueprint
-    return rrb.TimeSeriesView(
-        origin=origin,
-        contents=["$origin/**"] if contents is None else contents,
-        name=name,
-        time_ranges=_last_seconds(ROLLING_PLOT_S) if rolling else None,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
-    )
-
-
-def _plots(
-    vehicle: str, sensors: tuple[SensorDescription, ...], *, live: bool, links: bool, rolling: bool
-) -> list[Any]:
-    root = f"plots/{vehicle}"
-    plots = []
-    for sensor in sensors:
-        at = f"{root}/{sensor.name}"
-        if sensor.kind == "imu":
-            plots += [
-                _plot(f"{sensor.name}: specific force [m/s²]", f"{at}/specific_force", rolling=rolling),
-                _plot(f"{sensor.name}: angular rate [rad/s]", f"{at}/angular_rate", rolling=rolling),
-            ]
-    for sensor in sensors:
-        at = f"{root}/{sensor.name}"
-        if sensor.kind == "odometry":
-            motion = [f"/{at}/speed", f"/{at}/height"] + ([] if live else [f"/{root}/clearance"])
-            name = "speed [m/s], height" + (" [m]" if live else ", clearance [m]")
-            plots += [
-                _plot(name, at, motion, rolling=rolling),
-                _plot("rotor speed [rad/s]", f"{at}/rotor_speed", rolling=rolling),
-            ]
-    if live:
-        plots.append(_plot("command", f"{root}/command", rolling=rolling))
-        plots.append(_timing_plot(rolling=rolling))
-    if links:
-        plots.append(_plot("link delay [ms]", f"{root}/links", rolling=rolling))
-    return plots
-
-
-def _timing_plot(*, rolling: bool) -> Any:
-    return _plot("loop timing [ms]", "simulator/timing", rolling=rolling)
-
-
-def _simulator_plots(*, rolling: bool) -> list[Any]:
-    return [
-        _timing_plot(rolling=rolling),
-        _plot("real-time factor", "simulator/real_time_factor", rolling=rolling),
-        _plot("lost messages", "simulator/losses", rolling=rolling),
-    ]

@@ -1,15 +1,17 @@
-"""Packets as Rerun sees them: the same code fills a file and feeds a live viewer.
+"""Packets in Rerun: the same code fills a file and feeds a live viewer.
 
+The `display` of a packet's class and its schema say how it is shown; `DISPLAYS` has a function for each.
 Rerun gets what eyes need: pictures as JPEG, depth in whole millimetres, events as one picture per window.
 Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. Entities:
 
     world/scene/{room,ceiling}/<n>          the scene, one mesh per material; the ceiling is hidden
     world/bodies/<body>                     where it is, whenever the first vehicle says where that one is
-    world/vehicles/<vehicle>                its pose; below it one entity per camera, with frustum and picture
+    world/vehicles/<vehicle>                its pose
+    world/vehicles/<vehicle>/<sensor>       where the sensor sits; frustum and picture of a camera, points
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
     world/collisions/<vehicle>              where it touched the scene
-    plots/<vehicle>/<sensor>/<quantity>     IMU, speed, height, rotor speeds
+    plots/<vehicle>/<sensor>/<field>        numbers, bars and texts; speed, height, rotor speeds of a pose
     plots/<vehicle>/command/<mode>          what it was told to do
     plots/<vehicle>/links/<link>            delay of each message [ms]; a gap where one was lost
     plots/<vehicle>/<name>                  what `log_scalar` was given
@@ -27,17 +29,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.packets import Packet, PacketSchema, as_numpy, schema_of
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
-from neurosim_core.view.event_picture import EventWindow
-from neurosim_core.view.rerun_layout import make_blueprint
+from neurosim_core.view.pictures import EventWindow, picture_of
+from neurosim_core.view.rerun_layout import (
+    PICTURES,
+    Panel,
+    body,
+    make_blueprint,
+    picture_panel,
+    sensor_panels,
+)
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
 from neurosim_core.view.rerun_shapes import (
     SceneShapes,
     body_entity,
     encode_events,
-    encode_image,
+    encode_picture,
     event_colors,
 )
 
@@ -86,7 +95,6 @@ class RerunLogger:
         scene: SceneShapes | None = None,
         event_window_ns: int = 20_000_000,
         image_rate_max_hz: float | None = None,
-        links: bool = False,
         compress: bool = True,
         live: bool = False,
         keep_layout: bool = False,
@@ -95,14 +103,13 @@ class RerunLogger:
         """Log what does not change, and the layout of the viewer.
 
         Args:
-            recording: Where to log: `open_recording`.
+            recording: Where to log: `open_rerun`.
             vehicles: Descriptions of the sensors of each vehicle; packets of other sensors are shown without
                 frustum.
             scene: The scene to show.
             event_window_ns: How much time one picture of events shows [ns].
             image_rate_max_hz: Log no more images per sensor and second than this: of simulated time, or live,
                 by the wall clock. Live, pictures of events are as many as in real time, at most 50 a second.
-            links: Deliveries of links will come.
             compress: Make pictures small, for a file. What is not, a viewer shows without delay; it then
                 follows a stream, and shows the last seconds of it.
             live: This is a stream that may go on for hours.
@@ -125,7 +132,6 @@ class RerunLogger:
         self._event_window_ns = event_window_ns
         self._image_limit = _RateLimit(0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz))
         self._event_limit = _RateLimit(max(event_window_ns, _EVENT_PERIOD_NS), burst_ns=_EVENT_BURST_NS)
-        self._links = links
         self._compress = compress
         self._live = live
         self._keep_layout = keep_layout
@@ -135,21 +141,17 @@ class RerunLogger:
         self._trail_end: dict[str, NDArray[np.float64]] = {}
         self._pose_of: dict[str, str] = {}
         self._bodies: Mapping[str, BodyConfig] = {}
-        self._log_of: dict[type[Packet], Callable[[str, Any], None]] = {
-            Events: self._log_events,
-            Image: self._log_image,
-            ImuSample: self._log_imu,
-            Odometry: self._log_odometry,
-            Collision: self._log_collision,
-            Delivery: self._log_delivery,
-        }
+        self._scene = scene
+        self._panels: dict[str, dict[Panel, None]] = {name: {} for name in self._vehicles}
+        self._shown: set[tuple[str, str]] = set()
+        self._layout_is_old = False
         recording.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for name, sensors in self._vehicles.items():
-            recording.log(_body(name), self._rr.TransformAxes3D(_AXES_M), static=True)
+            recording.log(body(name), self._rr.TransformAxes3D(_AXES_M), static=True)
             for sensor in sensors:
                 self._log_description(name, sensor)
-        self._log_meshes(scene)
-        self._send_blueprint(scene)
+        self._log_meshes()
+        self._send_blueprint()
 
     def log(self, packet: Packet, *, vehicle: str | None = None) -> None:
         """Log one packet.
@@ -159,17 +161,24 @@ class RerunLogger:
             vehicle: Name of the vehicle; None: the first one.
 
         Raises:
-            ValueError: The packet is of a type that cannot be shown.
+            ValueError: The packet's class declares an unknown display, or its picture has no known encoding.
         """
-        if type(packet) not in self._log_of:
-            known = sorted(t.__name__ for t in self._log_of)
-            raise ValueError(f"cannot show a packet of type {type(packet).__name__!r}, known: {known}")
-        self._log_of[type(packet)](self._first if vehicle is None else vehicle, packet)
+        schema = schema_of(type(packet))
+        if schema.display not in DISPLAYS:
+            raise ValueError(
+                f"packet {schema.name!r} declares the unknown display {schema.display!r}, "
+                f"known: {', '.join(DISPLAYS)}"
+            )
+        vehicle = self._first if vehicle is None else vehicle
+        if (vehicle, packet.sensor) not in self._shown:
+            self._show_sensor(vehicle, packet, schema)
+        DISPLAYS[schema.display](self, vehicle, packet, schema)
 
     def log_scene(self, scene: SceneShapes) -> None:
         """Show a scene that was not there at the beginning, and look at it from above."""
-        self._log_meshes(scene)
-        self._send_blueprint(scene)
+        self._scene = scene
+        self._log_meshes()
+        self._send_blueprint()
 
     def log_path(self, position: NDArray[np.float64], *, vehicle: str | None = None) -> None:
         """Show where a vehicle is meant to fly.
@@ -247,7 +256,9 @@ class RerunLogger:
         self._recording.log("status", self._rr.TextDocument(text, media_type="text/markdown"))
 
     def send(self) -> None:
-        """Send what waits."""
+        """Send what waits, and the layout if there is more to show than before."""
+        if self._layout_is_old:
+            self._send_blueprint()
         for table in self._tables.values():
             table.send()
 
@@ -269,40 +280,49 @@ class RerunLogger:
     ) -> None:
         self.close()
 
-    def _log_meshes(self, scene: SceneShapes | None) -> None:
-        if scene is not None:
-            self._bodies = scene.bodies
-            for entity, mesh in scene.meshes:
+    def _log_meshes(self) -> None:
+        if self._scene is not None:
+            self._bodies = self._scene.bodies
+            for entity, mesh in self._scene.meshes:
                 self._recording.log(entity, mesh, static=True)
 
-    def _send_blueprint(self, scene: SceneShapes | None) -> None:
-        bounds_m = None if scene is None else scene.bounds_m
+    def _show_sensor(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
+        """Give the packets of a sensor their places in the layout, when the first comes."""
+        self._shown.add((vehicle, packet.sensor))
+        kind = schema.display
+        if kind in PICTURES and kind != "events":
+            kind = picture_of(packet)[0]
+        panels = self._panels.setdefault(vehicle, {})
+        if panels.pop(picture_panel(vehicle, packet.sensor), 0) is None:
+            self._layout_is_old = True  # it has another rank now
+        for panel in sensor_panels(vehicle, packet.sensor, schema, kind, live=self._live):
+            self._layout_is_old |= panel not in panels
+            panels[panel] = None
+
+    def _send_blueprint(self) -> None:
+        self._layout_is_old = False
         layout = make_blueprint(
-            self._vehicles,
-            bounds_m,
+            {vehicle: tuple(panels) for vehicle, panels in self._panels.items()},
+            None if self._scene is None else self._scene.bounds_m,
             live=self._live,
-            links=self._links,
             rolling=self._live and not self._compress,
         )
         self._recording.send_blueprint(layout, make_active=not self._keep_layout)
 
     def _log_description(self, vehicle: str, sensor: SensorDescription) -> None:
-        rr = self._rr
-        if sensor.kind == "odometry":
-            self._pose_of.setdefault(vehicle, sensor.name)
-        if sensor.intrinsics is not None:
-            lens = sensor.intrinsics
-            self._recording.log(
-                f"{_body(vehicle)}/{sensor.name}",
-                rr.Transform3D(translation=sensor.position, quaternion=sensor.orientation),
+        rr, lens = self._rr, sensor.intrinsics
+        parts = [rr.Transform3D(translation=sensor.position, quaternion=sensor.orientation)]
+        if lens is not None:
+            self._panels[vehicle][picture_panel(vehicle, sensor.name)] = None
+            parts += [
                 rr.Pinhole(
                     image_from_camera=[[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]],
                     resolution=[lens.width, lens.height],
                     camera_xyz=rr.ViewCoordinates.RDF,
                     image_plane_distance=_FRUSTUM_M,
-                ),
-                static=True,
-            )
+                )
+            ]
+        self._recording.log(f"{body(vehicle)}/{sensor.name}", *parts, static=True)
 
     def _set_time(self, stamp_ns: int) -> None:
         self._recording.set_time(TIMELINE, duration=np.timedelta64(stamp_ns, "ns"))
@@ -326,14 +346,39 @@ class RerunLogger:
             self._recording.log(entity, self._rr.SeriesLines(names=names, colors=colors), static=True)
         self._table(entity, {"scalars": len(names)}, self._send_scalars).append(stamp_ns, scalars=value)
 
-    def _log_imu(self, vehicle: str, packet: ImuSample) -> None:
-        plot = f"plots/{vehicle}/{packet.sensor}"
-        self._plot(f"{plot}/specific_force", packet.stamp_ns, packet.specific_force, ("x", "y", "z"))
-        self._plot(f"{plot}/angular_rate", packet.stamp_ns, packet.angular_rate, ("x", "y", "z"))
+    def _log_numbers(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
+        for field in schema.fields:
+            if field.is_number:
+                value = as_numpy(getattr(packet, field.name)).astype(np.float64).ravel()
+                names = (field.name,) if value.size == 1 else tuple("xyz")
+                if value.size not in (1, 3):
+                    names = tuple(f"{field.name} {k}" for k in range(value.size))
+                self._plot(f"plots/{vehicle}/{packet.sensor}/{field.name}", packet.stamp_ns, value, names)
 
-    def _log_odometry(self, vehicle: str, packet: Odometry) -> None:
+    def _log_bars(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
+        self._set_time(packet.stamp_ns)
+        for field in schema.fields:
+            if field.varying and len(field.shape) == 1:
+                bars = self._rr.BarChart(as_numpy(getattr(packet, field.name)))
+                self._recording.log(f"plots/{vehicle}/{packet.sensor}/{field.name}", bars)
+
+    def _log_text(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
+        self._set_time(packet.stamp_ns)
+        text = "\n".join(getattr(packet, field.name) for field in schema.fields if field.dtype == "str")
+        self._recording.log(f"plots/{vehicle}/{packet.sensor}", self._rr.TextLog(text))
+
+    def _log_points(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
+        points = next(f.name for f in schema.fields if f.varying and f.shape[1:] == (3,))
+        self._set_time(packet.stamp_ns)
+        cloud = self._rr.Points3D(as_numpy(getattr(packet, points)), radii=self._rr.Radius.ui_points(2.0))
+        self._recording.log(f"{body(vehicle)}/{packet.sensor}", cloud)
+
+    def _log_nothing(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
+        """Show nothing, as a packet class declares by "none"."""
+
+    def _log_pose(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         if self._pose_of.setdefault(vehicle, packet.sensor) == packet.sensor:
-            self._table(_body(vehicle), {"translation": 3, "quaternion": 4}, self._send_poses).append(
+            self._table(body(vehicle), {"translation": 3, "quaternion": 4}, self._send_poses).append(
                 packet.stamp_ns, translation=packet.position, quaternion=packet.orientation
             )
         plot = f"plots/{vehicle}/{packet.sensor}"
@@ -350,7 +395,7 @@ class RerunLogger:
         quaternion: NDArray[np.float64],
     ) -> None:
         rr = self._rr
-        vehicle = entity.removeprefix(_body(""))
+        vehicle = entity.removeprefix(body(""))
         times = rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
         columns = rr.Transform3D.columns(translation=translation, quaternion=quaternion)
         self._recording.send_columns(entity, indexes=[times], columns=columns)
@@ -373,15 +418,15 @@ class RerunLogger:
     def _color(self, vehicle: str) -> tuple[int, int, int]:
         return self._colors.get(vehicle, _VEHICLE_COLORS[0])
 
-    def _log_image(self, vehicle: str, packet: Image) -> None:
-        entity = f"{_body(vehicle)}/{packet.sensor}/image"
+    def _log_picture(self, vehicle: str, packet: Packet, _schema: PacketSchema) -> None:
+        entity = f"{body(vehicle)}/{packet.sensor}/image"
         now_ns = self._clock_ns() if self._live else packet.stamp_ns
         if self._image_limit.passes(entity, now_ns):
             self._set_time(packet.stamp_ns)
-            self._recording.log(entity, encode_image(packet, compress=self._compress))
+            self._recording.log(entity, encode_picture(packet, compress=self._compress))
 
-    def _log_events(self, vehicle: str, packet: Events) -> None:
-        entity = f"{_body(vehicle)}/{packet.sensor}/image"
+    def _log_events(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
+        entity = f"{body(vehicle)}/{packet.sensor}/image"
         if entity not in self._windows:
             self._windows[entity] = EventWindow(length_ns=self._event_window_ns)
             if not self._compress:
@@ -396,20 +441,30 @@ class RerunLogger:
                 )
                 self._recording.log(entity, picture)
 
-    def _log_collision(self, vehicle: str, packet: Collision) -> None:
+    def _log_contact(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         self._set_time(packet.stamp_ns)
         point = self._rr.Points3D([packet.position], colors=[_COLLISION_COLOR], radii=[0.08])
         self._recording.log(f"world/collisions/{vehicle}", point)
 
-    def _log_delivery(self, vehicle: str, packet: Delivery) -> None:
+    def _log_delay(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         link = packet.sensor.removesuffix("_link")
         delay_ms = 1e-6 * (packet.delivered_ns - packet.stamp_ns) if packet.delivered_ns >= 0 else np.nan
         self._plot(f"plots/{vehicle}/links/{link}", packet.stamp_ns, delay_ms, (link,))
 
 
-def _body(vehicle: str) -> str:
-    """Entity of a vehicle's body frame."""
-    return f"world/vehicles/{vehicle}"
+DISPLAYS: dict[str, Callable[[RerunLogger, str, Packet, PacketSchema], None]] = {
+    **dict.fromkeys(("image", "depth", "segmentation", "normals", "flow"), RerunLogger._log_picture),
+    "events": RerunLogger._log_events,
+    "points": RerunLogger._log_points,
+    "time series": RerunLogger._log_numbers,
+    "bars": RerunLogger._log_bars,
+    "text": RerunLogger._log_text,
+    "pose": RerunLogger._log_pose,
+    "contact": RerunLogger._log_contact,
+    "delay": RerunLogger._log_delay,
+    "none": RerunLogger._log_nothing,
+}
+"""How packets are logged, by the `display` of their class."""
 
 
 def _rotors(count: int) -> tuple[str, ...]:

@@ -39,9 +39,7 @@ def import_rerun() -> ModuleType:
     return rerun
 
 
-def open_recording(
-    path: str | Path | None = None, *, name: str = "", footer: bool = True
-) -> rr.RecordingStream:
+def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool = True) -> rr.RecordingStream:
     """Open a recording of its own, independent of others in this process.
 
     Args:

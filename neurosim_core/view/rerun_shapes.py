@@ -11,42 +11,52 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from neurosim_core.packets import EventArrays, Image
+from neurosim_core.packets import EventArrays, Packet
 from neurosim_core.scene.bodies import Body, BodyConfig
 from neurosim_core.scene.body_shapes import Solid
 from neurosim_core.scene.scene import Material, Scene
 from neurosim_core.scene.source import linear_to_srgb8
-from neurosim_core.view.event_picture import PALETTE, event_classes
+from neurosim_core.view.pictures import PALETTE, color_picture, event_classes, picture_of
 from neurosim_core.view.rerun_sdk import import_rerun
 
 _TEXTURE_MAX_PX = 256
 
 
-def encode_image(image: Image, *, compress: bool = True) -> Any:
-    """Return a picture as Rerun shows it.
+def encode_picture(packet: Packet, *, compress: bool = True) -> Any:
+    """Return the picture of a packet as Rerun shows it.
 
-    rgb8 and mono8 become JPEG; 32FC1 becomes a depth image in millimetres up to 65 m, 0 where nothing is hit.
+    Colours and greys become JPEG. Depth becomes a depth image in millimetres up to 65 m, 0 where nothing is
+    hit. Labels, normals and flow become colours without loss; labels that are not compressed keep their
+    numbers.
 
     Args:
-        image: The picture.
+        packet: A packet that `picture_of` finds a picture in.
         compress: Make it small. What is not, a viewer shows without delay.
 
     Raises:
-        ValueError: If another encoding is given.
+        ValueError: There is no picture, or one of an unknown encoding.
     """
     rr = import_rerun()
-    if image.encoding in ("rgb8", "mono8"):
-        picture = rr.Image(image.data)
-        return picture.compress(jpeg_quality=90) if compress else picture
-    if image.encoding == "32FC1":
-        high_mm = np.where(np.isfinite(image.data), np.minimum(image.data * 1000.0 + 0.5, 65535.0), 0.0)
+    kind, data = picture_of(packet)
+    if kind == "values":
+        return rr.Image(data.astype(np.float32))
+    if kind == "depth":
+        high_mm = np.where(np.isfinite(data), np.minimum(data * 1000.0 + 0.5, 65535.0), 0.0)
         depth_mm = high_mm.astype(np.uint16)
         colormap = rr.components.Colormap.Turbo
         if not compress:
             return rr.DepthImage(depth_mm, meter=1000.0, colormap=colormap)
         png = _png(PIL.Image.fromarray(depth_mm))
         return rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0, colormap=colormap)
-    raise ValueError(f"cannot show a picture of encoding {image.encoding!r}, known: rgb8, mono8, 32FC1")
+    if kind == "colour":
+        picture = rr.Image(data)
+        return picture.compress(jpeg_quality=90) if compress else picture
+    if compress:
+        png = _png(PIL.Image.fromarray(color_picture(kind, data)))
+        return rr.EncodedImage(contents=png, media_type="image/png")
+    if kind == "segmentation":
+        return rr.SegmentationImage(np.where(data < 0, 0, data + 1).astype(np.uint16), opacity=1.0)
+    return rr.Image(color_picture(kind, data))
 
 
 def encode_events(events: EventArrays, *, width: int, height: int, compress: bool = True) -> Any:

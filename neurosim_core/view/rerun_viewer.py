@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_sdk import import_rerun, open_recording
+from neurosim_core.view.rerun_sdk import import_rerun, open_rerun
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -110,7 +110,7 @@ class RerunViewer:
         Args:
             name: What the viewer calls it.
         """
-        recording = open_recording(name=name)
+        recording = open_rerun(name=name)
         recording.connect_grpc(self.data_url)
         return recording
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from neurosim_core.bench import delay
 from neurosim_core.bench.delay import DelayResult, bench_delay, predicted_settings, print_delays
 from neurosim_core.packets import Delivery, Odometry
-from neurosim_core.record import FlightHeader, FlightWriter
+from neurosim_core.record import RecordingHeader, RecordingWriter
 
 
 @pytest.fixture
@@ -35,14 +35,14 @@ def test_lockstep_asks_as_rarely_and_delays_as_long():
 def test_a_recording_gives_the_distance_from_the_path(tmp_path):
     """3 cm beside the path half of the time, 5 cm the other half, and commands 20 ms apart."""
     stamps = np.arange(0, 1_000_000_001, 5_000_000)
-    header = FlightHeader(
+    header = RecordingHeader(
         config_yaml="",
         seed=0,
         version="0",
         path_stamp_ns=np.array([0, 1_000_000_000]),
         path_position=np.array([[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]]),
     )
-    with FlightWriter(tmp_path / "flight.h5", header) as writer:
+    with RecordingWriter(tmp_path / "flight.h5", header) as writer:
         for tick, stamp_ns in enumerate(stamps.tolist()):
             beside_m = 0.03 if tick % 2 else 0.05
             writer.write(

@@ -19,14 +19,14 @@ from neurosim_core.convert.convert import (
 )
 from neurosim_core.convert.light import TRANSFERS
 from neurosim_core.flight import rerun_file
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 
 THRESHOLD = 0.2
 SRGB = TRANSFERS["srgb"]
 
 
 def events_of(file):
-    with Flight(file) as flight:
+    with Recording(file) as flight:
         return flight.events("events", 0.0, 1e6)
 
 
@@ -247,7 +247,7 @@ def test_who_stops_it_keeps_a_whole_file(tmp_path):
         folder, tmp_path / "e.h5", config, device="cpu", stack_length=2, stopped=lambda: True
     )
     assert (found.complete, found.frame_count) == (False, 2)
-    with Flight(tmp_path / "e.h5") as flight:
+    with Recording(tmp_path / "e.h5") as flight:
         assert flight.clean
         assert flight.packet_count("events") == 1
 
@@ -256,7 +256,7 @@ def test_the_file_has_what_was_decided(tmp_path):
     """The dark floor that was chosen, and the part of the picture that was taken; again it is the same."""
     folder = write_folder(tmp_path / "f", moving_pictures(5, width=40, height=30))
     found, events = convert(folder, tmp_path / "a.h5", fps=10.0, size="16x16")
-    with Flight(tmp_path / "a.h5") as flight:
+    with Recording(tmp_path / "a.h5") as flight:
         settings = yaml.safe_load(flight.header.config_yaml)["conversion"]
     assert settings["dark_floor"] == found.dark_floor > 0.0
     assert settings["crop"] == str(found.crop) == "30x30+5+0"
@@ -287,7 +287,7 @@ def test_what_was_converted_before_a_bad_frame_is_kept(tmp_path):
     (folder / "frame4.png").write_bytes(b"cut off")
     with pytest.raises(ValueError, match=r"frame4\.png is not a readable picture"):
         convert(folder, tmp_path / "e.h5", fps=10.0, stack_length=2)
-    with Flight(tmp_path / "e.h5") as flight:
+    with Recording(tmp_path / "e.h5") as flight:
         assert not flight.clean
         assert flight.packet_count("events") == 3  # the intervals between the four frames before it
 
@@ -302,7 +302,7 @@ def test_the_command_writes_a_file_that_says_where_it_is_from(tmp_path, capsys):
     assert "v.mkv: 40x30; bgr0, 8 bits, srgb" in printed
     assert "4 in 0.060 s, every 20 ms" in printed
     assert "does not name its transfer function" in printed
-    with Flight(out) as flight:
+    with Recording(out) as flight:
         settings = yaml.safe_load(flight.header.config_yaml)["conversion"]
         assert flight.clean
         assert flight.header.scene == "v.mkv"

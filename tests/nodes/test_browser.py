@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from processes import SOON_S
 
 from cortex import messages as msg
-from neurosim_core.view.event_picture import OFF_SRGB, ON_SRGB
+from neurosim_core.view.pictures import OFF_SRGB, ON_SRGB
 
 CHROMIUM = shutil.which("chromium")
 OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

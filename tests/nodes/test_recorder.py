@@ -19,7 +19,7 @@ from neurosim_core.nodes import recorder as recorder_module
 from neurosim_core.nodes.parameters import change
 from neurosim_core.nodes.recorder import Recorder, open_folders
 from neurosim_core.packets import ImuSample
-from neurosim_core.record import Flight, FlightWriter
+from neurosim_core.record import Recording, RecordingWriter
 
 
 def imu(number: int) -> ImuSample:
@@ -39,7 +39,7 @@ def make_recorder(folder: Path) -> Recorder:
 
 
 def stamps(file: Path) -> list[int]:
-    with Flight(file) as flight:
+    with Recording(file) as flight:
         return [packet.stamp_ns for packet in flight.packets()]
 
 
@@ -47,13 +47,13 @@ def test_a_slow_disk_holds_up_the_run(tmp_path: Path, monkeypatch: pytest.Monkey
     """The queue holds two packets; the third waits until one is written."""
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
     gate = threading.Semaphore(0)
-    write = FlightWriter.write
+    write = RecordingWriter.write
 
-    def slow(self: FlightWriter, packet: Any) -> None:
+    def slow(self: RecordingWriter, packet: Any) -> None:
         assert gate.acquire(timeout=SOON_S)
         write(self, packet)
 
-    monkeypatch.setattr(FlightWriter, "write", slow)
+    monkeypatch.setattr(RecordingWriter, "write", slow)
     recorder = make_recorder(tmp_path)
     written = []
 
@@ -78,10 +78,10 @@ def test_a_slow_disk_holds_up_the_run(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_disk_that_fails_is_told_and_hangs_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
 
-    def fail(self: FlightWriter, packet: Any) -> None:
+    def fail(self: RecordingWriter, packet: Any) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(FlightWriter, "write", fail)
+    monkeypatch.setattr(RecordingWriter, "write", fail)
     recorder = make_recorder(tmp_path)
     with pytest.raises(OSError, match="no space left"):
         all(recorder.write("drone", imu(number)) is None for number in range(100))
@@ -96,7 +96,7 @@ def test_what_waits_is_written_before_it_closes(tmp_path: Path):
         recorder.write("drone", imu(number))
     recorder.close()
     assert stamps(tmp_path / "flight.h5") == [1000 * number for number in range(1000)]
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         assert flight.header.seed == 11
 
 
@@ -106,15 +106,15 @@ def test_a_run_that_is_stopped_does_not_wait_for_the_disk(tmp_path: Path, monkey
     monkeypatch.setattr(recorder_module, "HURRY_S", 0.1)
     monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", SOON_S)
     gate, begun = threading.Event(), threading.Event()
-    write = FlightWriter.write
+    write = RecordingWriter.write
 
-    def slow(self: FlightWriter, packet: Any) -> None:
+    def slow(self: RecordingWriter, packet: Any) -> None:
         if packet.sequence == 2:
             begun.set()
             assert gate.wait(SOON_S)
         write(self, packet)
 
-    monkeypatch.setattr(FlightWriter, "write", slow)
+    monkeypatch.setattr(RecordingWriter, "write", slow)
     recorder = make_recorder(tmp_path)
     stop = recorder.stop
 
@@ -143,7 +143,7 @@ def test_a_run_that_is_stopped_does_not_wait_for_the_disk(tmp_path: Path, monkey
         recorder.close()
     assert recorder.unwritten_count == 17
     assert stamps(tmp_path / "flight.h5") == [0, 1000, 2000]
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         assert not flight.clean
 
 
@@ -152,11 +152,11 @@ def test_a_disk_that_hangs_hangs_nobody(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", 0.05)
     gate, begun = threading.Event(), threading.Event()
 
-    def hang(self: FlightWriter, packet: Any) -> None:
+    def hang(self: RecordingWriter, packet: Any) -> None:
         begun.set()
         gate.wait(SOON_S)
 
-    monkeypatch.setattr(FlightWriter, "write", hang)
+    monkeypatch.setattr(RecordingWriter, "write", hang)
     recorder = make_recorder(tmp_path)
     for number in range(5):
         recorder.write("drone", imu(number))
@@ -180,9 +180,9 @@ def test_files_say_which_settings_hold_and_which_were_changed(tmp_path: Path):
     recorder.begin({"drone": 12}, replace=False)
     recorder.write("drone", imu(0))
     recorder.close()
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         first = load_config(yaml.safe_load(flight.header.config_yaml))
-    with Flight(tmp_path / "flight-2.h5") as flight:
+    with Recording(tmp_path / "flight-2.h5") as flight:
         second = load_config(yaml.safe_load(flight.header.config_yaml))
     assert "imu" not in first.links
     assert (second.links["imu"].clock_offset_s, second.live.fail_safe, second.seed) == (0.003, "cut", 12)
@@ -207,7 +207,7 @@ def test_a_file_that_is_replaced_begins_with_what_was_changed(tmp_path: Path):
     recorder.write("drone", imu(0))
     recorder.close()
     assert not (tmp_path / "settings.jsonl").read_text()
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         assert load_config(yaml.safe_load(flight.header.config_yaml)).live.fail_safe == "cut"
 
 

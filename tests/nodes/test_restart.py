@@ -23,7 +23,7 @@ from processes import ROOT, processes_with, wait_for
 from cortex import Node, latest, reliable
 from cortex.messages import Clock, Image, MotorCommand, SimulatorStatus
 from neurosim_core.nodes.topics import STATUS, command_topic
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 
 START_S = 60.0
 """Deadline of a start, which imports much, on a machine that does a lot besides."""
@@ -220,7 +220,7 @@ def test_ctrl_c_ends_all_that_one_command_started(runtime, tmp_path, monkeypatch
     assert up.process.returncode == 130
     assert ended_s < END_S
     assert not [line for line in lines if "Traceback" in line]
-    with Flight(record / "flight.h5") as flight:
+    with Recording(record / "flight.h5") as flight:
         assert flight.clean
         assert flight.packet_count("imu") > 25
     assert picture.stat().st_size > 0
@@ -256,7 +256,7 @@ def test_ctrl_c_waits_for_no_reader_that_has_stopped_reading(runtime, tmp_path, 
         print(f"ended {time.monotonic() - begin_s:.2f} s after Ctrl-C")
     assert serve.process.returncode == 130
     assert not [line for line in lines if "Traceback" in line]
-    with Flight(record / "flight.h5") as flight:
+    with Recording(record / "flight.h5") as flight:
         assert flight.clean
         assert flight.packet_count("rgb") > 0
 

@@ -40,7 +40,7 @@ from neurosim_core.nodes import simulator as simulator_module
 from neurosim_core.nodes.console import print_end
 from neurosim_core.nodes.simulator import Simulator
 from neurosim_core.packets import Delivery
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 from neurosim_core.simulation import make_state, observe, step
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
@@ -453,7 +453,7 @@ def test_what_is_left_out_at_the_end_is_counted(
         rig.stop.set()
         assert rig.join() == 0
         flown_ns = rig.simulator.crafts[0].state.stamp_ns
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         packets = list(flight.packets())
     pictures = [p.stamp_ns for p in packets if p.sensor == "rgb"]
     dropped = told[-1].sensors[2].dropped_count
@@ -835,7 +835,7 @@ def test_what_is_recorded_is_what_was_published(tmp_path: Path, mode: str):
             rig.send(rig.hover())
         assert rig.join() == 0
         samples, pictures, windows = drain(imu, least=37), drain(rgb, least=6), drain(events, least=10)
-    with Flight(tmp_path / "flight" / "flight.h5") as flight:
+    with Recording(tmp_path / "flight" / "flight.h5") as flight:
         packets: dict[str, list[Any]] = {}
         for packet in flight.packets():
             packets.setdefault(packet.sensor, []).append(packet)
@@ -886,7 +886,7 @@ def test_a_recording_is_not_replaced_unasked_and_resets_begin_new_files(tmp_path
             pass
         rig.call("/reset", Reset(seed=5))
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["flight-2.h5", "flight.h5"]
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         stamps = [p.stamp_ns for p in flight.packets() if p.sensor == "odometry"]
         assert stamps == [0, PERIOD_NS]
         assert flight.header.seed == 4

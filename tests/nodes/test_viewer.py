@@ -32,7 +32,7 @@ from neurosim_core.nodes import viewer as viewer_module
 from neurosim_core.nodes.scene_loader import SceneLoader
 from neurosim_core.nodes.viewer import view, watch
 from neurosim_core.packets import EventArrays
-from neurosim_core.view import FileOutlet, event_picture
+from neurosim_core.view import FileTarget, event_picture
 
 BODY = "/world/vehicles/drone"
 
@@ -58,7 +58,7 @@ class Watcher:
 
     def _run(self, path: Path, options: dict[str, Any]) -> int:
         with Node("viewer") as node:
-            outlet = FileOutlet(path, self.said.append)
+            outlet = FileTarget(path, self.said.append)
             return watch(
                 node, outlet, SceneLoader(self.said.append), stop=self._stop, say=self.said.append, **options
             )

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from neurosim_core.links import Link
 from neurosim_core.live import LinkConfig
 from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
-from neurosim_core.record import Flight, FlightHeader, FlightWriter, Intrinsics, SensorDescription
+from neurosim_core.record import Intrinsics, Recording, RecordingHeader, RecordingWriter, SensorDescription
 
-HEADER = FlightHeader(config_yaml="duration_s: 1.0\n", seed=7, version="0.1.0", scene="flat")
+HEADER = RecordingHeader(config_yaml="duration_s: 1.0\n", seed=7, version="0.1.0", scene="flat")
 MS = 1_000_000
 
 
@@ -113,8 +113,8 @@ def assert_same(found: list[Packet], wanted: list[Packet]) -> None:
         assert {k: as_bits(v) for k, v in vars(a).items()} == {k: as_bits(v) for k, v in vars(b).items()}
 
 
-def write(path: Path, packets: list[Packet], header: FlightHeader = HEADER, **options: float) -> None:
-    with FlightWriter(path, header, **options) as writer:
+def write(path: Path, packets: list[Packet], header: RecordingHeader = HEADER, **options: float) -> None:
+    with RecordingWriter(path, header, **options) as writer:
         for packet in packets:
             writer.write(packet)
 
@@ -131,7 +131,7 @@ def test_round_trip_is_bitwise(tmp_path, seed, event_counts, images, rotors, flu
     """Same packets, same order, same bits, however often the writer flushes."""
     packets = make_flight(seed, event_counts, images=images, rotors=rotors)
     write(tmp_path / "f.h5", packets, flush_interval_s=flush_interval_s)
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         assert flight.clean
         assert flight.notes == ()
         assert_same(list(flight.packets()), packets)
@@ -142,7 +142,7 @@ def test_what_a_link_did_is_read_as_whole_numbers(tmp_path):
     link = Link(LinkConfig(latency_s=0.008, loss=0.5), seed=0, name="command")
     sent = [link.send(None, stamp_ns=2**60 + 10 * MS * k, size_bytes=90 + k) for k in range(50)]
     write(tmp_path / "f.h5", sent)
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         assert flight.sensors == ("command_link",)
         delivered_ns = flight.column("command_link", "delivered_ns")
         assert delivered_ns.dtype == np.int64
@@ -174,7 +174,7 @@ def test_many_packets_cross_chunks_and_blocks(tmp_path):
                 )
             )
     write(tmp_path / "f.h5", packets, buffer_bytes=300_000)
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         assert_same(list(flight.packets()), packets)
 
 
@@ -195,7 +195,7 @@ def test_header_round_trip(tmp_path):
         position=np.zeros(3),
         orientation=np.array([0.0, 0.0, 0.0, 1.0]),
     )
-    header = FlightHeader(
+    header = RecordingHeader(
         config_yaml="# ünits\n" + "a: 1\n" * 20_000,  # more than an HDF5 attribute can hold
         seed=2**63 - 1,
         version="9.9.9",
@@ -205,7 +205,7 @@ def test_header_round_trip(tmp_path):
         path_position=np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]),
     )
     write(tmp_path / "f.h5", [], header)
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         read = flight.header
     for name in ("config_yaml", "seed", "version", "scene"):
         assert getattr(read, name) == getattr(header, name)
@@ -274,7 +274,7 @@ def test_root_belongs_to_the_first_camera_of_the_configuration(tmp_path):
     write(
         tmp_path / "f.h5",
         packets,
-        FlightHeader(config_yaml="", seed=0, version="", scene="", sensors=cameras),
+        RecordingHeader(config_yaml="", seed=0, version="", scene="", sensors=cameras),
     )
     with h5py.File(tmp_path / "f.h5") as file:
         assert file["events/t"].shape == (9,)
@@ -290,7 +290,7 @@ def test_event_windows_match_brute_force(tmp_path):
     t, x = (np.concatenate([getattr(p, name) for p in packets]) for name in ("t", "x"))
     windows = [tuple(sorted(rng.uniform(-0.01, 0.12, 2))) for _ in range(200)]
     windows += [(0.0, 0.1), (0.02, 0.02), (0.05, 0.01), (5.0, 6.0), (float(t[17]) / 1e6, float(t[40]) / 1e6)]
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         for start_s, end_s in windows:
             inside = (t * 1000 >= round(start_s * 1e9)) & (t * 1000 < round(end_s * 1e9))
             found = flight.events("dvs", start_s, end_s)
@@ -301,7 +301,7 @@ def test_event_windows_match_brute_force(tmp_path):
 def test_packet_windows_and_columns_match_brute_force(tmp_path):
     packets = make_flight(3, [10, 0, 20, 5])[:-1]
     write(tmp_path / "f.h5", packets)
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         for start_s, end_s in ((None, 0.02), (0.02, None), (0.02, 0.030000137), (0.5, 0.6), (0.03, 0.01)):
             wanted = [
                 p
@@ -323,8 +323,8 @@ CHILD = """
 import sys, numpy as np
 sys.path.insert(0, sys.argv[2])
 from test_hdf5 import HEADER, make_flight
-from neurosim_core.record import FlightWriter
-writer = FlightWriter(sys.argv[1], HEADER, flush_interval_s=1e9)
+from neurosim_core.record import RecordingWriter
+writer = RecordingWriter(sys.argv[1], HEADER, flush_interval_s=1e9)
 packets = make_flight(5, [700, 0, 900, 30, 1, 500] * 4)[:-1]
 for packet in packets[:50]:
     writer.write(packet)
@@ -357,7 +357,7 @@ def test_killed_run_leaves_a_readable_file(tmp_path, then, caplog):
     path = tmp_path / "f.h5"
     kill_child(path, then)
     packets = make_flight(5, [700, 0, 900, 30, 1, 500] * 4)[:-1]
-    with Flight(path) as flight:
+    with Recording(path) as flight:
         assert not flight.clean
         assert "was not closed" in flight.notes[0]
         assert "was not closed" in caplog.text
@@ -379,7 +379,7 @@ def test_memory_is_bounded(tmp_path):
     """What waits in memory never exceeds the bound by more than one packet, and that is all it holds."""
     rng = np.random.default_rng(0)
     bound = 100_000
-    with FlightWriter(tmp_path / "f.h5", HEADER, flush_interval_s=1e9, buffer_bytes=bound) as writer:
+    with RecordingWriter(tmp_path / "f.h5", HEADER, flush_interval_s=1e9, buffer_bytes=bound) as writer:
         largest = 0
         for k in range(50):
             writer.write(
@@ -395,11 +395,11 @@ def test_memory_is_bounded(tmp_path):
 
 def test_caller_may_reuse_its_arrays(tmp_path):
     data = np.zeros((4, 4), dtype=np.float32)
-    with FlightWriter(tmp_path / "f.h5", HEADER, flush_interval_s=1e9) as writer:
+    with RecordingWriter(tmp_path / "f.h5", HEADER, flush_interval_s=1e9) as writer:
         for k in range(3):
             data[:] = k
             writer.write(Image(stamp_ns=k, sequence=k, sensor="depth", data=data, encoding="32FC1"))
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         assert flight.column("depth", "data")[:, 0, 0].tolist() == [0.0, 1.0, 2.0]
 
 
@@ -411,28 +411,31 @@ def image(stamp_ns=0, shape=(4, 5, 3), encoding="rgb8", sensor="rgb"):
     ("second", "message"),
     [
         (image(stamp_ns=9), "stamp 9 ns comes after 10 ns"),
-        (image(stamp_ns=11, shape=(5, 4, 3)), r"was .*\(4, 5, 3\).* got .*\(5, 4, 3\)"),
+        (image(stamp_ns=11, shape=(5, 4, 3)), r"was .*\(4, 5, 3, .* got .*\(5, 4, 3, "),
         (image(stamp_ns=11, shape=(4, 5), encoding="mono8"), "mono8"),
         (
             Collision(stamp_ns=11, sensor="rgb", position=np.zeros(3), clearance_m=0.0),
             "sends Image, got a Collision",
         ),
         (image(stamp_ns=11, sensor=""), "needs a sensor name"),
-        (Packet(stamp_ns=11, sensor="a"), "type 'Packet', known"),
+        (
+            Collision(stamp_ns=11, sensor="bump", position=np.zeros(2), clearance_m=0.0),
+            r"'bump': position must have shape \[3\], got \[2\]",
+        ),
     ],
 )
 def test_packets_that_do_not_fit_are_refused(tmp_path, second, message):
-    with FlightWriter(tmp_path / "f.h5", HEADER) as writer:
+    with RecordingWriter(tmp_path / "f.h5", HEADER) as writer:
         writer.write(image(stamp_ns=10))
         with pytest.raises(ValueError, match=message):
             writer.write(second)
-    with Flight(tmp_path / "f.h5") as flight:  # what was there is unharmed
+    with Recording(tmp_path / "f.h5") as flight:  # what was there is unharmed
         assert_same(list(flight.packets()), [image(stamp_ns=10)])
 
 
 def test_unwritable_path_is_named(tmp_path):
     with pytest.raises(OSError, match=r"cannot write .*nowhere/f.h5.*No such file or directory"):
-        FlightWriter(tmp_path / "nowhere" / "f.h5", HEADER)
+        RecordingWriter(tmp_path / "nowhere" / "f.h5", HEADER)
 
 
 def test_full_disk_is_reported_once_and_leaves_what_was_flushed(tmp_path):
@@ -446,9 +449,9 @@ from test_hdf5 import HEADER, image, make_events
 from neurosim_core.links import Link
 from neurosim_core.live import LinkConfig
 from neurosim_core.packets import Image
-from neurosim_core.record import FlightWriter
+from neurosim_core.record import RecordingWriter
 rng = np.random.default_rng(0)
-writer = FlightWriter(sys.argv[1], HEADER, flush_interval_s=0.0)
+writer = RecordingWriter(sys.argv[1], HEADER, flush_interval_s=0.0)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 try:
     with writer:
@@ -466,31 +469,32 @@ except OSError as error:
     assert "f.h5" in message
     assert 20 < int(count) < 40  # 30 kB of noise a picture
     assert done.stderr == ""
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         assert not flight.clean
         assert len(list(flight.packets())) == int(count)
 
 
 def test_files_that_are_not_ours_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="no file"):
-        Flight(tmp_path / "none.h5")
+        Recording(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(ValueError, match="not a readable HDF5 file"):
-        Flight(tmp_path / "text.h5")
+        Recording(tmp_path / "text.h5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["events/t"] = [1, 2]
-    with pytest.raises(ValueError, match="not a flight"):
-        Flight(tmp_path / "other.h5")
+    with pytest.raises(ValueError, match="not a recording"):
+        Recording(tmp_path / "other.h5")
     write(tmp_path / "later.h5", [])
-    with h5py.File(tmp_path / "later.h5", "r+") as file:
-        file.attrs["format_version"] = 99
-    with pytest.raises(ValueError, match="format version 99"):
-        Flight(tmp_path / "later.h5")
+    for version, age in ((1, "an older"), (99, "a newer")):
+        with h5py.File(tmp_path / "later.h5", "r+") as file:
+            file.attrs["format_version"] = version
+        with pytest.raises(ValueError, match=rf"written by {age} version .*format version {version}\)"):
+            Recording(tmp_path / "later.h5")
 
 
 def test_unknown_names_list_the_known_ones(tmp_path):
     write(tmp_path / "f.h5", make_flight(0, [1]))
-    with Flight(tmp_path / "f.h5") as flight:
+    with Recording(tmp_path / "f.h5") as flight:
         with pytest.raises(ValueError, match=r"unknown sensor 'nose', known: .*'imu'"):
             next(flight.packets("nose"))
         with pytest.raises(ValueError, match=r"unknown field 'smell' .* known: .*'specific_force'"):
@@ -501,6 +505,9 @@ def test_unknown_names_list_the_known_ones(tmp_path):
 
 def test_missing_h5py_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    for open_file in (lambda: FlightWriter(tmp_path / "f.h5", HEADER), lambda: Flight(tmp_path / "f.h5")):
+    for open_file in (
+        lambda: RecordingWriter(tmp_path / "f.h5", HEADER),
+        lambda: Recording(tmp_path / "f.h5"),
+    ):
         with pytest.raises(ImportError, match=r"pip install -e '\.\[record\]'"):
             open_file()

@@ -7,11 +7,30 @@ import pytest
 import rerun.blueprint as rrb
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_rerun_log import SENSORS
 
-from neurosim_core.view.rerun_layout import make_blueprint
+from neurosim_core.packets import PACKET_CLASSES, schema_of
+from neurosim_core.view.rerun_layout import make_blueprint, sensor_panels
 
 SIZES = st.floats(0.5, 200.0)
+
+
+RIG = (
+    ("dvs", "Events", "events"),
+    ("z", "Image", "depth"),
+    ("rgb", "Image", "colour"),
+    ("imu", "ImuSample", "time series"),
+    ("truth", "Odometry", "pose"),
+)
+
+
+def rig(vehicle: str = "drone", *, live: bool = False, links: bool = False):
+    """Panels of a vehicle, as its sensors declare them."""
+    sensors = (*RIG, ("imu_link", "Delivery", "delay")) if links else RIG
+    found = [
+        sensor_panels(vehicle, name, schema_of(PACKET_CLASSES[cls]), kind, live=live)
+        for name, cls, kind in sensors
+    ]
+    return [panel for panels in found for panel in panels]
 
 
 def views(part: object) -> list[rrb.View]:
@@ -49,7 +68,7 @@ def test_the_whole_scene_is_seen_at_first(size, middle):
 
 def test_nothing_has_an_empty_place():
     """A file has what sensors measure, a stream also commands, timing and status; links if there are any."""
-    file = origins(make_blueprint({"drone": SENSORS}))
+    file = origins(make_blueprint({"drone": rig()}))
     pictures = [f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "z")]
     plots = [
         "plots/drone/imu/specific_force",
@@ -58,17 +77,17 @@ def test_nothing_has_an_empty_place():
         "plots/drone/truth/rotor_speed",
     ]
     assert file == ["world", *plots, *pictures]
-    live = origins(make_blueprint({"drone": SENSORS}, live=True))
+    live = origins(make_blueprint({"drone": rig(live=True)}, live=True))
     simulator = ["simulator/timing", "simulator/real_time_factor", "simulator/losses"]
     commands = ["plots/drone/command", "simulator/timing"]
     assert live == ["world", *plots, *commands, *simulator, *pictures, "status"]
-    assert "plots/drone/links" in origins(make_blueprint({"drone": SENSORS}, live=True, links=True))
+    assert "plots/drone/links" in origins(make_blueprint({"drone": rig(live=True, links=True)}, live=True))
     assert origins(make_blueprint({"drone": ()})) == ["world"]
     assert origins(make_blueprint({"drone": ()}, live=True))[-1] == "status"
 
 
 def test_several_vehicles_have_tabs():
-    blueprint = make_blueprint({"alpha": SENSORS, "beta": SENSORS}, live=True)
+    blueprint = make_blueprint({name: rig(name, live=True) for name in ("alpha", "beta")}, live=True)
     found = origins(blueprint)
     assert len([o for o in found if o.startswith("world/vehicles/beta/")]) == 3
     assert len([o for o in found if o.startswith("plots/alpha/")]) == 5
@@ -84,7 +103,7 @@ def test_several_vehicles_have_tabs():
 def test_what_rolls_shows_the_last_seconds():
     """A stream in a viewer; a file shows all of it."""
     for rolling in (False, True):
-        blueprint = make_blueprint({"drone": SENSORS}, live=True, rolling=rolling)
+        blueprint = make_blueprint({"drone": rig(live=True)}, live=True, rolling=rolling)
         plots = [view for view in views(blueprint.root_container) if isinstance(view, rrb.TimeSeriesView)]
         assert len(plots) == 9
         assert all(("VisibleTimeRanges" in plot.properties) == rolling for plot in plots)

@@ -23,10 +23,10 @@ from neurosim_core.record import Intrinsics, SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, MotionConfig, make_bodies
 from neurosim_core.scene.body_shapes import CheckerSurface, SphereShape
 from neurosim_core.scene.scene import Material, Texture
-from neurosim_core.view.event_picture import event_picture
+from neurosim_core.view.pictures import event_picture
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_recording
-from neurosim_core.view.rerun_shapes import encode_events, encode_image, event_colors, scene_shapes
+from neurosim_core.view.rerun_sdk import open_rerun
+from neurosim_core.view.rerun_shapes import encode_events, encode_picture, event_colors, scene_shapes
 
 MS = 1_000_000
 LENS = Intrinsics(width=32, height=24, fx=30.0, fy=31.0, cx=16.0, cy=12.0)
@@ -96,7 +96,7 @@ def make_image(stamp_ns: int, sensor: str = "rgb") -> Image:
 def record(
     path: Path, packets: list[Packet], **options: Any
 ) -> dict[str, list[tuple[int | None, dict[str, Any]]]]:
-    with RerunLogger(open_recording(path), vehicles={"drone": SENSORS}, **options) as logger:
+    with RerunLogger(open_rerun(path), vehicles={"drone": SENSORS}, **options) as logger:
         for packet in packets:
             logger.log(packet)
     return read(path)
@@ -177,7 +177,7 @@ def test_image_rate_is_limited_per_sensor(tmp_path):
 
 def test_collisions_clearance_and_path(tmp_path):
     path = np.arange(9.0).reshape(3, 3)
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         logger.log_path(path)
         logger.log(
             Collision(stamp_ns=7, sensor="collision", position=np.array([1.0, 2.0, 3.0]), clearance_m=-0.1)
@@ -191,7 +191,7 @@ def test_collisions_clearance_and_path(tmp_path):
 
 def test_depth_is_in_millimetres_and_zero_is_nothing():
     depth = np.array([[0.5, 1.2345], [np.inf, 100.0]], dtype=np.float32)
-    encoded = encode_image(Image(data=depth, encoding="32FC1"))
+    encoded = encode_picture(Image(data=depth, encoding="32FC1"))
     assert encoded.meter.as_arrow_array().to_pylist() == [1000.0]
     blob = encoded.blob.as_arrow_array()[0].as_py()
     with PIL.Image.open(io.BytesIO(bytes(blob))) as found:
@@ -201,10 +201,10 @@ def test_depth_is_in_millimetres_and_zero_is_nothing():
 def test_pictures_for_a_viewer_are_not_compressed():
     """Raw pixels, depth in millimetres, events as classes that have their colours."""
     data = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    raw = encode_image(Image(data=data, encoding="rgb8"), compress=False)
+    raw = encode_picture(Image(data=data, encoding="rgb8"), compress=False)
     assert raw.buffer.as_arrow_array().to_pylist() == [data.ravel().tolist()]
     depth = np.array([[0.5, np.inf], [1.0, 70.0]], dtype=np.float32)
-    encoded = encode_image(Image(data=depth, encoding="32FC1"), compress=False)
+    encoded = encode_picture(Image(data=depth, encoding="32FC1"), compress=False)
     assert encoded.meter.as_arrow_array().to_pylist() == [1000.0]
     found = bytes(encoded.buffer.as_arrow_array()[0].as_py())
     assert np.frombuffer(found, np.uint16).tolist() == [500, 0, 1000, 65535]
@@ -221,7 +221,7 @@ def test_pictures_for_a_viewer_are_not_compressed():
 def test_several_vehicles_are_kept_apart(tmp_path):
     """Each has its pose, plots and path; a packet without a vehicle is of the first."""
     vehicles = {"alpha": SENSORS, "beta": SENSORS}
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=vehicles) as logger:
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=vehicles) as logger:
         logger.log(make_odometry(1))
         logger.log(make_odometry(2), vehicle="beta")
         logger.log(make_events(0), vehicle="beta")
@@ -238,13 +238,13 @@ def test_several_vehicles_are_kept_apart(tmp_path):
     assert "/world/paths/alpha" not in rows
     assert "/world/paths/beta" in rows
     with pytest.raises(ValueError, match="at least one vehicle"):
-        RerunLogger(open_recording(), vehicles={})
+        RerunLogger(open_rerun(), vehicles={})
 
 
 def test_the_pose_comes_from_one_sensor(tmp_path):
     """A second odometry, which a link may hold up, does not make the vehicle jump."""
     sensors = (*SENSORS, describe("late", "odometry"))
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles={"drone": sensors}) as logger:
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles={"drone": sensors}) as logger:
         for k in range(5):
             logger.log(make_odometry(k))
             logger.log(dataclasses.replace(make_odometry(k), sensor="late"))
@@ -257,7 +257,7 @@ def test_commands_are_plotted(tmp_path):
     """An attitude as angles: roll, then pitch, then yaw, as SciPy has them."""
     angles = np.array([0.3, -0.4, 2.0])
     attitude = Rotation.from_euler("ZYX", angles[::-1]).as_quat()
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         logger.log_command("attitude", 1, [5.0, *(3.0 * attitude)])
         logger.log_command("attitude", 2, [5.0, 0.0, 0.0, 0.0, 0.0])
         logger.log_command("motor_speeds", 3, np.arange(6))
@@ -274,7 +274,7 @@ def test_commands_are_plotted(tmp_path):
 
 def test_deliveries_are_plotted_as_delays(tmp_path):
     """In milliseconds, by link; what was lost is a gap."""
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING, links=True) as logger:
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         for stamp_ns, delivered_ns in ((10 * MS, 18 * MS), (20 * MS, -1)):
             logger.log(
                 Delivery(stamp_ns=stamp_ns, sensor="imu_link", delivered_ns=delivered_ns, size_bytes=40)
@@ -288,7 +288,7 @@ def test_live_is_sent_when_told_and_limited_by_the_wall_clock(tmp_path):
     """Rows wait for `send`, or for 1024 of their kind; pictures pass by wall-clock time, not by stamps."""
     now_ns = 0
     logger = RerunLogger(
-        open_recording(tmp_path / "f.rrd", footer=False),
+        open_rerun(tmp_path / "f.rrd", footer=False),
         vehicles={"drone": SENSORS},
         image_rate_max_hz=10.0,
         live=True,
@@ -363,7 +363,7 @@ def test_bodies_move_with_the_stamps_of_the_first_vehicle(tmp_path):
 
 def test_memory_is_bounded(tmp_path):
     """Rows wait for at most 50 ms or 1024 rows."""
-    with RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
+    with RerunLogger(open_rerun(tmp_path / "f.rrd"), vehicles=NOTHING) as logger:
         for k in range(3000):
             sample = make_imu(k)
             logger.log(
@@ -380,20 +380,18 @@ def test_memory_is_bounded(tmp_path):
 
 
 def test_wrong_input_is_refused(tmp_path):
-    with (
-        RerunLogger(open_recording(tmp_path / "f.rrd"), vehicles=NOTHING) as logger,
-        pytest.raises(ValueError, match="type 'Packet'"),
-    ):
-        logger.log(Packet())
-    with pytest.raises(ValueError, match="encoding '32SC1', known"):
-        encode_image(Image(data=np.zeros((2, 2), np.int32), encoding="32SC1"))
+    strange = Image(data=np.zeros((2, 2), np.int32), encoding="64FC9")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="encoding '64FC9', known: rgb8, mono8, 32FC1"):
+        encode_picture(strange)
+    with pytest.raises(ValueError, match=r"no field of shape \[H, W\]"):
+        encode_picture(make_imu(0))
     with pytest.raises(OSError, match=r"cannot write .*nowhere"):
-        open_recording(tmp_path / "nowhere" / "f.rrd")
+        open_rerun(tmp_path / "nowhere" / "f.rrd")
 
 
 def test_missing_rerun_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for call in (open_recording, lambda: encode_events(make_events(0).numpy(), width=32, height=24)):
+    for call in (open_rerun, lambda: encode_events(make_events(0).numpy(), width=32, height=24)):
         with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
             call()
 

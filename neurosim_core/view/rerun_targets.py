@@ -1,4 +1,4 @@
-"""Where the recordings of a live view go: to a viewer, or into files."""
+"""Where the Rerun recordings of a live view go: to a viewer, or into files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_recording
+from neurosim_core.view.rerun_sdk import open_rerun
 from neurosim_core.view.rerun_viewer import RerunViewer
 
 if TYPE_CHECKING:
@@ -19,12 +19,12 @@ CLOSE_S = 0.3
 
 
 def check_new_file(path: Path) -> None:
-    """Check that a recording can be written to a file of this name without replacing anything.
+    """Check that a Rerun file of this name can be written without replacing anything.
 
     Raises:
         ValueError: The name does not end in .rrd.
-        FileExistsError: It is there already.
-        OSError: There is no such folder, or it is one itself.
+        FileExistsError: The file exists.
+        OSError: There is no such folder, or the path is a folder.
     """
     if path.is_dir():
         raise OSError(f"cannot write {path}: it is a folder")
@@ -36,8 +36,8 @@ def check_new_file(path: Path) -> None:
         raise FileExistsError(f"{path} is there already: name another file")
 
 
-class Outlet(Protocol):
-    """Where recordings are opened.
+class RerunTarget(Protocol):
+    """Where Rerun recordings are opened.
 
     Attributes:
         compress: Whether pictures should be small, rather than there at once.
@@ -55,7 +55,7 @@ class Outlet(Protocol):
         """Send what is left, and close a recording."""
 
 
-class ViewerOutlet:
+class ViewerTarget:
     """Recordings go to a viewer."""
 
     compress = False
@@ -79,8 +79,8 @@ class ViewerOutlet:
         closing.join(CLOSE_S)
 
 
-class FileOutlet:
-    """Each recording is a file: the next of NAME.rrd, NAME-2.rrd, NAME-3.rrd, ... that is not there yet."""
+class FileTarget:
+    """Each recording is a file: the next of NAME.rrd, NAME-2.rrd, NAME-3.rrd, ... that does not exist."""
 
     compress = True
 
@@ -103,7 +103,7 @@ class FileOutlet:
     def open(self, name: str) -> rr.RecordingStream:
         """Open the next file."""
         self._path = next(self._next)
-        return open_recording(self._path, name=name, footer=False)
+        return open_rerun(self._path, name=name, footer=False)
 
     def check(self) -> bool:
         """Return True: files do not go away."""

@@ -1,18 +1,32 @@
-"""Pictures of events, as people draw them: brighter is red, darker is blue, nothing is white.
+"""Packets as colour pictures, for Rerun and for the overview.
 
-The last event of a pixel chooses the hue, the number of its events the strength: a pixel with n events has
-covered 1 - 0.4^n of the white, up to n = 4. So one event is clearly seen, and a pixel that fired often stands
-out.
+Events: a brighter pixel is red, a darker one blue, one without events white. The last event of a pixel
+chooses the hue, the number of its events the strength: a pixel with n events has covered 1 - 0.4^n of the
+white, up to n = 4. Each label has a colour. The components of a normal, -1 to 1, are red, green and blue. The
+direction of optical flow is the hue, its length the saturation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.packets import EventArrays
+from neurosim_core.packets import EventArrays, Packet, as_numpy, schema_of
+
+PictureKind = Literal["colour", "values", "depth", "segmentation", "normals", "flow"]
+_KINDS: dict[str, PictureKind] = {
+    "rgb8": "colour",
+    "mono8": "colour",
+    "32FC1": "depth",
+    "32FC2": "flow",
+    "32FC3": "normals",
+    "32SC1": "segmentation",
+}
+"""What pictures of an encoding show."""
+_NOTHING_SRGB = (233, 236, 239)
 
 BACKGROUND_SRGB = (255, 255, 255)
 ON_SRGB = (200, 16, 32)
@@ -30,6 +44,61 @@ def _palette() -> NDArray[np.uint8]:
 
 PALETTE = _palette()
 """sRGB colour of each class, shape [9, 3]: 0 no event, 1-4 last event darker, 5-8 brighter, by count."""
+
+
+def picture_of(packet: Packet) -> tuple[PictureKind, NDArray[Any]]:
+    """Return what the picture of a packet shows, and its pixels, shape [H, W] or [H, W, C].
+
+    The packet's class declares it by `display`; "image" goes by the field `encoding` if there is one, else
+    uint8 is a picture in colour or grey, and numbers of other types are values.
+
+    Raises:
+        ValueError: The packet has no picture, or one of an unknown encoding.
+    """
+    schema = schema_of(type(packet))
+    names = [f.name for f in schema.fields if len(f.shape) >= 2 and not f.varying]
+    if not names:
+        raise ValueError(f"a packet of type {schema.name!r} has no field of shape [H, W]")
+    data = as_numpy(getattr(packet, names[0]))
+    kind: Any = schema.display
+    if kind == "image":
+        encoding = getattr(packet, "encoding", None)
+        if encoding is not None and encoding not in _KINDS:
+            raise ValueError(f"cannot show a picture of encoding {encoding!r}, known: {', '.join(_KINDS)}")
+        kind = _KINDS[encoding] if encoding else "colour" if data.dtype == np.uint8 else "values"
+    return kind, data
+
+
+def color_picture(kind: PictureKind, data: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return pixels as sRGB, uint8 [H, W, 3]; for all kinds but depth and values."""
+    if kind == "segmentation":
+        hue = (np.maximum(data, 0) * 0.618034) % 1.0  # steps of the golden ratio keep neighbours apart
+        return _on_nothing(_hsv(hue, 0.65, 0.85 - 0.25 * (np.maximum(data, 0) % 3 == 1)), data >= 0)
+    if kind == "normals":
+        return _on_nothing(127.5 * (data + 1.0), np.isfinite(data).all(axis=-1) & (data != 0.0).any(axis=-1))
+    if kind == "flow":
+        known = np.isfinite(data).all(axis=-1)
+        x, y = np.where(known[..., None], data, 0.0).astype(np.float64).transpose(2, 0, 1)
+        length = np.hypot(x, y)
+        return _on_nothing(
+            _hsv(np.arctan2(y, x) / (2.0 * np.pi), length / max(1e-9, length.max()), 1.0), known
+        )
+    return data if data.ndim == 3 else np.repeat(data[..., None], 3, axis=-1)
+
+
+def _hsv(hue: NDArray[Any], saturation: Any, value: Any) -> NDArray[np.float64]:
+    """Return colours in 0 to 255 of a hue (1: a full turn), shape [..., 3]."""
+    phase = (np.asarray(hue)[..., None] + np.array([0.0, 2.0 / 3.0, 1.0 / 3.0])) % 1.0
+    pure = np.clip(np.abs(6.0 * phase - 3.0) - 1.0, 0.0, 1.0)
+    share = np.asarray(saturation)[..., None]
+    colors: NDArray[np.float64] = 255.0 * np.asarray(value)[..., None] * (1.0 - share + share * pure)
+    return colors
+
+
+def _on_nothing(colors: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    shown = np.where(known[..., None], np.nan_to_num(colors), _NOTHING_SRGB)
+    picture: NDArray[np.uint8] = shown.clip(0.0, 255.0).round().astype(np.uint8)
+    return picture
 
 
 def event_classes(events: EventArrays, *, width: int, height: int) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.packets import EventArrays
-from neurosim_core.view.event_picture import (
+from neurosim_core.view.pictures import (
     BACKGROUND_SRGB,
     OFF_SRGB,
     ON_SRGB,
