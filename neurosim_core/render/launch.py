@@ -7,6 +7,7 @@ parameter.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -14,20 +15,18 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.cores import all_cores, following
-from neurosim_core.priority import niceness, spared_count
-
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
 
+@cache
 def core_count() -> int:
     """Return how many cores this process may use."""
-    return len(all_cores())
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache
-def _pool(thread_count: int, niceness: int) -> ThreadPoolExecutor:
-    """Return the threads for those who launch at a priority: threads inherit it from who starts them."""
+def _pool(thread_count: int) -> ThreadPoolExecutor:
+    """Return the threads that share a launch."""
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
 
 
@@ -51,9 +50,9 @@ def launch_split(
         inputs: Parameters after the first.
         outputs: Parameters after the inputs.
         device: Where to launch.
-        thread_count: Threads of the pool; all cores if None, less those that `priority.sparing` leaves.
+        thread_count: Threads of the pool; None: one for each core.
     """
-    threads = thread_count or max(1, core_count() - spared_count())
+    threads = thread_count or core_count()
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64
     if not wp.get_device(device).is_cpu or threads == 1 or slice_size >= dim:
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=64)
@@ -66,5 +65,5 @@ def launch_split(
             kernel, dim=size, inputs=[first, *inputs], outputs=list(outputs), device=device, block_dim=64
         )
 
-    for _ in _pool(threads, niceness()).map(following(run), range(0, dim, slice_size)):
+    for _ in _pool(threads).map(run, range(0, dim, slice_size)):
         pass
