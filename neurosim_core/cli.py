@@ -245,7 +245,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _serve(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.nodes.simulator import serve
+    from neurosim_core.live.simulator import serve
 
     config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
     return serve(config, record=arguments.record, overwrite=arguments.overwrite)
@@ -253,7 +253,7 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 def _fly(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.nodes.controller import fly
+    from neurosim_core.live.controller import fly
 
     overrides = _overrides(arguments)
     given = arguments.config is not None or overrides
@@ -265,14 +265,14 @@ def _fly(arguments: argparse.Namespace) -> int:
 
 def _up(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.nodes.stack import up
+    from neurosim_core.live.stack import up
 
     config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
     return up(config, viewer=arguments.viewer, record=arguments.record, overwrite=arguments.overwrite)
 
 
 def _call(arguments: argparse.Namespace) -> int:
-    from neurosim_core.nodes.call import call
+    from neurosim_core.live.call import call
 
     with handle_signals(signal.default_int_handler):
         return call(arguments)
@@ -287,7 +287,7 @@ def _scene(arguments: argparse.Namespace) -> int:
 
 def _view(arguments: argparse.Namespace) -> int:
     if arguments.flight is None:
-        from neurosim_core.nodes.viewer import view
+        from neurosim_core.live.viewer import view
 
         return view(
             how="save" if arguments.save else "web" if arguments.web else "native",

@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from neurosim_core.control import Se3Config
-from neurosim_core.live import LinkConfig, LiveConfig
+from neurosim_core.live.config import LinkConfig, LiveConfig
 from neurosim_core.mistakes import explain, suggestion
 from neurosim_core.render.renderer import RenderConfig, RendererName
 from neurosim_core.scene.apartment import ApartmentConfig

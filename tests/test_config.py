@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
-from neurosim_core.live import LinkConfig
+from neurosim_core.live.config import LinkConfig
 from neurosim_core.settings import Settings
 
 

@@ -62,7 +62,7 @@ def imports(tree: ast.AST, *, top_level: bool, modules: Collection[str] = ()) ->
 def test_package_imports_only_what_it_may(package):
     for name, tree in modules(package).items():
         used = {n.split(".")[0] for n in imports(tree, top_level=False)}
-        allowed = {"cortex"} if name.startswith("neurosim_core.nodes") else set()
+        allowed = {"cortex"} if name.startswith("neurosim_core.live") else set()
         allowed |= {"rotorpy"} if name == "neurosim_core.bench.rotorpy_peer" else set()
         forbidden = FORBIDDEN[package] | ({"cortex"} if package == "neurosim_core" else set())
         assert not (used & forbidden) - allowed, name

@@ -133,7 +133,7 @@ def test_the_other_commands(house, tmp_path):
 
 
 def test_the_commands_of_the_live_stack():
-    """They go on until they are stopped, and are flown in tests/nodes; here, that they are commands."""
+    """They go on until they are stopped, and are flown in tests/live; here, that they are commands."""
     listed = commands("live")
     assert {line.split()[1] for line in listed} == {"up", "serve", "fly", "view", "call", "bench"}
     for line in listed:

@@ -32,8 +32,8 @@ from neurosim_core.bench.machine import StealTime, describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
-from neurosim_core.nodes.floor import measure_floor
-from neurosim_core.nodes.probe import ProbeError, answer_images
+from neurosim_core.live.floor import measure_floor
+from neurosim_core.live.probe import ProbeError, answer_images
 from neurosim_core.overrides import set_options
 
 if TYPE_CHECKING:

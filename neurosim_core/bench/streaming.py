@@ -22,7 +22,7 @@ from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.bench.step import measure_steps
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
-from neurosim_core.nodes.probe import ProbeError, StreamProbe, StreamTrace
+from neurosim_core.live.probe import ProbeError, StreamProbe, StreamTrace
 from neurosim_core.overrides import set_options
 
 if TYPE_CHECKING:

@@ -17,15 +17,15 @@ import warp as wp
 _SLICES_PER_CORE = 8  # uneven slices even out; a slice costs about 20 us of Python
 
 
+@cache
 def core_count() -> int:
     """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache
 def _pool(thread_count: int) -> ThreadPoolExecutor:
+    """Return the threads that share a launch."""
     return ThreadPoolExecutor(thread_count, thread_name_prefix="neurosim-render")
 
 
@@ -49,7 +49,7 @@ def launch_split(
         inputs: Parameters after the first.
         outputs: Parameters after the inputs.
         device: Where to launch.
-        thread_count: Threads of the pool; all cores if None.
+        thread_count: Threads of the pool; None: one for each core.
     """
     threads = thread_count or core_count()
     slice_size = -(-dim // (64 * threads * _SLICES_PER_CORE)) * 64

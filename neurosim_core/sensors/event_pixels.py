@@ -16,8 +16,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.cores import following
-from neurosim_core.priority import spared_count
 from neurosim_core.render.launch import core_count
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.sensors import event_scan
@@ -299,10 +297,8 @@ class Pixels:
         refuse_forked_process()
         if len(chunks) > 1 and self._pool is None:
             self._pool = ThreadPoolExecutor(len(chunks) - 1, thread_name_prefix="event-scan")
-        own = 1 + spared_count()  # chunks that this thread does one after the other
-        futures = [self._pool.submit(following(launch), c) for c in chunks[own:]] if self._pool else []
-        for chunk in chunks[:own]:
-            launch(chunk)
+        futures = [self._pool.submit(launch, chunk) for chunk in chunks[1:]] if self._pool else []
+        launch(chunks[0])
         for future in futures:
             future.result()
 

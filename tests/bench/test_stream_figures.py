@@ -13,7 +13,7 @@ from rich.console import Console
 
 from neurosim_core.bench import streaming
 from neurosim_core.bench.chapter import save_table
-from neurosim_core.nodes.probe import StreamTrace
+from neurosim_core.live.probe import StreamTrace
 
 MS = 1_000_000
 MIB = 1 << 20

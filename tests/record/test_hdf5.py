@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from neurosim_core.links import Link
-from neurosim_core.live import LinkConfig
+from neurosim_core.live.config import LinkConfig
+from neurosim_core.live.links import Link
 from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.record import Intrinsics, Recording, RecordingHeader, RecordingWriter, SensorDescription
 
@@ -446,8 +446,8 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 sys.path.insert(0, sys.argv[2])
 import numpy as np
 from test_hdf5 import HEADER, image, make_events
-from neurosim_core.links import Link
-from neurosim_core.live import LinkConfig
+from neurosim_core.live.links import Link
+from neurosim_core.live.config import LinkConfig
 from neurosim_core.packets import Image
 from neurosim_core.record import RecordingWriter
 rng = np.random.default_rng(0)

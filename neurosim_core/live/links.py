@@ -1,0 +1,147 @@
+"""What messages meet between the simulator and its controller: delay, loss, bandwidth, in simulated time.
+
+All times are whole nanoseconds and all random numbers are addressed by (seed, link, message number), so what
+a link does to message n depends on nothing but the settings, the seed and the messages before it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from neurosim_core.clock import NS_PER_S, to_ns
+from neurosim_core.live.config import LinkConfig
+from neurosim_core.packets import Delivery
+from neurosim_core.random import stream_id
+
+
+class Link:
+    """One direction of one stream: messages go in when they are sent, and come out when they arrive.
+
+    A message waits until those before it have left, occupies the link for size / bandwidth, and then travels
+    for latency + jitter. It never arrives before one that was sent earlier. A lost message occupies the link
+    as any other, since it is lost on the way, but holds nobody up by its jitter. One that would wait too long
+    to leave is lost without occupying the link. `len` says how many messages are under way.
+
+    Attributes:
+        lost_count: Messages that will never arrive, since the beginning or the last reset.
+    """
+
+    def __init__(self, config: LinkConfig, *, seed: int, name: str) -> None:
+        """Make an empty link.
+
+        Args:
+            config: Its settings; those of the sensor's clock are not looked at.
+            seed: Seed of jitter and loss, 0 <= seed < 2^64.
+            name: What travels on it, such as "command"; links of other names draw other numbers.
+        """
+        self._name = name
+        self._stream = stream_id(f"link/{name}")
+        self.reset(seed=seed)
+        self.configure(config)
+
+    def reset(self, *, seed: int) -> None:
+        """Forget everything that was sent; message numbers start again at 0, with the numbers of `seed`."""
+        self._seed = seed
+        self._sent_count = 0
+        self._sent_ns = 0
+        self.lost_count = 0
+        self._pending: deque[tuple[int, Any]] = deque()
+        self._last_delivered_ns = 0
+        self._busy_until_ns = 0
+        self._begin_burst(0)
+
+    def configure(self, config: LinkConfig) -> None:
+        """Change the settings for messages that are sent from now on; those under way stay as they are."""
+        self._latency_ns = to_ns(config.latency_s)
+        self._jitter_ns = to_ns(config.jitter_s)
+        self._queue_ns = to_ns(config.queue_s)
+        self._lost_below = int(Fraction(config.loss) * 2**64)
+        rate = config.bandwidth_bytes_s
+        self._ns_per_byte = None if rate is None else NS_PER_S / Fraction(rate)
+        self._begin_burst(self._busy_until_ns)
+
+    def send(self, item: Any, *, stamp_ns: int, size_bytes: int) -> Delivery:
+        """Send a message.
+
+        Args:
+            item: The message; kept until it is due.
+            stamp_ns: When it is sent [ns], not before the one sent last.
+            size_bytes: What it takes of the bandwidth [bytes].
+
+        Returns:
+            What becomes of it; `delivered_ns` is -1 if it is lost.
+
+        Raises:
+            ValueError: It is sent before an earlier message.
+        """
+        if stamp_ns < self._sent_ns:
+            raise ValueError(
+                f"link {self._name!r}: stamp_ns must be at least {self._sent_ns}, as the message before, "
+                f"got {stamp_ns}"
+            )
+        number = self._sent_count
+        self._sent_count += 1
+        self._sent_ns = stamp_ns
+        delay_ns, lost = self._latency_ns, self._wait_ns(stamp_ns) > self._queue_ns
+        left_ns = stamp_ns if lost else self._occupy(stamp_ns, size_bytes)
+        if self._jitter_ns or self._lost_below:
+            jitter_bits, loss_bits = self._random_bits(number)
+            delay_ns += jitter_bits * (self._jitter_ns + 1) >> 64
+            lost = lost or loss_bits < self._lost_below
+        if lost:
+            self.lost_count += 1
+            delivered_ns = -1
+        else:
+            delivered_ns = max(left_ns + delay_ns, self._last_delivered_ns)
+            self._last_delivered_ns = delivered_ns
+            self._pending.append((delivered_ns, item))
+        return Delivery(
+            stamp_ns=stamp_ns,
+            sequence=number,
+            sensor=f"{self._name}_link",
+            delivered_ns=delivered_ns,
+            size_bytes=size_bytes,
+        )
+
+    def due(self, stamp_ns: int) -> list[tuple[int, Any]]:
+        """Take what has arrived by a time [ns]: pairs of arrival [ns] and message, in the order sent."""
+        arrived = []
+        while self._pending and self._pending[0][0] <= stamp_ns:
+            arrived.append(self._pending.popleft())
+        return arrived
+
+    @property
+    def next_due_ns(self) -> int | None:
+        """When the next message arrives [ns]; None if there is none under way."""
+        return self._pending[0][0] if self._pending else None
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def _begin_burst(self, start_ns: int) -> None:
+        """Begin to count the bytes that follow each other without a gap: so no rounding adds up."""
+        self._burst_start_ns = start_ns
+        self._burst_bytes = 0
+
+    def _wait_ns(self, stamp_ns: int) -> int:
+        """How long a message that is sent now waits for those before it [ns]."""
+        return 0 if self._ns_per_byte is None else max(self._busy_until_ns - stamp_ns, 0)
+
+    def _occupy(self, stamp_ns: int, size_bytes: int) -> int:
+        """Put a message on the link after those before it; return when its last byte is on it [ns]."""
+        if self._ns_per_byte is None:
+            return stamp_ns
+        if stamp_ns >= self._busy_until_ns:
+            self._begin_burst(stamp_ns)
+        self._burst_bytes += size_bytes
+        self._busy_until_ns = self._burst_start_ns + -(-self._burst_bytes * self._ns_per_byte // 1)
+        return self._busy_until_ns
+
+    def _random_bits(self, number: int) -> tuple[int, int]:
+        """Two words of 64 random bits for a message: Philox 4x64-10, keyed by seed and link."""
+        words = np.random.Philox(key=self._stream << 64 | self._seed, counter=number).random_raw(2)
+        return int(words[0]), int(words[1])

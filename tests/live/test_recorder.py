@@ -1,0 +1,222 @@
+"""Recording in a thread: nothing is lost where the disk is slow, and nothing hangs where it fails."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from live_rig import make_config, models_of
+from processes import SOON_S, wait_for
+
+from neurosim_core.config import load_config
+from neurosim_core.live import recorder as recorder_module
+from neurosim_core.live.parameters import change
+from neurosim_core.live.recorder import Recorder, open_folders
+from neurosim_core.packets import ImuSample
+from neurosim_core.record import Recording, RecordingWriter
+
+
+def imu(number: int) -> ImuSample:
+    return ImuSample(
+        sensor="imu",
+        stamp_ns=number * 1000,
+        sequence=number,
+        specific_force=np.full(3, float(number)),
+        angular_rate=np.zeros(3),
+    )
+
+
+def make_recorder(folder: Path) -> Recorder:
+    recorder = Recorder({"drone": folder}, models_of(make_config()))
+    recorder.begin({"drone": 11}, replace=True)
+    return recorder
+
+
+def stamps(file: Path) -> list[int]:
+    with Recording(file) as flight:
+        return [packet.stamp_ns for packet in flight.packets()]
+
+
+def test_a_slow_disk_holds_up_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The queue holds two packets; the third waits until one is written."""
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
+    gate = threading.Semaphore(0)
+    write = RecordingWriter.write
+
+    def slow(self: RecordingWriter, packet: Any) -> None:
+        assert gate.acquire(timeout=SOON_S)
+        write(self, packet)
+
+    monkeypatch.setattr(RecordingWriter, "write", slow)
+    recorder = make_recorder(tmp_path)
+    written = []
+
+    def fill() -> None:
+        for number in range(6):
+            recorder.write("drone", imu(number))
+            written.append(number)
+
+    filler = threading.Thread(target=fill)
+    filler.start()
+    deadline_s = time.monotonic() + SOON_S
+    while len(written) < 3 and time.monotonic() < deadline_s:  # one at the writer, two in the queue
+        filler.join(0.01)
+    filler.join(0.05)
+    assert len(written) == 3
+    gate.release(6)
+    filler.join(SOON_S)
+    recorder.close()
+    assert stamps(tmp_path / "flight.h5") == [0, 1000, 2000, 3000, 4000, 5000]
+
+
+def test_a_disk_that_fails_is_told_and_hangs_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
+
+    def fail(self: RecordingWriter, packet: Any) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(RecordingWriter, "write", fail)
+    recorder = make_recorder(tmp_path)
+    with pytest.raises(OSError, match="no space left"):
+        all(recorder.write("drone", imu(number)) is None for number in range(100))
+    with pytest.raises(OSError, match="no space left"):
+        recorder.close()
+    recorder.close()
+
+
+def test_what_waits_is_written_before_it_closes(tmp_path: Path):
+    recorder = make_recorder(tmp_path)
+    for number in range(1000):
+        recorder.write("drone", imu(number))
+    recorder.close()
+    assert stamps(tmp_path / "flight.h5") == [1000 * number for number in range(1000)]
+    with Recording(tmp_path / "flight.h5") as flight:
+        assert flight.header.seed == 11
+
+
+def test_a_run_that_is_stopped_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Packets are taken without waiting; what is not written at the deadline is counted and said."""
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
+    monkeypatch.setattr(recorder_module, "HURRY_S", 0.1)
+    monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", SOON_S)
+    gate, begun = threading.Event(), threading.Event()
+    write = RecordingWriter.write
+
+    def slow(self: RecordingWriter, packet: Any) -> None:
+        if packet.sequence == 2:
+            begun.set()
+            assert gate.wait(SOON_S)
+        write(self, packet)
+
+    monkeypatch.setattr(RecordingWriter, "write", slow)
+    recorder = make_recorder(tmp_path)
+    stop = recorder.stop
+
+    def fill() -> None:
+        for number in range(20):
+            recorder.write("drone", imu(number))
+
+    filler = threading.Thread(target=fill)
+    filler.start()
+    assert begun.wait(SOON_S)
+    stop.set()
+    filler.join(SOON_S)
+    assert not filler.is_alive()
+
+    def go_on() -> None:
+        """Write on, later than the deadline and in time for the files to be closed."""
+        deadline_s = wait_for(lambda: recorder._deadline_s)
+        wait_for(lambda: time.monotonic() > deadline_s)
+        gate.set()
+
+    threading.Thread(target=go_on).start()
+    with pytest.raises(
+        TimeoutError,
+        match=r"the disk is too slow: 17 packets at the end of the run were not written in 0.1 s$",
+    ):
+        recorder.close()
+    assert recorder.unwritten_count == 17
+    assert stamps(tmp_path / "flight.h5") == [0, 1000, 2000]
+    with Recording(tmp_path / "flight.h5") as flight:
+        assert not flight.clean
+
+
+def test_a_disk_that_hangs_hangs_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recorder_module, "HURRY_S", 0.05)
+    monkeypatch.setattr(recorder_module, "CLOSE_FILES_S", 0.05)
+    gate, begun = threading.Event(), threading.Event()
+
+    def hang(self: RecordingWriter, packet: Any) -> None:
+        begun.set()
+        gate.wait(SOON_S)
+
+    monkeypatch.setattr(RecordingWriter, "write", hang)
+    recorder = make_recorder(tmp_path)
+    for number in range(5):
+        recorder.write("drone", imu(number))
+    assert begun.wait(SOON_S)
+    recorder.stop.set()
+    with pytest.raises(
+        TimeoutError, match=r"5 packets at the end of the run .*; it hangs, and the files are"
+    ):
+        recorder.close()
+    gate.set()
+
+
+def test_files_say_which_settings_hold_and_which_were_changed(tmp_path: Path):
+    """What changes while a file is open is a line beside it; the file after that begins with it."""
+    config = make_config()
+    recorder = make_recorder(tmp_path)
+    recorder.write("drone", imu(0))
+    offset = change(config, {"links.imu.clock_offset_s": 0.003})
+    recorder.change(offset, stamp_ns=335_000_000)
+    recorder.change(change(offset, {"live.fail_safe": "cut"}), stamp_ns=400_000_000)
+    recorder.begin({"drone": 12}, replace=False)
+    recorder.write("drone", imu(0))
+    recorder.close()
+    with Recording(tmp_path / "flight.h5") as flight:
+        first = load_config(yaml.safe_load(flight.header.config_yaml))
+    with Recording(tmp_path / "flight-2.h5") as flight:
+        second = load_config(yaml.safe_load(flight.header.config_yaml))
+    assert "imu" not in first.links
+    assert (second.links["imu"].clock_offset_s, second.live.fail_safe, second.seed) == (0.003, "cut", 12)
+    lines = [json.loads(line) for line in (tmp_path / "settings.jsonl").read_text().splitlines()]
+    at = {"file": "flight.h5", "stamp_ns": 335_000_000}
+    assert {**at, "key": "links.imu.clock_offset_s", "value": 0.003, "before": None} in lines
+    assert lines[-1] == {
+        "file": "flight.h5",
+        "stamp_ns": 400_000_000,
+        "key": "live.fail_safe",
+        "value": "cut",
+        "before": "hover",
+    }
+
+
+def test_a_file_that_is_replaced_begins_with_what_was_changed(tmp_path: Path):
+    recorder = make_recorder(tmp_path)
+    recorder.write("drone", imu(0))
+    recorder.change(change(make_config(), {"live.fail_safe": "cut"}), stamp_ns=0)
+    assert (tmp_path / "settings.jsonl").read_text()
+    recorder.begin({"drone": 11}, replace=True)
+    recorder.write("drone", imu(0))
+    recorder.close()
+    assert not (tmp_path / "settings.jsonl").read_text()
+    with Recording(tmp_path / "flight.h5") as flight:
+        assert load_config(yaml.safe_load(flight.header.config_yaml)).live.fail_safe == "cut"
+
+
+def test_several_vehicles_have_folders_of_their_own(tmp_path: Path):
+    assert open_folders(tmp_path, ["drone"], overwrite=False) == {"drone": tmp_path}
+    folders = open_folders(tmp_path, ["red", "blue"], overwrite=False)
+    assert folders == {"red": tmp_path / "red", "blue": tmp_path / "blue"}
+    (tmp_path / "blue").mkdir()
+    (tmp_path / "blue" / "flight.h5").touch()
+    with pytest.raises(FileExistsError, match="blue already holds a flight"):
+        open_folders(tmp_path, ["red", "blue"], overwrite=False)
+    assert open_folders(tmp_path, ["red", "blue"], overwrite=True) == folders

@@ -1,0 +1,513 @@
+"""What `neurosim view` leaves in files, while simulators come, begin again and go."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+from fake_simulator import HEIGHT, MS, ROTORS, WIDTH, FakeSimulator, make_events
+from processes import SOON_S, wait_for
+from rerun_file import Rows, read, scalars
+
+from cortex import Node
+from cortex import messages as msg
+from neurosim_core.live import show as show_module
+from neurosim_core.live import viewer as viewer_module
+from neurosim_core.live.scene_loader import SceneLoader
+from neurosim_core.live.viewer import view, watch
+from neurosim_core.packets import EventArrays
+from neurosim_core.view import FileTarget, event_picture
+
+BODY = "/world/vehicles/drone"
+
+pytestmark = pytest.mark.usefixtures("runtime")
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A scene that is loaded at once."""
+    path = tmp_path_factory.mktemp("scene") / "box.glb"
+    trimesh.creation.box((4, 4, 3)).export(path)
+    return str(path)
+
+
+class Watcher:
+    """A viewer in a thread, which writes files."""
+
+    def __init__(self, path: Path, **options: Any) -> None:
+        self.said: list[str] = []
+        self._stop = threading.Event()
+        self._pool = ThreadPoolExecutor(1)
+        self.result: Future[int] = self._pool.submit(self._run, path, options)
+
+    def _run(self, path: Path, options: dict[str, Any]) -> int:
+        with Node("viewer") as node:
+            outlet = FileTarget(path, self.said.append)
+            return watch(
+                node, outlet, SceneLoader(self.said.append), stop=self._stop, say=self.said.append, **options
+            )
+
+    def wait_for(self, text: str) -> None:
+        """Wait until it has said something."""
+        wait_for(lambda: self.result.done() or any(text in line for line in self.said))
+        assert any(text in line for line in self.said), (self.said, self.result)
+
+    def end(self) -> int:
+        """End it, and return what it returned."""
+        self._stop.set()
+        self._pool.shutdown()
+        return self.result.result()
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Watcher]]:
+    """Starts viewers, and ends them."""
+    watchers: list[Watcher] = []
+
+    def make(path: Path, **options: Any) -> Watcher:
+        watchers.append(Watcher(path, **options))
+        return watchers[-1]
+
+    yield make
+    for watcher in watchers:
+        watcher._stop.set()
+        watcher._pool.shutdown()
+
+
+def grows_to(
+    path: Path, check: Callable[[Rows], object], meanwhile: Callable[[], object] = lambda: None
+) -> Rows:
+    """Wait until what is in a file, which is still written, fulfils a condition."""
+    rows: Rows = {}
+
+    def fulfilled() -> bool:
+        nonlocal rows
+        meanwhile()
+        # it has no recording yet, or its last message is half written
+        with contextlib.suppress(FileNotFoundError, ValueError, RuntimeError):
+            rows = read(path)
+        return bool(rows and check(rows))
+
+    wait_for(fulfilled, every_s=0.1)
+    return rows
+
+
+def test_what_is_published_is_in_the_file(tmp_path, box, start):
+    """Every sample at its stamp, one picture of events per window, path, commands, timing, losses, status."""
+    file = tmp_path / "live.rrd"
+    watcher = start(file, event_window_s=0.03, image_rate_hz=1000.0)
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        for k in range(101):
+            simulator.state(k)
+            if k % 2 and k < 99:
+                simulator.sensors["dvs"].publish(make_events(k // 2))
+        simulator.image(1)
+        simulator.status(0, "waiting")
+        wait_for(lambda: simulator.statuses.counters.published == 1)
+        grows_to(file, lambda rows: "/status" in rows and "/world/scene/room/0" in rows)
+        simulator.status(500 * MS, dropped=9)
+        simulator.commands["rates"].publish(
+            msg.RateThrustCommand(stamp_ns=480 * MS, thrust_n=5.0, body_rate=np.arange(3.0))
+        )
+        half = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
+        for _ in range(2):  # without a stamp: it is shown when it comes
+            simulator.commands["attitude"].publish(
+                msg.AttitudeCommand(stamp_ns=0, thrust_n=6.0, orientation=half)
+            )
+        simulator.commands["motor_speeds"].publish(msg.MotorCommand(stamp_ns=490 * MS, speed=np.ones(7)))
+        simulator.commands["motor_speeds"].publish(msg.MotorCommand(stamp_ns=495 * MS, speed=ROTORS))
+        simulator.collisions.publish(msg.Collision(stamp_ns=7, position=np.ones(3), clearance_m=-0.1))
+        wait_for(lambda: simulator.statuses.counters.published == 2)
+        grows_to(file, lambda rows: len(scalars(rows, "/simulator/timing")) == 1)
+    assert watcher.end() == 130
+    rows = read(file)
+
+    stamps = [5 * MS * k for k in range(101)]
+    force = scalars(rows, "/plots/drone/imu/specific_force")
+    assert force == [(t, [k, 0.0, 9.81]) for k, t in enumerate(stamps)]
+    assert scalars(rows, "/plots/drone/odometry/speed") == [(t, [5.0]) for t in stamps]
+    rotors = scalars(rows, "/plots/drone/odometry/rotor_speed")
+    assert rotors == [(t, list(ROTORS + k)) for k, t in enumerate(stamps)]
+    poses = [(t, v["translation"][0][0]) for t, v in rows[BODY] if t is not None]
+    assert [t for t, _ in poses] == stamps
+    assert [x for _, x in poses] == pytest.approx([0.01 * k for k in range(101)], rel=1e-6)  # float32
+
+    pictures = rows[f"{BODY}/dvs/image"]
+    assert [t for t, _ in pictures] == [30 * MS * (k + 1) for k in range(16)]
+    for k, (_, values) in enumerate(pictures):
+        parts = [make_events(j) for j in range(3 * k, 3 * k + 3)]
+        joined = EventArrays(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("t", "x", "y", "polarity"))
+        )
+        with PIL.Image.open(io.BytesIO(bytes(values["blob"][0]))) as found:
+            assert (
+                np.asarray(found.convert("RGB")) == event_picture(joined, width=WIDTH, height=HEIGHT)
+            ).all()
+    assert [t for t, _ in rows[f"{BODY}/rgb/image"]] == [50 * MS]
+    assert [t for t, _ in rows[f"{BODY}/z/image"]] == [50 * MS]
+
+    assert rows["/world/paths/drone"][0][1]["strips"] == [np.arange(9.0).reshape(3, 3).tolist()]
+    assert [v["positions"] for _, v in rows["/world/collisions/drone"]] == [[[1.0, 1.0, 1.0]]]
+    assert scalars(rows, "/plots/drone/command/rates") == [(480 * MS, [5.0, 0.0, 1.0, 2.0])]
+    attitudes = scalars(rows, "/plots/drone/command/attitude")
+    assert [t for t, _ in attitudes] == [0, 500 * MS]
+    assert attitudes[1][1] == pytest.approx([6.0, 0.0, 0.0, 0.5])
+    assert scalars(rows, "/plots/drone/command/motor_speeds") == [(495 * MS, list(ROTORS))]
+    assert scalars(rows, "/simulator/timing") == [(500 * MS, [2.0, 3.0, 0.5, 1.0])]
+    assert scalars(rows, "/simulator/real_time_factor") == [(500 * MS, [0.5])]
+    assert scalars(rows, "/simulator/losses") == [
+        (0, [0.0, 0.0, 3.0, 5.0, 0.0]),
+        (500 * MS, [36.0, 0.0, 3.0, 5.0, 0.0]),
+    ]
+    text = rows["/status"][-1][1]["text"][0]
+    assert re.search(r"\*\*running\*\*.*0\.50 s, 0\.50 x real time \(wanted: 1\)", text, re.DOTALL)
+    assert "| dvs | 100 | 9 | 0 | 0 |" in text  # 50 windows in half a second
+    assert "| rgb | 100 | 9 | 2 | 0 |" in text
+    assert "| z | off | 9 | 0 | 0 |" in text
+
+
+def test_a_link_that_is_set_in_flight_is_shown(tmp_path, box, start, monkeypatch):
+    monkeypatch.setattr(show_module, "APART_S", 0.0)
+    file = tmp_path / "live.rrd"
+    watcher = start(file)
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        simulator.change({"links.imu.latency_s": 0.008})
+        deliveries = simulator.node.publisher("/drone/imu/delivery", msg.Delivery)
+        assert deliveries.wait_for_subscribers(timeout_s=SOON_S)
+        delivery = msg.Delivery(stamp_ns=5 * MS, delivered_ns=13 * MS, size_bytes=48, sequence=0)
+        deliveries.publish(delivery)
+        simulator.state(1)
+        grows_to(file, lambda rows: "/plots/drone/links/imu" in rows)
+    watcher.end()
+    assert scalars(read(file), "/plots/drone/links/imu") == [(5 * MS, [8.0])]
+
+
+def test_pictures_are_limited_by_the_wall_clock(tmp_path, box, start):
+    """Of images that come up to 500 times a second, 20 are shown, of windows of events 50."""
+    file = tmp_path / "live.rrd"
+    watcher = start(file, image_rate_hz=20.0)
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        begin_s, k = time.monotonic(), 0
+        while time.monotonic() - begin_s < 1.0 or k <= 100:
+            simulator.image(k)
+            simulator.sensors["dvs"].publish(make_events(k))
+            k += 1
+            time.sleep(2e-3)  # faster ones would keep the interpreter, which the viewer shares here
+        elapsed_s = time.monotonic() - begin_s
+        simulator.status(50 * MS * k)
+        grows_to(file, lambda rows: "/status" in rows)
+    watcher.end()
+    rows = read(file)
+    for camera, rate_hz in (("rgb", 20.0), ("z", 20.0), ("dvs", 50.0)):
+        count = len(rows[f"{BODY}/{camera}/image"])
+        late_s = 1.0  # half a second at the end, and as much of windows that are ahead
+        assert 5 <= count <= rate_hz * (elapsed_s + late_s), camera  # a busy machine may show fewer
+
+
+def test_a_reset_begins_a_new_file(tmp_path, box, start, monkeypatch):
+    """What is left over of the run before does not come into it; a file that is there already is kept."""
+    monkeypatch.setattr(show_module, "APART_S", 0.0)
+    (tmp_path / "live-2.rrd").write_bytes(b"mine")
+    watcher = start(tmp_path / "live.rrd", image_rate_hz=1000.0)
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        for k in range(101):
+            simulator.state(k)
+        simulator.image(9)
+        grows_to(tmp_path / "live.rrd", lambda rows: f"{BODY}/rgb/image" in rows)
+        for k in range(11):
+            simulator.state(k)
+        wait_for(lambda: (tmp_path / "live-3.rrd").exists())
+        simulator.image(10)
+        simulator.status(50 * MS)
+        grows_to(tmp_path / "live-3.rrd", lambda rows: "/status" in rows)
+        simulator.image(1)
+        grows_to(tmp_path / "live-3.rrd", lambda rows: f"{BODY}/rgb/image" in rows)
+    watcher.end()
+    assert (tmp_path / "live-2.rrd").read_bytes() == b"mine"
+    old, new = read(tmp_path / "live.rrd"), read(tmp_path / "live-3.rrd")
+    for rows, count in ((old, 101), (new, 11)):
+        assert [t for t, _ in scalars(rows, "/plots/drone/odometry/speed")] == [
+            5 * MS * k for k in range(count)
+        ]
+        assert len(rows["/world/paths/drone"]) == 1
+    assert [t for t, _ in old[f"{BODY}/rgb/image"]] == [450 * MS]
+    assert [t for t, _ in new[f"{BODY}/rgb/image"]] == [50 * MS]
+    assert "/world/scene/room/0" in new
+
+
+def test_of_two_simulators_the_newest_is_shown(tmp_path, box, start, monkeypatch):
+    """What the other one sends meanwhile is neither shown nor taken for a reset."""
+    monkeypatch.setattr(show_module, "APART_S", 0.0)
+    watcher = start(tmp_path / "live.rrd")
+    with FakeSimulator(box) as first, FakeSimulator(box) as second:
+        first.announce()
+        first.wait_for_cameras()
+        assert second.odometry.wait_for_subscribers(timeout_s=SOON_S)
+        second.wait_for_cameras()
+
+        number = itertools.count()
+
+        def fly() -> None:
+            for k in itertools.islice(number, 10):
+                second.state(10_000 + k)
+                first.state(k)
+
+        def stamps(rows: Rows) -> list[list[int]]:
+            plots = ("odometry/speed", "odometry/rotor_speed", "imu/specific_force")
+            return [[t for t, _ in scalars(rows, f"/plots/drone/{plot}")] for plot in plots]
+
+        def enough(rows: Rows) -> bool:
+            return all(len(plot) >= 50 for plot in stamps(rows))
+
+        fly()
+        grows_to(tmp_path / "live.rrd", enough, meanwhile=fly)
+        second.announce()
+        wait_for(lambda: (tmp_path / "live-2.rrd").exists())
+        grows_to(tmp_path / "live-2.rrd", enough, meanwhile=fly)
+        second.close()
+        watcher.wait_for("the simulator is gone")
+    watcher.end()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["live-2.rrd", "live.rrd"]
+    assert all(t < 50_000 * MS for plot in stamps(read(tmp_path / "live.rrd")) for t in plot)
+    assert all(t >= 50_000 * MS for plot in stamps(read(tmp_path / "live-2.rrd")) for t in plot)
+
+
+def test_resets_in_quick_succession_share_a_file(tmp_path, box, start, monkeypatch):
+    """Also simulators: a new one is not shown before its time. It is said once."""
+    monkeypatch.setattr(show_module, "APART_S", 1e9)
+    watcher = start(tmp_path / "live.rrd")
+    with FakeSimulator(box) as simulator, FakeSimulator(box) as other:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        other.announce()
+        for _ in range(10):
+            for k in range(3):
+                simulator.state(k)
+        stamps = [5 * MS * k for k in range(3)] * 10
+        speed = "/plots/drone/odometry/speed"
+        grows_to(
+            tmp_path / "live.rrd", lambda rows: sorted(t for t, _ in scalars(rows, speed)) == sorted(stamps)
+        )
+        assert sum("such runs share a recording" in line for line in watcher.said) == 1
+        assert not (tmp_path / "live-2.rrd").exists()
+        monkeypatch.setattr(show_module, "APART_S", 0.0)
+        wait_for(lambda: (tmp_path / "live-2.rrd").exists())
+    watcher.end()
+
+
+def test_a_file_that_comes_up_meanwhile_is_kept(tmp_path, box, start):
+    watcher = start(tmp_path / "live.rrd")
+    watcher.wait_for("waiting for a simulator")
+    (tmp_path / "live.rrd").write_bytes(b"mine")
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+    watcher.end()
+    assert (tmp_path / "live.rrd").read_bytes() == b"mine"
+    assert watcher.said[-1] == f"wrote {tmp_path / 'live-2.rrd'}"
+
+
+def test_only_what_is_shown_is_subscribed_to(tmp_path, box, start):
+    watcher = start(tmp_path / "live.rrd", only=["dvs"])
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        assert simulator.sensors["dvs"].wait_for_subscribers(timeout_s=SOON_S)
+        watcher.wait_for("showing drone: odometry, dvs (streaming)")
+        assert [simulator.sensors[name].subscriber_count for name in ("rgb", "z", "imu")] == [0, 0, 0]
+        watcher.end()
+
+
+def test_an_unknown_sensor_is_an_error_once_the_known_are_known(tmp_path, box, start):
+    watcher = start(tmp_path / "live.rrd", only=["imuu"])
+    with FakeSimulator(box) as simulator:
+        simulator.announce(wait=False)
+        with pytest.raises(ValueError, match=r"unknown sensor 'imuu', known: odometry, dvs, rgb, z, imu"):
+            watcher.result.result(SOON_S)
+    assert not (tmp_path / "live.rrd").exists()
+
+
+def test_simulators_come_and_go(tmp_path, box, start, monkeypatch):
+    """Gone and back, with a scene whose file is not there: each in a file of its own."""
+    monkeypatch.setattr(viewer_module, "OVER_S", 0.0)  # would end it at once
+    watcher = start(tmp_path / "live.rrd", to_the_end=True)
+    for count, (name, scene) in enumerate((("live", box), ("live-2", "nowhere.glb")), start=1):
+        with FakeSimulator(scene) as simulator:
+            simulator.announce()
+            simulator.state(4)
+            grows_to(
+                tmp_path / f"{name}.rrd",
+                lambda rows: "/status" in rows,
+                meanwhile=lambda: simulator.status(20 * MS),  # one may go to those that listened to the last
+            )
+        wait_for(lambda: sum("is gone" in line for line in watcher.said) == count)  # noqa: B023
+    assert not watcher.result.done()
+    watcher.end()
+    assert any("shown without the scene" in line and "nowhere.glb" in line for line in watcher.said)
+    for name in ("live", "live-2"):
+        speeds = scalars(read(tmp_path / f"{name}.rrd"), "/plots/drone/odometry/speed")
+        assert {t for t, _ in speeds} == {20 * MS}
+
+
+def test_a_file_is_closed_when_the_flight_is_over(tmp_path, box, start, monkeypatch):
+    """With all that had come, though it was not yet sent."""
+    monkeypatch.setattr(viewer_module, "SEND_S", 1e9)
+    watcher = start(tmp_path / "live.rrd", to_the_end=True)
+    with FakeSimulator(box, run_on=False) as simulator:
+        simulator.announce()
+        simulator.state(3)
+        simulator.status(20 * MS, "ended")
+        grows_to(tmp_path / "live.rrd", lambda rows: "/status" in rows)
+        assert not watcher.result.done()
+        simulator.state(4)
+    assert watcher.result.result(SOON_S) == 0
+    rows = read(tmp_path / "live.rrd")
+    assert "it is over" in rows["/status"][0][1]["text"][0]
+    assert [t for t, _ in scalars(rows, "/plots/drone/odometry/speed")] == [15 * MS, 20 * MS]
+    assert watcher.said[-1] == f"wrote {tmp_path / 'live.rrd'}"
+
+
+def test_a_publisher_of_another_type_is_named(tmp_path, box, start):
+    watcher = start(tmp_path / "live.rrd")
+    with FakeSimulator(box) as simulator, Node("other") as other:
+        other.publisher("/drone/imu", msg.Clock)
+        simulator.announce()
+        watcher.wait_for("/drone/imu is of another type")
+        simulator.state(1)
+        grows_to(tmp_path / "live.rrd", lambda rows: "/plots/drone/imu/specific_force" in rows)
+        watcher.end()
+
+
+@contextlib.contextmanager
+def viewer_process(file: Path) -> Iterator[subprocess.Popen[str]]:
+    """`neurosim view --save`, once it waits for a simulator."""
+    command = [sys.executable, "-m", "neurosim_core", "view", "--save", str(file)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            line = process.stdout.readline()
+            assert "waiting for a simulator" in line, process.stderr.read()
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_and_close_the_file(tmp_path, box, number):
+    """As its own process; the file holds what came before."""
+    file = tmp_path / "live.rrd"
+    with viewer_process(file) as process, FakeSimulator(box) as simulator:
+        simulator.announce()
+        for k in range(100):
+            simulator.state(k)
+        simulator.status(500 * MS)
+        grows_to(file, lambda rows: "/status" in rows)
+        process.send_signal(number)
+        out, errors = process.communicate(timeout=SOON_S)
+        assert (process.returncode, errors) == (130, "")
+        assert out.endswith(f"wrote {file}\n")
+    assert len(scalars(read(file), "/plots/drone/odometry/speed")) == 100
+
+
+def test_loading_a_scene_is_interrupted(tmp_path):
+    """The thread that loads is not torn down in the middle of foreign code, which would abort the process."""
+    rooms = {"scene": {"kind": "apartment", "rooms": 8}}
+    with viewer_process(tmp_path / "live.rrd") as process, FakeSimulator(overrides=rooms) as simulator:
+        simulator.announce()
+        assert process.stdout is not None
+        assert "showing" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=SOON_S)
+        assert (process.returncode, errors) == (130, "")
+
+
+def test_waiting_is_interrupted(tmp_path):
+    with viewer_process(tmp_path / "live.rrd") as process:
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=SOON_S)
+        assert (process.returncode, errors) == (130, "")
+    assert not (tmp_path / "live.rrd").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"how": "television"}, "unknown way to view 'television', known: native, web, save"),
+        ({"how": "save"}, "a file to save to goes with"),
+        ({"how": "web", "event_window_s": 0.0}, r"the event window must be 0.0001 to 10 s, got 0.0"),
+        ({"how": "web", "image_rate_hz": float("nan")}, "the image rate must be above 0"),
+        ({"how": "web", "port": 70_000}, "a port is 0 to 65535, got 70000"),
+        ({"how": "web", "only": [""]}, "sensors to show are names, such as events,imu, got ''"),
+        ({"how": "web", "only": ["", ""]}, "got ','"),
+        ({"how": "save", "save": Path("q.txt")}, r"a file of Rerun ends in .rrd, got q.txt"),
+        ({"how": "native"}, "no display to open a window on: `neurosim view --web`.*--save"),
+    ],
+)
+def test_wrong_arguments_are_refused(options, reason, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match=reason):
+        view(**options)
+
+
+def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path):
+    with pytest.raises(OSError, match=r"cannot write .*: there is no folder .*nowhere"):
+        view(how="save", save=tmp_path / "nowhere" / "f.rrd")
+    with pytest.raises(OSError, match="it is a folder"):
+        view(how="save", save=tmp_path)
+    assert not (tmp_path / "nowhere").exists()
+    (tmp_path / "x.rrd").write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match=r"x.rrd is there already: name another file"):
+        view(how="save", save=tmp_path / "x.rrd")
+    assert (tmp_path / "x.rrd").read_bytes() == b"mine"
+
+
+def test_memory_stays(tmp_path, box, start):
+    """Thousands of messages leave no more behind than the buffers of the first ones."""
+
+    def resident_mb() -> float:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    file = tmp_path / "live.rrd"
+    watcher = start(file, image_rate_hz=100.0)
+    with FakeSimulator(box) as simulator:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        sizes_mb, written = [], 0
+        for k in range(6000):
+            simulator.state(k)
+            if k % 2:
+                simulator.sensors["dvs"].publish(make_events(k // 2, count=4000))
+            if k % 10 == 0:
+                simulator.image(k // 10)
+                simulator.status(5 * MS * k)
+            if k % 2000 == 1999:
+                wait_for(lambda before=written: file.stat().st_size > before)
+                written = file.stat().st_size
+                sizes_mb.append(resident_mb())
+    watcher.end()
+    assert len(read(file)[f"{BODY}/dvs/image"]) > 10  # at most 100 a second of the wall clock
+    assert sizes_mb[2] - sizes_mb[0] < 20.0  # the events of 2000 windows, 13 bytes each, would be 100 MB
