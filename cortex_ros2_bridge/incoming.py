@@ -143,12 +143,16 @@ class Incoming:
         context.now_ns = self.whereabouts.now_ns or 0
         context.odometry = self.whereabouts.odometry
         context.max_thrust_n = self.whereabouts.max_thrust_n
+        context.ranges = self.whereabouts.ranges
+        context.excess = ""
         return target.convert(data, context)
 
     def _deliver(self, target: Target, command: Any) -> None:
         """Send a command to where it belongs, or refuse it."""
         context = target.context
         target.tally.receive()
+        if context.excess:
+            target.tally.clamp(context.excess)
         if target.restamp:
             command = dataclasses.replace(command, stamp_ns=context.now_ns)
         reason = _staleness(command.stamp_ns, self.whereabouts.now_ns, target.stale_ns)

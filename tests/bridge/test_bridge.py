@@ -843,13 +843,20 @@ def test_the_simulator_says_what_full_thrust_is():
     with rig_of() as rig:
         craft = Craft(rig, rates=msg.RateThrustCommand)
         about = rig.simulator.publisher("/simulation", msg.Simulation, latch=True)
-        about.publish(msg.Simulation("", "1", ["other", "drone"], "streaming", 100.0, [40.0, 8.0]))
+        ranges = [msg.CommandRanges(False, 900.0, n, 10.0, 4.0, 50.0) for n in (40.0, 8.0)]
+        about.publish(msg.Simulation("", "1", ["other", "drone"], "streaming", 100.0, [40.0, 8.0], ranges))
         (target,) = rig.subscribes("/drone/attitude_target")
         rig.update_until(lambda: about.subscriber_count == 1)
         rig.update_until(lambda: rig.bridge._vehicles["drone"].max_thrust_n == 8.0)
         rig.update_until(craft.connected)
         target.put(message_class("mavros_msgs/msg/AttitudeTarget")(type_mask=128, thrust=0.5))
         assert craft.recv("rates").thrust_n == 4.0
+        fast = message_class("mavros_msgs/msg/AttitudeTarget")(type_mask=128, thrust=0.5)
+        fast.body_rate.x = 1e308
+        target.put(fast)
+        assert craft.recv("rates").body_rate.tolist() == [4.0, 0.0, 0.0]
+        (counts,) = [each for route, each in rig.bridge.totals().items() if "rates <-" in route]
+        assert (counts.sent, counts.clamped, counts.refused) == (2, 1, 0)
 
 
 def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
@@ -877,6 +884,7 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
         "sent": "1",
         "lost": "0",
         "refused": "0",
+        "clamped": "0",
         "dropped": "0",
         "rate_hz": "",
         "listeners": "1",
