@@ -23,7 +23,6 @@ from cortex import (
 from cortex.messages import SimulatorReply
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import RosSubscription
-from cortex_ros2_bridge.backend.base import Trigger as TriggerReply
 from cortex_ros2_bridge.convert import Context, ConvertError
 from cortex_ros2_bridge.outgoing import Whereabouts
 from cortex_ros2_bridge.routes import CORTEX_TYPES, Route
@@ -225,11 +224,12 @@ class Caller:
         except (ConvertError, cdr.CdrError) as error:
             self.tally.refuse(str(error))
 
-    def serve(self) -> TriggerReply:
+    def serve(self, request: Any, response: Any) -> Any:
         """Call the service for a request of ROS (std_srvs/Trigger); waits for the answer."""
         self.tally.receive()
-        reason = self._call(self._default)
-        return TriggerReply(not reason, reason)
+        response.message = self._call(self._default)
+        response.success = not response.message
+        return response
 
     def close(self) -> None:
         """End the thread; a call that is under way is given up."""

@@ -15,6 +15,7 @@ DISTROS = {
     "iron": Stores.ROS2_IRON,
     "jazzy": Stores.ROS2_JAZZY,
     "kilted": Stores.ROS2_KILTED,
+    "lyrical": Stores.ROS2_LYRICAL,
     "rolling": Stores.LATEST,
 }
 """Distributions that are known. The messages that the bridge sends are the same in all of them."""
@@ -36,8 +37,10 @@ def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
         raise ValueError(f"unknown ROS distribution {distro!r}, known: {', '.join(DISTROS)}")
     store = get_typestore(DISTROS[distro])
     for name, text in definitions().items():
+        message = name.replace("/srv/", "/msg/")  # as which rosbags reads the halves of a service
         try:
-            store.register(get_types_from_msg(text, name))
+            (definition,) = get_types_from_msg(text, message).values()
+            store.register({name: definition})
         except TypesysError as error:
             raise RuntimeError(f"definition of {name}: {error}") from error
     return store
@@ -48,11 +51,30 @@ def definitions() -> dict[str, str]:
     """Return the text of each definition that the bridge brings along, by its type's name."""
     found = {}
     for package in files("cortex_ros2_bridge").joinpath("definitions").iterdir():
-        for path in package.joinpath("msg").iterdir():
-            if path.name.endswith(".msg"):
-                name = f"{package.name}/msg/{path.name.removesuffix('.msg')}"
-                found[name] = path.read_text(encoding="utf-8")
+        for folder in package.iterdir():
+            for path in folder.iterdir():
+                name, _, kind = path.name.partition(".")
+                text = path.read_text(encoding="utf-8")
+                if kind == "msg":
+                    found[f"{package.name}/msg/{name}"] = text
+                elif kind == "srv":
+                    for half, part in zip(
+                        service_types(f"{package.name}/srv/{name}"), _halves(text), strict=True
+                    ):
+                        found[half] = part
     return dict(sorted(found.items()))
+
+
+def service_types(type_name: str) -> tuple[str, str]:
+    """Return the types of a service's request and response; they are messages of their own."""
+    return f"{type_name}_Request", f"{type_name}_Response"
+
+
+def _halves(text: str) -> list[str]:
+    """Split the definition of a service at its line of three dashes."""
+    lines = text.splitlines()
+    at = lines.index("---")
+    return ["\n".join(lines[:at]) + "\n", "\n".join(lines[at + 1 :]) + "\n"]
 
 
 def check_type(type_name: str, distro: str = DEFAULT_DISTRO) -> None:

@@ -711,7 +711,8 @@ def test_requests_as_topics_and_as_services():
         pause.put(message_class("std_msgs/msg/Empty")())
         wait_for(lambda: len(asked) == 3)
         assert asked == [msg.Reset(), msg.Step(3), msg.Trigger()]
-        assert rig.backend.services["/reset"].call() == (True, "")
+        done = rig.backend.services["/reset"].call()
+        assert (done.success, done.message) == (True, "")
         step.put(message_class("std_msgs/msg/UInt32")(data=6))
         wait_for(lambda: rig.tally("/step <- /step").refused == 1)
         step.put(b"\x00\x01\x00\x00\x01")
@@ -894,6 +895,17 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
     assert level[f"cortex_bridge: {ROTORS}"] == b"\x01"
     assert "1 refused" in found[ROTORS]["message"]
     assert "finite" in found[ROTORS]["message"]
+
+
+def test_a_backend_that_fails_is_told_or_ends_the_bridge(monkeypatch):
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    with rig_of() as rig, rig.backend.listening("/diagnostics") as (diagnostics,):
+        rig.backend.trouble = "it was restarted"
+        rig.update_until(lambda: statuses(diagnostics).get("bridge", {}).get("message") == "it was restarted")
+        assert diagnostics.messages()[-1].status[0].level == b"\1"
+        rig.backend.failure = "it is dead"
+        with pytest.raises(BackendError, match="it is dead"):
+            rig.bridge.run(threading.Event())
 
 
 def statuses(publisher):

@@ -15,7 +15,7 @@ import pytest
 from foreigners import Foreigner
 from processes import SOON_S, wait_for
 
-from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo
 from cortex_ros2_bridge.backend.cyclone import Fast, Public, Refused, choose_transport, self_test
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.typestore import typestore
@@ -25,6 +25,7 @@ PRIMITIVES = (
     *("Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64"),
 )
 IMAGE = "sensor_msgs/msg/Image"
+TRIGGER = "std_srvs/srv/Trigger"
 STRING = "std_msgs/msg/String"
 SOME = np.arange(1001, dtype=np.uint32).astype(np.uint8)  # odd: CDR is padded
 LARGE = np.tile(np.arange(256, dtype=np.uint8), 3600)  # 0.9 MB
@@ -203,7 +204,7 @@ def test_names_and_types_are_checked(backend: DdsBackend) -> None:
         with pytest.raises(ValueError, match="invalid ROS name"):
             backend.subscription(name, IMAGE, Qos(), print)
         with pytest.raises(ValueError, match="invalid ROS name"):
-            backend.service(name, lambda: Trigger(True, ""))
+            backend.service(name, TRIGGER, print)
     with pytest.raises(ValueError, match=r"sensor_msgs/msg/Imagee.*jazzy"):
         backend.publisher("/image", "sensor_msgs/msg/Imagee", Qos())
     with pytest.raises(ValueError, match="invalid ROS name"):
@@ -550,8 +551,13 @@ def test_threads_publish_at_once(backend: DdsBackend) -> None:
 
 def test_a_service_answers(backend: DdsBackend, foreigner: Start, caplog: pytest.LogCaptureFixture) -> None:
     """The header of the request comes back; a callback that raises is an answer too."""
-    answers = iter([Trigger(True, "reset, t = 0 s"), Trigger(False, "")])
-    service = backend.service("/drone/reset", lambda: next(answers))
+    answers = iter([(True, "reset, t = 0 s"), (False, "")])
+
+    def answer(request: Any, response: Any) -> Any:
+        response.success, response.message = next(answers)
+        return response
+
+    service = backend.service("/drone/reset", TRIGGER, answer)
     other = foreigner()
     guid = "0x123456789abcdef0"
     assert other.do("call", name="/drone/reset", number=7) == [[guid, 7, True, "reset, t = 0 s"]]
@@ -559,7 +565,7 @@ def test_a_service_answers(backend: DdsBackend, foreigner: Start, caplog: pytest
     assert service.error_count == 0
     with caplog.at_level(logging.CRITICAL):
         failed = other.do("call", name="/drone/reset", number=9)
-    assert failed == [[guid, 9, False, "StopIteration: "]]
+    assert failed == [[guid, 9, False, ""]]
     wait_for(lambda: service.error_count == 1)
     endpoints = [one for one in other.do("look").values() if "drone/reset" in str(one["topic"])]
     ids = {one["user_data"] for one in endpoints if one["user_data"]}
