@@ -4,19 +4,33 @@ from __future__ import annotations
 
 import functools
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+
+class Distro(NamedTuple):
+    """What differs between distributions of ROS 2."""
+
+    store: Stores
+    """Its message definitions, in rosbags."""
+    gid_bytes: int = 16
+    """Length of an endpoint's id in `ros_discovery_info`."""
+    shows_type_hash: bool = True
+    """Whether endpoints show the hash of their type in discovery."""
+    range_variable: str = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    """Environment variable by which nodes keep to this host."""
+
+
 DISTROS = {
-    "humble": Stores.ROS2_HUMBLE,
-    "iron": Stores.ROS2_IRON,
-    "jazzy": Stores.ROS2_JAZZY,
-    "kilted": Stores.ROS2_KILTED,
-    "lyrical": Stores.ROS2_LYRICAL,
-    "rolling": Stores.LATEST,
+    "humble": Distro(Stores.ROS2_HUMBLE, 24, shows_type_hash=False, range_variable="ROS_LOCALHOST_ONLY"),
+    "iron": Distro(Stores.ROS2_IRON),
+    "jazzy": Distro(Stores.ROS2_JAZZY),
+    "kilted": Distro(Stores.ROS2_KILTED),
+    "lyrical": Distro(Stores.ROS2_LYRICAL),
+    "rolling": Distro(Stores.LATEST),
 }
 """Distributions that are known. The messages that the bridge sends are the same in all of them."""
 DEFAULT_DISTRO = "jazzy"
@@ -35,7 +49,7 @@ def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
     """
     if distro not in DISTROS:
         raise ValueError(f"unknown ROS distribution {distro!r}, known: {', '.join(DISTROS)}")
-    store = get_typestore(DISTROS[distro])
+    store = get_typestore(DISTROS[distro].store)
     for name, text in definitions().items():
         message = name.replace("/srv/", "/msg/")  # as which rosbags reads the halves of a service
         try:

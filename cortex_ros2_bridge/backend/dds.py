@@ -32,7 +32,14 @@ from cyclonedds.util import duration
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
-from cortex_ros2_bridge.backend.cyclone import ENTITIES, Choice, Refused, Transport, choose_transport
+from cortex_ros2_bridge.backend.cyclone import (
+    ENTITIES,
+    NO_TYPE_HASH,
+    Choice,
+    Refused,
+    Transport,
+    choose_transport,
+)
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
 from cortex_ros2_bridge.backend.graph import (
@@ -388,7 +395,7 @@ class DdsService:
         self._request_type, self._response_type = service_types(type_name)
         self._name = name
         identity = ".".join(f"{byte:x}" for byte in os.urandom(16))
-        user_data = f"serviceid={identity};".encode()
+        user_data = f"serviceid={identity};".encode() + NO_TYPE_HASH
         qos = Qos(depth=10)
         header = {"guid": types.uint64, "seq": types.int64}
         request = idl_struct(self._request_type, site.distro, header)

@@ -235,7 +235,9 @@ def test_opening_and_closing_does_not_make_the_node_deaf(make: Any) -> None:
         for _ in range(20):
             parts = [other.subscription(f"/more{n}", STRING, Qos(), print) for n in range(3)]
             parts += [other.publisher(f"/some{n}", STRING, Qos()) for n in range(2)]
-            parts += [other.service(f"/ask_{threading.get_ident()}", TRIGGER, lambda request, response: response)]
+            parts += [
+                other.service(f"/ask_{threading.get_ident()}", TRIGGER, lambda request, response: response)
+            ]
             for part in parts:
                 part.close()
 
