@@ -156,8 +156,14 @@ class Bridge:
         self._failure = ""
 
     def run(self, stop: threading.Event) -> None:
-        """Work until told to stop; what goes wrong with one look is said, and the next one may go well."""
+        """Work until told to stop; what goes wrong with one look is said, and the next one may go well.
+
+        Raises:
+            BackendError: The backend is dead for good.
+        """
         while not stop.is_set():
+            if self._backend.failure:
+                raise BackendError(self._backend.failure)
             try:
                 self.update()
             except Exception as error:  # streams and commands of others must not end with one mistake
@@ -341,7 +347,7 @@ class Bridge:
         subscription = self._backend.subscription(route.ros_topic, route.ros_type, route.qos, caller.take)
         stack.callback(subscription.close)
         if route.ros_type.startswith("std_msgs/"):  # a Trigger has no more to say than these
-            service = self._backend.service(route.ros_topic, caller.serve)
+            service = self._backend.service(route.ros_topic, "std_srvs/srv/Trigger", caller.serve)
             if service is not None:
                 stack.callback(service.close)
         return caller.tally, lambda: subscription.publisher_count
@@ -502,7 +508,7 @@ class Bridge:
     def _diagnose(self, elapsed_s: float) -> None:
         """Publish how everything is doing."""
         failure, self._failure = self._failure, ""
-        wrong = self.problems + self._notes
+        wrong = self.problems + self._notes + ([self._backend.trouble] if self._backend.trouble else [])
         statuses = [
             diagnostics.Status(
                 name="bridge",

@@ -107,9 +107,10 @@ def type_name_of(message: Any) -> str:
         return message.__ros_type__
     kind = type(message)
     package, _, module = kind.__module__.partition(".")
-    if not hasattr(kind, "get_fields_and_field_types") or not module.startswith("msg"):
+    folder = module.partition(".")[0]
+    if not hasattr(kind, "get_fields_and_field_types") or folder not in ("msg", "srv"):
         raise TypeError(f"{message!r:.80} is not a ROS message")
-    return f"{package}/msg/{kind.__name__}"
+    return f"{package}/{folder}/{kind.__name__}"
 
 
 def _serialise(record: Any, type_name: str) -> memoryview:

@@ -35,8 +35,8 @@ SETTLED_S = 0.3
 """After so long without news, all nodes have been heard [s]."""
 SWITCH_S = 0.5e-3
 """How long a thread may keep others from running [s]: messages pass on others than what opens routes."""
-EXIT_S = 0.9
-"""Longest time to leave in; then the process ends as it is [s]."""
+EXIT_S = 4.0
+"""Longest time to leave in [s]; then the process ends as it is. `ros2 launch` kills after 5 s."""
 
 _EXAMPLES = """examples:
   cortex-ros2-bridge                                   all standard topics, both ways

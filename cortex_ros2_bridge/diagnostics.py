@@ -44,6 +44,7 @@ def route_status(
     gone = {
         "lost": now.lost - before.lost,
         "refused": now.refused - before.refused,
+        "clamped": now.clamped - before.clamped,
         "events dropped by the sensor": now.dropped - before.dropped,
     }
     rate_hz = (now.sent - before.sent) / elapsed_s if elapsed_s > 0.0 else 0.0
@@ -61,6 +62,7 @@ def route_status(
             ("sent", str(now.sent)),
             ("lost", str(now.lost)),
             ("refused", str(now.refused)),
+            ("clamped", str(now.clamped)),
             ("dropped", str(now.dropped)),
             ("rate_hz", f"{rate_hz:.1f}"),
             ("listeners", str(listeners)),

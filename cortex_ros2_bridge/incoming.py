@@ -23,7 +23,6 @@ from cortex import (
 from cortex.messages import SimulatorReply
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import RosSubscription
-from cortex_ros2_bridge.backend.base import Trigger as TriggerReply
 from cortex_ros2_bridge.convert import Context, ConvertError
 from cortex_ros2_bridge.outgoing import Whereabouts
 from cortex_ros2_bridge.routes import CORTEX_TYPES, Route
@@ -143,12 +142,16 @@ class Incoming:
         context.now_ns = self.whereabouts.now_ns or 0
         context.odometry = self.whereabouts.odometry
         context.max_thrust_n = self.whereabouts.max_thrust_n
+        context.ranges = self.whereabouts.ranges
+        context.excess = ""
         return target.convert(data, context)
 
     def _deliver(self, target: Target, command: Any) -> None:
         """Send a command to where it belongs, or refuse it."""
         context = target.context
         target.tally.receive()
+        if context.excess:
+            target.tally.clamp(context.excess)
         if target.restamp:
             command = dataclasses.replace(command, stamp_ns=context.now_ns)
         reason = _staleness(command.stamp_ns, self.whereabouts.now_ns, target.stale_ns)
@@ -221,11 +224,12 @@ class Caller:
         except (ConvertError, cdr.CdrError) as error:
             self.tally.refuse(str(error))
 
-    def serve(self) -> TriggerReply:
+    def serve(self, request: Any, response: Any) -> Any:
         """Call the service for a request of ROS (std_srvs/Trigger); waits for the answer."""
         self.tally.receive()
-        reason = self._call(self._default)
-        return TriggerReply(not reason, reason)
+        response.message = self._call(self._default)
+        response.success = not response.message
+        return response
 
     def close(self) -> None:
         """End the thread; a call that is under way is given up."""

@@ -136,13 +136,16 @@ def _message_class(type_name: str) -> Any:
 
 
 def _ros_class(type_name: str) -> Any | None:
-    package, _, name = type_name.partition("/msg/")
-    if not name or not package.isidentifier():
+    package, kind, name = type_name.split("/") if type_name.count("/") == 2 else ("", "", "")
+    if kind not in ("msg", "srv") or not package.isidentifier():
         return None
     try:
-        module = importlib.import_module(f"{package}.msg")
+        module = importlib.import_module(f"{package}.{kind}")
     except ImportError:  # ROS is not sourced, or lacks the package
         return None
+    if kind == "srv":  # Trigger_Request is Trigger.Request there
+        name, _, half = name.rpartition("_")
+        return getattr(getattr(module, name, None), half, None)
     return getattr(module, name, None)
 
 
@@ -419,7 +422,7 @@ def _by_base_name() -> dict[str, str]:
     found: dict[str, str] = {}
     for name in sorted(typestore().fielddefs):
         package, _, base = name.split("/")
-        if package not in _HIDDEN:
+        if package not in _HIDDEN and "/msg/" in name:
             assert base not in found, f"{base} is in {found[base]} and {name}"
             found[base] = name
     return found

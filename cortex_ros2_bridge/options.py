@@ -49,6 +49,10 @@ OPTIONS: Mapping[str, Option] = MappingProxyType(
         "stamp": _one_of("header", "now"),
         "max_speed_rad_s": _not_negative(None),
         "max_thrust_n": _not_negative(None),
+        "max_speed_m_s": _not_negative(None),
+        "max_rate_rad_s": _not_negative(None),
+        "max_position_m": _not_negative(None),
+        "beyond": Option(None, lambda v: v in (None, "clamp", "refuse"), "clamp, refuse or null"),
         "frame": Option(
             "base_footprint", lambda v: isinstance(v, str) and bool(v), "the name of a frame, such as map"
         ),

@@ -13,6 +13,7 @@ from cortex import Node, Subscriber, keep_last
 from cortex.messages import (
     CameraInfo,
     Clock,
+    CommandRanges,
     Events,
     Image,
     Odometry,
@@ -344,6 +345,7 @@ class Whereabouts:
 
     Attributes:
         odometry: The newest state; None if none has come.
+        ranges: What it can be asked for; None if the simulator has not said.
         max_thrust_n: Thrust with all rotors at their highest speed [N]; None if the simulator has not said.
         sources: Topics of state, of time and of the simulation; None where there is none.
         resources: What is to be closed when the sources change.
@@ -357,6 +359,7 @@ class Whereabouts:
         """
         self.odometry: Odometry | None = None
         self.max_thrust_n: float | None = None
+        self.ranges: CommandRanges | None = None
         self.sources: tuple[str | None, ...] = None, None, None
         self._vehicle = vehicle
         self.resources = contextlib.ExitStack()
@@ -366,7 +369,7 @@ class Whereabouts:
         """Forget all that came from other sources."""
         self.resources.close()
         self.sources = sources
-        self.odometry = self._clock_ns = self.max_thrust_n = None
+        self.odometry = self._clock_ns = self.max_thrust_n = self.ranges = None
 
     def take_odometry(self, message: Odometry) -> None:
         """Take in a state."""
@@ -380,6 +383,8 @@ class Whereabouts:
         """Take in what a vehicle can do."""
         known = dict(zip(message.vehicles, message.thrust_max_n, strict=False))
         self.max_thrust_n = known.get(self._vehicle)
+        ranges = dict(zip(message.vehicles, message.command_ranges, strict=False))
+        self.ranges = ranges.get(self._vehicle)
 
     @property
     def now_ns(self) -> int | None:

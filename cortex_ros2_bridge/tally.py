@@ -22,8 +22,9 @@ class Tally:
         sent: Messages that went out; where a converter makes one of many, fewer than came in.
         lost: Messages that went missing: overtaken in a queue, or not taken by the other side.
         refused: Messages that make no sense: malformed, not finite, stale.
+        clamped: Commands out of range, which went out as the nearest ones within it.
         dropped: Events that a sensor had no room for, as its messages say; they never were in one.
-        reason: Why the last one was lost or refused; empty if none was.
+        reason: Why the last one was lost, refused or clamped; empty if none was.
     """
 
     def __init__(self, name: str) -> None:
@@ -33,7 +34,7 @@ class Tally:
             name: Of the route, for the log.
         """
         self.name = name
-        self.received = self.sent = self.lost = self.refused = self.dropped = 0
+        self.received = self.sent = self.lost = self.refused = self.clamped = self.dropped = 0
         self.reason = ""
         self._said_s = -SAY_INTERVAL_S
         self._unsaid = 0
@@ -55,6 +56,12 @@ class Tally:
             self.refused += 1
             self._say("refused", reason, 1)
 
+    def clamp(self, reason: str) -> None:
+        """Count a command that was out of range."""
+        with self._lock:
+            self.clamped += 1
+            self._say("clamped", reason, 1)
+
     def lose(self, reason: str, count: int = 1) -> None:
         """Count messages that went missing."""
         with self._lock:
@@ -74,6 +81,7 @@ class Tally:
             sent=self.sent,
             lost=self.lost,
             refused=self.refused,
+            clamped=self.clamped,
             dropped=self.dropped,
         )
 
@@ -94,4 +102,5 @@ class Totals:
     sent: int = 0
     lost: int = 0
     refused: int = 0
+    clamped: int = 0
     dropped: int = 0

@@ -4,18 +4,33 @@ from __future__ import annotations
 
 import functools
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+
+class Distro(NamedTuple):
+    """What differs between distributions of ROS 2."""
+
+    store: Stores
+    """Its message definitions, in rosbags."""
+    gid_bytes: int = 16
+    """Length of an endpoint's id in `ros_discovery_info`."""
+    shows_type_hash: bool = True
+    """Whether endpoints show the hash of their type in discovery."""
+    range_variable: str = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    """Environment variable by which nodes keep to this host."""
+
+
 DISTROS = {
-    "humble": Stores.ROS2_HUMBLE,
-    "iron": Stores.ROS2_IRON,
-    "jazzy": Stores.ROS2_JAZZY,
-    "kilted": Stores.ROS2_KILTED,
-    "rolling": Stores.LATEST,
+    "humble": Distro(Stores.ROS2_HUMBLE, 24, shows_type_hash=False, range_variable="ROS_LOCALHOST_ONLY"),
+    "iron": Distro(Stores.ROS2_IRON),
+    "jazzy": Distro(Stores.ROS2_JAZZY),
+    "kilted": Distro(Stores.ROS2_KILTED),
+    "lyrical": Distro(Stores.ROS2_LYRICAL),
+    "rolling": Distro(Stores.LATEST),
 }
 """Distributions that are known. The messages that the bridge sends are the same in all of them."""
 DEFAULT_DISTRO = "jazzy"
@@ -34,10 +49,12 @@ def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
     """
     if distro not in DISTROS:
         raise ValueError(f"unknown ROS distribution {distro!r}, known: {', '.join(DISTROS)}")
-    store = get_typestore(DISTROS[distro])
+    store = get_typestore(DISTROS[distro].store)
     for name, text in definitions().items():
+        message = name.replace("/srv/", "/msg/")  # as which rosbags reads the halves of a service
         try:
-            store.register(get_types_from_msg(text, name))
+            (definition,) = get_types_from_msg(text, message).values()
+            store.register({name: definition})
         except TypesysError as error:
             raise RuntimeError(f"definition of {name}: {error}") from error
     return store
@@ -48,11 +65,30 @@ def definitions() -> dict[str, str]:
     """Return the text of each definition that the bridge brings along, by its type's name."""
     found = {}
     for package in files("cortex_ros2_bridge").joinpath("definitions").iterdir():
-        for path in package.joinpath("msg").iterdir():
-            if path.name.endswith(".msg"):
-                name = f"{package.name}/msg/{path.name.removesuffix('.msg')}"
-                found[name] = path.read_text(encoding="utf-8")
+        for folder in package.iterdir():
+            for path in folder.iterdir():
+                name, _, kind = path.name.partition(".")
+                text = path.read_text(encoding="utf-8")
+                if kind == "msg":
+                    found[f"{package.name}/msg/{name}"] = text
+                elif kind == "srv":
+                    for half, part in zip(
+                        service_types(f"{package.name}/srv/{name}"), _halves(text), strict=True
+                    ):
+                        found[half] = part
     return dict(sorted(found.items()))
+
+
+def service_types(type_name: str) -> tuple[str, str]:
+    """Return the types of a service's request and response; they are messages of their own."""
+    return f"{type_name}_Request", f"{type_name}_Response"
+
+
+def _halves(text: str) -> list[str]:
+    """Split the definition of a service at its line of three dashes."""
+    lines = text.splitlines()
+    at = lines.index("---")
+    return ["\n".join(lines[:at]) + "\n", "\n".join(lines[at + 1 :]) + "\n"]
 
 
 def check_type(type_name: str, distro: str = DEFAULT_DISTRO) -> None:

@@ -18,6 +18,7 @@ from cortex.messages.commands import (
 from cortex.messages.sensors import CameraInfo, Events, Image, Imu, PointCloud
 from cortex.messages.session import Clock, Parameter, Parameters, Text
 from cortex.messages.simulation import (
+    CommandRanges,
     Delivery,
     Reset,
     SensorStatus,
@@ -35,6 +36,7 @@ __all__ = [
     "CameraInfo",
     "Clock",
     "Collision",
+    "CommandRanges",
     "Delivery",
     "Events",
     "Image",

@@ -8,6 +8,24 @@ from typing import Annotated
 from cortex.message import Array, Int64, UInt32, UInt64, Unit, message
 
 
+@message(name="cortex/CommandRanges")
+class CommandRanges:
+    """The largest commands that one vehicle accepts."""
+
+    refuse: bool
+    """Whether the simulator refuses commands out of range; else it clamps them."""
+    rotor_speed_max_rad_s: Annotated[float, Unit("rad/s")]
+    """Speed of a rotor, from 0 [rad/s]."""
+    thrust_max_n: Annotated[float, Unit("N")]
+    """Collective thrust, from 0 [N]."""
+    speed_max_m_s: Annotated[float, Unit("m/s")]
+    """Length of a velocity [m/s]."""
+    body_rate_max_rad_s: Annotated[float, Unit("rad/s")]
+    """Length of a body rate, and size of a yaw rate [rad/s]."""
+    position_max_m: Annotated[float, Unit("m")]
+    """Size of each coordinate of a position [m]."""
+
+
 @message(name="cortex/Simulation")
 class Simulation:
     """What is simulated; for those who come later, too.
@@ -27,6 +45,8 @@ class Simulation:
     """Control periods a second [Hz]."""
     thrust_max_n: Annotated[list[float], Unit("N")] = field(default_factory=list)
     """Thrust of each vehicle with all rotors at their highest speed, in the order of `vehicles` [N]."""
+    command_ranges: list[CommandRanges] = field(default_factory=list)
+    """What each vehicle can be asked for, in the order of `vehicles`."""
 
 
 @message(name="cortex/Trigger")
@@ -133,6 +153,10 @@ class VehicleStatus:
     """As in `SensorStatus`, of its other topics: odometry, rotor speeds, collisions, deliveries."""
     refused_reason: str = ""
     """Why the last command was refused; empty if none was."""
+    clamped_count: UInt64 = 0
+    """Commands out of range that were clamped."""
+    clamped_reason: str = ""
+    """What was out of range the last time; empty if nothing was."""
 
 
 @message(name="cortex/SimulatorStatus")

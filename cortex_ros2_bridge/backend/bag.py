@@ -19,7 +19,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys.store import Typestore
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, check_type, typestore
@@ -47,6 +47,7 @@ class BagBackend:
     """
 
     name = "bag"
+    failure = trouble = ""
 
     def __init__(self, path: str | Path, *, distro: str | None = None) -> None:
         """Begin a bag.
@@ -95,7 +96,7 @@ class BagBackend:
         check_type(type_name, self.distro)
         return BagSubscription()
 
-    def service(self, name: str, callback: Callable[[], Trigger]) -> None:
+    def service(self, name: str, type_name: str, callback: Serve) -> None:
         """There are no services: nobody could ask."""
         check_name(name)
 

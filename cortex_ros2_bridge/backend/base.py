@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 Buffer = bytes | bytearray | memoryview
 """A message in CDR: little endian, with its header of four bytes."""
@@ -35,11 +35,8 @@ class TopicInfo(NamedTuple):
     subscriber_count: int
 
 
-class Trigger(NamedTuple):
-    """Answer of a service of type std_srvs/srv/Trigger."""
-
-    success: bool
-    message: str
+Serve = Callable[[Any, Any], Any]
+"""Answers a request: takes the request and an empty response, fills the response in, and returns it."""
 
 
 class RosPublisher(Protocol):
@@ -90,7 +87,7 @@ class RosService(Protocol):
 
     @property
     def error_count(self) -> int:
-        """Requests with which the callback raised; each is logged, and answered with its error."""
+        """Requests with which the callback raised; each is logged, and answered with an empty response."""
 
     def close(self) -> None:
         """Withdraw the service."""
@@ -106,6 +103,14 @@ class Backend(Protocol):
     """Such as "dds"; shown to the user."""
     distro: str
     """Distribution whose message definitions are spoken, such as "jazzy"."""
+
+    @property
+    def failure(self) -> str:
+        """Why nothing is received any more, for good; empty while all is well."""
+
+    @property
+    def trouble(self) -> str:
+        """What went wrong and was mended; empty if nothing was."""
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
         """Publish on a topic.
@@ -125,13 +130,13 @@ class Backend(Protocol):
             ValueError: The type is unknown, or the topic's name is not valid.
         """
 
-    def service(self, name: str, callback: Callable[[], Trigger]) -> RosService | None:
-        """Answer requests to a service of type std_srvs/srv/Trigger, on a thread of the backend.
+    def service(self, name: str, type_name: str, callback: Serve) -> RosService | None:
+        """Answer requests to a service such as of type "std_srvs/srv/Trigger", on a thread of the backend.
 
         None: this backend has no services.
 
         Raises:
-            ValueError: The name is not valid.
+            ValueError: The type is unknown, or the name is not valid.
         """
 
     def topics(self) -> list[TopicInfo]:

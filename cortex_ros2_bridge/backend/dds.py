@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import struct
 import threading
 import time
 from collections.abc import Callable
@@ -31,8 +30,16 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, Trigger
-from cortex_ros2_bridge.backend.cyclone import ENTITIES, Choice, Refused, Transport, choose_transport
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
+from cortex_ros2_bridge.backend.cyclone import (
+    ENTITIES,
+    NO_TYPE_HASH,
+    Choice,
+    Refused,
+    Transport,
+    choose_transport,
+)
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
 from cortex_ros2_bridge.backend.graph import (
@@ -43,7 +50,7 @@ from cortex_ros2_bridge.backend.graph import (
     Kind,
     user_data_of_type,
 )
-from cortex_ros2_bridge.backend.idl import idl_struct, make_struct, types
+from cortex_ros2_bridge.backend.idl import idl_struct, types
 from cortex_ros2_bridge.backend.names import (
     REPLY_PREFIX,
     REQUEST_PREFIX,
@@ -51,7 +58,8 @@ from cortex_ros2_bridge.backend.names import (
     check_name,
     check_node_name,
 )
-from cortex_ros2_bridge.typestore import DEFAULT_DISTRO
+from cortex_ros2_bridge.msgs import message_class
+from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, service_types
 
 _log = logging.getLogger(__name__)
 
@@ -100,6 +108,7 @@ class DdsBackend:
     """A node of ROS 2 that speaks DDS itself."""
 
     name = "dds"
+    failure = trouble = ""
 
     def __init__(
         self,
@@ -168,11 +177,11 @@ class DdsBackend:
         with self._lock:
             return self._keep(DdsSubscription(self._site(), topic, type_name, qos, callback))
 
-    def service(self, name: str, callback: Callable[[], Trigger]) -> DdsService:
+    def service(self, name: str, type_name: str, callback: Serve) -> DdsService:
         """Answer requests of nodes that use Cyclone DDS too; services of other implementations differ."""
         check_name(name)
         with self._lock:
-            return self._keep(DdsService(self._site(), name, callback))
+            return self._keep(DdsService(self._site(), name, type_name, callback))
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
@@ -380,20 +389,17 @@ class DdsService:
     Requests and replies are topics; before the fields go the client's number and that of its request.
     """
 
-    def __init__(self, site: _Site, name: str, callback: Callable[[], Trigger]) -> None:
+    def __init__(self, site: _Site, name: str, type_name: str, callback: Serve) -> None:
         self._site = site
         self._callback = callback
+        self._request_type, self._response_type = service_types(type_name)
+        self._name = name
         identity = ".".join(f"{byte:x}" for byte in os.urandom(16))
-        user_data = f"serviceid={identity};".encode()
+        user_data = f"serviceid={identity};".encode() + NO_TYPE_HASH
         qos = Qos(depth=10)
         header = {"guid": types.uint64, "seq": types.int64}
-        request = make_struct(
-            "std_srvs::srv::dds_::Trigger_Request_",
-            {**header, "structure_needs_at_least_one_member": types.uint8},
-        )
-        reply = make_struct(
-            "std_srvs::srv::dds_::Trigger_Response_", {**header, "success": bool, "message": str}
-        )
+        request = idl_struct(self._request_type, site.distro, header)
+        reply = idl_struct(self._response_type, site.distro, header)
         self._writer = site.writer(f"{REPLY_PREFIX}{name}Reply", reply, qos, user_data)
         self._reader = site.reader(f"{REQUEST_PREFIX}{name}Request", request, qos, user_data)
         self._guids = self._writer.guid.bytes, self._reader.guid.bytes
@@ -415,18 +421,19 @@ class DdsService:
                 self._reader = self._writer = None
             self._site.forget(self)
 
-    def _answer(self, request: bytes) -> None:
-        client = request[4 : 4 + _CLIENT_BYTES]
+    def _answer(self, data: bytes) -> None:
+        client = data[4 : 4 + _CLIENT_BYTES]
+        response = message_class(self._response_type)()
         try:
-            answer = self._callback()
-        except Exception as error:
-            self._reply(client, Trigger(success=False, message=f"{type(error).__name__}: {error}"))
+            request = cdr.decode(data[:4] + data[4 + _CLIENT_BYTES :], self._request_type)
+            response = self._callback(request, response)
+        except Exception:
+            self._reply(client, message_class(self._response_type)())
             raise
-        self._reply(client, answer)
+        self._reply(client, response)
 
-    def _reply(self, client: bytes, answer: Trigger) -> None:
-        text = answer.message.encode() + b"\0"
-        body = client + struct.pack("<B3xI", answer.success, len(text)) + text
+    def _reply(self, client: bytes, response: Any) -> None:
+        message = bytes(cdr.encode(response))
         # A client that has just appeared hears us a moment later than we hear it.
         deadline_s = time.monotonic() + _CLIENT_S
         writer, reader = self._writer, self._reader
@@ -436,4 +443,4 @@ class DdsService:
             and time.monotonic() < deadline_s
         ):
             time.sleep(1e-3)
-        self._site.transport.write(writer, b"\0\1\0\0" + body + bytes(-len(body) % 4))
+        self._site.transport.write(writer, message[:4] + client + message[4:])

@@ -83,7 +83,7 @@ def cyclone_config(distro: str | None = None, environment: Mapping[str, str] = o
     theirs = environment.get("CYCLONEDDS_URI", "")
     general, discovery = "", _INDEX
     if _localhost_only(environment):
-        if distro == "humble":
+        if distro is not None and DISTROS[distro].range_variable == "ROS_LOCALHOST_ONLY":
             general = f"<Interfaces>{_LOOPBACK}</Interfaces>"
             area, peers = "SYSTEM_DEFAULT", ["localhost"]
         else:

@@ -40,7 +40,7 @@ from cortex_ros2_bridge.backend.base import TopicInfo
 from cortex_ros2_bridge.backend.cyclone import ENTITIES, Refused, Transport
 from cortex_ros2_bridge.backend.idl import idl_struct
 from cortex_ros2_bridge.backend.names import TOPIC_PREFIX, ros_topic, ros_type
-from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, type_hash, typestore
+from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, DISTROS, type_hash, typestore
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +54,7 @@ DISCOVERY_TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 Kind = Literal["writer", "reader"]
 _CLOSE_S = 5.0
 _BATCH = 64
+_WITHOUT_HASH = next(name for name, distro in DISTROS.items() if not distro.shows_type_hash)
 
 
 class Endpoint(NamedTuple):
@@ -232,21 +233,21 @@ class Graph:
         """Find out which layout the others speak; announce in it."""
         with self._lock:
             heard = {
-                "later" if b"typehash=" in endpoint.user_data else "humble"
+                b"typehash=" in endpoint.user_data
                 for endpoint in self._endpoints.values()
                 if endpoint.topic.startswith((TOPIC_PREFIX + "/", DISCOVERY_TOPIC))
                 and self._is_ros(endpoint.participant)
             }
             if self._layout is None and heard:
-                # In company of both, Humble's: what is wrong there breaks the tools of everybody.
-                self._speak("humble" if "humble" in heard else DEFAULT_DISTRO)
-            spoken = "humble" if self._layout == "humble" else "later"
+                # In company of both, that without hashes: what is wrong there breaks the tools of everybody.
+                self._speak(DEFAULT_DISTRO if min(heard) else _WITHOUT_HASH)
+            spoken = DISTROS[self._layout].shows_type_hash if self._layout else True
             for stranger in sorted(heard - {spoken}):
-                if ("", stranger) not in self._warned:
-                    self._warned.add(("", stranger))
+                if ("", str(stranger)) not in self._warned:
+                    self._warned.add(("", str(stranger)))
                     _log.warning(
                         "nodes of ROS %s are here too: they cannot see this node's name, announced as in %s",
-                        "Humble" if stranger == "humble" else "Iron or later",
+                        "Iron or later" if stranger else _WITHOUT_HASH.capitalize(),
                         self._layout,
                     )
 
@@ -263,7 +264,7 @@ class Graph:
             Policy.History.KeepLast(1),
             Policy.WriterDataLifecycle(autodispose=False),
         )
-        if distro != "humble":
+        if DISTROS[distro].shows_type_hash:
             qos = Qos(Policy.Userdata(user_data_of_type(DISCOVERY_TYPE, distro)), base=qos)
         with ENTITIES:
             topic = Topic(self._participant, DISCOVERY_TOPIC, idl_struct(DISCOVERY_TYPE, distro))
@@ -279,7 +280,7 @@ class Graph:
             store.types[f"rmw_dds_common/msg/{name}"]
             for name in ("ParticipantEntitiesInfo", "NodeEntitiesInfo", "Gid")
         )
-        gid_bytes = 24 if self._layout == "humble" else 16
+        gid_bytes = DISTROS[self._layout].gid_bytes
 
         def as_gid(guid: bytes) -> Any:
             return gid(data=np.frombuffer(guid.ljust(gid_bytes, b"\0"), dtype=np.uint8))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from cyclonedds import idl
@@ -11,21 +12,26 @@ from cortex_ros2_bridge.typestore import check_type, dds_type_name, typestore
 
 types: Any = idl.types
 """Types of fields; mypy does not see that they take parameters."""
-_structs: dict[tuple[str, str], Any] = {}
+_structs: dict[tuple[str, str, bool], Any] = {}
 
 
-def idl_struct(type_name: str, distro: str) -> Any:
+def idl_struct(type_name: str, distro: str, header: Mapping[str, Any] | None = None) -> Any:
     """Return the class of cyclonedds for a message, as a distribution defines it.
+
+    Args:
+        type_name: Such as "sensor_msgs/msg/Imu".
+        distro: The distribution.
+        header: Fields before those of the message, always the same ones for a type.
 
     Raises:
         ValueError: The type is unknown, or has a field for which DDS has no type.
     """
-    key = type_name, distro
+    key = type_name, distro, header is not None
     if key not in _structs:
         check_type(type_name, distro)
         definition = typestore(distro).fielddefs[type_name][1]
         fields = {name: _field(description, distro) for name, description in definition}
-        _structs[key] = make_struct(dds_type_name(type_name), fields)
+        _structs[key] = make_struct(dds_type_name(type_name), {**(header or {}), **fields})
     return _structs[key]
 
 

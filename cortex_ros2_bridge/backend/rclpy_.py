@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import importlib
 import logging
 import threading
+import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, split_type
@@ -16,12 +20,184 @@ from cortex_ros2_bridge.typestore import DEFAULT_DISTRO
 
 _log = logging.getLogger(__name__)
 
-_CLOSE_S = 5.0
-_Part = TypeVar("_Part")
+_CLOSE_S = 3.0
+"""Longest wait for an executor that was told to end [s]."""
+_CALL_S = 10.0
+"""Longest wait for an executor to make or destroy something [s]."""
+_RESTART_COUNT_MAX = 10
+"""An executor that fails more often than this within `_RESTART_PERIOD_S` is given up."""
+_RESTART_PERIOD_S = 10.0
+_SERVICES = "_services"
+"""Added to the node's name for the node of its services; `ros2 node list` hides names with a leading "_"."""
+_Result = TypeVar("_Result")
+_Part = TypeVar("_Part", bound="_Endpoint")
+
+
+class _Loop:
+    """A node, and the thread that executes its callbacks.
+
+    Everything that the executor waits for is made and destroyed on its thread, between two waits: a handle
+    that another thread destroys while the executor builds its wait set ends the executor of Humble. An
+    executor that fails nevertheless is replaced, and what it waited for is made anew.
+
+    Attributes:
+        node: The node of rclpy.
+        failure: Why it is dead for good; empty while it lives.
+        restart_count: How often the executor was replaced.
+        restart_reason: Why, the last time.
+    """
+
+    def __init__(self, context: Any, name: str, namespace: str) -> None:
+        import rclpy
+
+        self.failure = ""
+        self.restart_count = 0
+        self.restart_reason = ""
+        self._context = context
+        self._restarts_s: deque[float] = deque(maxlen=_RESTART_COUNT_MAX + 1)
+        self._jobs: deque[Callable[[], None]] = deque()
+        self._endpoints: dict[_Endpoint, None] = {}
+        self._closed = False
+        self.node: Any = rclpy.create_node(
+            name,
+            context=context,
+            namespace=namespace,
+            use_global_arguments=False,
+            start_parameter_services=False,
+        )
+        self._executor: Any = self._make_executor()
+        self._thread = threading.Thread(target=self._run, name=f"executor {name}", daemon=True)
+        self._thread.start()
+
+    def call(self, function: Callable[[], _Result]) -> _Result:
+        """Call a function on the executor's thread; returns its result, or raises its error.
+
+        Raises:
+            BackendError: The executor is dead, or too busy.
+        """
+        if threading.current_thread() is self._thread:
+            return function()
+        if self.failure:
+            raise BackendError(self.failure)
+        future: concurrent.futures.Future[_Result] = concurrent.futures.Future()
+
+        def job() -> None:
+            try:
+                future.set_result(function())
+            except Exception as error:  # it belongs to the caller
+                future.set_exception(error)
+
+        self.defer(job)
+        try:
+            return future.result(_CALL_S)
+        except concurrent.futures.TimeoutError:
+            raise BackendError(
+                self.failure or f"the executor of rclpy has been busy for {_CALL_S} s"
+            ) from None
+
+    def defer(self, job: Callable[[], None]) -> None:
+        """Have a function called on the executor's thread, after the callback that runs now."""
+        self._jobs.append(job)
+        with contextlib.suppress(Exception):  # it is being replaced: the new one begins with the jobs
+            self._executor.create_task(self._work)
+
+    def add(self, endpoint: _Part) -> _Part:
+        """Make the handle of an endpoint, and keep it over a restart."""
+
+        def make() -> None:
+            endpoint.handle = endpoint.make(self.node)
+            self._endpoints[endpoint] = None
+
+        self.call(make)
+        return endpoint
+
+    def remove(self, endpoint: _Endpoint) -> None:
+        """Destroy the handle of an endpoint."""
+
+        def destroy() -> None:
+            if endpoint in self._endpoints:
+                del self._endpoints[endpoint]
+                handle, endpoint.handle = endpoint.handle, None
+                endpoint.destroy(self.node, handle)
+
+        if self._closed or self.failure:
+            endpoint.handle = None  # it went with the node
+        elif threading.current_thread() is self._thread:
+            self.defer(destroy)
+        else:
+            self.call(destroy)
+
+    def endpoints(self) -> list[_Endpoint]:
+        """Return what is open."""
+        return list(self._endpoints)
+
+    def close(self) -> None:
+        """End the thread, and then the node with all that it has."""
+        self._closed = True
+        if self._thread.is_alive():
+            self._executor.create_task(lambda: None)  # wakes it up
+            if threading.current_thread() is not self._thread:
+                self._thread.join(_CLOSE_S)
+        if self._thread.is_alive():
+            _log.error("a callback still runs %g s after the end: its node is left as it is", _CLOSE_S)
+            return
+        for endpoint in self._endpoints:
+            endpoint.handle = None
+        self._executor.shutdown(timeout_sec=0.0)
+        self.node.destroy_node()
+
+    def _make_executor(self) -> Any:
+        from rclpy.executors import SingleThreadedExecutor
+
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(self.node)
+        return executor
+
+    def _run(self) -> None:
+        while not self._closed and not self.failure:
+            try:
+                self._executor.spin_once()
+                if not self._context.ok() and not self._closed:
+                    self.failure = "the context of rclpy was shut down from outside"
+            except Exception as error:  # whatever rclpy raises: the node must not go deaf
+                self._restart(error)
+        if self.failure:
+            _log.error("%s: nothing is received any more", self.failure)
+
+    def _restart(self, error: Exception) -> None:
+        """Replace the executor, and make anew what it waits for: it may never look at the old ones again."""
+        if self._closed:
+            return
+        reason = f"{type(error).__name__}: {error}"
+        now_s = time.monotonic()
+        self._restarts_s.append(now_s)
+        self.restart_count += 1
+        self.restart_reason = reason
+        if not self._context.ok():
+            self.failure = "the context of rclpy was shut down from outside"
+        elif len(self._restarts_s) > _RESTART_COUNT_MAX and now_s - self._restarts_s[0] < _RESTART_PERIOD_S:
+            self.failure = f"the executor of rclpy fails again and again: {reason}"
+        if self.failure:
+            return
+        _log.warning("the executor of rclpy has failed and is restarted: %s", reason, exc_info=error)
+        try:
+            self._executor.shutdown(timeout_sec=0.0)
+            self._executor = self._make_executor()
+            for endpoint in self._endpoints:
+                if endpoint.is_waited_for:
+                    endpoint.destroy(self.node, endpoint.handle)
+                    endpoint.handle = endpoint.make(self.node)
+            self._executor.create_task(self._work)
+        except Exception as fatal:  # nothing is left that could be tried
+            self.failure = f"the executor of rclpy cannot be restarted: {type(fatal).__name__}: {fatal}"
+
+    def _work(self) -> None:
+        while self._jobs:
+            self._jobs.popleft()()
 
 
 class RclpyBackend:
-    """A node of `rclpy`, in a context and with an executor of its own."""
+    """A node of `rclpy`, in a context and with executors of its own."""
 
     name = "rclpy"
 
@@ -40,17 +216,15 @@ class RclpyBackend:
             BackendError: rclpy does not start.
         """
         import rclpy
-        from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
         from rclpy.context import Context
-        from rclpy.executors import MultiThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
-        node_name, namespace = check_node_name(node_name, namespace)
+        self._names = check_node_name(node_name, namespace)
         self.distro = chosen_distro() or DEFAULT_DISTRO
         self._lock = threading.Lock()
-        self._parts: dict[Any, None] = {}
         self._closed = False
         self._context = Context()
+        self._service_loop: _Loop | None = None
         try:
             rclpy.init(
                 args=[],
@@ -58,50 +232,65 @@ class RclpyBackend:
                 domain_id=domain,
                 signal_handler_options=SignalHandlerOptions.NO,
             )
-            self._node: Any = rclpy.create_node(
-                node_name, context=self._context, namespace=namespace, use_global_arguments=False
-            )
-            # One thread for subscriptions, one for services, which take their time.
-            self._executor: Any = MultiThreadedExecutor(2, context=self._context)
-            self._service_group: Any = MutuallyExclusiveCallbackGroup()
-            self._executor.add_node(self._node)
+            self._loop = _Loop(self._context, *self._names)
         except Exception as error:  # rclpy has many, of modules without public names
             raise BackendError(f"rclpy does not start: {error}") from error
-        self._thread = threading.Thread(target=self._spin, name="ros-executor", daemon=True)
-        self._thread.start()
+
+    @property
+    def failure(self) -> str:
+        """Why nothing is received any more, for good; empty while all is well."""
+        return next((loop.failure for loop in self._loops() if loop.failure), "")
+
+    @property
+    def trouble(self) -> str:
+        """What went wrong and was mended; empty if nothing was."""
+        return "; ".join(
+            f"the executor of rclpy failed and was restarted, {loop.restart_count} times by now "
+            f"({loop.restart_reason})"
+            for loop in self._loops()
+            if loop.restart_count
+        )
 
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RclpyPublisher:
         """Publish on a topic."""
         check_name(topic)
-        kind = _interface(type_name)
-        with self._lock:
-            node = self._here()
-            return self._keep(RclpyPublisher(self, node.create_publisher(kind, topic, _profile(qos)), topic))
+        kind, profile = _interface(type_name), _profile(qos)
+        loop = self._here()
+        return loop.add(RclpyPublisher(loop, topic, lambda node: node.create_publisher(kind, topic, profile)))
 
     def subscription(
         self, topic: str, type_name: str, qos: Qos, callback: Callable[[bytes], None]
     ) -> RclpySubscription:
         """Subscribe to a topic; all subscriptions share a thread."""
         check_name(topic)
-        kind = _interface(type_name)
+        kind, profile = _interface(type_name), _profile(qos)
         deliver = Delivery(callback, topic)
-        with self._lock:
-            handle = self._here().create_subscription(kind, topic, deliver, _profile(qos), raw=True)
-            return self._keep(RclpySubscription(self, handle, topic, deliver))
+        loop = self._here()
+        made = RclpySubscription(
+            loop, topic, lambda node: node.create_subscription(kind, topic, deliver, profile, raw=True)
+        )
+        made.deliver = deliver
+        return loop.add(made)
 
-    def service(self, name: str, callback: Callable[[], Trigger]) -> RclpyService:
-        """Answer requests to a service; all services share a thread."""
+    def service(self, name: str, type_name: str, callback: Serve) -> RclpyService:
+        """Answer requests to a service; all services share a node and a thread of their own."""
         check_name(name)
-        kind = _interface("std_srvs/srv/Trigger")
+        kind = _interface(type_name)
         with self._lock:
-            return self._keep(RclpyService(self, self._here(), kind, name, callback, self._service_group))
+            self._here()
+            if self._service_loop is None:
+                node_name, namespace = self._names
+                self._service_loop = _Loop(self._context, f"_{node_name}{_SERVICES}", namespace)
+        loop = self._service_loop
+        made = RclpyService(loop, name, lambda node: node.create_service(kind, name, made.answer))
+        made.callback = callback
+        return loop.add(made)
 
     def topics(self) -> list[TopicInfo]:
         """Return what others have."""
-        with self._lock:
-            if self._closed:
-                return []
-            node, parts = self._node, list(self._parts)
+        if self._closed or self._loop.failure:
+            return []
+        node, parts = self._loop.node, self._loop.endpoints()
         found = []
         for topic, types in node.get_topic_names_and_types():
             own = [sum(isinstance(part, kind) and part.topic == topic for part in parts) for kind in _ENDS]
@@ -116,66 +305,66 @@ class RclpyBackend:
             if self._closed:
                 return
             self._closed = True
-            parts, self._parts = list(self._parts), {}
-        for part in parts:
-            part.close()
-        self._executor.shutdown(timeout_sec=_CLOSE_S)
-        pool = getattr(self._executor, "_executor", None)
-        if pool is not None:  # rclpy leaves the threads of its executor behind
-            pool.shutdown(wait=False)
-        self._thread.join(_CLOSE_S)
-        self._node.destroy_node()
+        for loop in self._loops():
+            loop.close()
         self._context.try_shutdown()
-
-    def destroy(self, part: Any, destroy: Callable[[Any], object], handle: Any) -> None:
-        """Take a part out of the node."""
-        destroy(handle)
-        with self._lock:
-            self._parts.pop(part, None)
 
     @property
     def node(self) -> Any:
         """The node of rclpy."""
-        return self._node
+        return self._loop.node
 
-    def _spin(self) -> None:
-        from rclpy.executors import ExternalShutdownException
+    def _loops(self) -> list[_Loop]:
+        return [self._loop] if self._service_loop is None else [self._loop, self._service_loop]
 
-        try:
-            self._executor.spin()
-        except ExternalShutdownException:
-            if not self._closed:
-                _log.error("the context of rclpy was shut down from outside: nothing is received any more")
-        except Exception:  # else the thread would end without a word
-            _log.exception("the executor of rclpy failed: nothing is received any more")
-
-    def _here(self) -> Any:
+    def _here(self) -> _Loop:
         if self._closed:
             raise BackendError("this node is closed")
-        return self._node
-
-    def _keep(self, part: _Part) -> _Part:
-        self._parts[part] = None
-        return part
+        return self._loop
 
 
-class RclpyPublisher:
+class _Endpoint:
+    """A publisher, a subscription or a service.
+
+    Attributes:
+        topic: Its topic, or the name of the service.
+        handle: What rclpy has for it; None once it is closed.
+        make: Makes the handle for a node.
+    """
+
+    is_waited_for = True
+    """Whether the executor waits for it."""
+
+    def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
+        self.topic = topic
+        self.handle: Any = None
+        self.make = make
+        self._loop = loop
+
+    def destroy(self, node: Any, handle: Any) -> None:
+        """Destroy the handle."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Withdraw it."""
+        if self.handle is not None:
+            self._loop.remove(self)
+
+
+class RclpyPublisher(_Endpoint):
     """Publishes on one topic."""
 
-    def __init__(self, backend: RclpyBackend, handle: Any, topic: str) -> None:
-        self.topic = topic
-        self._backend = backend
-        self._handle = handle
+    is_waited_for = False
 
     @property
     def subscriber_count(self) -> int:
         """Subscriptions that match now."""
-        handle = self._handle
+        handle = self.handle
         return 0 if handle is None else int(handle.get_subscription_count())
 
     def publish(self, message: Buffer) -> None:
         """Send a message."""
-        handle = self._handle
+        handle = self.handle
         if handle is None:
             raise BackendError(f"the publisher of {self.topic} is closed")
         if len(message) <= 4 or bytes(message[:2]) != b"\0\1":
@@ -185,81 +374,57 @@ class RclpyPublisher:
         except Exception as error:  # errors of rclpy have no public base
             raise BackendError(f"a message for {self.topic} cannot be sent: {error}") from error
 
-    def close(self) -> None:
-        """Withdraw the publisher."""
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            self._backend.destroy(self, self._backend.node.destroy_publisher, handle)
+    def destroy(self, node: Any, handle: Any) -> None:
+        """Destroy the handle."""
+        node.destroy_publisher(handle)
 
 
-class RclpySubscription:
+class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
     lost_count = 0
     """rclpy does not tell."""
-
-    def __init__(self, backend: RclpyBackend, handle: Any, topic: str, deliver: Delivery) -> None:
-        self.topic = topic
-        self._backend = backend
-        self._handle = handle
-        self._deliver = deliver
+    deliver: Delivery
 
     @property
     def publisher_count(self) -> int:
         """Publishers of the topic now, the own included."""
-        return 0 if self._handle is None else int(self._backend.node.count_publishers(self.topic))
+        return 0 if self.handle is None else int(self._loop.node.count_publishers(self.topic))
 
     @property
     def error_count(self) -> int:
         """Messages with which the callback raised."""
-        return self._deliver.error_count
+        return self.deliver.error_count
+
+    def destroy(self, node: Any, handle: Any) -> None:
+        """Destroy the handle."""
+        node.destroy_subscription(handle)
 
     def close(self) -> None:
         """Withdraw the subscription."""
-        self._deliver.close()
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            self._backend.destroy(self, self._backend.node.destroy_subscription, handle)
+        self.deliver.close()
+        super().close()
 
 
-class RclpyService:
+class RclpyService(_Endpoint):
     """Answers the requests to one service."""
 
-    def __init__(
-        self,
-        backend: RclpyBackend,
-        node: Any,
-        kind: Any,
-        name: str,
-        callback: Callable[[], Trigger],
-        group: Any,
-    ) -> None:
-        self.topic = None
-        self._backend = backend
-        self._callback = callback
-        self._name = name
-        self._error_count = 0
-        self._handle = node.create_service(kind, name, self._answer, callback_group=group)
+    error_count = 0
+    """Requests with which the callback raised."""
+    callback: Serve
 
-    @property
-    def error_count(self) -> int:
-        """Requests with which the callback raised."""
-        return self._error_count
+    def destroy(self, node: Any, handle: Any) -> None:
+        """Destroy the handle."""
+        node.destroy_service(handle)
 
-    def close(self) -> None:
-        """Withdraw the service."""
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            self._backend.destroy(self, self._backend.node.destroy_service, handle)
-
-    def _answer(self, request: Any, response: Any) -> Any:
+    def answer(self, request: Any, response: Any) -> Any:
+        """Answer a request; an empty response where the callback raises."""
         try:
-            response.success, response.message = self._callback()
-        except Exception as error:  # whatever it raises: the client is told, and the node goes on
-            self._error_count += 1
-            _log.exception("the service %s failed", self._name)
-            response.success, response.message = False, f"{type(error).__name__}: {error}"
-        return response
+            return self.callback(request, response)
+        except Exception:  # whatever it raises: the client gets an answer, and the node goes on
+            self.error_count += 1
+            _log.exception("the service %s failed", self.topic)
+            return type(response)()
 
 
 _ENDS = (RclpyPublisher, RclpySubscription)

@@ -144,10 +144,12 @@ OPTIONS: Mapping[Callable[..., Any], frozenset[str]] = {
     ),
     event_packet: frozenset({"encoding"}),
     event_image: frozenset({"period_s"}),
-    actuators: frozenset({"max_speed_rad_s"}),
+    actuators: frozenset({"max_speed_rad_s", "beyond"}),
     attitude: frozenset({"max_thrust_n"}),
-    rates: frozenset({"max_thrust_n"}),
-    twist_stamped: frozenset({"frame"}),
-    twist: frozenset({"frame"}),
+    rates: frozenset({"max_thrust_n", "max_rate_rad_s", "beyond"}),
+    twist_stamped: frozenset({"frame", "max_speed_m_s", "max_rate_rad_s", "beyond"}),
+    twist: frozenset({"frame", "max_speed_m_s", "max_rate_rad_s", "beyond"}),
+    pose: frozenset({"max_position_m", "beyond"}),
+    trajectory: frozenset({"max_position_m", "beyond"}),
 }
 """Names of the options that a conversion knows; the others know none."""

@@ -44,6 +44,7 @@ def actuators(data: Buffer, context: Context) -> messages.MotorCommand:
     check_finite("rotor speeds", speed)
     if (speed < 0.0).any():
         raise ConvertError(f"rotor speeds must be >= 0, got {speed.min()} rad/s")
+    speed = context.within("rotor speed", speed, "max_speed_rad_s", "rad/s")
     return messages.MotorCommand(stamp_ns=_stamp_ns(message, context), speed=speed, sequence=context.sequence)
 
 
@@ -86,6 +87,7 @@ def rates(data: Buffer, context: Context) -> messages.RateThrustCommand | None:
         )
     rate = _xyz(message.body_rate)
     check_finite("body rates", rate)
+    rate = context.within("body rate", rate, "max_rate_rad_s", "rad/s")
     return messages.RateThrustCommand(
         stamp_ns=_stamp_ns(message, context),
         thrust_n=_thrust_n(message, context),
@@ -217,6 +219,8 @@ def _velocity(message: Any, frame: str, stamp_ns: int, context: Context) -> mess
         raise ConvertError(
             f"angular.x and angular.y must be 0: only the heading can turn, got {rate.tolist()}"
         )
+    velocity = context.within("velocity", velocity, "max_speed_m_s", "m/s")
+    rate = context.within("yaw rate", rate, "max_rate_rad_s", "rad/s")
     kind = context.frames.kind_of(frame, context.vehicle)
     if kind is None:
         names = (
@@ -245,6 +249,7 @@ def _pose_command(message: Any, point: Any, quaternion: Any, context: Context) -
         )
     position = _xyz(point)
     check_finite("position", position)
+    position = context.within("position", position, "max_position_m", "m")
     return messages.PoseCommand(
         stamp_ns=_stamp_ns(message, context),
         position=position,

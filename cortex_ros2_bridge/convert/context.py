@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortex import messages
 from cortex_ros2_bridge.backend.base import Buffer
@@ -40,6 +42,10 @@ class Context:
     """Newest state of the vehicle, to turn velocities that are given in its body frame."""
     max_thrust_n: float | None = None
     """Thrust of the vehicle at full speed of its rotors [N]; None: the simulator does not say."""
+    ranges: messages.CommandRanges | None = None
+    """What the vehicle can be asked for; None: the simulator does not say."""
+    excess: str = ""
+    """What of the last command was out of range and has been clamped; empty if nothing was."""
     now_ns: int = 0
     """Newest time that is known [ns]; commands without a stamp get it."""
     sequence: int = 0
@@ -55,12 +61,52 @@ class Context:
         """Return an option of the route, or its default."""
         return self.options.get(name, OPTIONS[name].default)
 
+    def within(self, what: str, value: NDArray[np.float64], limit: str, unit: str) -> NDArray[np.float64]:
+        """Return a part of a command, clamped to its range.
+
+        Args:
+            what: Name of the part, for people.
+            value: Finite numbers, any shape; the length of "velocity" and "body rate" is limited, the size of
+                each element of the others.
+            limit: Option that sets the limit.
+            unit: Of the numbers, for people.
+
+        Raises:
+            ConvertError: The value is out of range, and that is refused.
+        """
+        field, fallback = _LIMITS[limit]
+        highest = self.option(limit)
+        if highest is None:
+            highest = fallback if self.ranges is None else getattr(self.ranges, field)
+        size = math.hypot(*value.tolist()) if what in _VECTORS else float(np.abs(value).max(initial=0.0))
+        if size <= highest:
+            return value
+        excess = f"a {what} of {size:.6g} {unit} is out of range: up to {highest:.6g} {unit}"
+        beyond = self.option("beyond")
+        if beyond == "refuse" or (beyond is None and self.ranges is not None and self.ranges.refuse):
+            raise ConvertError(excess)
+        self.excess = excess
+        if what in _VECTORS:
+            largest = float(np.abs(value).max())
+            direction = value / largest  # the length itself may be beyond float64
+            return np.asarray(direction * (highest / math.hypot(*direction.tolist())))
+        return np.asarray(np.clip(value, -highest, highest))
+
     def remembered(self, name: str, make: Callable[[], Any]) -> Any:
         """Return what is kept under a name; made when it is first asked for."""
         if name not in self.memory:
             self.memory[name] = make()
         return self.memory[name]
 
+
+_VECTORS = ("velocity", "body rate")
+_LIMITS = {
+    "max_speed_rad_s": ("rotor_speed_max_rad_s", math.inf),
+    "max_speed_m_s": ("speed_max_m_s", 100.0),
+    "max_rate_rad_s": ("body_rate_max_rad_s", 34.9),
+    "max_position_m": ("position_max_m", 10_000.0),
+}
+"""By option: where the simulator says the limit of its vehicle, and what holds if it does not."""
 
 Out = Callable[[Any, Context], "Buffer | None"]
 """Makes CDR of a message of Cortex; None: there is nothing to send now."""

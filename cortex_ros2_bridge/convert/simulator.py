@@ -25,6 +25,7 @@ _SENSOR_VALUES = (
 )
 _VEHICLE_VALUES = (
     *("command_count", "refused_count", "refused_reason", "superseded_count", "lost_count"),
+    *("clamped_count", "clamped_reason"),
     *("command_age_ns", "fail_safe_count", "collision_count", "undelivered_count"),
 )
 
@@ -142,6 +143,9 @@ def _of_vehicle(vehicle: messages.VehicleStatus, judged: _Judged) -> Any:
     if refused:
         reason = f" ({vehicle.refused_reason})" if vehicle.refused_reason else ""
         trouble.append(f"{refused} commands refused {judged.period}{reason}")
+    clamped = judged.more(vehicle, "clamped_count", vehicle.name)
+    if clamped:
+        trouble.append(f"{clamped} commands clamped {judged.period} ({vehicle.clamped_reason})")
     collisions = judged.more(vehicle, "collision_count", vehicle.name)
     if collisions:
         trouble.append(f"{collisions} collisions {judged.period}")

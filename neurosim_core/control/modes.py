@@ -16,6 +16,7 @@ sin yaw, 0). A mode is compiled when it is first used, and only then.
 """
 
 import functools
+import logging
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,14 +39,17 @@ from neurosim_core.control.se3 import (
     point_wrench,
     present_heading,
     rate_wrench,
+    scale_to_squarable,
     shorten,
     velocity_wrench,
 )
 from neurosim_core.frames import UNIT_TOLERANCE, as_rows
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
 from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.command_ranges import CommandRanges, command_ranges
 from neurosim_core.vehicle.multirotor import MultirotorConfig
 
+logger = logging.getLogger(__name__)
 wp.set_module_options({"enable_backward": False})
 
 CommandMode = Literal["motor_speeds", "rates", "attitude", "velocity", "position", "path"]
@@ -76,6 +80,11 @@ def _vector3(rows: wp.array2d[wp.float64], row: int, first: int) -> wp.vec3d:
 
 
 @wp.func
+def _thrust(parameters: Se3Parameters, setpoint: wp.array2d[wp.float64], vehicle: int) -> wp.float64:
+    return clip(setpoint[vehicle, 0], wp.float64(0.0), parameters.command_thrust_max_n)
+
+
+@wp.func
 def _rates(
     parameters: Se3Parameters,
     path: PathArrays,
@@ -84,8 +93,9 @@ def _rates(
     stamp_ns: wp.int64,
     state: VehicleState,
 ) -> Wrench:
-    rate = shorten(_vector3(setpoint, vehicle, 1), parameters.body_rate_max_rad_s)
-    return rate_wrench(parameters, state, setpoint[vehicle, 0], rate, wp.vec3d())
+    rate_max = wp.min(parameters.body_rate_max_rad_s, parameters.command_rate_max_rad_s)
+    rate = shorten(_vector3(setpoint, vehicle, 1), rate_max)
+    return rate_wrench(parameters, state, _thrust(parameters, setpoint, vehicle), rate, wp.vec3d())
 
 
 @wp.func
@@ -98,10 +108,12 @@ def _attitude(
     state: VehicleState,
 ) -> Wrench:
     v = _vector3(setpoint, vehicle, 1)
-    q = wp.quatd(v[0], v[1], v[2], setpoint[vehicle, 4])
+    w = setpoint[vehicle, 4]
+    largest = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.max(wp.abs(v[2]), wp.abs(w)))
+    q = wp.quatd(v[0], v[1], v[2], w) * scale_to_squarable(largest)
     reference = AttitudeReference()
     reference.orientation = q / wp.length(q)  # `wp.normalize` would make the identity of nan
-    return attitude_wrench(parameters, state, setpoint[vehicle, 0], reference)
+    return attitude_wrench(parameters, state, _thrust(parameters, setpoint, vehicle), reference)
 
 
 @wp.func
@@ -113,8 +125,9 @@ def _velocity(
     stamp_ns: wp.int64,
     state: VehicleState,
 ) -> Wrench:
-    heading = present_heading(state.orientation, setpoint[vehicle, 3])
-    velocity = _vector3(setpoint, vehicle, 0)
+    rate_max = parameters.command_rate_max_rad_s
+    heading = present_heading(state.orientation, clip(setpoint[vehicle, 3], -rate_max, rate_max))
+    velocity = shorten(_vector3(setpoint, vehicle, 0), parameters.command_speed_max_m_s)
     return velocity_wrench(parameters, state, velocity, wp.vec3d(), wp.vec3d(), wp.vec3d(), heading)
 
 
@@ -128,7 +141,9 @@ def _position(
     state: VehicleState,
 ) -> Wrench:
     point = PathPoint()
-    point.position = _vector3(setpoint, vehicle, 0)
+    limit = parameters.command_position_max_m
+    p = _vector3(setpoint, vehicle, 0)
+    point.position = wp.vec3d(clip(p[0], -limit, limit), clip(p[1], -limit, limit), clip(p[2], -limit, limit))
     point.yaw = setpoint[vehicle, 3]
     return point_wrench(parameters, state, point)
 
@@ -276,7 +291,10 @@ class Controller:
     Attributes:
         mode: Name of the command mode.
         layout: Name and unit of each element of a setpoint row.
-        setpoint: The setpoints on the device, float64 [N, len(layout)]; written by whoever commands.
+        setpoint: The setpoints on the device, float64 [N, len(layout)]; written by whoever commands. What is
+            finite and out of range is clamped where it is read.
+        ranges: What the vehicles can be asked for.
+        clamped_count: Setpoints out of range that came from the host so far.
     """
 
     def __init__(
@@ -289,8 +307,11 @@ class Controller:
         count: int,
         rotor_count: int,
         device: Any,
+        ranges: CommandRanges,
     ) -> None:
         self.mode = mode
+        self.ranges = ranges
+        self.clamped_count = 0
         self.layout = layout
         self.count = count
         self.rotor_count = rotor_count
@@ -378,12 +399,16 @@ class Controller:
             setpoint: Rows as in `layout`, shape [N, len(layout)] or one row for all.
 
         Raises:
-            ValueError: If the shape does not fit or an element is not finite.
+            ValueError: If the shape does not fit, an element is not finite, or a command is out of range and
+                the vehicle's `command_ranges.beyond` is "refuse".
         """
         self.setpoint.assign(self.checked(setpoint))
 
     def checked(self, setpoint: ArrayLike) -> NDArray[np.float64]:
-        """Return setpoints as rows, shape [N, len(layout)]; arguments and errors as for `set`."""
+        """Return setpoints as rows, shape [N, len(layout)]; arguments and errors as for `set`.
+
+        Rows out of range are counted and, the first time, logged; `update` clamps them.
+        """
         try:
             rows = as_rows(setpoint, name="setpoint", count=self.count, width=len(self.layout))
         except ValueError as error:
@@ -392,6 +417,14 @@ class Controller:
             ) from None
         if self.mode == "attitude" and not (np.abs(rows[:, 1:]).max(axis=1) > 1e-6).all():
             raise ValueError(f"mode 'attitude' takes unit quaternions, got {rows[:, 1:].tolist()}")
+        beyond = np.flatnonzero(self.ranges.beyond(self.mode, rows))
+        if len(beyond):
+            reason = self.ranges.excess(self.mode, rows[beyond[0]].tolist())
+            if self.ranges.refuse:
+                raise ValueError(f"setpoint of mode {self.mode!r}, vehicle {beyond[0]}: {reason}")
+            if not self.clamped_count:
+                logger.warning("mode %s, vehicle %d: %s; it is clamped", self.mode, beyond[0], reason)
+            self.clamped_count += len(beyond)
         return rows
 
     def _record(self, arrays: Any) -> Any:
@@ -485,4 +518,5 @@ def make_controller(
         count=count,
         rotor_count=vehicle.rotor_count,
         device=place,
+        ranges=command_ranges(vehicle),
     )

@@ -23,6 +23,7 @@ from neurosim_core.control.allocation import Motors, clip
 from neurosim_core.control.flatness import AttitudeReference, Heading, attitude_reference
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory.path import PathPoint
+from neurosim_core.vehicle.command_ranges import command_ranges
 from neurosim_core.vehicle.multirotor import MultirotorConfig
 
 wp.set_module_options({"enable_backward": False})
@@ -33,6 +34,8 @@ Limit = Annotated[float, Field(gt=0.0, le=1e6)]
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
+_SQUARABLE = wp.constant(wp.float64(1.0e100))
+"""The square of a number up to this one is finite."""
 
 
 class Se3Config(Settings):
@@ -102,6 +105,14 @@ class Se3Parameters:
     """Highest correcting acceleration [m/s^2]."""
     body_rate_max_rad_s: wp.float64
     """Highest body rate asked for [rad/s]."""
+    command_thrust_max_n: wp.float64
+    """Highest collective thrust that a command may ask for [N]."""
+    command_speed_max_m_s: wp.float64
+    """Highest speed that a command may ask for [m/s]."""
+    command_rate_max_rad_s: wp.float64
+    """Highest body or yaw rate that a command may ask for [rad/s]."""
+    command_position_max_m: wp.float64
+    """Largest coordinate that a command may ask for [m]."""
     use_jerk: wp.float64
     """1: feed jerk and yaw rate of a path forward, 0: do not."""
     use_snap: wp.float64
@@ -138,6 +149,11 @@ def make_parameters(
     parameters.speed_max_m_s = config.correction_speed_max_m_s
     parameters.acceleration_max_m_s2 = config.correction_acceleration_max_m_s2
     parameters.body_rate_max_rad_s = config.body_rate_max_rad_s
+    ranges = command_ranges(vehicle)
+    parameters.command_thrust_max_n = ranges.thrust_max_n
+    parameters.command_speed_max_m_s = ranges.speed_max_m_s
+    parameters.command_rate_max_rad_s = ranges.body_rate_max_rad_s
+    parameters.command_position_max_m = ranges.position_max_m
     parameters.use_jerk = float(config.feed_forward_jerk)
     parameters.use_snap = float(config.feed_forward_snap)
     return parameters
@@ -172,11 +188,21 @@ class Wrench:
 
 
 @wp.func
+def scale_to_squarable(largest: wp.float64) -> wp.float64:
+    """Return the factor after which a vector with this largest element has a finite length; mostly 1."""
+    if largest > _SQUARABLE:
+        return _ONE / largest
+    return _ONE
+
+
+@wp.func
 def shorten(vector: wp.vec3d, length_max: wp.float64) -> wp.vec3d:
-    """Return `vector`, made no longer than `length_max`."""
-    length = wp.length(vector)
-    if length > length_max:
-        return vector * (length_max / length)
+    """Return `vector`, made no longer than `length_max`; any finite vector is allowed."""
+    scale = scale_to_squarable(wp.max(wp.max(wp.abs(vector[0]), wp.abs(vector[1])), wp.abs(vector[2])))
+    scaled = vector * scale
+    length = wp.length(scaled)
+    if length > length_max * scale:
+        return scaled * (length_max / length)
     return vector
 
 

@@ -102,6 +102,10 @@ def print_status(status: SimulatorStatus, console: Console) -> None:
         if vehicle.undelivered_count:
             lost = f"{vehicle.undelivered_count:,} messages on other topics than those of sensors"
             run.add_row("by readers", f"{escape(vehicle.name)} lost {lost}")
+        if vehicle.clamped_count:
+            run.add_row(
+                "clamped", f"{vehicle.clamped_count:,} commands to {escape(vehicle.name)}, out of range"
+            )
     console.print(run)
 
     vehicles = _table("vehicle", "flown by", "commands", "age", "refused", "superseded", "lost", "fail-safe")

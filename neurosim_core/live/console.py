@@ -144,10 +144,12 @@ def print_end(
     taken = sum(vehicle.command_count for vehicle in last.vehicles)
     lost = sum(vehicle.lost_count for vehicle in last.vehicles)
     refused = sum(vehicle.refused_count for vehicle in last.vehicles)
+    clamped = sum(vehicle.clamped_count for vehicle in last.vehicles)
+    refusals = f"{refused:,} refused" + (f", {clamped:,} clamped to their range" if clamped else "")
     collisions = sum(vehicle.collision_count for vehicle in last.vehicles)
     console.print(
         f"simulated {last.stamp_ns / 1e9:.3f} s: {last.step_count:,} control periods, {taken:,} commands "
-        f"({lost:,} lost, {refused:,} refused), {collisions:,} collisions",
+        f"({lost:,} lost, {refusals}), {collisions:,} collisions",
         highlight=False,
         soft_wrap=True,
     )

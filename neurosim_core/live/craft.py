@@ -30,6 +30,7 @@ from neurosim_core.simulation import (
     settle,
     want,
 )
+from neurosim_core.vehicle.command_ranges import command_ranges
 
 
 class Craft:
@@ -72,6 +73,7 @@ class Craft:
             node,
             name,
             rotor_count=model.airframe.rotor_count,
+            ranges=command_ranges(model.airframe),
             lockstep=config.live.mode == "lockstep",
         )
         self.helm = Helm(config.live, link, airframe=model.airframe, seed=config.seed)

@@ -17,6 +17,7 @@ from neurosim_core.live.helm import Command
 from neurosim_core.live.topics import COMMANDS, command_topic
 from neurosim_core.live.translate import setpoint_of
 from neurosim_core.render.launch import core_count
+from neurosim_core.vehicle.command_ranges import CommandRanges
 
 log = logging.getLogger(__name__)
 
@@ -35,11 +36,13 @@ class InboxCounts:
     """What happened to the commands of a vehicle before they were taken."""
 
     refused: int = 0
-    """Had numbers that are not finite, or a wrong shape."""
+    """Had numbers that are not finite, or a wrong shape, or were out of range where that is refused."""
     superseded: int = 0
     """Gave way to a newer one, or answered what nobody waits for."""
     lost: int = 0
     """Never arrived."""
+    clamped: int = 0
+    """Were out of range, and are flown as the nearest command within it."""
 
 
 class Inbox:
@@ -48,28 +51,33 @@ class Inbox:
     Attributes:
         missed: The last command that did not fit what was waited for; None if there was none.
         refusal: Why the last command was refused; empty if none was.
+        clamping: What of the last command that was clamped was out of range; empty if none was.
     """
 
-    def __init__(self, node: Node, vehicle: str, *, rotor_count: int, lockstep: bool = False) -> None:
+    def __init__(
+        self, node: Node, vehicle: str, *, rotor_count: int, ranges: CommandRanges, lockstep: bool = False
+    ) -> None:
         """Subscribe to the commands of a vehicle.
 
         Args:
             node: Where to.
             vehicle: Its name.
             rotor_count: Numbers in a command of rotor speeds.
+            ranges: What the vehicle can be asked for; its controller clamps what is beyond.
             lockstep: Every command counts. Who floods is held up; and `wait` is in the socket at once.
         """
         policy = reliable(timeout_s=0.1) if lockstep else keep_last()
         self.vehicle = vehicle
         self.missed: Command | None = None
-        self.refusal = ""
+        self.refusal = self.clamping = ""
+        self._ranges = ranges
         self._widths = {mode: len(MODES[mode].layout) for mode in COMMANDS} | {"motor_speeds": rotor_count}
         self._subscribers: dict[CommandMode, Subscriber[Any]] = {
             cast(CommandMode, mode): node.subscriber(command_topic(vehicle, mode), message, policy=policy)
             for mode, message in COMMANDS.items()
         }
         self._known: dict[CommandMode, set[int]] = {mode: set() for mode in self._subscribers}
-        self._refused = 0
+        self._refused = self._clamped = 0
         self._superseded = 0
         self._before = InboxCounts()
         self._hot = next(iter(self._subscribers))
@@ -99,6 +107,7 @@ class Inbox:
             refused=now.refused - before.refused,
             superseded=now.superseded - before.superseded,
             lost=now.lost - before.lost,
+            clamped=now.clamped - before.clamped,
         )
 
     def reset(self) -> None:
@@ -187,19 +196,33 @@ class Inbox:
                 self._refuse(str(error))
                 continue
             setpoint = setpoint_of(mode, message)
-            reason = _fault(mode, setpoint, self._widths[mode])
+            reason = _fault(mode, setpoint, self._widths[mode]) or self._excess(mode, setpoint)
             if not reason:
                 return Command(mode=mode, setpoint=setpoint, stamp_ns=message.stamp_ns)
             self._refuse(reason)
         return None
 
+    def _excess(self, mode: CommandMode, setpoint: np.ndarray) -> str:
+        """Say what is out of range where that is refused; else count it: the controller clamps it."""
+        excess = self._ranges.excess(mode, setpoint.tolist())
+        if not excess or self._ranges.refuse:
+            return excess
+        self._clamped += 1
+        self.clamping = excess
+        self._log("clamped", self._clamped, excess)
+        return ""
+
     def _refuse(self, reason: str) -> None:
         self._refused += 1
         self.refusal = reason
+        self._log("refused", self._refused, reason)
+
+    def _log(self, what: str, count: int, reason: str) -> None:
+        """Log once a second at most."""
         now_s = time.monotonic()
         if now_s - self._logged_s >= _LOG_INTERVAL_S:
             self._logged_s = now_s
-            log.warning("%s: refused a command (%d so far): %s", self.vehicle, self._refused, reason)
+            log.warning("%s: %s a command (%d so far): %s", self.vehicle, what, count, reason)
 
     def _totals(self) -> InboxCounts:
         counters = [subscriber.counters for subscriber in self._subscribers.values()]
@@ -207,6 +230,7 @@ class Inbox:
             refused=self._refused,
             superseded=self._superseded + sum(c.overtaken for c in counters),
             lost=sum(c.lost for c in counters),
+            clamped=self._clamped,
         )
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 
 from cortex import Node
-from cortex.messages import Clock, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
+from cortex.messages import Clock, CommandRanges, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.live import topics
 from neurosim_core.live.config import LiveConfig
 from neurosim_core.live.craft import Craft
 from neurosim_core.live.pacing import Timings
+from neurosim_core.vehicle.command_ranges import command_ranges
 from neurosim_core.vehicle.multirotor import MultirotorConfig
 
 STATUS_INTERVAL_S = 0.2
@@ -41,6 +43,8 @@ class Board:
 
     def announce(self, config: SimulationConfig) -> None:
         """Say what is flown, and with which settings: at the beginning, and when they have changed."""
+        airframes = [config.of(name).vehicle.airframe() for name in config.vehicles]
+        ranges = [command_ranges(airframe) for airframe in airframes]
         self._simulation.publish(
             Simulation(
                 config=to_yaml(config),
@@ -48,7 +52,8 @@ class Board:
                 vehicles=list(config.vehicles),
                 mode=config.live.mode,
                 control_rate_hz=config.control.rate_hz,
-                thrust_max_n=[_thrust_max_n(config.of(name).vehicle.airframe()) for name in config.vehicles],
+                thrust_max_n=[_thrust_max_n(airframe) for airframe in airframes],
+                command_ranges=[CommandRanges(**dataclasses.asdict(each)) for each in ranges],
             )
         )
 
@@ -201,6 +206,8 @@ def _vehicle(craft: Craft, stamp_ns: int) -> VehicleStatus:
         collision_count=craft.state.counts["collisions"],
         undelivered_count=craft.outlet.other_undelivered_count,
         refused_reason=craft.inbox.refusal if counts.refused else "",
+        clamped_count=counts.clamped,
+        clamped_reason=craft.inbox.clamping if counts.clamped else "",
     )
 
 

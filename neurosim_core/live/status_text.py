@@ -46,6 +46,7 @@ def status_text(
                 (vehicle.fail_safe_count, "fail-safes"),
                 (vehicle.lost_count, "commands lost"),
                 (vehicle.refused_count, "refused"),
+                (vehicle.clamped_count, "clamped"),
                 (vehicle.collision_count, "collisions"),
             )
             if count

@@ -23,6 +23,7 @@ from neurosim_core.vehicle.aerodynamics import (
     vec8d,
     vec10d,
 )
+from neurosim_core.vehicle.command_ranges import CommandRangesConfig
 from neurosim_core.vehicle.ground import GroundConfig, make_ground
 from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
 from neurosim_core.vehicle.motor import LagConstants, lag_constants
@@ -102,6 +103,8 @@ class MultirotorConfig(Settings):
     """Random wind; null: none."""
     ground: GroundConfig | None = None
     """A horizontal plane to land on; null: the vehicle falls for ever."""
+    command_ranges: CommandRangesConfig = CommandRangesConfig()
+    """The largest commands that the vehicle accepts."""
 
     @model_validator(mode="after")
     def _is_a_body(self) -> MultirotorConfig:

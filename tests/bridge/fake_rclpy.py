@@ -114,8 +114,6 @@ class Trigger:
 NAMES = {String: "std_msgs/msg/String"}
 WORLD: dict[int, list[Node]] = {}
 """Nodes by domain."""
-ACTIVE: list[threading.Thread] = []
-"""Threads in which an executor spins."""
 
 
 class Context:
@@ -201,6 +199,8 @@ class Subscription:
         self.qos_profile = qos
         self.waiting: deque[bytes] = deque(maxlen=qos.depth)
 
+    destroyed = False
+
     def push(self, msg: bytes) -> None:
         with self.node.context.wake:
             self.waiting.append(msg)
@@ -214,6 +214,7 @@ class Service:
         self.node, self.srv_type, self.srv_name, self.callback = node, srv_type, srv_name, callback
         self.callback_group = callback_group
         self.waiting: deque[tuple[Any, Callable[[Any], None]]] = deque()
+        self.destroyed = False
 
 
 class Node:
@@ -287,11 +288,18 @@ class Node:
         return True
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
-        self.subs.remove(subscription)
-        return True
+        return self._destroy(self.subs, subscription)
 
     def destroy_service(self, service: Service) -> bool:
-        self.services.remove(service)
+        return self._destroy(self.services, service)
+
+    def _destroy(self, among: list[Any], one: Any) -> bool:
+        if one not in among:
+            return False
+        with self.context.wake:
+            among.remove(one)
+            one.destroyed = True
+            self.context.wake.notify_all()
         return True
 
     def count_publishers(self, topic_name: str) -> int:
@@ -345,71 +353,64 @@ def create_node(
     return Node(node_name, context, namespace)
 
 
-class MutuallyExclusiveCallbackGroup:
-    """Its members run one at a time."""
+class SingleThreadedExecutor:
+    """Waits for tasks, subscriptions and services of its nodes, as that of Humble does.
 
+    What is destroyed by another thread while it waits ends `spin_once` with `InvalidHandle`, and the executor
+    is of no more use.
+    """
 
-class MultiThreadedExecutor:
-    def __init__(self, num_threads: int | None = None, *, context: Context | None = None) -> None:
+    def __init__(self, *, context: Context | None = None) -> None:
         assert context is not None, "the fake has no default context"
-        self._free = num_threads or 4
         self._context = context
         self._nodes: list[Node] = []
-        self._busy: set[Any] = set()
+        self._tasks: deque[Callable[[], object]] = deque()
         self._is_shutdown = False
+        self.broken = False
 
     def add_node(self, node: Node) -> bool:
         self._nodes.append(node)
         return True
 
-    def spin(self) -> None:
-        """Run callbacks, of each group one at a time; what one raises ends it."""
-        ACTIVE.append(threading.current_thread())
-        while True:
-            with self._context.wake:
-                while (found := self._job()) is None:
-                    if self._is_shutdown:
-                        return
-                    if not self._context.ok():
-                        raise ExternalShutdownException()
-                    self._context.wake.wait()
-                group, job = found
-                self._busy.add(group)
-                self._free -= 1
-            threading.Thread(target=self._run, args=(group, job)).start()
-
-    def _run(self, group: Any, job: Callable[[], None]) -> None:
-        try:
-            job()
-        except Exception:
-            self._context.shutdown()
+    def create_task(self, callback: Callable[[], object]) -> None:
         with self._context.wake:
-            self._busy.discard(group)
-            self._free += 1
+            assert not self._is_shutdown
+            self._tasks.append(callback)
             self._context.wake.notify_all()
 
-    def _job(self) -> tuple[Any, Callable[[], None]] | None:
-        if not self._free:
-            return None
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Run one callback; what it raises ends the call."""
+        with self._context.wake:
+            if self.broken:
+                self._context.wake.wait()  # deaf
+            waited_for = [one for node in self._nodes for one in (*node.subs, *node.services)]
+            while (job := self._job()) is None:
+                if not self._context.ok():
+                    raise ExternalShutdownException()
+                self._context.wake.wait()
+                if any(one.destroyed for one in waited_for):
+                    self.broken = True
+                    raise InvalidHandle("cannot use Destroyable because destruction was requested")
+        job()
+
+    def _job(self) -> Callable[[], object] | None:
+        if self._tasks:
+            return self._tasks.popleft()
         for node in self._nodes:
             for subscription in node.subs:
-                if subscription.waiting and node not in self._busy:
+                if subscription.waiting:
                     message = subscription.waiting.popleft()
-                    return node, lambda s=subscription, m=message: s.callback(m)
+                    return lambda s=subscription, m=message: s.callback(m)
             for service in node.services:
-                group = service.callback_group or node
-                if service.waiting and group not in self._busy:
+                if service.waiting:
                     request, answer = service.waiting.popleft()
-                    return group, lambda s=service, r=request, a=answer: a(
-                        s.callback(r, s.srv_type.Response())
-                    )
+                    return lambda s=service, r=request, a=answer: a(s.callback(r, s.srv_type.Response()))
         return None
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         with self._context.wake:
             self._is_shutdown = True
-            self._context.wake.notify_all()
-            return self._context.wake.wait_for(lambda: not self._busy, timeout_sec)
+            return True
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -417,10 +418,9 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     WORLD.clear()
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": init, "create_node": create_node},
-        "rclpy.callback_groups": {"MutuallyExclusiveCallbackGroup": MutuallyExclusiveCallbackGroup},
         "rclpy.context": {"Context": Context},
         "rclpy.executors": {
-            "MultiThreadedExecutor": MultiThreadedExecutor,
+            "SingleThreadedExecutor": SingleThreadedExecutor,
             "ExternalShutdownException": ExternalShutdownException,
         },
         "rclpy.qos": {

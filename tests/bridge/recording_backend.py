@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
+from cortex_ros2_bridge.msgs import message_class
+from cortex_ros2_bridge.typestore import service_types
 
 
 class RecordedPublisher:
@@ -57,9 +60,13 @@ class RecordedSubscription:
 class RecordedService:
     error_count = 0
 
-    def __init__(self, callback: Callable[[], Trigger], on_close: Callable[[], None]) -> None:
-        self.call = callback
-        self._on_close = on_close
+    def __init__(self, type_name: str, callback: Serve, on_close: Callable[[], None]) -> None:
+        self.type_name, self._callback, self._on_close = type_name, callback, on_close
+
+    def call(self, **fields: Any) -> Any:
+        """Ask it, as a client would; returns the response."""
+        request, response = (message_class(name) for name in service_types(self.type_name))
+        return self._callback(request(**fields), response())
 
     def close(self) -> None:
         self._on_close()
@@ -70,6 +77,7 @@ class RecordingBackend:
 
     name = "recording"
     distro = "jazzy"
+    failure = trouble = ""
 
     def __init__(self) -> None:
         self.publishers: dict[str, RecordedPublisher] = {}
@@ -102,8 +110,9 @@ class RecordingBackend:
         self.subscriptions[topic] = made
         return made
 
-    def service(self, name: str, callback: Callable[[], Trigger]) -> RecordedService | None:
-        made = self.services[name] = RecordedService(callback, lambda: self.services.pop(name, None))
+    def service(self, name: str, type_name: str, callback: Serve) -> RecordedService | None:
+        made = RecordedService(type_name, callback, lambda: self.services.pop(name, None))
+        self.services[name] = made
         return made
 
     def topics(self) -> list[TopicInfo]:

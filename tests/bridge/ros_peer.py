@@ -79,7 +79,7 @@ class Peer:
     def publishers(self, topic: str) -> list[Any]:
         """Return who publishes on a topic: node, type, and hash of the type."""
         return [
-            [info.node_name, info.topic_type, str(info.topic_type_hash)]
+            [info.node_name, info.topic_type, str(getattr(info, "topic_type_hash", None))]
             for info in self.node.get_publishers_info_by_topic(topic)
         ]
 
@@ -90,7 +90,7 @@ class Peer:
         while not (found := self.node.get_publishers_info_by_topic("/own")) and time.monotonic() < deadline:
             time.sleep(0.01)
         self.node.destroy_publisher(publisher)
-        return str(found[0].topic_type_hash)
+        return str(getattr(found[0], "topic_type_hash", None))  # Humble has none
 
     def call(self, name: str) -> Any:
         """Call a service of type Trigger."""

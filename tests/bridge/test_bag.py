@@ -201,7 +201,9 @@ def test_nobody_else_is_there(tmp_path: Path) -> None:
     subscription = bag.subscription("/cmd_vel", "geometry_msgs/msg/Twist", Qos(), print)
     assert (subscription.publisher_count, subscription.lost_count, subscription.error_count) == (0, 0, 0)
     subscription.close()
-    assert bag.service("/reset", lambda: pytest.fail("called")) is None
+    assert (
+        bag.service("/reset", "std_srvs/srv/Trigger", lambda request, response: pytest.fail("called")) is None
+    )
     assert bag.topics() == []
     bag.close()
 

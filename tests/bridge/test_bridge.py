@@ -711,7 +711,8 @@ def test_requests_as_topics_and_as_services():
         pause.put(message_class("std_msgs/msg/Empty")())
         wait_for(lambda: len(asked) == 3)
         assert asked == [msg.Reset(), msg.Step(3), msg.Trigger()]
-        assert rig.backend.services["/reset"].call() == (True, "")
+        done = rig.backend.services["/reset"].call()
+        assert (done.success, done.message) == (True, "")
         step.put(message_class("std_msgs/msg/UInt32")(data=6))
         wait_for(lambda: rig.tally("/step <- /step").refused == 1)
         step.put(b"\x00\x01\x00\x00\x01")
@@ -843,13 +844,20 @@ def test_the_simulator_says_what_full_thrust_is():
     with rig_of() as rig:
         craft = Craft(rig, rates=msg.RateThrustCommand)
         about = rig.simulator.publisher("/simulation", msg.Simulation, latch=True)
-        about.publish(msg.Simulation("", "1", ["other", "drone"], "streaming", 100.0, [40.0, 8.0]))
+        ranges = [msg.CommandRanges(False, 900.0, n, 10.0, 4.0, 50.0) for n in (40.0, 8.0)]
+        about.publish(msg.Simulation("", "1", ["other", "drone"], "streaming", 100.0, [40.0, 8.0], ranges))
         (target,) = rig.subscribes("/drone/attitude_target")
         rig.update_until(lambda: about.subscriber_count == 1)
         rig.update_until(lambda: rig.bridge._vehicles["drone"].max_thrust_n == 8.0)
         rig.update_until(craft.connected)
         target.put(message_class("mavros_msgs/msg/AttitudeTarget")(type_mask=128, thrust=0.5))
         assert craft.recv("rates").thrust_n == 4.0
+        fast = message_class("mavros_msgs/msg/AttitudeTarget")(type_mask=128, thrust=0.5)
+        fast.body_rate.x = 1e308
+        target.put(fast)
+        assert craft.recv("rates").body_rate.tolist() == [4.0, 0.0, 0.0]
+        (counts,) = [each for route, each in rig.bridge.totals().items() if "rates <-" in route]
+        assert (counts.sent, counts.clamped, counts.refused) == (2, 1, 0)
 
 
 def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
@@ -877,6 +885,7 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
         "sent": "1",
         "lost": "0",
         "refused": "0",
+        "clamped": "0",
         "dropped": "0",
         "rate_hz": "",
         "listeners": "1",
@@ -886,6 +895,17 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
     assert level[f"cortex_bridge: {ROTORS}"] == b"\x01"
     assert "1 refused" in found[ROTORS]["message"]
     assert "finite" in found[ROTORS]["message"]
+
+
+def test_a_backend_that_fails_is_told_or_ends_the_bridge(monkeypatch):
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    with rig_of() as rig, rig.backend.listening("/diagnostics") as (diagnostics,):
+        rig.backend.trouble = "it was restarted"
+        rig.update_until(lambda: statuses(diagnostics).get("bridge", {}).get("message") == "it was restarted")
+        assert diagnostics.messages()[-1].status[0].level == b"\1"
+        rig.backend.failure = "it is dead"
+        with pytest.raises(BackendError, match="it is dead"):
+            rig.bridge.run(threading.Event())
 
 
 def statuses(publisher):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -540,6 +541,8 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
                         pair("refused_reason", "three rotors"),
                         pair("superseded_count", "0"),
                         pair("lost_count", "0"),
+                        pair("clamped_count", "0"),
+                        pair("clamped_reason", ""),
                         pair("command_age_ns", "5"),
                         pair("fail_safe_count", "1"),
                         pair("collision_count", "2"),
@@ -1174,6 +1177,68 @@ def test_velocities_that_cannot_be_used_are_refused():
         take(convert.twist, velocity())
     with pytest.raises(ConvertError, match="frame 'other/base_link', known: drone/base_link"):
         take(convert.twist_stamped, stamped(TwistStamped(), "other/base_link"), odometry=state(TURN))
+
+
+RANGES = messages.CommandRanges(
+    refuse=False,
+    rotor_speed_max_rad_s=900.0,
+    thrust_max_n=20.0,
+    speed_max_m_s=10.0,
+    body_rate_max_rad_s=4.0,
+    position_max_m=50.0,
+)
+
+
+def asked_for(largest: float) -> list[tuple[Callable[..., Any], Any, str, list[float]]]:
+    """Return a command of each kind beyond `RANGES`: its conversion, message, field, and what is flown."""
+    pose = PoseStamped()
+    pose.pose.position.y = -largest
+    rate = AttitudeTarget(type_mask=128, thrust=0.5)
+    rate.body_rate.x, rate.body_rate.y = 0.6 * largest, 0.8 * largest
+    flying = velocity(x=0.6 * largest, y=0.0, z=0.8 * largest, yaw=0.0)
+    return [
+        (convert.twist, flying, "velocity", [6.0, 0.0, 8.0]),
+        (convert.twist, Twist(angular=Vector3(z=-largest)), "yaw_rate_rad_s", [-4.0]),
+        (convert.twist_stamped, stamped(TwistStamped(twist=flying), "map"), "velocity", [6.0, 0.0, 8.0]),
+        (convert.rates, stamped(rate), "body_rate", [2.4, 3.2, 0.0]),
+        (convert.pose, stamped(pose, "map"), "position", [0.0, -50.0, 0.0]),
+        (convert.actuators, stamped(Actuators(velocity=[1.0, largest])), "speed", [1.0, 900.0]),
+    ]
+
+
+@pytest.mark.parametrize("largest", [1e3, 1e308])
+def test_commands_out_of_range_are_clamped_or_refused(largest):
+    """By what the simulator says of its vehicle; options of the route come first."""
+    for function, message, field, flown in asked_for(largest):
+        at = context(now_ns=99, ranges=RANGES, options={"frame": "map"} if function is convert.twist else {})
+        command = function(cdr.encode(message), at)
+        assert np.atleast_1d(getattr(command, field)) == pytest.approx(flown, rel=1e-14)
+        assert re.match(r"a [a-z ]+ of \S+ \S+ is out of range: up to", at.excess)
+        for refusing in (
+            {"ranges": dataclasses.replace(RANGES, refuse=True)},
+            {"ranges": RANGES, "options": {"beyond": "refuse"}},
+        ):
+            with pytest.raises(ConvertError, match="is out of range"):
+                take(function, message, odometry=state(TURN), **refusing)
+    option = {"max_speed_m_s": 2.0, "frame": "map"}
+    slow = take(convert.twist, velocity(x=5.0), ranges=RANGES, options=option).velocity
+    assert np.linalg.norm(slow) == pytest.approx(2.0, rel=1e-14)
+    free = context(now_ns=99, ranges=RANGES, options={"frame": "map"})
+    assert convert.twist(cdr.encode(velocity()), free).velocity.tolist() == [1.0, 2.0, 3.0]
+    assert free.excess == ""
+
+
+@pytest.mark.parametrize("known", [None, RANGES])
+def test_no_finite_command_becomes_one_that_is_not_finite(known):
+    """Numbers of all magnitudes, in every frame, whether the simulator has said its ranges or not."""
+    random = np.random.default_rng(5)
+    for _ in range(300):
+        x, y, z, yaw = random.choice([-1.0, 1.0], 4) * 1.7 * 10.0 ** random.uniform(-300.0, 308.0, 4)
+        for frame in ("map", "base_link", "base_footprint"):
+            message = stamped(TwistStamped(twist=velocity(x, y, z, yaw)), frame)
+            command = take(convert.twist_stamped, message, odometry=state(TURN), ranges=known)
+            assert np.linalg.norm(command.velocity) <= (100.0 if known is None else 10.0) * (1.0 + 1e-14)
+            assert abs(command.yaw_rate_rad_s) <= (34.9 if known is None else 4.0)
 
 
 @pytest.mark.parametrize("frame", ["", "map", "drone/odom", "world"])

@@ -13,7 +13,7 @@ from foreigners import Foreigner
 from processes import wait_for
 
 from cortex_ros2_bridge.backend import environment
-from cortex_ros2_bridge.backend.base import Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.base import Qos, TopicInfo
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, ros_topic, ros_type, split_type
@@ -146,7 +146,7 @@ def test_topics_of_others(short_lease: None, make: Any, foreigner: Start) -> Non
     """Both directions are counted; own endpoints, services and what is no topic of ROS are left out."""
     node = make(distro="jazzy")
     node.publisher("/mine", STRING, Qos())
-    node.service("/drone/reset", lambda: Trigger(True, ""))
+    node.service("/drone/reset", "std_srvs/srv/Trigger", lambda request, response: response)
     other, another = foreigner(), foreigner()
     other.do("advertise", topic="rt/b", kind="String", matched=False)
     other.do("advertise", topic="elsewhere", kind="String", matched=False)

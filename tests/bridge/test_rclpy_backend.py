@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
 import threading
@@ -14,12 +15,13 @@ import fake_rclpy
 import pytest
 from processes import SOON_S, wait_for
 
-from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo, Trigger
+from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo
 from cortex_ros2_bridge.backend.choose import open_backend
 from cortex_ros2_bridge.backend.rclpy_ import RclpyBackend
 from cortex_ros2_bridge.typestore import typestore
 
 STRING = "std_msgs/msg/String"
+TRIGGER = "std_srvs/srv/Trigger"
 HAS_RCLPY = importlib.util.find_spec("rclpy") is not None
 
 
@@ -148,19 +150,24 @@ def test_errors(make: Any) -> None:
 
 def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None:
     node, other = RclpyBackend(), RclpyBackend(node_name="other")
-    answers = iter([Trigger(True, "reset"), Trigger(False, "not now")])
-    service = node.service("/drone/reset", lambda: next(answers))
+    answers = iter([(True, "reset"), (False, "not now")])
+
+    def answer(request: Any, response: Any) -> Any:
+        response.success, response.message = next(answers)
+        return response
+
+    service = node.service("/drone/reset", TRIGGER, answer)
     replies = [other.node.call("/drone/reset") for _ in range(3)]
     assert [(reply.success, reply.message) for reply in replies] == [
         (True, "reset"),
         (False, "not now"),
-        (False, "StopIteration: "),
+        (False, ""),
     ]
     assert service.error_count == 1
     assert "the service /drone/reset failed" in caplog.text
     service.close()
     service.close()
-    assert node.node.services == []
+    assert [one.services for one in fake_rclpy.WORLD[0]] == [[], [], []]
     node.close()
     other.close()
 
@@ -169,11 +176,12 @@ def test_a_slow_service_does_not_hold_up_messages(fake: None) -> None:
     node, other = RclpyBackend(), RclpyBackend(node_name="other")
     go, got, replies = threading.Event(), [], []
 
-    def serve() -> Trigger:
+    def serve(request: Any, response: Any) -> Any:
         assert go.wait(SOON_S)
-        return Trigger(True, "")
+        response.success = True
+        return response
 
-    node.service("/reset", serve)
+    node.service("/reset", TRIGGER, serve)
     node.subscription("/words", STRING, Qos(), got.append)
     asking = threading.Thread(target=lambda: replies.append(other.node.call("/reset")))
     asking.start()
@@ -205,9 +213,79 @@ def test_quality_of_service_reaches_rclpy(fake: None) -> None:
 
 def test_the_end_of_the_context_is_told(fake: None, caplog: pytest.LogCaptureFixture) -> None:
     node = RclpyBackend()
-    wait_for(lambda: fake_rclpy.ACTIVE)
+    node.publisher("/words", STRING, Qos())
+    assert node.failure == ""
     node.node.context.shutdown()
-    wait_for(lambda: "the context of rclpy was shut down from outside" in caplog.text)
+    wait_for(lambda: "the context of rclpy was shut down from outside: nothing is received" in caplog.text)
+    assert node.failure == "the context of rclpy was shut down from outside"
+    with pytest.raises(BackendError, match="shut down from outside"):
+        node.subscription("/words", STRING, Qos(), print)
+    node.close()
+
+
+def test_opening_and_closing_does_not_make_the_node_deaf(make: Any) -> None:
+    """From other threads, while messages come: nothing that the executor waits for vanishes under it."""
+    node, other = make(), make(node_name="other")
+    got: list[bytes] = []
+    other.subscription("/words", STRING, Qos(), got.append)
+    publisher = node.publisher("/words", STRING, Qos())
+    wait_for(lambda: publisher.subscriber_count == 1)
+
+    def cycle() -> None:
+        for _ in range(20):
+            parts = [other.subscription(f"/more{n}", STRING, Qos(), print) for n in range(3)]
+            parts += [other.publisher(f"/some{n}", STRING, Qos()) for n in range(2)]
+            parts += [
+                other.service(f"/ask_{threading.get_ident()}", TRIGGER, lambda request, response: response)
+            ]
+            for part in parts:
+                part.close()
+
+    threads = [threading.Thread(target=cycle) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    sent = 0
+    while any(thread.is_alive() for thread in threads):
+        publisher.publish(text("x"))
+        sent += 1
+        time.sleep(0.001)
+    publisher.publish(text("last"))
+    wait_for(lambda: text("last") in [message[: len(text("last"))] for message in got])
+    assert (other.failure, other.trouble) == ("", "")
+
+
+def test_an_executor_that_fails_is_restarted(fake: None, caplog: pytest.LogCaptureFixture) -> None:
+    """Whatever breaks it; what it waited for is made anew, and /diagnostics can say so."""
+    node, other = RclpyBackend(), RclpyBackend(node_name="other")
+    got: list[bytes] = []
+    subscription = other.subscription("/words", STRING, Qos(), got.append)
+    publisher = node.publisher("/words", STRING, Qos())
+    publisher.publish(text("a"))
+    wait_for(lambda: len(got) == 1)
+    before = other.node.subs[0]
+    other.node.destroy_subscription(before)  # from this thread, as nobody should
+    wait_for(lambda: other.trouble)
+    assert "failed and was restarted, 1 times by now (InvalidHandle: cannot use" in other.trouble
+    wait_for(lambda: publisher.subscriber_count == 1)
+    publisher.publish(text("b"))
+    wait_for(lambda: len(got) == 2)
+    subscription.close()
+    assert publisher.subscriber_count == 0
+    node.close()
+    other.close()
+
+
+def test_an_executor_that_fails_for_ever_is_given_up(fake: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = RclpyBackend()
+
+    def fail(self: Any, timeout_sec: float | None = None) -> None:
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr(fake_rclpy.SingleThreadedExecutor, "spin_once", fail)
+    with contextlib.suppress(BackendError):
+        node.subscription("/words", STRING, Qos(), print)
+    wait_for(lambda: node.failure)
+    assert node.failure == "the executor of rclpy fails again and again: RuntimeError: broken"
     node.close()
 
 

@@ -1,7 +1,13 @@
 """The bridge and real nodes of ROS 2 (rclpy), in processes of their own, through DDS and through rclpy.
 
-They run where rclpy imports in this Python, or where NEUROSIM_ROS_PYTHON names one in which it does, with
-what the bridge needs (pyzmq, msgspec, rosbags). INSTALL says how to make that without a ROS installation.
+Humble, Jazzy, Lyrical and those between. The tests run where rclpy imports in this Python, or where
+NEUROSIM_ROS_PYTHON names one in which it does, with what the bridge needs (numpy, pyyaml, pyzmq, rosbags):
+
+    source /opt/ros/humble/setup.bash      # sets ROS_DISTRO
+    pip install numpy pyyaml pyzmq rosbags
+    NEUROSIM_ROS_PYTHON=python3 .venv/bin/python -m pytest tests/bridge/test_ros_interop.py
+
+cyclonedds has no wheels for Python 3.14 (Lyrical): the tests through DDS skip where it is not installed.
 """
 
 from __future__ import annotations
@@ -25,16 +31,16 @@ from runtime_directory import own_directory
 
 from cortex import Node
 from cortex import messages as msg
+from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, DISTROS
 
-INSTALL = (
-    "no rclpy; pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-{sensor,nav,geometry,std,diagnostic,"
-    "rosgraph,trajectory}-msgs ros-jazzy-std-srvs pyzmq msgspec rosbags numpy pyyaml, in this Python or "
-    "in that of NEUROSIM_ROS_PYTHON"
-)
+INSTALL = "no rclpy: source a ROS installation, or name a Python that has it in NEUROSIM_ROS_PYTHON"
 ROS_PYTHON = os.environ.get("NEUROSIM_ROS_PYTHON") or (
     sys.executable if importlib.util.find_spec("rclpy") is not None else ""
 )
 pytestmark = pytest.mark.skipif(not ROS_PYTHON, reason=INSTALL)
+DISTRO = os.environ.get("ROS_DISTRO") or DEFAULT_DISTRO
+THIS_HOST = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
+"""How nodes are told to keep to this host, by the variable that their distribution reads."""
 
 
 class RosNode(Child):
@@ -60,9 +66,11 @@ class RosNode(Child):
 @pytest.fixture
 def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A domain on this host, found as ROS does: no settings of Cyclone DDS, which Fast DDS does not know."""
-    for name in ("ROS_DISTRO", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"):
+    for name in (*THIS_HOST, "ROS_STATIC_PEERS", "CYCLONEDDS_URI"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    variable = DISTROS[DISTRO].range_variable
+    monkeypatch.setenv(variable, THIS_HOST[variable])
+    monkeypatch.setenv("ROS_DISTRO", DISTRO)
     monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 102)))
     with own_directory(monkeypatch):
         yield
@@ -78,6 +86,8 @@ def ros_node(ros_domain: None) -> Iterator[RosNode]:
 @pytest.fixture(params=["dds", "rclpy"])
 def bridge(request: pytest.FixtureRequest, ros_domain: None) -> Iterator[BridgeProcess]:
     """A bridge through DDS, in this Python without ROS; or through rclpy."""
+    if request.param == "dds" and importlib.util.find_spec("cyclonedds") is None:
+        pytest.skip("cyclonedds is not installed")
     python = sys.executable if request.param == "dds" else ROS_PYTHON
     with BridgeProcess("--verbose", "--backend", request.param, python=python) as process:
         process.wait_for("waiting for Cortex topics")
@@ -115,6 +125,9 @@ def test_a_node_of_ros_hears_sees_and_commands(bridge: BridgeProcess, ros_node: 
             ros_node.do("own_hash", type_name="sensor_msgs/msg/Imu"),
         ]
     assert bridge.end(signal.SIGINT) < 5.0
+    ros_node.process.kill()  # what it has said is complete then
+    assert ros_node.process.stderr is not None
+    assert "type hash" not in ros_node.process.stderr.read().decode()
 
 
 def test_who_comes_late_gets_what_is_latched_and_no_other(bridge: BridgeProcess, ros_node: RosNode) -> None:

@@ -16,6 +16,7 @@ from cortex.messages import (
     CameraInfo,
     Clock,
     Collision,
+    CommandRanges,
     Delivery,
     Events,
     Image,
@@ -79,6 +80,7 @@ EXAMPLES = [
     Reset(3, "drone", position=V3),
     Reset(),
     Simulation("seed: 0\n", "1.0", ["a", "b"], "lockstep", 200.0),
+    CommandRanges(True, 1500.0, 50.0, 51.0, 35.0, 1e4),
     SimulatorReply(False, "why not", 1, "paused"),
     Step(5),
     Trigger(),
@@ -88,7 +90,10 @@ EXAMPLES = [
         1, 2, "running", "", "streaming", 1.0, 0.9, 7, 1, 2, 3, 4, 5, 6, [SENSOR_STATUS], [VEHICLE_STATUS]
     ),
 ]
-WITHOUT_HEADER = {Parameter, SensorStatus, VehicleStatus, Simulation, Reset, Step, Trigger, SimulatorReply}
+WITHOUT_HEADER = {
+    *(Parameter, SensorStatus, VehicleStatus, Simulation, CommandRanges),
+    *(Reset, Step, Trigger, SimulatorReply),
+}
 """Parts of others, requests and their reply, and what does not change."""
 
 

@@ -43,7 +43,7 @@ STATUS_NOW = SimulatorStatus(
         SensorStatus("red", "events", True, 2, 1357, 3, 1, 12, 98_500_000),
         SensorStatus("red", "rgb", False, 0, 0, 0, 0),
     ],
-    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13)],
+    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13, "", 4)],
 )
 
 
@@ -146,6 +146,7 @@ def test_status(shared_runtime, capsys):
         "late by 0.06 ms (99 %: 0.21 ms)",
         "overruns 17; held back by 0.345 s",
         "by readers red lost 13 messages on other topics than those of sensors",
+        "clamped 4 commands to red, out of range",
         "vehicle flown by commands age refused superseded lost fail-safe",
         "red velocity 4,321 8.00 ms 5 6 7 9, flies now",
         "sensor state readers published dropped by link by reader late",

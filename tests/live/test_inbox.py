@@ -18,6 +18,8 @@ from cortex.messages import Imu
 from neurosim_core.live.inbox import _SPIN_S, Inbox
 from neurosim_core.live.topics import COMMANDS, command_topic
 from neurosim_core.live.translate import command_of
+from neurosim_core.vehicle import preset
+from neurosim_core.vehicle.command_ranges import command_ranges
 
 ROWS = {
     "motor_speeds": [100.0, 200.0, 300.0, 400.0],
@@ -31,9 +33,10 @@ ROWS = {
 class Desk:
     """An inbox, and publishers of commands."""
 
-    def __init__(self, node: Node, *, lockstep: bool) -> None:
+    def __init__(self, node: Node, *, lockstep: bool, beyond: str = "clamp") -> None:
         self.node = node
-        self.inbox = Inbox(node, "drone", rotor_count=4, lockstep=lockstep)
+        ranges = command_ranges(preset("hummingbird", command_ranges={"beyond": beyond}))
+        self.inbox = Inbox(node, "drone", rotor_count=4, ranges=ranges, lockstep=lockstep)
         self._publishers: dict[str, Publisher[Any]] = {}
 
     def publisher(self, mode: str) -> Publisher[Any]:
@@ -117,6 +120,24 @@ def test_bad_commands_are_refused(desk: Desk, mode: str, row: Any, caplog: pytes
     assert mode in caplog.text
     desk.send("rates", stamp_ns=5)
     assert wait_for(desk.inbox.poll).stamp_ns == 5
+
+
+@pytest.mark.parametrize(("beyond", "taken"), [("clamp", True), ("refuse", False)])
+def test_what_is_out_of_range_is_clamped_or_refused(
+    shared_runtime: Path, caplog: pytest.LogCaptureFixture, *, beyond: str, taken: bool
+):
+    """Counted and said either way; the controller clamps what is taken."""
+    with Node("inbox") as node, caplog.at_level(logging.WARNING):
+        desk = Desk(node, lockstep=False, beyond=beyond)
+        desk.send("velocity", row=[1e308, 0.0, 0.0, 0.0], stamp_ns=3)
+        desk.settle(1)
+        assert (desk.inbox.poll() is not None) == taken
+        assert (desk.inbox.counts.clamped, desk.inbox.counts.refused) == ((1, 0) if taken else (0, 1))
+        reason = desk.inbox.clamping if taken else desk.inbox.refusal
+        assert reason.startswith("a velocity of 1e+308, 0, 0 m/s is out of range: up to 51.")
+        assert reason in caplog.text
+        desk.inbox.reset()
+        assert (desk.inbox.counts.clamped, desk.inbox.counts.refused) == (0, 0)
 
 
 def test_another_type_on_the_topic_is_refused(desk: Desk):

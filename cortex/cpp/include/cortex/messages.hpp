@@ -1,4 +1,4 @@
-// Written by `cortex cpp`; do not edit. Types: cortex::messages::AttitudeCommand, cortex::messages::CameraInfo, cortex::messages::Clock, cortex::messages::Collision, cortex::messages::Delivery, cortex::messages::Events, cortex::messages::Image, cortex::messages::Imu, cortex::messages::MotorCommand, cortex::messages::Odometry, cortex::messages::Parameter, cortex::messages::Parameters, cortex::messages::Path, cortex::messages::PointCloud, cortex::messages::PoseCommand, cortex::messages::RateThrustCommand, cortex::messages::Reset, cortex::messages::RotorSpeeds, cortex::messages::SensorStatus, cortex::messages::Simulation, cortex::messages::SimulatorReply, cortex::messages::VehicleStatus, cortex::messages::SimulatorStatus, cortex::messages::Step, cortex::messages::Text, cortex::messages::Transform, cortex::messages::Trigger, cortex::messages::VelocityCommand.
+// Written by `cortex cpp`; do not edit. Types: cortex::messages::AttitudeCommand, cortex::messages::CameraInfo, cortex::messages::Clock, cortex::messages::Collision, cortex::messages::CommandRanges, cortex::messages::Delivery, cortex::messages::Events, cortex::messages::Image, cortex::messages::Imu, cortex::messages::MotorCommand, cortex::messages::Odometry, cortex::messages::Parameter, cortex::messages::Parameters, cortex::messages::Path, cortex::messages::PointCloud, cortex::messages::PoseCommand, cortex::messages::RateThrustCommand, cortex::messages::Reset, cortex::messages::RotorSpeeds, cortex::messages::SensorStatus, cortex::messages::Simulation, cortex::messages::SimulatorReply, cortex::messages::VehicleStatus, cortex::messages::SimulatorStatus, cortex::messages::Step, cortex::messages::Text, cortex::messages::Transform, cortex::messages::Trigger, cortex::messages::VelocityCommand.
 #pragma once
 
 #include <array>
@@ -271,6 +271,74 @@ struct Codec<::cortex::messages::Collision> {
 };
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_Collision_3BC3B9F2DE012E00
+
+#ifndef CORTEX_TYPE_cortex_messages_CommandRanges_729DCC2C178D66AB
+#define CORTEX_TYPE_cortex_messages_CommandRanges_729DCC2C178D66AB
+namespace cortex::messages {
+struct CommandRanges {
+  bool refuse{};
+  double rotor_speed_max_rad_s{};  // rad/s
+  double thrust_max_n{};  // N
+  double speed_max_m_s{};  // m/s
+  double body_rate_max_rad_s{};  // rad/s
+  double position_max_m{};  // m
+
+  friend bool operator==(const CommandRanges& a, const CommandRanges& b) {
+    return a.refuse == b.refuse &&
+           a.rotor_speed_max_rad_s == b.rotor_speed_max_rad_s &&
+           a.thrust_max_n == b.thrust_max_n &&
+           a.speed_max_m_s == b.speed_max_m_s &&
+           a.body_rate_max_rad_s == b.body_rate_max_rad_s &&
+           a.position_max_m == b.position_max_m;
+  }
+  friend bool operator!=(const CommandRanges& a, const CommandRanges& b) { return !(a == b); }
+};
+}  // namespace cortex::messages
+namespace cortex {
+template <>
+struct Codec<::cortex::messages::CommandRanges> {
+  static constexpr std::string_view name = "cortex/CommandRanges";
+  static constexpr std::uint64_t fingerprint = 0x729DCC2C178D66ABu;
+  static constexpr std::string_view schema =
+      "{\"name\":\"cortex/CommandRanges\",\"fields\":[{\"name\":\"refuse\",\"type\":\"bool\",\"unit\":\"\",\"frame\":"
+      "\"\"},{\"name\":\"rotor_speed_max_rad_s\",\"type\":\"float64\",\"unit\":\"rad/s\",\"frame\":\"\"},{\"name\":\"t"
+      "hrust_max_n\",\"type\":\"float64\",\"unit\":\"N\",\"frame\":\"\"},{\"name\":\"speed_max_m_s\",\"type\":\"float"
+      "64\",\"unit\":\"m/s\",\"frame\":\"\"},{\"name\":\"body_rate_max_rad_s\",\"type\":\"float64\",\"unit\":\"rad/s\""
+      ",\"frame\":\"\"},{\"name\":\"position_max_m\",\"type\":\"float64\",\"unit\":\"m\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 48;
+  static constexpr std::size_t alignment = 8;
+  static constexpr bool fixed = true;
+  static constexpr bool stamped = false;
+
+  static std::int64_t stamp([[maybe_unused]] const ::cortex::messages::CommandRanges& message) noexcept {
+    return 0;
+  }
+
+  static void decode(Reader& reader, std::size_t at, ::cortex::messages::CommandRanges& out) {
+    reader.scalar(at, out.refuse);
+    reader.scalar(at + 8, out.rotor_speed_max_rad_s);
+    reader.scalar(at + 16, out.thrust_max_n);
+    reader.scalar(at + 24, out.speed_max_m_s);
+    reader.scalar(at + 32, out.body_rate_max_rad_s);
+    reader.scalar(at + 40, out.position_max_m);
+  }
+
+  template <class Sink>
+  static void encode(Sink& sink, std::size_t at, const ::cortex::messages::CommandRanges& message) {
+    sink.scalar(at, message.refuse);
+    sink.zero(at + 1, 7);
+    sink.scalar(at + 8, message.rotor_speed_max_rad_s);
+    sink.scalar(at + 16, message.thrust_max_n);
+    sink.scalar(at + 24, message.speed_max_m_s);
+    sink.scalar(at + 32, message.body_rate_max_rad_s);
+    sink.scalar(at + 40, message.position_max_m);
+  }
+
+  static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::CommandRanges& out) {
+  }
+};
+}  // namespace cortex
+#endif  // CORTEX_TYPE_cortex_messages_CommandRanges_729DCC2C178D66AB
 
 #ifndef CORTEX_TYPE_cortex_messages_Delivery_2D8117FB3B19969D
 #define CORTEX_TYPE_cortex_messages_Delivery_2D8117FB3B19969D
@@ -1435,8 +1503,8 @@ struct Codec<::cortex::messages::SensorStatus> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_SensorStatus_D4AD0AAC0CCF4967
 
-#ifndef CORTEX_TYPE_cortex_messages_Simulation_269694B7F6067838
-#define CORTEX_TYPE_cortex_messages_Simulation_269694B7F6067838
+#ifndef CORTEX_TYPE_cortex_messages_Simulation_6E54A4EFCCEB44C8
+#define CORTEX_TYPE_cortex_messages_Simulation_6E54A4EFCCEB44C8
 namespace cortex::messages {
 struct Simulation {
   std::string config{};
@@ -1445,6 +1513,7 @@ struct Simulation {
   std::string mode{};
   double control_rate_hz{};  // Hz
   std::vector<double> thrust_max_n{};  // N
+  std::vector<::cortex::messages::CommandRanges> command_ranges{};
 
   friend bool operator==(const Simulation& a, const Simulation& b) {
     return a.config == b.config &&
@@ -1452,7 +1521,8 @@ struct Simulation {
            a.vehicles == b.vehicles &&
            a.mode == b.mode &&
            a.control_rate_hz == b.control_rate_hz &&
-           a.thrust_max_n == b.thrust_max_n;
+           a.thrust_max_n == b.thrust_max_n &&
+           a.command_ranges == b.command_ranges;
   }
   friend bool operator!=(const Simulation& a, const Simulation& b) { return !(a == b); }
 };
@@ -1461,14 +1531,20 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::Simulation> {
   static constexpr std::string_view name = "cortex/Simulation";
-  static constexpr std::uint64_t fingerprint = 0x269694B7F6067838u;
+  static constexpr std::uint64_t fingerprint = 0x6E54A4EFCCEB44C8u;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/Simulation\",\"fields\":[{\"name\":\"config\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},"
       "{\"name\":\"version\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"vehicles\",\"type\":{\"list\":\"st"
       "r\"},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"contr"
       "ol_rate_hz\",\"type\":\"float64\",\"unit\":\"Hz\",\"frame\":\"\"},{\"name\":\"thrust_max_n\",\"type\":{\"list\""
-      ":\"float64\"},\"unit\":\"N\",\"frame\":\"\"}]}";
-  static constexpr std::size_t block = 48;
+      ":\"float64\"},\"unit\":\"N\",\"frame\":\"\"},{\"name\":\"command_ranges\",\"type\":{\"list\":{\"message\":{\"na"
+      "me\":\"cortex/CommandRanges\",\"fields\":[{\"name\":\"refuse\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},"
+      "{\"name\":\"rotor_speed_max_rad_s\",\"type\":\"float64\",\"unit\":\"rad/s\",\"frame\":\"\"},{\"name\":\"thrus"
+      "t_max_n\",\"type\":\"float64\",\"unit\":\"N\",\"frame\":\"\"},{\"name\":\"speed_max_m_s\",\"type\":\"float64\","
+      "\"unit\":\"m/s\",\"frame\":\"\"},{\"name\":\"body_rate_max_rad_s\",\"type\":\"float64\",\"unit\":\"rad/s\",\"fr"
+      "ame\":\"\"},{\"name\":\"position_max_m\",\"type\":\"float64\",\"unit\":\"m\",\"frame\":\"\"}]}}},\"unit\":\"\",\"f"
+      "rame\":\"\"}]}";
+  static constexpr std::size_t block = 56;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
   static constexpr bool stamped = false;
@@ -1502,6 +1578,16 @@ struct Codec<::cortex::messages::Simulation> {
         out.thrust_max_n.push_back(std::move(item2));
       }
     }
+    {
+      const auto list2 = reader.list(at + 48, 48);
+      out.command_ranges.clear();
+      out.command_ranges.reserve(list2.count);
+      for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
+        ::cortex::messages::CommandRanges item2{};
+        Codec<::cortex::messages::CommandRanges>::decode(reader, list2.at + k2 * 48, item2);
+        out.command_ranges.push_back(std::move(item2));
+      }
+    }
   }
 
   template <class Sink>
@@ -1526,13 +1612,21 @@ struct Codec<::cortex::messages::Simulation> {
         sink.scalar(start2 + k2 * 8, item2);
       }
     }
+    {
+      const std::size_t start2 =
+          sink.list(at + 48, message.command_ranges.size(), 48, 8);
+      for (std::size_t k2 = 0; k2 < message.command_ranges.size(); ++k2) {
+        const auto& item2 = message.command_ranges[k2];
+        Codec<::cortex::messages::CommandRanges>::encode(sink, start2 + k2 * 48, item2);
+      }
+    }
   }
 
   static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::Simulation& out) {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_Simulation_269694B7F6067838
+#endif  // CORTEX_TYPE_cortex_messages_Simulation_6E54A4EFCCEB44C8
 
 #ifndef CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
 #define CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
@@ -1593,8 +1687,8 @@ struct Codec<::cortex::messages::SimulatorReply> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_SimulatorReply_5DCD028328196B99
 
-#ifndef CORTEX_TYPE_cortex_messages_VehicleStatus_15C1F6CC547E3916
-#define CORTEX_TYPE_cortex_messages_VehicleStatus_15C1F6CC547E3916
+#ifndef CORTEX_TYPE_cortex_messages_VehicleStatus_80FB9B86E76C25D5
+#define CORTEX_TYPE_cortex_messages_VehicleStatus_80FB9B86E76C25D5
 namespace cortex::messages {
 struct VehicleStatus {
   std::string name{};
@@ -1609,6 +1703,8 @@ struct VehicleStatus {
   std::uint64_t collision_count{};
   std::uint64_t undelivered_count{};
   std::string refused_reason{};
+  std::uint64_t clamped_count{};
+  std::string clamped_reason{};
 
   friend bool operator==(const VehicleStatus& a, const VehicleStatus& b) {
     return a.name == b.name &&
@@ -1622,7 +1718,9 @@ struct VehicleStatus {
            a.fail_safe_count == b.fail_safe_count &&
            a.collision_count == b.collision_count &&
            a.undelivered_count == b.undelivered_count &&
-           a.refused_reason == b.refused_reason;
+           a.refused_reason == b.refused_reason &&
+           a.clamped_count == b.clamped_count &&
+           a.clamped_reason == b.clamped_reason;
   }
   friend bool operator!=(const VehicleStatus& a, const VehicleStatus& b) { return !(a == b); }
 };
@@ -1631,7 +1729,7 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::VehicleStatus> {
   static constexpr std::string_view name = "cortex/VehicleStatus";
-  static constexpr std::uint64_t fingerprint = 0x15C1F6CC547E3916u;
+  static constexpr std::uint64_t fingerprint = 0x80FB9B86E76C25D5u;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/VehicleStatus\",\"fields\":[{\"name\":\"name\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}"
       ",{\"name\":\"command_mode\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"command_count\",\"type\":"
@@ -1641,8 +1739,9 @@ struct Codec<::cortex::messages::VehicleStatus> {
       "frame\":\"\"},{\"name\":\"fail_safe\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"fail_safe_coun"
       "t\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"collision_count\",\"type\":\"uint64\",\"unit\":"
       "\"\",\"frame\":\"\"},{\"name\":\"undelivered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\""
-      "refused_reason\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}]}";
-  static constexpr std::size_t block = 96;
+      "refused_reason\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"clamped_count\",\"type\":\"uint64\""
+      ",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"clamped_reason\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 112;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
   static constexpr bool stamped = false;
@@ -1664,6 +1763,8 @@ struct Codec<::cortex::messages::VehicleStatus> {
     reader.scalar(at + 72, out.collision_count);
     reader.scalar(at + 80, out.undelivered_count);
     reader.text(at + 88, out.refused_reason);
+    reader.scalar(at + 96, out.clamped_count);
+    reader.text(at + 104, out.clamped_reason);
   }
 
   template <class Sink>
@@ -1681,16 +1782,18 @@ struct Codec<::cortex::messages::VehicleStatus> {
     sink.scalar(at + 72, message.collision_count);
     sink.scalar(at + 80, message.undelivered_count);
     sink.text(at + 88, message.refused_reason);
+    sink.scalar(at + 96, message.clamped_count);
+    sink.text(at + 104, message.clamped_reason);
   }
 
   static void draft([[maybe_unused]] Placer& placer, [[maybe_unused]] ::cortex::messages::VehicleStatus& out) {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_VehicleStatus_15C1F6CC547E3916
+#endif  // CORTEX_TYPE_cortex_messages_VehicleStatus_80FB9B86E76C25D5
 
-#ifndef CORTEX_TYPE_cortex_messages_SimulatorStatus_85796E14C8EA717A
-#define CORTEX_TYPE_cortex_messages_SimulatorStatus_85796E14C8EA717A
+#ifndef CORTEX_TYPE_cortex_messages_SimulatorStatus_3BDFB9CD2C469ACD
+#define CORTEX_TYPE_cortex_messages_SimulatorStatus_3BDFB9CD2C469ACD
 namespace cortex::messages {
 struct SimulatorStatus {
   std::int64_t stamp_ns{};  // ns
@@ -1737,7 +1840,7 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::SimulatorStatus> {
   static constexpr std::string_view name = "cortex/SimulatorStatus";
-  static constexpr std::uint64_t fingerprint = 0x85796E14C8EA717Au;
+  static constexpr std::uint64_t fingerprint = 0x3BDFB9CD2C469ACDu;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/SimulatorStatus\",\"fields\":[{\"name\":\"stamp_ns\",\"type\":\"int64\",\"unit\":\"ns\",\""
       "frame\":\"\"},{\"name\":\"wall_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"CLOCK_REALTIME\"},{\"name\":"
@@ -1765,8 +1868,9 @@ struct Codec<::cortex::messages::SimulatorStatus> {
       "e\",\"type\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"fail_safe_count\",\"type\":\"uint64\",\"unit\":\"\""
       ",\"frame\":\"\"},{\"name\":\"collision_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"unde"
       "livered_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"refused_reason\",\"type\":\"str\""
-      ",\"unit\":\"\",\"frame\":\"\"}]}}},\"unit\":\"\",\"frame\":\"\"},{\"name\":\"sequence\",\"type\":\"uint64\",\"unit\""
-      ":\"\",\"frame\":\"\"}]}";
+      ",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"clamped_count\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"},{\"nam"
+      "e\":\"clamped_reason\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"}]}}},\"unit\":\"\",\"frame\":\"\"},{\"name\":\""
+      "sequence\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
   static constexpr std::size_t block = 136;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
@@ -1802,12 +1906,12 @@ struct Codec<::cortex::messages::SimulatorStatus> {
       }
     }
     {
-      const auto list2 = reader.list(at + 120, 96);
+      const auto list2 = reader.list(at + 120, 112);
       out.vehicles.clear();
       out.vehicles.reserve(list2.count);
       for (std::size_t k2 = 0; k2 < list2.count; ++k2) {
         ::cortex::messages::VehicleStatus item2{};
-        Codec<::cortex::messages::VehicleStatus>::decode(reader, list2.at + k2 * 96, item2);
+        Codec<::cortex::messages::VehicleStatus>::decode(reader, list2.at + k2 * 112, item2);
         out.vehicles.push_back(std::move(item2));
       }
     }
@@ -1840,10 +1944,10 @@ struct Codec<::cortex::messages::SimulatorStatus> {
     }
     {
       const std::size_t start2 =
-          sink.list(at + 120, message.vehicles.size(), 96, 8);
+          sink.list(at + 120, message.vehicles.size(), 112, 8);
       for (std::size_t k2 = 0; k2 < message.vehicles.size(); ++k2) {
         const auto& item2 = message.vehicles[k2];
-        Codec<::cortex::messages::VehicleStatus>::encode(sink, start2 + k2 * 96, item2);
+        Codec<::cortex::messages::VehicleStatus>::encode(sink, start2 + k2 * 112, item2);
       }
     }
     sink.scalar(at + 128, message.sequence);
@@ -1853,7 +1957,7 @@ struct Codec<::cortex::messages::SimulatorStatus> {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_SimulatorStatus_85796E14C8EA717A
+#endif  // CORTEX_TYPE_cortex_messages_SimulatorStatus_3BDFB9CD2C469ACD
 
 #ifndef CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
 #define CORTEX_TYPE_cortex_messages_Step_F36F31368FC43311
