@@ -32,6 +32,7 @@ typedef struct {
     Py_ssize_t limit; /* where the body must end */
     const char *place; /* where it goes, if arrays may lie there already; NULL: they do not */
     int64_t stamp_ns;
+    Py_ssize_t values_left; /* objects that the elements of lists may still become */
     int defers; /* whether large arrays are left to `copy_deferred` */
     int deferred_count;
     Deferred deferred[DEFERRED_MAX];

@@ -121,7 +121,10 @@ static int take_optional(Item *item, PyObject *detail, Py_ssize_t room, int dime
 
 static int take_list(List *list, PyObject *detail) {
     PyObject *row;
-    if (!PyArg_ParseTuple(detail, "Onni", &row, &list->stride, &list->alignment, &list->dimension_count)) return 0;
+    if (!PyArg_ParseTuple(detail, "Onnin", &row, &list->stride, &list->alignment, &list->dimension_count,
+                          &list->values))
+        return 0;
+    if (list->values < 1) return refuse("elements of no values");
     if (list->stride < 1 || list->alignment < 1 || list->alignment & (list->alignment - 1)) return refuse("a wrong stride");
     if (list->dimension_count < 0 || list->dimension_count > DIMENSIONS_MAX) return refuse("too many names");
     list->item = allocate(1, sizeof(Item));

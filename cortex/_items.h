@@ -8,6 +8,7 @@
 
 enum {
     RANK_MAX = 32,
+    VALUES_MAX = 1 << 20, /* objects that the elements of all lists of a body become */
     DIMENSIONS_MAX = 64, /* named dimensions that must agree, in one scope */
 };
 static const Py_ssize_t BODY_LIMIT = (Py_ssize_t)1 << 32;
@@ -48,6 +49,7 @@ typedef struct {
 typedef struct {
     Item *item;
     Py_ssize_t stride, alignment;
+    Py_ssize_t values; /* objects that an element becomes */
     int dimension_count; /* of the scope that each element is */
 } List;
 

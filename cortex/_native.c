@@ -17,7 +17,7 @@ PyMODINIT_FUNC PyInit__native(void) {
     import_array();
     PyObject *module = PyModule_Create(&native_module);
     if (module == NULL) return NULL;
-    if (PyModule_AddIntConstant(module, "INTERFACE", 8) < 0 /* compiled.py compares it */
+    if (PyModule_AddIntConstant(module, "INTERFACE", 9) < 0 /* compiled.py compares it */
         || add_arrival(module) < 0 || add_coder(module) < 0 || add_construct(module) < 0 || add_gate(module) < 0
         || add_inlet(module) < 0 || add_pipe(module) < 0 || add_relay(module) < 0 || add_ring(module) < 0
         || add_socket(module) < 0) {

@@ -203,7 +203,8 @@ static int pack_fixed(Pack *pack, const Array *known, PyObject *value, Py_ssize_
 static int pack_list(Pack *pack, const List *list, PyObject *value, Py_ssize_t at) {
     if (!PyList_CheckExact(value) && !PyTuple_CheckExact(value)) return 0;
     const Py_ssize_t count = PySequence_Fast_GET_SIZE(value);
-    if (count > BODY_LIMIT / list->stride) return 0;
+    if (count > pack->values_left / list->values) return 0;
+    pack->values_left -= count * list->values;
     const Py_ssize_t start = claim(pack, count * list->stride, list->alignment);
     if (start < 0) return 0;
     if (pack->out != NULL) {
@@ -273,6 +274,7 @@ Py_ssize_t measure_body(const Coder *coder, PyObject *message) {
     pack.end = block->size;
     pack.limit = BODY_LIMIT - 1;
     pack.place = NULL;
+    pack.values_left = VALUES_MAX;
     return pack_message(&pack, block, message, 0) ? pack.end : -1;
 }
 
@@ -283,6 +285,7 @@ Py_ssize_t measure_in_place(const Coder *coder, PyObject *message, const char *p
     pack.end = block->size;
     pack.limit = room < BODY_LIMIT ? room : BODY_LIMIT - 1;
     pack.place = place;
+    pack.values_left = VALUES_MAX;
     return block->has_tail && block->size <= room && pack_message(&pack, block, message, 0) ? pack.end : -1;
 }
 
@@ -292,6 +295,7 @@ int write_body(const Coder *coder, PyObject *message, Pack *pack, char *out, Py_
     pack->end = block->size;
     pack->limit = size;
     pack->place = NULL;
+    pack->values_left = VALUES_MAX;
     pack->stamp_ns = 0;
     pack->defers = defers;
     pack->deferred_count = 0;

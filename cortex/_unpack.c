@@ -12,6 +12,7 @@ typedef struct {
     const char *data;
     Py_ssize_t size;
     Py_ssize_t left; /* bytes that items may still take up, as in `decoder.py` */
+    Py_ssize_t values_left;
 } Body;
 
 static PyObject *unpack_item(Body *body, const Item *item, Py_ssize_t at, npy_intp *dimensions);
@@ -118,7 +119,9 @@ static PyObject *unpack_list(Body *body, const List *list, Py_ssize_t at) {
     uint32_t numbers[2];
     memcpy(numbers, body->data + at, sizeof numbers);
     const Py_ssize_t start = numbers[0], count = numbers[1];
-    if (count > BODY_LIMIT / list->stride || !claim(body, start, count * list->stride)) return NULL;
+    if (count > body->values_left / list->values) return NULL;
+    body->values_left -= count * list->values;
+    if (!claim(body, start, count * list->stride)) return NULL;
     PyObject *elements = PyList_New(count);
     if (elements == NULL) return NULL;
     npy_intp dimensions[DIMENSIONS_MAX];
@@ -186,6 +189,6 @@ static PyObject *unpack_item(Body *body, const Item *item, Py_ssize_t at, npy_in
 PyObject *read_body(const Coder *coder, PyObject *owner, const char *data, Py_ssize_t size) {
     const Block *block = &coder->block;
     if (size < block->size || size >= BODY_LIMIT || (size > block->size && !block->has_tail)) return NULL;
-    Body body = {owner, data, size, size - block->size};
+    Body body = {owner, data, size, size - block->size, VALUES_MAX};
     return unpack_message(&body, block, 0);
 }

@@ -10,7 +10,9 @@ import logging
 import os
 from typing import Any
 
-INTERFACE = 8
+logger = logging.getLogger(__name__)
+
+INTERFACE = 9
 """What `_native.c` must say of itself: counts up with each change of what it offers."""
 
 
@@ -20,10 +22,15 @@ def _load() -> Any:
         return None
     try:
         module = importlib.import_module("cortex._native")
-    except ImportError:  # there was no compiler when this was installed
+    except ModuleNotFoundError as error:  # there was no compiler when this was installed
+        if error.name == "cortex._native":
+            return None
+        raise
+    except ImportError as error:
+        logger.warning("the C module of cortex cannot be loaded; all goes on, more slowly: %s", error)
         return None
     if getattr(module, "INTERFACE", 0) != INTERFACE:
-        logging.getLogger(__name__).warning(
+        logger.warning(
             "%s is older or newer than cortex and is left out, which is slower: install cortex again",
             module.__file__,
         )

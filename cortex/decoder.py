@@ -15,6 +15,7 @@ from cortex.layout import (
     DTYPE_CODES,
     DTYPES,
     SCALAR_CODES,
+    VALUES_MAX,
     array_dtype,
     block_size,
     has_tail,
@@ -23,6 +24,7 @@ from cortex.layout import (
     measure_fields,
     reading_struct,
     stride_of,
+    values_of,
 )
 from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
 from cortex.structure import new_message
@@ -39,7 +41,7 @@ DECODE_ERRORS = (ValueError, TypeError, LookupError, ArithmeticError, struct.err
 class Body:
     """The bytes being decoded."""
 
-    __slots__ = ("buffer", "left", "size", "start")
+    __slots__ = ("buffer", "left", "size", "start", "values_left")
 
     def __init__(self, buffer: Any, start: int, size: int, left: int) -> None:
         self.buffer = buffer
@@ -52,6 +54,8 @@ class Body:
         Items never overlap in a body that an encoder wrote: their sizes add up to less than the body's.
         Without this bound, many offsets to one place would let a small body demand any amount of memory.
         """
+        self.values_left = VALUES_MAX
+        """Objects that the elements of lists may still become."""
 
     def claim(self, offset: int, size: int) -> int:
         """Return where an item lies in the buffer."""
@@ -61,6 +65,12 @@ class Body:
         if self.left < 0:
             raise MalformedMessage(f"the items claim more than the body of {self.size} bytes")
         return self.start + offset
+
+    def claim_values(self, count: int) -> None:
+        """Account for the elements of a list."""
+        self.values_left -= count
+        if self.values_left < 0:
+            raise MalformedMessage(f"the lists hold more than {VALUES_MAX} values; large ones must be arrays")
 
 
 Scope: TypeAlias = "dict[str, int] | None"
@@ -222,9 +232,11 @@ def _get_list(kind: ListType, bound: Any, index: int) -> Get:
     names = shared_names([item])
     get_item = make_get(item, bound, names, 0, 0)
     unpack = reading_struct(item, stride).unpack_from
+    values = values_of(item)
 
     def get_elements(numbers: Sequence[Any], at: int, body: Body, scope: Scope) -> list[Any]:
         count = numbers[index + 1]
+        body.claim_values(count * values)
         start = body.claim(numbers[index], count * stride)
         buffer = body.buffer
         return [
@@ -234,6 +246,7 @@ def _get_list(kind: ListType, bound: Any, index: int) -> Get:
 
     def get_numbers(numbers: Sequence[Any], at: int, body: Body, scope: Scope) -> list[Any]:
         count = numbers[index + 1]
+        body.claim_values(count)
         start = body.claim(numbers[index], count * stride)
         result = list(struct.unpack_from(f"<{count}{code}", body.buffer, start))
         return [_truth(number) for number in result] if item == "bool" else result

@@ -18,12 +18,14 @@ from cortex.layout import (
     DTYPES,
     LARGE_ARRAY_BYTES,
     SCALAR_CODES,
+    VALUES_MAX,
     array_dtype,
     block_size,
     fixed_bytes,
     leaves,
     measure,
     stride_of,
+    values_of,
     writing_structs,
 )
 from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
@@ -48,12 +50,14 @@ CODE_OF_DTYPE = {dtype: code for code, dtype in enumerate(DTYPES)}
 class Tail:
     """What follows the fixed block: parts in order, each padded to its place."""
 
-    __slots__ = ("end", "parts")
+    __slots__ = ("end", "parts", "values_left")
 
     def __init__(self, end: int) -> None:
         self.end = end
         """Where the next item may begin, counted from the start of the body."""
         self.parts: list[Any] = []
+        self.values_left = VALUES_MAX
+        """Objects that the elements of lists may still become where they are read."""
 
     def add(self, part: Any, size: int, mask: int) -> int:
         """Append an item at a multiple of mask + 1 and return its offset."""
@@ -313,6 +317,7 @@ def _put_list(kind: ListType, bound: Any) -> Put:
     names = shared_names([item])
     put_item = make_put(item, bound, names)
     pack = pack_block(item, stride)
+    weight = values_of(item)
 
     def put(value: Any, values: list[Any], tail: Tail, scope: Scope) -> None:
         if not isinstance(value, (list, tuple)):
@@ -321,6 +326,9 @@ def _put_list(kind: ListType, bound: Any) -> Put:
         if not count:
             values += (0, 0)
             return
+        tail.values_left -= count * weight
+        if tail.values_left < 0:
+            raise ValueError(f"the lists hold more than {VALUES_MAX} values; send large ones as arrays")
         if code:
             values += (tail.add(struct.pack(f"<{count}{code}", *value), count * stride, mask), count)
             return

@@ -34,6 +34,7 @@ class Fanout:
         outlets: Tell who has come and gone.
         patience: Waits for reliable readers.
         plain: Whether the gate may send messages.
+        max_wait_s: Longest time that a reader may hold up the publisher, whatever it asks for [s].
         next_sequence: Says with which sequence a reader that comes now begins.
     """
 
@@ -47,6 +48,7 @@ class Fanout:
         outlets: Outlets,
         patience: Patience,
         plain: bool,
+        max_wait_s: float,
         next_sequence: Callable[[], int],
     ) -> None:
         self._topic = topic
@@ -56,6 +58,7 @@ class Fanout:
         self._outlets = outlets
         self._patience = patience
         self._plain = plain
+        self._max_wait_ms = round(max_wait_s * 1000.0)
         self._next_sequence = next_sequence
         self.readers: dict[bytes, Reader] = {}
         self.pipes = Pipes(self._await_room, patience.is_over)
@@ -89,6 +92,7 @@ class Fanout:
                 self._outlets.note(f"{self._topic}: has {READERS_MAX} subscribers, further ones are refused")
             self._crowded = True
             return
+        request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
         reader = self._large.admit(key, request, outlet)
         self.readers[key] = reader
         sequence = self._next_sequence()

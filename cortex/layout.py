@@ -28,6 +28,9 @@ ROOT_ALIGNMENT = 8
 BODY_LIMIT = 2**32
 """A body is shorter than this [bytes]."""
 
+VALUES_MAX = 1 << 20
+"""Most values that the lists of one body may hold together: each becomes an object of 30 to 100 bytes."""
+
 SCALAR_CODES = {
     "bool": "B",
     "int8": "b",
@@ -109,6 +112,15 @@ def stride_of(kind: FieldType) -> int:
     """Return the distance of list elements [bytes]."""
     size, alignment = measure(kind)
     return max(1, align(size, alignment))
+
+
+def values_of(kind: FieldType) -> int:
+    """Return how many objects a value of a type becomes, without the elements of lists within."""
+    if isinstance(kind, OptionalType):
+        return values_of(kind.item)
+    if isinstance(kind, Schema):
+        return 1 + sum(values_of(field.type) for field in kind.fields)
+    return 1
 
 
 @dataclass(frozen=True)

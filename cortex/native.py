@@ -8,7 +8,8 @@ the kind:
 - array: dtypes that it may have; sizes (-1: any) and names (a number in the scope, -1: none) of its
   dimensions; and the second number of its descriptor, less the index of the dtype
 - optional: the item
-- list: the item, the distance of elements, how they are aligned, and how many names each has to itself
+- list: the item, the distance of elements, how they are aligned, how many names each has to itself, and how
+  many objects each becomes
 - message: its class, size of its block, how many names it has, and (name, item) for each field
 """
 
@@ -29,6 +30,7 @@ from cortex.layout import (
     measure,
     measure_fields,
     stride_of,
+    values_of,
 )
 from cortex.schema import ArrayType, EnumType, FieldType, ListType, OptionalType, Schema
 
@@ -125,4 +127,5 @@ def _array(kind: ArrayType, scope: _Scope) -> tuple[Any, ...]:
 def _list(kind: ListType, bound: Any) -> tuple[Any, ...]:
     scope = _scope([kind.item])
     alignment = max(ITEM_ALIGNMENT, measure(kind.item)[1])
-    return _item(kind.item, bound, 0, scope), stride_of(kind.item), alignment, len(scope)
+    item = _item(kind.item, bound, 0, scope)
+    return item, stride_of(kind.item), alignment, len(scope), values_of(kind.item)

@@ -39,7 +39,7 @@ from cortex.overview import (
 )
 from cortex.places import Places, clock_offset_ns
 from cortex.policy import Policy, keep_last
-from cortex.publisher import INLINE_MAX, Publisher, close_publishers
+from cortex.publisher import COMMAND_MAX_WAIT_S, INLINE_MAX, MAX_WAIT_S, Publisher, close_publishers
 from cortex.raw import RawCodec, RawMessage
 from cortex.records import NodeRecord, StatsReply, StatsRequest
 from cortex.schema import Schema, schema_of
@@ -147,6 +147,7 @@ class Node:
         coalesce: bool = False,
         inline_max: int = INLINE_MAX,
         expected_bytes: int = 0,
+        max_wait_s: float | None = None,
     ) -> Publisher[T]:
         """Publish messages of a type on a topic.
 
@@ -160,7 +161,17 @@ class Node:
             expected_bytes: Bodies will hardly be larger than this: shared memory for them is made when the
                 first local subscriber comes, and not while messages grow, which takes milliseconds then
                 [bytes]. 0: not known.
+            max_wait_s: Longest time that reliable subscribers may hold up one `publish`, whatever they
+                ask for [s]. None: 1 s, for the types of `cortex.messages.commands` 0.1 s.
+
+        Raises:
+            ValueError: The topic is not one, or `max_wait_s` is not 0 to 86400.
         """
+        if max_wait_s is None:
+            is_command = message_type.__module__ == "cortex.messages.commands"
+            max_wait_s = COMMAND_MAX_WAIT_S if is_command else MAX_WAIT_S
+        if not 0.0 <= max_wait_s <= 86_400.0:
+            raise ValueError(f"max_wait_s must be 0 to 86400, got {max_wait_s}")
         return self._add_publisher(
             Publisher(
                 check_topic(topic),
@@ -170,6 +181,7 @@ class Node:
                 coalesce=coalesce,
                 inline_max=inline_max,
                 expected_bytes=expected_bytes,
+                max_wait_s=max_wait_s,
                 on_batch=self._flusher.wake,
                 on_close=self._drop_publisher,
             ),

@@ -46,6 +46,10 @@ REFRESH_NS = 1_000_000
 LINGER_S = 0.5
 """How long `close` waits for whom it owes nothing: lossy readers, and slots that nobody has given back."""
 
+MAX_WAIT_S = 1.0
+COMMAND_MAX_WAIT_S = 0.1
+"""Default of `max_wait_s` for the types of `cortex.messages.commands`: a controller must not stand still."""
+
 BURST_NS = 15_000
 """Two messages closer than this are a burst."""
 
@@ -63,6 +67,7 @@ class Publisher(Generic[T]):
         coalesce: bool = False,
         inline_max: int = INLINE_MAX,
         expected_bytes: int = 0,
+        max_wait_s: float = MAX_WAIT_S,
         on_batch: Callable[[], None] | None = None,
         on_close: Callable[[Publisher[T]], None] | None = None,
     ) -> None:
@@ -117,6 +122,7 @@ class Publisher(Generic[T]):
             outlets=outlets,
             patience=self._patience,
             plain=not latch and not coalesce,
+            max_wait_s=max_wait_s,
             next_sequence=self._next_sequence,
         )
         self._was_large = False

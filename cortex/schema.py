@@ -54,7 +54,9 @@ DTYPE_NAMES = (
 ANY_DTYPE = "any"
 MAX_FIELDS = 256
 MAX_DEPTH = 8
-MAX_TEXT_BYTES = 1 << 20
+MAX_TEXT_BYTES = 1 << 16
+MAX_NODES = 2048
+"""Most fields, enum values and dimensions of a schema, nested ones included: it takes time to build each."""
 MAX_DIMENSIONS = 32
 MAX_LABEL = 64
 MAX_FIXED_BYTES = 1 << 30
@@ -193,6 +195,11 @@ class Schema:
             raise SchemaError(f"{self.name} defines a field twice: {', '.join(twice)}")
         if _depth(self) > MAX_DEPTH:
             raise SchemaError(f"{self.name} nests {_depth(self)} levels deep, allowed are {MAX_DEPTH}")
+        if _count_nodes(self) > MAX_NODES:
+            raise SchemaError(
+                f"{self.name} has {_count_nodes(self)} fields, enum values and dimensions with those of "
+                f"nested types, allowed are {MAX_NODES}"
+            )
         _check_fixed_size(self.name, _block_size(self))
         if len(self._text.encode()) > MAX_TEXT_BYTES:
             raise SchemaError(f"{self.name}: the schema is longer than {MAX_TEXT_BYTES} bytes")
@@ -200,6 +207,10 @@ class Schema:
     @cached_property
     def _text(self) -> str:
         return json.dumps(_schema_to_plain(self), ensure_ascii=False, separators=(",", ":"))
+
+    @cached_property
+    def _node_count(self) -> int:
+        return len(self.fields) + sum(_count_nodes(field.type) for field in self.fields)
 
     @cached_property
     def fingerprint(self) -> int:
@@ -328,6 +339,16 @@ def _block_size(schema: Schema) -> int:
     from cortex.layout import block_size  # it needs the records of this module
 
     return block_size(schema)
+
+
+def _count_nodes(kind: FieldType) -> int:
+    if isinstance(kind, (OptionalType, ListType)):
+        return _count_nodes(kind.item)
+    if isinstance(kind, Schema):
+        return kind._node_count
+    if isinstance(kind, EnumType):
+        return len(kind.values)
+    return len(kind.shape) if isinstance(kind, ArrayType) else 0
 
 
 def _depth(kind: FieldType) -> int:

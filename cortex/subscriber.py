@@ -99,6 +99,7 @@ class Subscriber(Generic[T]):
         """Publishers that this subscriber cannot be connected to; kept by the node."""
         self._poll: select.poll | None = None
         self._looks_left_out = 0
+        self._mismatch: TypeMismatch | None = None
 
     def recv(self, timeout_s: float | None = None) -> T:
         """Take the next message.
@@ -110,7 +111,8 @@ class Subscriber(Generic[T]):
 
         Raises:
             TimeoutError: None came in time.
-            TypeMismatch: A publisher of this topic sends another type; raised once for each.
+            TypeMismatch: A publisher of this topic sends another type; raised once for each, and in place of
+                TimeoutError while there is no publisher of the right type.
             Closed: The subscriber was closed.
         """
         message: T = self._inlet(timeout_s is None or timeout_s >= BLOCK_S)
@@ -226,7 +228,7 @@ class Subscriber(Generic[T]):
             look = True
             left_s = WAIT_MAX_S if deadline_s is None else deadline_s - time.monotonic()
             if left_s <= 0.0:
-                raise TimeoutError(self._nothing_came(timeout_s))
+                raise self._nothing_came(timeout_s)
             if self._queue or not inlet.exhausted:  # what came could not be read
                 await asyncio.sleep(0)
                 continue
@@ -266,9 +268,12 @@ class Subscriber(Generic[T]):
         except Closed:
             raise StopAsyncIteration from None
 
-    def _nothing_came(self, timeout_s: float | None) -> str:
+    def _nothing_came(self, timeout_s: float | None) -> Exception:
+        """What to raise when no message came in time: if all publishers have another type, that is why."""
+        if self._mismatch is not None and self.refused and not self._links:
+            return self._mismatch
         others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
-        return f"{self.topic}: no message within {timeout_s} s{others}"
+        return TimeoutError(f"{self.topic}: no message within {timeout_s} s{others}")
 
     def _watched(self) -> tuple[int, list[int]]:
         with self._turn:
@@ -292,7 +297,7 @@ class Subscriber(Generic[T]):
             if deadline_s is not None:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0.0:
-                    raise TimeoutError(self._nothing_came(timeout_s))
+                    raise self._nothing_came(timeout_s)
             if item is None:  # else what came could not be read: look for the next
                 self._wait(min(left_s, WAIT_MAX_S))
                 if deadline_s is not None:
@@ -570,6 +575,7 @@ class Subscriber(Generic[T]):
         with self._turn:
             self.counters.rejected += 1
             self._problems.append(problem)
+            self._mismatch = problem
             self._open_inlet()
         self.wakeup.set()
 

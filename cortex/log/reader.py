@@ -423,8 +423,6 @@ def _stamp_in(channel: _Channel, body: bytes) -> int | None:
 
 def _read_chunk(file: BinaryIO, position: int, size: int) -> bytes:
     """Return the records of a chunk, uncompressed and checked."""
-    from mcap.stream_reader import get_chunk_data_stream
-
     file.seek(position)
     with _Damage(f"the chunk at byte {position} is damaged"):
         code, length = _FRAME.unpack(file.read(_FRAME.size))
@@ -433,10 +431,29 @@ def _read_chunk(file: BinaryIO, position: int, size: int) -> bytes:
         chunk = _record_types()["Chunk"](_stream(file.read(length)))
         if chunk.uncompressed_size > _CHUNK_MAX:
             raise LogError(f"it claims {chunk.uncompressed_size} bytes")
-        if not chunk.compression and len(chunk.data) != chunk.uncompressed_size:
-            raise LogError(f"it has {len(chunk.data)} bytes and claims {chunk.uncompressed_size}")
-        stream, data_size = get_chunk_data_stream(chunk, validate_crc=True)
-        return stream.read(data_size)
+        data = _decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise LogError("its check sum is wrong")
+        return data
+
+
+def _decompress(compression: str, data: bytes, size: int) -> bytes:
+    """Return a chunk's data; no more than the size that it claims is ever unpacked."""
+    if compression == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        unpacked = LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    elif compression == "zstd":
+        from zstandard import ZstdDecompressor
+
+        with ZstdDecompressor().stream_reader(data) as reader:
+            unpacked = reader.read(size + 1)
+    else:
+        unpacked = data
+    if len(unpacked) != size:
+        more = "more" if len(unpacked) > size else str(len(unpacked))
+        raise LogError(f"it has {more} bytes uncompressed and claims {size}")
+    return bytes(unpacked)
 
 
 def _payloads(data: bytes, wanted: int, position: int) -> Iterator[memoryview]:

@@ -176,8 +176,8 @@ def test_limits_are_inclusive():
     with pytest.raises(SchemaError, match="9 levels deep, allowed are 8"):
         Schema("a", (field(nested(8)),))
     assert Schema("a" * 128, (field(name="b" * 64, unit="m" * 64),))
-    values = tuple((f"A{k}" + "x" * 50, k) for k in range(20000))
-    with pytest.raises(SchemaError, match="longer than 1048576 bytes"):
+    values = tuple((f"A{k}" + "x" * 50, k) for k in range(2000))
+    with pytest.raises(SchemaError, match="longer than 65536 bytes"):
         Schema("a", (field(EnumType("E", values)),))
 
 
