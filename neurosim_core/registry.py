@@ -11,8 +11,10 @@ In a script, importing or defining the class before the settings are loaded is e
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import logging
+import pkgutil
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TypeVar
@@ -87,15 +89,18 @@ def on_change(listener: Callable[[str], None]) -> None:
 
 
 def load_plugins() -> None:
-    """Import the modules that entry points of `neurosim.plugins` name, once in a process.
+    """Import every module of `neurosim_core.sensors`, and those that entry points name, once in a process.
 
-    A module that cannot be imported is left out with a warning: one broken package must not take the others
+    A foreign module that cannot be imported is left out with a warning: one broken package must not take the others
     down.
     """
     global _loaded
     if _loaded:
         return
     _loaded = True
+    sensors = importlib.import_module("neurosim_core.sensors")
+    for module in pkgutil.iter_modules(sensors.__path__, f"{sensors.__name__}."):
+        importlib.import_module(module.name)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
         try:
             entry.load()

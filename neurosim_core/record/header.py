@@ -80,7 +80,6 @@ def describe_sensors(sensors: Mapping[str, SensorConfig]) -> tuple[SensorDescrip
 
 
 def _describe(name: str, sensor: Any) -> SensorDescription:
-    rate: Any = getattr(sensor, "packets", sensor)  # an event camera has a clock of its own for packets
     mount, lens = getattr(sensor, "mount", None), getattr(sensor, "lens", None)
     position, orientation = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     if mount is not None:
@@ -93,7 +92,7 @@ def _describe(name: str, sensor: Any) -> SensorDescription:
     return SensorDescription(
         name=name,
         kind=sensor.kind,
-        rate_hz=rate.rate_hz,
+        rate_hz=sensor.packets.rate_hz,
         position=position,
         orientation=orientation,
         intrinsics=intrinsics,

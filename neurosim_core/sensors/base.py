@@ -48,7 +48,12 @@ class SensorConfig(Settings):
     @property
     def clock(self) -> Rate:
         """When it samples."""
-        return Rate(self.rate_hz)  # type: ignore[attr-defined,no-any-return]
+        return Rate(self.rate_hz)  # type: ignore[attr-defined]
+
+    @property
+    def packets(self) -> Rate:
+        """When its packets come."""
+        return self.clock
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -247,7 +252,3 @@ class FrameSensorConfig(CameraConfig):
             ValueError: It cannot be in many worlds; the message says why.
         """
         raise ValueError(f"{context.name!r} is for single runs")
-
-    def packet_clock(self) -> Rate:
-        """Return the clock at which packets end."""
-        raise NotImplementedError(f"{type(self).__name__} must say when its packets end")

@@ -52,8 +52,9 @@ class EventSensorConfig(FrameSensorConfig):
         """When log radiance is rendered for it."""
         return Rate(self.sampling_rate_hz)
 
-    def packet_clock(self) -> Rate:
-        """Return the clock at which packets end."""
+    @property
+    def packets(self) -> Rate:
+        """The clock at which packets end."""
         if self.packet_rate_hz is not None:
             return Rate(self.packet_rate_hz)
         sampling = Fraction(str(self.sampling_rate_hz))
@@ -68,7 +69,7 @@ class EventSensorConfig(FrameSensorConfig):
             rate_hz=self.sampling_rate_hz,
             every_instant=True,
             max_displacement_px=self.max_displacement_px,
-            required=self.packet_clock() if adaptive else None,
+            required=self.packets if adaptive else None,
         )
 
     def make(self, context: FrameContext) -> EventChannel:
@@ -136,7 +137,7 @@ class EventChannel:
         )
         self.terms = self.camera.terms
         self.watching = False
-        self._packets = config.packet_clock()
+        self._packets = config.packets
         self._sequence = 0
         self._seen_ns = 0
 

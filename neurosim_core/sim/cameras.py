@@ -9,7 +9,6 @@ from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
-from neurosim_core.sensors.base import FrameSensorConfig
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import (
     RenderGroupState,
@@ -98,8 +97,7 @@ def choose(
 
 def _required_clocks(model: Model, group: RenderGroupState) -> dict[str, Rate]:
     """Return the clocks whose ticks an adaptive group renders in any case, by frame sensor."""
-    configs = {name: model.config.sensors[name] for name in group.frames}
-    return {name: c.packet_clock() for name, c in configs.items() if isinstance(c, FrameSensorConfig)}
+    return {name: model.config.sensors[name].packets for name in group.frames}
 
 
 def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> list[RenderJob]:

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from late_device import LateDevice, install
 
-from neurosim_core import streams
+from neurosim_core.runtime import cuda
 from neurosim_core.packets import Events
 from neurosim_core.sensors.event_config import ShotNoiseConfig
 from neurosim_core.sensors.event_keys import EventKeys
@@ -260,7 +260,7 @@ def test_a_flight_of_changing_views_needs_no_memory(monkeypatch, lanes):
     camera = make_camera("cpu", lanes=lanes)
     for owner, name in (
         (Pixels, "_empty"), (EventKeys, "_empty"),
-        (streams.LentBlock, "__init__"), (streams.HostCopy, "__init__"),
+        (cuda.PooledBuffer, "__init__"), (cuda.HostCopy, "__init__"),
     ):  # fmt: skip
         monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
     camera.reset(first)

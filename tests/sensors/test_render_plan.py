@@ -80,7 +80,7 @@ def test_adaptive_cameras_that_need_the_same_renders_share_them():
 @pytest.mark.parametrize("value", [0.0, -1.0, 101.0, float("nan")])
 def test_a_displacement_out_of_range_is_refused(value):
     with pytest.raises(ValueError, match="max_displacement_px"):
-        casts({"events": {**EVENTS, "max_displacement_px": value}})
+        groups({"events": {**EVENTS, "max_displacement_px": value}})
 
 
 def test_slow_image_sensors_join_fast_ones():
@@ -90,4 +90,4 @@ def test_slow_image_sensors_join_fast_ones():
 
 
 def test_sensors_that_need_no_picture_need_no_cast():
-    assert casts({"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}}) == ()
+    assert groups({"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}}) == ()

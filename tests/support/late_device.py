@@ -18,7 +18,7 @@ import warp as wp
 from neurosim_core.runtime import cuda
 from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, events
 
-_MODULES = (streams, events, event_keys, event_pixels, event_readout)
+_MODULES = (cuda, events, event_keys, event_pixels, event_readout)
 
 
 class LateStream:
@@ -95,10 +95,10 @@ class LateDevice(str):
         yield
         self.stream = before
 
-    def make_stream(self, device: Any, *, urgent: bool = False) -> LateStream:
+    def make_stream(self, device: Any, *, high_priority: bool = False) -> LateStream:
         """Return a new stream."""
         stream = LateStream()
-        self.cuda.append(stream)
+        self.streams.append(stream)
         return stream
 
 
@@ -151,7 +151,7 @@ class _LateFence:
         point = self._point
         self._device.run_until(lambda: point.passed)
 
-    def hold(self) -> None:
+    def wait_on_stream(self) -> None:
         if self._device.stream is not self._behind:
             self._behind = self._device.stream
             self._device.add(lambda: None, after=self._point)
@@ -221,7 +221,7 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
     late = _LateWarp(device)
     for module in _MODULES:
         monkeypatch.setattr(module, "wp", late)
-        if module is not streams:
+        if module is not cuda:
             monkeypatch.setattr(module, "Fence", lambda _: _LateFence(device), raising=False)
             monkeypatch.setattr(module, "GraphCache", lambda _: _LateGraphCache(device), raising=False)
     monkeypatch.setattr(events, "use_stream", device.on)
