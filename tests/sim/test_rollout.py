@@ -273,11 +273,11 @@ def test_an_outside_controller_flies_the_same(settings):
     expected = fly(settings)
     model = sim.make_model(config)
     inside, outside = sim.make_state(model), sim.make_state(model)
-    inside.controller.update(inside.vehicle.arrays)
+    inside.path_controller.update(inside.vehicle.arrays)
     packets: list[Packet] = []
     while outside.stamp_ns < model.duration_ns:
         outside_now = outside.vehicle.arrays
-        inside.controller.update(outside_now)
+        inside.path_controller.update(outside_now)
         packets += ns.step(model, outside, outside_now.rotor_speed_command.numpy()[0])
     packets += sim.finish(outside)
     assert content(packets) == content(expected)
@@ -667,7 +667,7 @@ def test_gains_can_change_between_two_periods(outside_model):
     fresh = sim.make_state(model)
     for period in range(12):
         if period == 4:
-            fresh.pilots.clear()
+            fresh.controllers.clear(), fresh.commands.clear()
         sim.step(model if period < 4 else other, fresh, setpoint, mode="position")
     assert sim.observe(changed).position.tobytes() == sim.observe(fresh).position.tobytes()
     assert sim.observe(changed).position.tobytes() != sim.observe(steady).position.tobytes()
