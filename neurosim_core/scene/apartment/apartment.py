@@ -55,7 +55,7 @@ def make_apartment(config: ApartmentConfig) -> Scene:
     finishes = {
         room.name: palette.finish(room.name, room.role, index) for index, room in enumerate(plan.rooms)
     }
-    add_shell(assembly, plan, finishes, ceiling_m=config.ceiling_m)
+    add_shell(assembly, plan, finishes, palette.common, ceiling_m=config.ceiling_m)
     spaces = [
         furnish(
             room,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.scene.apartment.assembly import Assembly, Piece
-from neurosim_core.scene.apartment.floorplan import Rect, Room, Wall
+from neurosim_core.scene.apartment.assembly import Assembly
+from neurosim_core.scene.apartment.draws import Draws
+from neurosim_core.scene.apartment.floorplan import Room, Wall
+from neurosim_core.scene.apartment.geometry import Array
+from neurosim_core.scene.apartment.pieces import Piece
 
 WALL_GAP_M = 0.024
 """Between the wall and the back of what stands at it: room for the baseboard [m]."""
@@ -21,76 +22,63 @@ _APART_M = 0.03
 _DOOR_FREE_M = 1.05
 """Floor that stays free in front of a doorway [m]."""
 
-
-@dataclass(frozen=True)
-class Volume:
-    """A block of space: a floor rectangle from one height to another [m]."""
-
-    rect: Rect
-    low: float
-    high: float
-
-    def overlaps(self, other: Volume) -> bool:
-        """Whether the two share space."""
-        return self.low < other.high and other.low < self.high and self.rect.overlaps(other.rect)
+Place = Literal["anywhere", "corner", "middle"]
 
 
 class RoomSpace:
-    """What is still free in one room; pieces that fit are handed to the assembly."""
+    """What is still free in one room; pieces that fit are handed to the assembly.
+
+    Boxes are lowest and highest corners in the world [m], shape [N, 2, 3].
+    """
 
     def __init__(self, room: Room, assembly: Assembly, ceiling_m: float) -> None:
+        """Start with an empty room, whose doors and windows stay free."""
         self.room = room
         self.ceiling_m = ceiling_m
         self._assembly = assembly
-        self._bodies: list[Volume] = []
-        self._doors: list[Volume] = []
-        self._windows: list[Volume] = []
-        self._clearances: list[Volume] = []
+        self._bodies: list[Array] = []
+        self._doors: list[Array] = []
+        self._windows: list[Array] = []
+        self._clearances: list[Array] = []
         for wall in room.walls:
-            for opening in wall.openings:
-                if opening.kind == "door":
-                    rect = wall.rect(opening.x0 - 0.14, opening.x1 + 0.14, _DOOR_FREE_M)
-                    self._doors.append(Volume(rect, 0.02, ceiling_m))
+            for o in wall.openings:
+                if o.kind == "door":
+                    self._doors.append(
+                        _front_of(wall, o.x0 - 0.14, o.x1 + 0.14, _DOOR_FREE_M, (0.02, ceiling_m))
+                    )
                 else:
-                    rect = wall.rect(opening.x0 - 0.05, opening.x1 + 0.05, 0.4)
-                    self._windows.append(Volume(rect, opening.z0 - 0.05, ceiling_m))
+                    above = (o.z0 - 0.05, ceiling_m)
+                    self._windows.append(_front_of(wall, o.x0 - 0.05, o.x1 + 0.05, 0.4, above))
 
-    def keep_free(self, rect: Rect, low: float = 0.02, high: float = 1.9) -> None:
-        """Let nothing be put there but what belongs to a group [m]."""
-        self._clearances.append(Volume(rect, low, high))
-
-    def fits(self, volume: Volume, *, group: bool = False, window: bool = False) -> bool:
-        """Whether a body can be there.
+    def _free(self, boxes: Array, *, group: bool = False, window: bool = False) -> NDArray[np.bool_]:
+        """Return for each box whether a body can be there, shape [N].
 
         Args:
-            volume: The body.
-            group: It belongs to what asked for clearance, and may stand in it.
-            window: It may hide a window.
+            boxes: The bodies.
+            group: They belong to what asked for clearance, and may stand in it.
+            window: They may hide a window.
         """
-        grown = Volume(volume.rect.grown(_APART_M), volume.low, volume.high)
-        obstacles = [*self._doors, *([] if window else self._windows), *([] if group else self._clearances)]
-        return (
-            self.room.rect.contains(volume.rect)
-            and not any(grown.overlaps(body) for body in self._bodies)
-            and not any(volume.overlaps(obstacle) for obstacle in obstacles)
-        )
+        rect = self.room.rect
+        inside = (boxes[:, 0, :2] >= (rect.x0, rect.y0)) & (boxes[:, 1, :2] <= (rect.x1, rect.y1))
+        grown = boxes + np.array([[-_APART_M, -_APART_M, 0.0], [_APART_M, _APART_M, 0.0]])
+        kept = [*self._doors, *([] if window else self._windows), *([] if group else self._clearances)]
+        return inside.all(axis=1) & ~_touches(grown, self._bodies) & ~_touches(boxes, kept)
 
     def put(
         self,
         piece: Piece,
-        offset: tuple[float, float, float],
+        offset: ArrayLike,
         yaw_rad: float = 0.0,
         *,
         group: bool = False,
         window: bool = False,
     ) -> bool:
-        """Place a piece at a position in the world if it fits there; see `fits`."""
-        moved = piece.moved((offset[0], offset[1], offset[2] + _LIFT_M), yaw_rad)
-        volume = _volume(moved)
-        if not self.fits(volume, group=group, window=window):
+        """Place a piece at a position in the world if it fits there; see `_free`."""
+        moved = piece.moved(np.add(offset, (0.0, 0.0, _LIFT_M)), yaw_rad)
+        if not self._free(moved.bounds[None], group=group, window=window)[0]:
             return False
         self._assembly.place(moved)
-        self._bodies.append(volume)
+        self._bodies.append(moved.bounds[None])
         return True
 
     def put_at_wall(
@@ -106,142 +94,128 @@ class RoomSpace:
         window: bool = False,
     ) -> bool:
         """Place a piece in the frame of a wall, at x along it and `out` in front of it, if it fits there."""
-        wx, wy = wall_point(wall, x, out)
-        return self.put(piece, (wx, wy, lift), wall.yaw_rad + yaw_rad, group=group, window=window)
-
-    def spots(
-        self,
-        piece: Piece,
-        rng: np.random.Generator,
-        *,
-        front_m: float = 0.5,
-        sides_m: float = 0.0,
-        liking: Callable[[Wall, float], float] | None = None,
-        window: bool = False,
-    ) -> list[tuple[Wall, float]]:
-        """Places along the walls where a piece fits, the best first.
-
-        Args:
-            piece: What shall be placed.
-            rng: Breaks ties.
-            front_m: Floor in front of it that must be free of other bodies [m].
-            sides_m: The same on both sides [m].
-            liking: Higher for better places; of a wall and a position along it.
-            window: It may hide a window.
-        """
-        (x0, y0, z0), (x1, _, z1) = piece.bounds
-        ranked: list[tuple[float, Wall, float]] = []
-        for wall in self.room.walls:
-            margin = 0.04
-            low, high = margin - x0 + sides_m, wall.length_m - margin - x1 - sides_m
-            if high < low:
-                continue
-            for x in np.unique(np.concatenate([np.arange(low, high, 0.1), [high, 0.5 * (low + high)]])):
-                rect = wall.rect(x + x0 - sides_m, x + x1 + sides_m, WALL_GAP_M - y0)
-                if not self.fits(Volume(rect, z0 + _LIFT_M, z1 + _LIFT_M), window=window):
-                    continue
-                front = wall.rect(x + x0, x + x1, WALL_GAP_M - y0 + front_m)
-                if not self.room.rect.contains(front) or any(
-                    Volume(front, 0.05, 1.5).overlaps(body) for body in self._bodies
-                ):
-                    continue
-                score = float(rng.uniform()) * 0.6 + (liking(wall, float(x)) if liking else 0.0)
-                ranked.append((score, wall, float(x)))
-        ranked.sort(key=lambda item: -item[0])
-        return [(wall, x) for _, wall, x in ranked]
-
-    def along_wall(
-        self,
-        piece: Piece,
-        rng: np.random.Generator,
-        *,
-        front_m: float = 0.5,
-        sides_m: float = 0.0,
-        liking: Callable[[Wall, float], float] | None = None,
-        window: bool = False,
-    ) -> tuple[Wall, float] | None:
-        """Place a piece at the best spot along the walls; where that is, or None when it fits nowhere."""
-        for wall, x in self.spots(piece, rng, front_m=front_m, sides_m=sides_m, liking=liking, window=window):
-            if self.put_at_wall(piece, wall, x, window=window):
-                (x0, y0, _), (x1, _, _) = piece.bounds
-                self.keep_free(wall.rect(x + x0, x + x1, WALL_GAP_M - y0 + front_m))
-                return wall, x
-        return None
+        offset = (*wall.point(x, out), lift)
+        return self.put(piece, offset, wall.yaw_rad + yaw_rad, group=group, window=window)
 
     def hang(self, piece: Piece, wall: Wall, x: float, *, window: bool = False) -> bool:
         """Hang a piece on a wall, 3 mm off it, if it fits there."""
         return self.put_at_wall(piece, wall, x, out=0.003, group=True, window=window)
 
+    def along_wall(
+        self,
+        piece: Piece,
+        draws: Draws,
+        *,
+        front: float = 0.5,
+        sides: float = 0.0,
+        prefer: Place = "anywhere",
+        window: bool = False,
+    ) -> tuple[Wall, float] | None:
+        """Place a piece at the best spot along the walls.
+
+        Args:
+            piece: What shall be placed.
+            draws: Breaks ties.
+            front: Floor in front of it that must be free of other bodies, and stays so but for its group [m].
+            sides: Floor on both sides that must be free [m].
+            prefer: The ends of walls, or the middle of long walls without windows.
+            window: It may hide a window.
+
+        Returns:
+            The wall and the position along it, or None when it fits nowhere.
+        """
+        (x0, y0, z0), (x1, _, z1) = piece.bounds
+        heights = (z0 + _LIFT_M, z1 + _LIFT_M)
+        best: tuple[float, Wall, float] | None = None
+        for index, wall in enumerate(self.room.walls):
+            low, high = 0.04 - x0 + sides, wall.length_m - 0.04 - x1 - sides
+            if high < low:
+                continue
+            x = np.unique(np.concatenate([np.arange(low, high, 0.1), [high, 0.5 * (low + high)]]))
+            fits = self._free(
+                _front_of(wall, x + x0 - sides, x + x1 + sides, WALL_GAP_M - y0, heights), window=window
+            )
+            fits &= self._free(_front_of(wall, x + x0, x + x1, WALL_GAP_M - y0, heights), window=window)
+            ahead = _front_of(wall, x + x0, x + x1, WALL_GAP_M - y0 + front, (0.05, 1.5))
+            floor = self.room.rect
+            fits &= (
+                (ahead[:, 0, :2] >= (floor.x0, floor.y0)) & (ahead[:, 1, :2] <= (floor.x1, floor.y1))
+            ).all(1)
+            fits &= ~_touches(ahead, self._bodies)
+            for k in np.nonzero(fits)[0]:
+                score = 0.6 * draws.uniform(f"spot {index} {k}") + _liking(prefer, wall, float(x[k]))
+                if best is None or score > best[0]:
+                    best = score, wall, float(x[k])
+        if best is None:
+            return None
+        _, wall, at = best
+        self.put_at_wall(piece, wall, at, window=window)
+        self._clearances.append(_front_of(wall, at + x0, at + x1, WALL_GAP_M - y0 + front, (0.02, 1.9)))
+        return wall, at
+
     def open_spot(
-        self, bounds: NDArray[np.float64], rng: np.random.Generator, *, around_m: float, group: bool = False
+        self, bounds: Array, draws: Draws, *, around: float, group: bool = False
     ) -> tuple[float, float] | None:
-        """The most central place found for something with `around_m` of free floor around it.
+        """Return where something has the most central place with `around` of free floor [m], or None.
 
         Args:
             bounds: Lowest and highest corner of it [m], shape [2, 3].
-            rng: Proposes places.
-            around_m: Free floor on all sides [m].
+            draws: Proposes places.
+            around: Free floor on all sides [m].
             group: It may stand in what other pieces want free.
-
-        Returns:
-            Where its origin has to be [m], or None.
         """
-        (x0, y0, z0), (x1, y1, z1) = (
-            bounds[0] - (around_m, around_m, 0.0),
-            bounds[1] + (around_m, around_m, 0.0),
-        )
-        room = self.room.rect
-        if room.width < x1 - x0 or room.depth < y1 - y0:
+        rect = self.room.rect
+        box = bounds + np.array([[-around, -around, _LIFT_M], [around, around, _LIFT_M]])
+        low, high = np.array([rect.x0, rect.y0]) - box[0, :2], np.array([rect.x1, rect.y1]) - box[1, :2]
+        if (high < low).any():
             return None
-        best: tuple[float, float, float] | None = None
-        for _ in range(80):
-            x = float(rng.uniform(room.x0 - x0, room.x1 - x1))
-            y = float(rng.uniform(room.y0 - y0, room.y1 - y1))
-            volume = Volume(Rect(x + x0, y + y0, x + x1, y + y1), z0 + _LIFT_M, z1 + _LIFT_M)
-            if not self.fits(volume, group=group):
-                continue
-            away = abs(x - room.center[0]) / room.width + abs(y - room.center[1]) / room.depth
-            if best is None or away < best[0]:
-                best = away, x, y
-        return None if best is None else best[1:]
+        share = np.array([[draws.uniform(f"{axis} {k}") for axis in "xy"] for k in range(80)])
+        places = low + (high - low) * share
+        boxes = box + np.append(places, np.zeros((80, 1)), axis=1)[:, None]
+        away = (np.abs(places - rect.center) / (rect.width, rect.depth)).sum(axis=1)
+        away[~self._free(boxes, group=group)] = np.inf
+        best = int(np.argmin(away))
+        return (float(places[best, 0]), float(places[best, 1])) if np.isfinite(away[best]) else None
 
     def roomiest(self, height_m: float) -> tuple[float, tuple[float, float, float]]:
-        """The point at a height that is furthest from walls and furniture's bounds, and that distance [m]."""
-        room = self.room.rect
-        xs, ys = np.arange(room.x0 + 0.2, room.x1 - 0.2, 0.1), np.arange(room.y0 + 0.2, room.y1 - 0.2, 0.1)
+        """Return the point at a height that is furthest from walls and bodies, after that distance [m]."""
+        rect = self.room.rect
+        xs, ys = np.arange(rect.x0 + 0.2, rect.x1 - 0.2, 0.1), np.arange(rect.y0 + 0.2, rect.y1 - 0.2, 0.1)
         x, y = (grid.reshape(-1) for grid in np.meshgrid(xs, ys))
-        clear = np.minimum(np.minimum(x - room.x0, room.x1 - x), np.minimum(y - room.y0, room.y1 - y))
+        points = np.stack([x, y, np.full_like(x, height_m)], axis=1)
+        clear = np.minimum.reduce([x - rect.x0, rect.x1 - x, y - rect.y0, rect.y1 - y])
         for body in self._bodies:
-            dx = np.maximum(np.maximum(body.rect.x0 - x, x - body.rect.x1), 0.0)
-            dy = np.maximum(np.maximum(body.rect.y0 - y, y - body.rect.y1), 0.0)
-            dz = max(body.low - height_m, height_m - body.high, 0.0)
-            clear = np.minimum(clear, np.sqrt(dx * dx + dy * dy + dz * dz))
+            gap = np.maximum(np.maximum(body[0, 0] - points, points - body[0, 1]), 0.0)
+            clear = np.minimum(clear, np.linalg.norm(gap, axis=1))
         best = int(np.argmax(clear))
         return float(clear[best]), (float(x[best]), float(y[best]), height_m)
 
 
-def wall_point(wall: Wall, x: float, out: float) -> tuple[float, float]:
-    """A point of the floor at x along a wall and `out` in front of it, in the world [m]."""
-    c, s = round(math.cos(wall.yaw_rad)), round(math.sin(wall.yaw_rad))
-    return wall.origin[0] + c * x + s * out, wall.origin[1] + s * x - c * out
+def _front_of(wall: Wall, x0: ArrayLike, x1: ArrayLike, depth: float, heights: tuple[float, float]) -> Array:
+    """Return boxes in front of a wall, from x0 to x1 along it [m], shape [N, 2, 3]."""
+    ends = np.stack(
+        [np.stack(wall.point(np.atleast_1d(x0), 0.0)), np.stack(wall.point(np.atleast_1d(x1), depth))]
+    )
+    boxes = np.empty((ends.shape[2], 2, 3))
+    boxes[:, 0, :2], boxes[:, 1, :2] = ends.min(axis=0).T, ends.max(axis=0).T
+    boxes[:, :, 2] = heights
+    return boxes
 
 
-def _volume(piece: Piece) -> Volume:
-    (x0, y0, z0), (x1, y1, z1) = piece.bounds
-    return Volume(Rect(float(x0), float(y0), float(x1), float(y1)), float(z0), float(z1))
+def _touches(boxes: Array, others: list[Array]) -> NDArray[np.bool_]:
+    """Return for each box whether it shares space with one of the others, shape [N]."""
+    if not others:
+        return np.zeros(len(boxes), bool)
+    there = np.concatenate(others)
+    apart = (boxes[:, None, 0] >= there[None, :, 1]) | (there[None, :, 0] >= boxes[:, None, 1])
+    return np.asarray(~np.any(apart, axis=2)).any(axis=1)
 
 
-def corner_liking(wall: Wall, x: float) -> float:
-    """Prefers the ends of walls."""
-    return 1.5 * abs(x / wall.length_m - 0.5)
-
-
-def middle_liking(wall: Wall, x: float) -> float:
-    """Prefers the middle of long walls without windows."""
+def _liking(prefer: Place, wall: Wall, x: float) -> float:
+    off_middle = abs(x / wall.length_m - 0.5)
     windows = sum(opening.x1 - opening.x0 for opening in wall.openings)
-    return 0.25 * (wall.length_m - windows) - 2.5 * abs(x / wall.length_m - 0.5)
-
-
-def opposite(room: Room, wall: Wall) -> Wall:
-    """The wall across the room."""
-    return room.walls[(room.walls.index(wall) + 2) % 4]
+    return {
+        "anywhere": 0.0,
+        "corner": 1.5 * off_middle,
+        "middle": 0.25 * (wall.length_m - windows) - 2.5 * off_middle,
+    }[prefer]

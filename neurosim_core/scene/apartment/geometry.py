@@ -1,4 +1,4 @@
-"""Solids that furniture and walls are made of: boxes, rounded boxes, lathed and swept bodies, sheets.
+"""Solids that furniture and walls are made of: boxes, cushions, lathed bodies, tubes, sheets and frames.
 
 Every part has unit normals, faces that wind counter-clockwise seen from outside, and texture coordinates in
 metres, so that one material has one texel density wherever it is used.
@@ -32,11 +32,8 @@ class Part:
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), *, yaw_rad: float = 0.0) -> Part:
         """The part turned about the z axis by `yaw_rad`, then shifted by `offset` [m]."""
-        return self.turned(yaw_rad, axis=2).shifted(offset) if yaw_rad else self.shifted(offset)
-
-    def shifted(self, offset: ArrayLike) -> Part:
-        """The part shifted by `offset` [m]."""
-        return replace(self, vertices=self.vertices + np.asarray(offset, float))
+        part = self.turned(yaw_rad, axis=2) if yaw_rad else self
+        return replace(part, vertices=part.vertices + np.asarray(offset, float))
 
     def turned(self, angle_rad: float, *, axis: int) -> Part:
         """The part turned about a coordinate axis through the origin, right-handed."""
@@ -48,21 +45,16 @@ class Part:
 
 
 def turned(points: Array, angle_rad: float, *, axis: int) -> Array:
-    """Vectors turned about a coordinate axis, right-handed, shape [..., 3]."""
-    c, s = _cos_sin(angle_rad)
+    """Vectors turned about a coordinate axis, right-handed, shape [..., 3]; right angles are exact."""
+    quarter = angle_rad / (0.5 * np.pi)
+    c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
+    if abs(quarter - round(quarter)) < 1e-9:  # walls stay exactly axis-aligned
+        c, s = float(round(c)), float(round(s))
     first, second = (axis + 1) % 3, (axis + 2) % 3
     result: Array = points.copy()
     result[..., first] = c * points[..., first] - s * points[..., second]
     result[..., second] = s * points[..., first] + c * points[..., second]
     return result
-
-
-def _cos_sin(angle_rad: float) -> tuple[float, float]:
-    """Cosine and sine, exact for multiples of a right angle, so that walls stay exactly axis-aligned."""
-    quarter = angle_rad / (0.5 * np.pi)
-    if abs(quarter - round(quarter)) < 1e-9:
-        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]
-    return float(np.cos(angle_rad)), float(np.sin(angle_rad))
 
 
 def merge(parts: Sequence[Part]) -> Part:
@@ -76,18 +68,25 @@ def merge(parts: Sequence[Part]) -> Part:
     )
 
 
+def unit(vectors: Array) -> Array:
+    """Vectors of length 1 with the same direction; zero stays zero. Shape [..., 3]."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0.0, length, 1.0))
+
+
+def _facet(corners: Array, uv: Array) -> Part:
+    """A planar quadrilateral; its corners run counter-clockwise, shape [4, 3]."""
+    normal = unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+    return Part(
+        vertices=corners, normals=np.tile(normal, (4, 1)), uv=uv, faces=np.array([[0, 1, 2], [0, 2, 3]])
+    )
+
+
 def quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike) -> Part:
     """A rectangle; its front is on the side of `edge_u x edge_v`, its uv starts at the world's origin."""
     corner, edge_u, edge_v = (np.asarray(value, float) for value in (corner, edge_u, edge_v))
     vertices = np.stack([corner, corner + edge_u, corner + edge_u + edge_v, corner + edge_v])
-    normal = np.cross(edge_u, edge_v)
-    along = np.stack([edge_u / np.linalg.norm(edge_u), edge_v / np.linalg.norm(edge_v)], axis=1)
-    return Part(
-        vertices=vertices,
-        normals=np.tile(normal / np.linalg.norm(normal), (4, 1)),
-        uv=vertices @ along,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-    )
+    return _facet(vertices, vertices @ np.stack([unit(edge_u), unit(edge_v)], axis=1))
 
 
 def picture_quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike) -> Part:
@@ -96,7 +95,28 @@ def picture_quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike) -> Par
     return replace(part, uv=part.uv - part.uv[0])
 
 
-def grid_surface(points: Array, uv: Array, *, normals: Array | None = None, closed_u: bool = False) -> Part:
+def frame(size: ArrayLike, *, profile: ArrayLike) -> Part:
+    """A mitred moulding around a rectangle in the plane y = 0 that faces -y.
+
+    Args:
+        size: Width along x and height along z of the rectangle [m].
+        profile: Distance outwards from the rectangle and y [m], from outside to inside, shape [N, 2].
+    """
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    rings = []
+    for out, y in np.asarray(profile, float):
+        x, z = (corners * (0.5 * np.asarray(size, float) + out)).T
+        rings.append(np.stack([x, np.full(4, y), z], axis=1))
+    parts = []
+    for outer, inner in itertools.pairwise(rings):
+        for k, after in ((0, 1), (1, 2), (2, 3), (3, 0)):
+            points = np.stack([outer[k], outer[after], inner[after], inner[k]])
+            along, across = (0, 2) if k % 2 == 0 else (2, 0)
+            parts.append(_facet(points, np.stack([points[:, along], points[:, 1] + points[:, across]], 1)))
+    return merge(parts)
+
+
+def grid_surface(points: Array, uv: Array, *, normals: Array | None = None) -> Part:
     """A smooth surface through a grid of points.
 
     Args:
@@ -104,25 +124,25 @@ def grid_surface(points: Array, uv: Array, *, normals: Array | None = None, clos
             (rightwards along N) x (forwards along M).
         uv: Texture coordinates [m], shape [M, N, 2].
         normals: Unit normals, shape [M, N, 3]; from the grid itself when not given.
-        closed_u: The last column lies on the first one (a tube): normals there are averaged.
     """
     rows, columns = points.shape[:2]
     if normals is None:
-        along_n = np.gradient(points, axis=1)
-        if closed_u:
-            along_n[:, 0] = along_n[:, -1] = (points[:, 1] - points[:, -2]) / 2.0
-        normal = np.cross(along_n, np.gradient(points, axis=0))
-        length = np.linalg.norm(normal, axis=2, keepdims=True)
-        normals = normal / np.where(length > 0.0, length, 1.0)
+        normals = unit(np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0)))
+    return Part(
+        vertices=points.reshape(-1, 3),
+        normals=normals.reshape(-1, 3),
+        uv=uv.reshape(-1, 2),
+        faces=_grid_faces(rows, columns),
+    )
+
+
+def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None, :]).reshape(-1)
-    faces = np.concatenate(
+    return np.concatenate(
         [
             np.stack([corner, corner + 1, corner + columns + 1], axis=1),
             np.stack([corner, corner + columns + 1, corner + columns], axis=1),
         ]
-    )
-    return Part(
-        vertices=points.reshape(-1, 3), normals=normals.reshape(-1, 3), uv=uv.reshape(-1, 2), faces=faces
     )
 
 
@@ -135,7 +155,7 @@ def without_slivers(part: Part) -> Part:
 
 @dataclass(frozen=True, eq=False)
 class _Cube:
-    """The surface of a cube as a grid that can be stretched into boxes."""
+    """The surface of a cube as a grid that can be stretched into boxes and cushions."""
 
     corner: Array
     """Signs of the corner that each vertex belongs to, shape [V, 3]."""
@@ -155,46 +175,22 @@ def _cube(lines: int, *, sharp: bool = False) -> _Cube:
     spread = np.linspace(-1.0, 1.0, lines)
     # In a rounded corner the first line is where the flat part ends, the last one is the middle of the edge.
     bend = np.tan(0.25 * np.pi * np.arange(half) / max(1, half - 1))
-    offset = np.concatenate([-bend[::-1], bend]) if 2 * half == lines else np.zeros(lines)
-    rows, columns = (
-        grid.reshape(-1) for grid in np.meshgrid(np.arange(lines), np.arange(lines), indexing="ij")
-    )
-    cell = (np.arange(lines - 1)[:, None] * lines + np.arange(lines - 1)[None, :]).reshape(-1)
-    quads = np.stack(
-        [cell, cell + 1, cell + lines + 1, cell, cell + lines + 1, cell + lines], axis=1
-    ).reshape(-1, 3)
-    corner: list[Array] = []
-    normals: list[Array] = []
-    points: list[Array] = []
-    side: list[NDArray[np.int64]] = []
-    faces: list[NDArray[np.int64]] = []
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            right, up = (axis + 1) % 3, (axis + 2) % 3
-            if sign < 0.0:
-                right, up = up, right
-            at, bent, spot = (
-                np.empty((lines * lines, 3)),
-                np.empty((lines * lines, 3)),
-                np.empty((lines * lines, 3)),
-            )
-            at[:, right], at[:, up], at[:, axis] = np.sign(spread[columns]), np.sign(spread[rows]), sign
-            bent[:, right], bent[:, up], bent[:, axis] = offset[columns], offset[rows], sign
-            if sharp:
-                bent[:, [right, up]] = 0.0
-            tangent = np.tan(0.25 * np.pi * spread)
-            spot[:, right], spot[:, up], spot[:, axis] = tangent[columns], tangent[rows], sign
-            faces.append(quads + len(faces) * lines * lines)
-            corner.append(at)
-            normals.append(bent / np.linalg.norm(bent, axis=1, keepdims=True))
-            points.append(spot)
-            side.append(np.full(lines * lines, axis))
+    offset = np.concatenate([-bend[::-1], bend]) if 2 * half == lines and not sharp else np.zeros(lines)
+    across, along = (grid.reshape(-1) for grid in np.meshgrid(*[np.arange(lines)] * 2, indexing="ij"))
+    lined = [np.sign(spread), offset, np.tan(0.25 * np.pi * spread)]
+    sheets: list[list[Array]] = [[], [], []]
+    for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
+        first, second = (along, across) if sign > 0.0 else (across, along)
+        for sheet, line in zip(sheets, lined, strict=True):
+            columns = (np.full(lines * lines, sign), line[first], line[second])
+            sheet.append(np.roll(np.stack(columns, axis=1), axis, axis=1))
+    corner, normals, points = (np.concatenate(sheet) for sheet in sheets)
     return _Cube(
-        corner=np.concatenate(corner),
-        normals=np.concatenate(normals),
-        points=np.concatenate(points),
-        side=np.concatenate(side),
-        faces=np.concatenate(faces),
+        corner=corner,
+        normals=unit(normals),
+        points=points,
+        side=np.repeat(np.arange(3), 2 * lines * lines),
+        faces=np.concatenate([_grid_faces(lines, lines) + k * lines * lines for k in range(6)]),
     )
 
 
@@ -205,61 +201,33 @@ def _planar_uv(positions: Array, side: NDArray[np.int64], grain: int) -> Array:
     return np.stack([positions[index, along], positions[index, 3 - side - along]], axis=1)
 
 
-def box(size: ArrayLike, *, center: ArrayLike = (0.0, 0.0, 0.0), grain: int = 0) -> Part:
-    """A sharp box.
-
-    Args:
-        size: Edge lengths [m].
-        center: Where its middle is [m].
-        grain: Axis that u follows.
-    """
-    cube = _cube(2, sharp=True)
-    vertices = cube.corner * (0.5 * np.asarray(size, float))
-    uv = _planar_uv(vertices, cube.side, grain)
-    return Part(vertices=vertices + np.asarray(center, float), normals=cube.normals, uv=uv, faces=cube.faces)
-
-
-def rounded_box(
-    size: ArrayLike,
-    radius_m: float,
-    *,
-    center: ArrayLike = (0.0, 0.0, 0.0),
-    grain: int = 0,
-    segments: int = 1,
-) -> Part:
-    """A box whose edges and corners are rounded.
+def box(size: ArrayLike, *, edge: float = 0.0, segments: int = 1, grain: int = 0) -> Part:
+    """A box about the origin, sharp or rounded.
 
     Args:
         size: Outer edge lengths [m].
-        radius_m: Radius of the edges [m]; at most nearly half the shortest edge is used.
-        center: Where its middle is [m].
+        edge: Radius of edges and corners [m]; at most nearly half the shortest edge is used.
+        segments: Facets per half edge; 1 makes 108 triangles, 2 make 300, a sharp box has 12.
         grain: Axis that u follows.
-        segments: Facets per half edge; 1 makes 108 triangles, 2 make 300.
     """
-    cube = _cube(2 * (segments + 1))
     half = 0.5 * np.asarray(size, float)
-    radius = min(radius_m, 0.98 * float(half.min()))
+    radius = min(edge, 0.98 * float(half.min()))
+    cube = _cube(2 * (segments + 1)) if edge else _cube(2, sharp=True)
     vertices = cube.corner * (half - radius) + radius * cube.normals
     uv = _planar_uv(vertices, cube.side, grain)
-    return Part(vertices=vertices + np.asarray(center, float), normals=cube.normals, uv=uv, faces=cube.faces)
+    return Part(vertices=vertices, normals=cube.normals, uv=uv, faces=cube.faces)
 
 
 def cushion(
-    size: ArrayLike,
-    *,
-    center: ArrayLike = (0.0, 0.0, 0.0),
-    power: ArrayLike = (4.0, 4.0, 2.4),
-    grain: int = 0,
-    segments: int = 7,
+    size: ArrayLike, *, power: ArrayLike = (2.0, 2.0, 2.0), segments: int = 7, folds: Sequence[float] = ()
 ) -> Part:
-    """A soft body |x/a|^p + |y/b|^q + |z/c|^r = 1: from an egg (2) to nearly a box (8).
+    """A soft body |x/a|^p + |y/b|^q + |z/c|^r = 1 about the origin: from an egg (2) to nearly a box (8).
 
     Args:
         size: Outer edge lengths [m].
-        center: Where its middle is [m].
         power: Exponents per axis.
-        grain: Axis that u follows.
         segments: Facets along each edge; 12 * segments^2 triangles.
+        folds: Phases of two waves of 6 mm that crease its top, as of a blanket; none leave it smooth.
     """
     half = 0.5 * np.asarray(size, float)
     exponent = np.asarray(power, float)
@@ -269,154 +237,98 @@ def cushion(
         value = np.abs(cube.points * scale[:, None]) ** exponent
         scale -= (value.sum(axis=1) - 1.0) * scale / (exponent * value).sum(axis=1)
     surface = cube.points * scale[:, None]
-    normals = np.sign(surface) * exponent * np.abs(surface) ** (exponent - 1.0) / half
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    uv = _planar_uv(cube.points * half, cube.side, grain)
-    return Part(vertices=surface * half + np.asarray(center, float), normals=normals, uv=uv, faces=cube.faces)
+    normals = unit(np.sign(surface) * exponent * np.abs(surface) ** (exponent - 1.0) / half)
+    vertices = surface * half
+    for phase, height, wave in zip(folds, (0.006, 0.0042), ((9.0, 3.0), (5.0, -8.0)), strict=False):
+        angle = vertices[:, :2] @ wave + phase
+        vertices[:, 2] += height * np.sin(angle) * np.clip(2.0 * surface[:, 2], 0.0, 1.0)
+        slope = height * np.cos(angle) * np.clip(normals[:, 2], 0.0, 1.0)
+        normals = normals - np.append(slope[:, None] * wave, np.zeros((len(slope), 1)), axis=1)
+    uv = _planar_uv(cube.points * half, cube.side, 0)
+    return Part(vertices=vertices, normals=unit(normals), uv=uv, faces=cube.faces)
 
 
 def lathe(
-    profile: ArrayLike, *, sides: int = 24, crease_rad: float = 0.6, center: ArrayLike = (0.0, 0.0, 0.0)
+    profile: ArrayLike,
+    *,
+    sides: int = 24,
+    crease: float = 0.6,
+    stretch: tuple[float, float] = (1.0, 1.0),
+    power: float = 2.0,
 ) -> Part:
     """A body turned about the z axis.
 
     Args:
         profile: Radius and height [m] of the outline, shape [N, 2], counter-clockwise seen with the axis on
-            the left: from the bottom outwards and up. A point is a sharp edge where the outline bends by more
-            than `crease_rad`.
+            the left: from the bottom outwards and up.
         sides: Facets around.
-        crease_rad: Bend from which on an edge is sharp [rad].
-        center: Added to all positions [m].
+        crease: Bend of the outline from which on an edge is sharp [rad].
+        stretch: Scale along x and y.
+        power: Shape seen from above, |x|^p + |y|^p = 1: 2 is a circle, 8 nearly a square.
     """
     outline = np.asarray(profile, float)
     segment = np.diff(outline, axis=0)
     heading = np.arctan2(segment[:, 1], segment[:, 0])
     bend = np.abs((np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi)
-    cuts = [0, *(np.nonzero(bend > crease_rad)[0] + 1), len(outline) - 1]
+    cuts = [0, *(np.nonzero(bend > crease)[0] + 1), len(outline) - 1]
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    around[-1] = around[0]
+    outward = np.sign(around) * np.abs(around) ** (power - 1.0) / stretch  # normal of the outline from above
+    around /= (np.abs(around) ** power).sum(axis=1, keepdims=True) ** (1.0 / power)
+    around, outward = around * stretch, outward / (np.abs(around * outward).sum(axis=1, keepdims=True))
+    around[-1], outward[-1] = around[0], outward[0]
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(segment, axis=1))])
-    girth = 2.0 * np.pi * float(outline[:, 0].max())
+    girth = 2.0 * np.pi * float(outline[:, 0].max()) * max(stretch)
     parts = []
     for first, last in itertools.pairwise(cuts):
         run = outline[first : last + 1]
         tangent = np.gradient(run, axis=0) if len(run) > 2 else np.tile(run[1] - run[0], (2, 1))
-        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-        points = np.empty((len(run), sides + 1, 3))
-        points[..., :2] = run[:, :1, None] * around[None]
-        points[..., 2] = run[:, 1:]
-        normals = np.empty_like(points)
-        normals[..., :2] = tangent[:, 1:, None] * around[None]
-        normals[..., 2] = -tangent[:, :1]
-        flat = np.all(np.abs(run[:, 1] - run[0, 1]) < 1e-9)
-        if flat:  # a disc: its texture must not wind around
-            uv = points[..., :2].copy()
-        else:
-            uv = np.stack(
-                np.broadcast_arrays((angle / (2.0 * np.pi) * girth)[None], length[first : last + 1, None]), -1
-            )
-        parts.append(grid_surface(points, uv, normals=normals))
-    return without_slivers(merge(parts)).shifted(center)
+        points, normals = np.empty((2, len(run), sides + 1, 3))
+        points[..., :2], points[..., 2] = run[:, :1, None] * around, run[:, 1:]
+        normals[..., :2], normals[..., 2] = tangent[:, 1:, None] * outward, -tangent[:, :1]
+        wound = np.broadcast_arrays((angle / (2.0 * np.pi) * girth)[None], length[first : last + 1, None])
+        flat = np.all(np.abs(run[:, 1] - run[0, 1]) < 1e-9)  # the texture of a disc must not wind around
+        uv = points[..., :2].copy() if flat else np.stack(wound, axis=-1)
+        parts.append(grid_surface(points, uv, normals=unit(normals)))
+    return without_slivers(merge(parts))
 
 
-def cylinder(
-    radius_m: float,
-    bottom_m: float,
-    top_m: float,
-    *,
-    x: float = 0.0,
-    y: float = 0.0,
-    sides: int = 24,
-    edge_m: float = 0.0,
-) -> Part:
-    """An upright cylinder with an optional chamfer of `edge_m` at both ends."""
-    profile = [(0.0, bottom_m), (radius_m - edge_m, bottom_m), (radius_m, bottom_m + edge_m)]
-    profile += [(radius_m, top_m - edge_m), (radius_m - edge_m, top_m), (0.0, top_m)]
-    if edge_m == 0.0:
-        profile = [profile[0], profile[1], profile[4], profile[5]]
-    return lathe(profile, sides=sides, center=(x, y, 0.0))
+def cylinder(size: tuple[float, float, float], *, sides: int = 24, edge: float = 0.0) -> Part:
+    """An upright cylinder of a radius, from a bottom to a top [m], with a chamfer of `edge` at both ends."""
+    radius, bottom, top = size
+    if edge == 0.0:
+        return lathe([(0.0, bottom), (radius, bottom), (radius, top), (0.0, top)], sides=sides)
+    side = [(radius - edge, bottom), (radius, bottom + edge), (radius, top - edge), (radius - edge, top)]
+    return lathe([(0.0, bottom), *side, (0.0, top)], sides=sides)
 
 
-def tube(path: ArrayLike, radius_m: ArrayLike, *, sides: int = 12) -> Part:
+def tube(path: ArrayLike, *, radius: ArrayLike, sides: int = 8) -> Part:
     """A round bar along a path, closed at both ends.
 
     Args:
         path: Points [m], shape [N, 3].
-        radius_m: Radius [m], one or per point.
+        radius: Radius [m], one or per point.
         sides: Facets around.
     """
     spine = np.asarray(path, float)
-    radius = np.broadcast_to(np.asarray(radius_m, float), (len(spine),))
-    tangent = np.gradient(spine, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    radii = np.broadcast_to(np.asarray(radius, float), (len(spine),))
+    tangent = unit(np.gradient(spine, axis=0))
     side = np.empty_like(spine)
     guide = np.eye(3)[np.argmin(np.abs(tangent[0]))]
     for index, direction in enumerate(tangent):  # carry one frame along, so that the tube does not twist
-        guide = guide - direction * float(guide @ direction)
-        guide /= np.linalg.norm(guide)
-        side[index] = guide
+        guide = side[index] = unit(guide - direction * float(guide @ direction))
     other = np.cross(tangent, side)
-    angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
-    normals = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+    angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)[None, :, None]
+    normals = np.cos(angle) * side[:, None] + np.sin(angle) * other[:, None]
     normals[:, -1] = normals[:, 0]
-    points = spine[:, None] + radius[:, None, None] * normals
+    points = spine[:, None] + radii[:, None, None] * normals
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spine, axis=0), axis=1))])
-    around = angle * float(radius.max())
     # The grain runs along the bar.
-    uv = np.stack(np.broadcast_arrays(length[:, None], around[None]), axis=-1)
+    uv = np.stack(np.broadcast_arrays(length[:, None], angle[..., 0] * float(radii.max())), axis=-1)
     parts = [grid_surface(points, uv, normals=normals)]
-    for index, direction in ((0, -tangent[0]), (len(spine) - 1, tangent[-1])):
-        ring = points[index, :-1] if index else points[index, -2::-1]
-        fan = np.arange(1, sides - 1)
-        parts.append(
-            Part(
-                vertices=ring,
-                normals=np.tile(direction, (sides, 1)),
-                uv=np.stack(
-                    [(ring - spine[index]) @ side[index], (ring - spine[index]) @ other[index]], axis=1
-                ),
-                faces=np.stack([np.zeros_like(fan), fan, fan + 1], axis=1),
-            )
-        )
-    return merge(parts)
-
-
-def strip(profile: ArrayLike, length_m: float) -> Part:
-    """An open moulding along x from 0 to `length_m`.
-
-    Args:
-        profile: Points (y, z) [m], shape [N, 2]; the front is on the left of the way along it.
-        length_m: Length [m].
-    """
-    outline = np.asarray(profile, float)
-    run = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
-    parts = []
-    for index, ((y0, z0), (y1, z1)) in enumerate(itertools.pairwise(outline)):
-        part = quad((0.0, y0, z0), (length_m, 0.0, 0.0), (0.0, y1 - y0, z1 - z0))
-        uv = np.array(
-            [[0.0, run[index]], [length_m, run[index]], [length_m, run[index + 1]], [0.0, run[index + 1]]]
-        )
-        parts.append(replace(part, uv=uv))
-    return merge(parts)
-
-
-def panel_with_holes(
-    width_m: float, height_m: float, holes: Sequence[tuple[float, float, float, float]]
-) -> Part:
-    """A wall in the plane y = 0 that faces -y, from x = 0 and z = 0 on, with rectangular openings.
-
-    Args:
-        width_m: Extent along x [m].
-        height_m: Extent along z [m].
-        holes: Openings (x0, z0, x1, z1) [m], inside the wall and apart from each other.
-    """
-    x_lines = sorted({0.0, width_m, *(x for hole in holes for x in (hole[0], hole[2]))})
-    parts = []
-    for x0, x1 in itertools.pairwise(x_lines):
-        over = sorted((z0, z1) for a, z0, b, z1 in holes if a < 0.5 * (x0 + x1) < b)
-        ends = [0.0, *(z for span in over for z in span), height_m]
-        for z0, z1 in zip(ends[0::2], ends[1::2], strict=True):
-            if z1 > z0:
-                parts.append(quad((x0, 0.0, z0), (x1 - x0, 0.0, 0.0), (0.0, 0.0, z1 - z0)))
+    fan = np.arange(1, sides - 1)
+    for end, outward, ring in ((0, -tangent[0], points[0, -2::-1]), (-1, tangent[-1], points[-1, :-1])):
+        flat = (ring - spine[end]) @ np.stack([side[end], other[end]], axis=1)
+        faces = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)
+        parts.append(Part(vertices=ring, normals=np.tile(outward, (sides, 1)), uv=flat, faces=faces))
     return merge(parts)

@@ -6,16 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurosim_core.scene.apartment.surfaces import Field, Picture, blend, grid_px, noise, rgb
+from neurosim_core.scene.apartment.textures import Field, Picture, blend, noise, rgb, texel_grid
 
 SPINE_COLUMNS, SPINE_ROWS = 16, 2
 """Cells of the picture that `spines` paints; the last one is paper."""
-
-
-def _canvas(width_px: int, height_px: int) -> tuple[Field, Field]:
-    """Column in [0, 1) and row in [0, height/width) of each texel's centre."""
-    x, y = np.meshgrid(np.arange(width_px, dtype=np.float32), np.arange(height_px, dtype=np.float32))
-    return (x + np.float32(0.5)) / np.float32(width_px), (y + np.float32(0.5)) / np.float32(width_px)
 
 
 def _cover(picture: Picture, inside: Field, color: str, *, px: float = 384.0) -> Picture:
@@ -26,16 +20,16 @@ def _cover(picture: Picture, inside: Field, color: str, *, px: float = 384.0) ->
 def _framed(picture: Picture, rng: np.random.Generator, *, margin: float = 0.07) -> Picture:
     """White paper around a print, and the tooth of the paper over both."""
     height, width = picture.shape[:2]
-    x, y = _canvas(width, height)
+    x, y = texel_grid(width, height)
     inset = np.minimum(np.minimum(x, 1.0 - x), np.minimum(y, height / width - y))
     picture = blend(rgb("#f3efe6"), picture, (inset - margin) * width)
-    tooth = noise(rng, slope=0.6, size=512)[:height, :width]
+    tooth = noise(rng, 0.6)[:height, :width]
     return np.asarray(picture * (1.0 + 0.025 * tooth[..., None]), np.float32)
 
 
 def poster_hills(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """A sun over ranges of hills, paler with distance."""
-    x, y = _canvas(384, 512)
+    x, y = texel_grid(384, 512)
     picture = blend(rgb(colors[0]), rgb("#f6e8cf"), y * 1.1)
     center = rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.5)
     picture = _cover(picture, np.hypot(x - center[0], y - center[1]) - 0.15, colors[1])
@@ -52,7 +46,7 @@ def poster_hills(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
 
 def poster_shapes(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """Quarter discs, rings and bars on a grid."""
-    x, y = _canvas(384, 512)
+    x, y = texel_grid(384, 512)
     picture = np.broadcast_to(rgb("#efe6d6"), (512, 384, 3)).astype(np.float32)
     for row in range(4):
         for column in range(3):
@@ -101,7 +95,7 @@ def poster_blocks(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
 
 def poster_contours(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """Level lines of a landscape, filled between some of them."""
-    height = noise(rng, slope=2.6)[:, :384]
+    height = noise(rng, 2.6)[:, :384]
     level = height * 4.5
     index = np.floor(level).astype(np.int64) % len(colors)
     picture = np.stack([rgb(color) for color in colors])[index]
@@ -112,8 +106,8 @@ def poster_contours(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
 
 def poster_stems(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """A pressed plant: stems with pairs of leaves on paper."""
-    x, y = _canvas(384, 512)
-    picture = blend(rgb("#efe4cc"), rgb("#e2d3b4"), 0.5 + 0.3 * noise(rng, slope=1.8)[:, :384])
+    x, y = texel_grid(384, 512)
+    picture = blend(rgb("#efe4cc"), rgb("#e2d3b4"), 0.5 + 0.3 * noise(rng, 1.8)[:, :384])
     for stem in range(3):
         root, lean = 0.5 + 0.05 * (stem - 1), 0.3 * (stem - 1) + rng.uniform(-0.06, 0.06)
         top = rng.uniform(0.16, 0.3)
@@ -146,7 +140,7 @@ POSTERS = (poster_hills, poster_shapes, poster_blocks, poster_contours, poster_s
 
 def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """A woven rug with borders around stepped diamonds, zigzags or a medallion; fits one rug exactly."""
-    u, v = grid_px()
+    u, v = texel_grid()
     knots_u, knots_v = np.floor(u * 192.0) / 192.0, np.floor(v * 144.0) / 144.0
     x, y = np.abs(knots_u - 0.5), np.abs(knots_v - 0.5)
     palette = np.stack([rgb(color) for color in colors])
@@ -170,7 +164,7 @@ def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     )
     picture = palette[index]
     knot = 0.5 + 0.5 * np.cos(2.0 * np.pi * 192.0 * u) * np.cos(2.0 * np.pi * 144.0 * v)
-    wear = 0.82 + 0.16 * knot + 0.06 * noise(rng, slope=0.4) + 0.05 * noise(rng, slope=1.6)
+    wear = 0.82 + 0.16 * knot + 0.06 * noise(rng, 0.4) + 0.05 * noise(rng, 1.6)
     return np.asarray(picture * wear[..., None], np.float32)
 
 
@@ -209,7 +203,7 @@ def spines(rng: np.random.Generator) -> Picture:
             picture[row * height : (row + 1) * height, column * width : (column + 1) * width] = cell
     lines = 0.8 + 0.15 * (np.arange(width) % 3 != 0)
     picture[-height:, -width:] = rgb("#efe6d2") * lines[None, :, None]
-    return np.asarray(picture * (1.0 + 0.05 * noise(rng, slope=0.7))[..., None], np.float32)
+    return np.asarray(picture * (1.0 + 0.05 * noise(rng, 0.7))[..., None], np.float32)
 
 
 def screen(rng: np.random.Generator) -> Picture:
@@ -232,9 +226,9 @@ def screen(rng: np.random.Generator) -> Picture:
 
 def view(rng: np.random.Generator) -> Picture:
     """What is outside: sky with clouds, a hazy town, trees; row 0 is the top."""
-    x, y = _canvas(512, 512)
+    x, y = texel_grid(512, 512)
     picture = blend(rgb("#8db9e8"), rgb("#e9f1f7"), y * 1.5)
-    cloud = noise(rng, slope=1.75, stretch=2.2)
+    cloud = noise(rng, 1.75, stretch=2.2)
     picture = blend(picture, rgb("#ffffff"), (cloud - 0.2) * 0.9 * (1.0 - y))
     for depth in range(3):
         haze = 0.62 - 0.2 * depth
@@ -252,6 +246,6 @@ def view(rng: np.random.Generator) -> Picture:
             visible = min(wide, 512 - left)
             picture[top:, left : left + visible] = block[:, :visible]
             left += wide
-    tree = 0.80 + 0.05 * np.sin(2.0 * np.pi * 2.0 * x + 1.0) + 0.035 * noise(rng, slope=1.1)[:1]
-    foliage = blend(rgb("#34502c"), rgb("#9dbb68"), 0.45 + 0.3 * noise(rng, slope=0.9, coarsest=8.0))
+    tree = 0.80 + 0.05 * np.sin(2.0 * np.pi * 2.0 * x + 1.0) + 0.035 * noise(rng, 1.1)[:1]
+    foliage = blend(rgb("#34502c"), rgb("#9dbb68"), 0.45 + 0.3 * noise(rng, 0.9, coarsest=8.0))
     return blend(picture, foliage, (y - tree) * 120.0)
