@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -42,6 +43,7 @@ def neurosim(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedPr
         capture_output=True,
         text=True,
         cwd=cwd,
+        env=dict(os.environ),  # without the COLUMNS that GNU readline has put where Python does not see it
         timeout=900,
     )
 
@@ -260,8 +262,7 @@ def test_options_are_not_abbreviated():
     assert "unrecognized arguments: --ou" in done.stderr
 
 
-def test_sensors_that_are_absent_are_said_first(tmp_path, monkeypatch):
-    monkeypatch.delenv("COLUMNS", raising=False)
+def test_sensors_that_are_absent_are_said_first(tmp_path):
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump({**SETTINGS, "sensors": {"imu": {"kind": "imu"}}}))
     done = neurosim("run", "scene.yaml", "--duration", "0.05", "--no-rrd", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
