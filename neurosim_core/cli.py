@@ -6,6 +6,7 @@ import argparse
 import atexit
 import gc
 import logging
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -22,9 +23,14 @@ if TYPE_CHECKING:
     _Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 
 
+_PIPED_COLUMNS = 120
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted."""
     atexit.register(gc.freeze)  # a last collection looks at every object again: 0.4 s with a scene in memory
+    if not sys.stdout.isatty():
+        os.environ.setdefault("COLUMNS", str(_PIPED_COLUMNS))  # rich would take 80
     arguments = _parser().parse_args(argv)
     with handle_signals(leave_at_once):  # commands with something to close have handlers of their own
         from neurosim_core.warp_start import start_warp
@@ -41,8 +47,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 130
 
 
+class _Parser(argparse.ArgumentParser):
+    """Takes no abbreviations of options: what `--ou` means may change with the next option."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{**options, "allow_abbrev": False})
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = _Parser(
         prog="neurosim",
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )

@@ -96,6 +96,8 @@ if TYPE_CHECKING:
     AnySensor = SensorConfig
 else:
     AnySensor = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]
+_ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
+"""Keys of a scene that say that it is of kind mesh."""
 Sensors = dict[Name, AnySensor]
 Links = dict[Name, LinkConfig]
 
@@ -107,6 +109,8 @@ _RESERVED = {
     "path": "the planned path",
     "rotor_speeds": "the speeds of the rotors",
 }
+_ADDED = "sensors+"
+"""Key of a settings file for changes of the default set of sensors."""
 _SEED_STRIDE = 0x9E3779B97F4A7C15
 
 
@@ -157,7 +161,8 @@ class SimulationConfig(Settings):
     """What flies it."""
     sensors: Sensors = Field(default_factory=_default_sensors)
     """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
-    exist, nor does one that is null, as in --set sensors.depth=null."""
+    exist, nor does one that is null, as in --set sensors.depth=null. Under the key `sensors+` they change the
+    default set or add to it."""
     vehicles: Annotated[dict[Name, FleetMember], Field(min_length=1)] = Field(
         default_factory=lambda: {"drone": FleetMember()}
     )
@@ -269,7 +274,8 @@ def load_config(
             there is said of it, and so is what lacks or is unknown in a group that only it has made.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
-    A sensor or body that is null is left out: {"sensors.depth": None}.
+    A sensor or body that is null is left out: {"sensors.depth": None}. Sensors under the key `sensors+`
+    change the default set, as overrides do.
 
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
@@ -278,6 +284,12 @@ def load_config(
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
     patches = [_nest(key, value) for key, value in (overrides or {}).items()]
+    if _ADDED in raw:
+        if "sensors" in raw:
+            reason = f"give `sensors`, which replace the default set, or `{_ADDED}`, not both"
+            raise ConfigError(f"{origin}: {reason}")
+        patches.insert(0, {"sensors": raw[_ADDED]})
+        raw = {key: value for key, value in raw.items() if key != _ADDED}
     if "sensors" not in raw and any("sensors" in patch for patch in patches):
         # pixels are ideal where nothing is said of them, which leaves a preset free to say it
         sensors = _default_sensors()
@@ -292,6 +304,17 @@ def load_config(
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
         raise ConfigError(_say(origin, list(_explain(error, raw)), options or {}, given)) from None
+
+
+def absent_sensors(config: SimulationConfig) -> str:
+    """Return one sentence on the sensors of the default set that a configuration leaves out; "" if none."""
+    absent = [name for name in _default_sensors() if name not in config.sensors]
+    if not absent:
+        return ""
+    return (
+        f"Of the default sensors there is no {', '.join(absent)}: `sensors` replaces the default set, "
+        f"`{_ADDED}` adds to it."
+    )
 
 
 def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
@@ -365,8 +388,8 @@ def _with_default_kinds(raw: dict[str, Any]) -> dict[str, Any]:
     for key, item in SimulationConfig.model_fields.items():
         group = raw.get(key)
         if isinstance(group, Mapping) and "kind" not in group and hasattr(item.default, "kind"):
-            kind = "mesh" if key == "scene" and "file" in group else item.default.kind
-            raw = {**raw, key: {"kind": kind, **group}}
+            is_mesh = key == "scene" and not _ONLY_MESH.isdisjoint(group)
+            raw = {**raw, key: {"kind": "mesh" if is_mesh else item.default.kind, **group}}
     return raw
 
 
@@ -388,6 +411,8 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
         elif name == "kind" and group.startswith("sensors.") and reason.startswith("required"):
             others = [str(key) for key in raw["sensors"] if f"sensors.{key}" != group]
             yield f"{line}; {suggestion(group.removeprefix('sensors.'), others)}".rstrip("; ")
+        elif path == "scene.path":
+            yield f"{path}: unknown key; the file of a scene is scene.file"
         elif path == "device" and "pattern" in reason:
             yield f"{path}: must be auto, cpu, cuda, or cuda:0 and so on, got {raw['device']!r}"
         else:

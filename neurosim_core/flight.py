@@ -19,7 +19,7 @@ from rich.table import Table
 
 from neurosim_core import __version__
 from neurosim_core.clock import NS_PER_S
-from neurosim_core.config import SimulationConfig, load_config, to_yaml
+from neurosim_core.config import SimulationConfig, absent_sensors, load_config, to_yaml
 from neurosim_core.install import install_hint
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
@@ -295,7 +295,7 @@ def _print_plan(console: Console, model: Model) -> None:
         highlight=False,
     )
     notes = [f"{body.name}: {note}" for body in model.bodies for note in body.solid.notes]
-    for note in (*scene.notes, *notes, *model.free_space.notes):
+    for note in filter(None, (*scene.notes, *notes, *model.free_space.notes, absent_sensors(config))):
         console.print(f"  {note}", style="dim", highlight=False)
     beyond_s = (model.path.end_ns - model.duration_ns) / NS_PER_S
     rest = f"; the whole path takes {beyond_s:.1f} s more" if beyond_s > 0.0 else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import types
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -70,6 +71,8 @@ def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
         return f"{shown}: must have at least {least} item{'s' * (least > 1)}{got}"
     if kind == "path_type":
         return f"{shown}: must be the name of a file{got}"
+    if shown.endswith("_rad") and isinstance(value, int | float) and kind.startswith("less_than"):
+        got += f"; if these are degrees, write {math.radians(value):.6g}"
     reason = item["msg"].partition(", unable to")[0].partition(", got")[0]
     return f"{shown}: {reason}{got}" if shown else f"{reason}{got}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -42,6 +43,7 @@ def neurosim(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedPr
         capture_output=True,
         text=True,
         cwd=cwd,
+        env=dict(os.environ),  # without the COLUMNS that GNU readline has put where Python does not see it
         timeout=900,
     )
 
@@ -252,3 +254,19 @@ def test_mistakes_of_set_are_said_of_it(settings, said, capsys):
     assert cli.main(["run", *options]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"neurosim: {said}")
+
+
+def test_options_are_not_abbreviated():
+    done = neurosim("run", "--ou", "x")
+    assert done.returncode == 2
+    assert "unrecognized arguments: --ou" in done.stderr
+
+
+def test_sensors_that_are_absent_are_said_first(tmp_path):
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump({**SETTINGS, "sensors": {"imu": {"kind": "imu"}}}))
+    done = neurosim("run", "scene.yaml", "--duration", "0.05", "--no-rrd", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    first = done.stdout.partition(" flies ")[0]
+    assert "apartment with 1 room, seed" in first
+    assert "Of the default sensors there is no events, rgb, depth, odometry" in first
+    assert max(map(len, first.splitlines())) > 80  # lines are not broken for a pipe as for a narrow terminal

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
+from neurosim_core.config import ConfigError, SimulationConfig, absent_sensors, load_config, to_yaml
 from neurosim_core.live.config import LinkConfig
 from neurosim_core.settings import Settings
 
@@ -240,6 +240,39 @@ def test_a_preset_counts_for_the_default_sensors():
         assert config.sensors["events"] == expected.sensors["events"]
         assert config.sensors["events"].pixel.leak is not None
         assert config.sensors.keys() == load_config().sensors.keys()
+
+
+def test_sensors_can_be_added_to_the_default_set(tmp_path):
+    file = tmp_path / "rig.yaml"
+    file.write_text("sensors+: {rgb: {rate_hz: 40}, depth: null, rear: {kind: rgb}}")
+    config = load_config(file, overrides={"sensors.imu.rate_hz": 100})
+    assert list(config.sensors) == ["events", "rgb", "imu", "odometry", "rear"]
+    assert (config.sensors["rgb"].rate_hz, config.sensors["imu"].rate_hz) == (40.0, 100.0)
+    assert config.sensors["events"] == load_config().sensors["events"]
+    with pytest.raises(ConfigError, match="give `sensors`, which replace the default set, or `sensors\\+`"):
+        load_config({"sensors": {}, "sensors+": {}})
+
+
+def test_sensors_that_a_file_leaves_out_are_named():
+    absent = absent_sensors(load_config({"sensors": {"events": {"kind": "event_camera"}}}))
+    assert "no rgb, depth, imu, odometry" in absent
+    assert "`sensors+` adds" in absent
+    assert absent_sensors(load_config()) == ""
+
+
+def test_the_kind_of_a_scene_follows_from_its_keys(tmp_path):
+    assert load_config({"scene": {"file": "/a.glb"}}).scene.kind == "mesh"
+    assert load_config({"scene": {"rooms": 2}}).scene.kind == "apartment"
+    with pytest.raises(ConfigError, match=r"scene.path: unknown key; the file of a scene is scene.file"):
+        load_config({"scene": {"path": "a.glb"}})
+    with pytest.raises(ConfigError, match=r"scene.file: required, and not given"):
+        load_config({"scene": {"up_axis": "z"}})
+
+
+def test_an_angle_in_degrees_is_told():
+    lens = {"width": 64, "height": 48, "horizontal_fov_rad": 90}
+    with pytest.raises(ConfigError, match=r"got 90; if these are degrees, write 1\.5708"):
+        load_config({"sensors": {"rgb": {"kind": "rgb", "lens": lens}}})
 
 
 def test_null_leaves_sensors_and_bodies_out():

@@ -14,6 +14,7 @@ view: `bake_light` computes it once, with shadows and ambient occlusion, and a r
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 
@@ -26,6 +27,8 @@ from neurosim_core.render.launch import launch_split
 from neurosim_core.scene.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
+
+log = logging.getLogger(__name__)
 
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _BURIED = 0.1  # occluders at 5 % of the ambient radius all around
@@ -72,13 +75,33 @@ class RefinedMesh:
     """Face of the scene that each face is a part of, shape [F]."""
 
 
-def refine(scene: Scene, edge_max_m: float | None) -> RefinedMesh:
+def refine(scene: Scene, edge_max_m: float | None, *, added_count_max: int = 4_000_000) -> RefinedMesh:
     """Split edges of triangles in halves until none is longer than `edge_max_m`; None: leave all as they are.
+
+    Where that would add more than `added_count_max` faces, `edge_max_m` grows by factors of sqrt(2) until it
+    does not, and a warning is logged. A face takes about 230 bytes.
 
     Whether an edge is split, and where, depends on nothing but its two ends, so faces that share an edge
     (also with vertices of their own at the same places) split it alike: no cracks, no T-junctions. Area is
     preserved.
     """
+    edge_m = edge_max_m
+    while (mesh := _refine(scene, edge_m, added_count_max)) is None:
+        assert edge_m is not None
+        edge_m *= math.sqrt(2.0)
+    if edge_m != edge_max_m:
+        log.warning(
+            "baked light: the scene is so large that triangles have edges of up to %.3g m instead of %g m "
+            "(render.lighting.edge_max_m), or they would be more than %d; shadows are as coarse",
+            edge_m,
+            edge_max_m,
+            len(scene.faces) + added_count_max,
+        )
+    return mesh
+
+
+def _refine(scene: Scene, edge_max_m: float | None, added_count_max: int) -> RefinedMesh | None:
+    """Return what `refine` returns; None if more faces are added than allowed."""
     vertices, normals, uv = scene.vertices, scene.normals, scene.uv
     faces = scene.faces
     origin = np.arange(len(faces), dtype=np.int32)
@@ -89,6 +112,8 @@ def refine(scene: Scene, edge_max_m: float | None) -> RefinedMesh:
         split = long.any(axis=1)
         if not split.any():
             break
+        if len(faces) + int(long.sum()) > len(scene.faces) + added_count_max:
+            return None
         chosen, chosen_long = faces[split], long[split]
         ends = np.sort(np.stack([chosen, chosen[:, (1, 2, 0)]], axis=-1), axis=-1)[chosen_long].astype(
             np.int64

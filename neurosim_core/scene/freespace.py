@@ -293,6 +293,33 @@ class FreeSpace:
         """
         return _reachable(self, clearance_m)
 
+    def check_start(self, point_m: ArrayLike) -> None:
+        """Refuse to begin inside a solid.
+
+        A solid is a region that is closed on all sides, does not hold the seed, and is smaller than a room
+        (12 m^3). Outside the grid, and where a surface passes, there is no solid to be inside of.
+
+        Args:
+            point_m: In the world [m], shape [3].
+
+        Raises:
+            ValueError: The point is inside a solid.
+        """
+        point = np.asarray(point_m, dtype=np.float64)
+        voxel = self.voxel_of(point)
+        if (point < self.bounds_m[0]).any() or (point > self.bounds_m[1]).any() or self.occupied[voxel]:
+            return
+        labels, _ = ndimage.label(~self.occupied)
+        region = labels == labels[voxel]
+        ends = [region[side] for side in (0, -1)] + [region[:, side] for side in (0, -1)]
+        open_sides = any(face.any() for face in (*ends, region[:, :, 0], region[:, :, -1]))
+        volume_m3 = float(region.sum()) * self.voxel_m**3
+        if not open_sides and volume_m3 < _ROOM_MIN_M3 and not region[self.voxel_of(self.seed_m)]:
+            raise ValueError(
+                f"the path begins at {np.round(point, 3).tolist()} m, inside a solid of {volume_m3:.2g} m^3; "
+                f"free space is around {np.round(self.seed_m, 3).tolist()} m"
+            )
+
     @functools.cached_property
     def grid_clearance(self) -> NDArray[np.float32]:
         """Clearance at voxel centres: `distance`, or the distance to the bounds where less [m]."""

@@ -31,6 +31,8 @@ _log = logging.getLogger(__name__)
 
 _GLTF = frozenset({"gltf", "glb"})
 _EXTENT_MAX_M = 20_000.0
+_FAR_M = 100.0
+"""From here on the origin of a scene is moved [m]: float32 rounds to 8 um."""
 _STOREY_M = (1.8, 15.0)
 """Heights that a building is taken to have, from one low room to a hall [m]."""
 _LEVEL_RAD = math.radians(2.0)
@@ -52,11 +54,13 @@ class MeshSceneConfig(Settings):
     """Axis of the file that points up: x, y or z. None: what the file says, else y or z where it shows a
     building that stands so, else what its format has by default."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Added to every point, after units and axes [m]; brings far-off coordinates near the origin."""
+    """Added to every point, after units and axes [m]. A scene that then lies more than 100 m from the origin
+    along an axis is moved there, by whole metres, and a note says by how much."""
     inside_m: tuple[float, float, float] | None = None
     """A point in free space of the loaded scene, where rooms are entered [m]. None: unknown."""
     light_scale: float | None = Field(default=None, gt=0.0)
-    """Factor from candela in the file to radiance reflected at 1 m. None: such that rooms are well lit."""
+    """Factor from candela in the file to radiance reflected at 1 m, refused where the file has no lights.
+    None: such that rooms are well lit."""
     missing_texture: Literal["error", "ignore"] = "error"
     """What to do when a texture file is not there: stop, or go on with the base colour alone."""
     ambient_up: LinearRgb = (0.35, 0.35, 0.36)
@@ -81,7 +85,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
     Raises:
         SceneError: If the file is missing, of an unknown format, truncated or malformed; if a texture is
             missing or cannot be decoded; if a vertex in use is not finite; if no face is left; if the scene
-            reaches farther than 20 km from the origin.
+            reaches farther than 20 km from its origin; if there are no lights to scale by `light_scale`.
     """
     path = config.file.expanduser()
     source = _read(path, config, pictures)
@@ -98,6 +102,14 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         part["positions"] = part["positions"] @ turn.T + config.position_m
         if part["normals"] is not None:
             part["normals"] = part["normals"] @ _TURN[axis].T
+    origin = _origin(parts)
+    for part in parts:
+        part["positions"] = part["positions"] - origin
+    if origin.any():
+        notes.append(
+            f"The scene lies far from the origin: {origin.tolist()} m was subtracted from its coordinates; "
+            "all places in settings and recordings count from there."
+        )
     _check_extent(parts, path)
 
     arrays = _assembled(parts, source, notes, path)
@@ -109,11 +121,12 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         )
     return Scene(
         name=path.stem,
-        lights=_lights(config, source, turn, triangles, notes),
+        lights=_lights(config, source, turn, np.array(config.position_m) - origin, triangles, notes),
         ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
         instance_names=tuple(source.instance_names),
         notes=tuple(notes),
         inside_m=config.inside_m,
+        origin_m=(float(origin[0]), float(origin[1]), float(origin[2])),
         **arrays,
     )
 
@@ -222,12 +235,21 @@ def _looks_up(parts: list[dict[str, Any]], unit_m: float) -> Axis | None:
     return ("x", "y", "z")[axis] if (floors > 0.002 * amount[axis]).sum() >= 3 else None
 
 
+def _origin(parts: list[dict[str, Any]]) -> NDArray[np.float64]:
+    """Return whole metres to subtract along axes on which the scene is far from 0, shape [3]."""
+    used = [part["positions"][part["faces"].reshape(-1)] for part in parts if len(part["faces"])]
+    low = np.min([rows.min(axis=0) for rows in used], axis=0)
+    high = np.max([rows.max(axis=0) for rows in used], axis=0)
+    away = np.maximum(low, -high)  # negative where 0 is within
+    return np.asarray(np.where(away > _FAR_M, np.rint(0.5 * (low + high)), 0.0))
+
+
 def _check_extent(parts: list[dict[str, Any]], path: Path) -> None:
     far = max(float(np.abs(part["positions"][part["faces"]]).max()) for part in parts if len(part["faces"]))
     if far > _EXTENT_MAX_M:
         raise SceneError(
             f"{path}: reaches {far:.4g} m from the origin, allowed are {_EXTENT_MAX_M:g} m; declare unit_m "
-            "(0.001 for millimetres), or move it with position_m"
+            "(0.001 for millimetres)"
         )
 
 
@@ -437,10 +459,16 @@ def _lights(
     config: MeshSceneConfig,
     source: Source,
     turn: NDArray[np.float64],
+    shift: NDArray[np.float64],
     triangles: NDArray[np.float64],
     notes: list[str],
 ) -> Any:
     if not source.lamps:
+        if config.light_scale is not None:
+            raise SceneError(
+                f"light_scale = {config.light_scale:g} scales the lights of the file, and {config.file} has "
+                "none: leave it out"
+            )
         places, sentence = hang_lamps(triangles)
         notes.append(f"The file has no lights; {len(places)} are {sentence}.")
         return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), triangles, factor=None)[0]
@@ -454,7 +482,7 @@ def _lights(
             positions.append((low + high) / 2.0 - away * vector)
             intensities.append(rgb(np.asarray(lamp.intensity) * away**2))
         else:
-            positions.append(vector + config.position_m)
+            positions.append(vector + shift)
             intensities.append(lamp.intensity)
     lights, factor = scaled_lights(positions, intensities, triangles, factor=config.light_scale)
     how = "as declared" if config.light_scale is not None else "so that the median surface is well lit"

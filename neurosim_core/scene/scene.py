@@ -96,6 +96,10 @@ class Scene:
     inside_m: tuple[float, float, float] | None = None
     """A point known to be in free space, if the source of the scene knows one [m]."""
 
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What was subtracted from the coordinates of the file, in metres and with z up, as float32 could not
+    tell places apart so far from its zero [m]."""
+
     def __post_init__(self) -> None:
         """Refuse what renderers cannot show: a GPU would look for its tree in memory that is not there."""
         if len(self.faces) == 0:

@@ -23,7 +23,7 @@ from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.base import StateSensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
 from neurosim_core.sim.schedule import Schedule
-from neurosim_core.trajectory import Path, make_path
+from neurosim_core.trajectory import CollisionFreeConfig, Path, make_path
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.warp_start import start_warp
 
@@ -170,7 +170,10 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
 
 
 def _plan(config: SimulationConfig, free_space: FreeSpace) -> Path:
-    return make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
+    path = make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
+    if not isinstance(config.path, CollisionFreeConfig):  # those begin in free space
+        free_space.check_start(path.evaluate([0]).position[0])
+    return path
 
 
 def _make_member(

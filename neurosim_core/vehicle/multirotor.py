@@ -138,6 +138,12 @@ class MultirotorConfig(Settings):
                 "rotor_speed_min_rad_s must be below "
                 f"rotor_speed_max_rad_s = {self.rotor_speed_max_rad_s:g}, got {self.rotor_speed_min_rad_s:g}"
             )
+        air = {"wind_m_s": any(self.wind_m_s), "gusts": self.gusts, "turbulence": self.turbulence}
+        if (moved := [name for name, given in air.items() if given]) and not self._feels_air:
+            raise ValueError(
+                f"{', '.join(moved)}: moving air does nothing to a vehicle without drag; give it "
+                "rotor_drag_kg, parasitic_drag_kg_m or another coefficient of the air"
+            )
         return self
 
     @property
@@ -170,6 +176,11 @@ class MultirotorConfig(Settings):
     def _of_each(self, common: float, scale: tuple[float, ...]) -> NDArray[np.float64]:
         return common * np.array(scale or self.rotor_count * (1.0,))
 
+    @property
+    def _feels_air(self) -> bool:
+        of_rotors = (self.rotor_drag_kg, self.rotor_inflow_kg, self.translational_lift_kg_m)
+        return any((*of_rotors, self.flapping_kg_m, *self.parasitic_drag_kg_m))
+
     def terms(self) -> tuple[str, ...]:
         """Return the terms (of `TERMS`) that these parameters need."""
         inertia = np.array(self.inertia_kg_m2)
@@ -184,10 +195,9 @@ class MultirotorConfig(Settings):
             "ground_effect": self.ground is not None and self.ground.rotor_radius_m > 0.0,
             "full_inertia": bool(np.any(inertia - np.diag(np.diag(inertia)))),
         }
-        felt = any(needed[term] for term in AIR_TERMS)
-        needed["wind"] = felt and any(self.wind_m_s)
-        needed["gusts"] = felt and bool(self.gusts)
-        needed["turbulence"] = felt and self.turbulence is not None
+        needed["wind"] = any(self.wind_m_s)
+        needed["gusts"] = bool(self.gusts)
+        needed["turbulence"] = self.turbulence is not None
         return tuple(term for term in TERMS if needed[term])
 
 

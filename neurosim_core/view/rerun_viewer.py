@@ -182,9 +182,7 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
         ImportError, OSError, ViewerEnded: As `RerunViewer`.
     """
     if not web and without_display():
-        raise ValueError(
-            "there is no display to open a window on: --web serves a page"
-        )
+        raise ValueError("there is no display to open a window on: --web serves a page")
     stop = threading.Event()
     with (
         stop_at_signals(stop),

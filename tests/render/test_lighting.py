@@ -71,6 +71,19 @@ def test_short_edges_and_no_limit_leave_faces_alone():
         np.testing.assert_array_equal(refine(scene, limit).faces, scene.faces)
 
 
+def test_refinement_of_a_huge_scene_is_bounded_and_says_so(caplog):
+    """Two triangles of 1 km at edges of 0.5 m were 17 million."""
+    scene = scene_of(plane(1000.0))
+    mesh = refine(scene, 0.5, added_count_max=50_000)
+    assert 25_000 / 2 < len(mesh.faces) <= 50_002  # the next shorter edge would have been too many
+    assert areas(mesh.vertices, mesh.faces).sum() == pytest.approx(1e6, rel=1e-6)
+    assert "edges of up to" in caplog.text
+    assert "instead of 0.5 m (render.lighting.edge_max_m)" in caplog.text
+    caplog.clear()
+    assert len(refine(scene_of(plane(4.0)), 0.5, added_count_max=50_000).faces) < 600
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("flipped", [False, True])
 def test_open_surface_gets_the_ambient_of_its_normal(device, flipped):
     """No occluders: up * (1 + n_z) / 2 + down * (1 - n_z) / 2 on each side, whichever way faces are wound."""

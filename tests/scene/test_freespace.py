@@ -271,6 +271,15 @@ def test_a_huge_scene_gets_coarser_voxels_and_says_so():
     assert "instead of 0.1 m" in space.notes[0]
 
 
+def test_a_start_inside_a_solid_is_refused(furnished):
+    furnished.check_start((0.5, 0.5, 1.2))
+    furnished.check_start((-3.0, 0.0, 1.0))  # not in the scene at all: flights there are allowed
+    with pytest.raises(ValueError, match=r"begins at \[1.75, 1.5, 0.6\] m, inside a solid of"):
+        furnished.check_start((1.75, 1.5, 0.6))
+    cut_off = make_free_space(two_rooms(0.0), FreeSpaceConfig())
+    cut_off.check_start((6.0, 1.5, 1.2))  # another room of 30 m^3, behind a closed wall
+
+
 def test_outside_the_bounds_nothing_is_free(furnished):
     assert furnished.clearance([[-1.0, 1.0, 1.0], [2.0, 1.0, 9.0]]) == pytest.approx([-1.0, -6.5])
 

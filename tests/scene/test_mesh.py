@@ -360,6 +360,20 @@ def test_position_is_added_before_rounding(tmp_path):
     assert scene.vertices[0, 0] == pytest.approx(0.001, abs=2e-9)  # float64 spacing at 4.5e6 is 1e-9
 
 
+@pytest.mark.parametrize("away_m", [(0.0, 0.0, 0.0), (12_000.0, -3_000.0, 0.0), (4_500_000.0, 0.0, 800.0)])
+def test_a_scene_far_from_the_origin_is_moved_there(tmp_path, away_m):
+    """To float32 the mesh is that of the same scene near the origin, and a note says what was subtracted."""
+    here = np.array([[-1.4, -2.0, 0.0], [1.6, 0.1, 0.3], [0.25, 2.3, 2.7]])
+    lines = [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in here + away_m]
+    scene = load(tmp_path / "a.obj", "\n".join([*lines, "f 1 2 3", ""]), up_axis="z")
+    moved = np.where(
+        np.abs(away_m) > 100.0, away_m + np.rint(0.5 * (here.min(axis=0) + here.max(axis=0))), 0.0
+    )
+    assert scene.origin_m == pytest.approx(moved)
+    assert scene.vertices == pytest.approx(here + away_m - moved, abs=3e-7)  # a spacing of float32 at 2 m
+    assert any("was subtracted from its coordinates" in note for note in scene.notes) == moved.any()
+
+
 # materials and textures
 
 
@@ -701,6 +715,15 @@ def test_light_of_the_file(tmp_path):
         middle = scene.vertices.mean(axis=0)
         distance2 = float(((scene.lights[0].position_m - middle) ** 2).sum())
         assert scene.lights[0].intensity[0] / distance2 == pytest.approx(0.3, rel=0.1)
+
+
+def test_a_scale_for_lights_that_are_not_there_is_refused(tmp_path):
+    model = Gltf()
+    model.node(mesh=model.mesh())
+    with pytest.raises(
+        SceneError, match=r"light_scale = 2 scales the lights of the file, and .*a\.glb has none"
+    ):
+        load(tmp_path / "a.glb", model.glb(), light_scale=2.0)
 
 
 def test_sun_is_a_far_light(tmp_path):

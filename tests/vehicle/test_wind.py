@@ -436,10 +436,15 @@ def test_a_run_has_the_wind_of_its_seed():
     assert not np.isclose(ends[0][0, :3], ends[2][0, :3], rtol=1e-9, atol=0.0).any()
 
 
-def test_what_nothing_feels_is_left_out(device):
+@pytest.mark.parametrize("name", ["wind_m_s", "gusts", "turbulence"])
+def test_moving_air_that_nothing_feels_is_refused(name):
+    """The racer has no drag of any kind."""
     gust = GustConfig(velocity_m_s=(1.0, 0.0, 0.0), start_s=0.0, rise_s=1.0)
-    vehicle = Multirotor(preset("racer", turbulence=MODERATE, gusts=(gust,)), device=device)
-    assert vehicle.terms == ("motor_lag",)
+    weather = {"wind_m_s": (1.0, 0.0, 0.0), "gusts": (gust,), "turbulence": MODERATE}[name]
+    with pytest.raises(ValidationError, match=f"{name}: moving air does nothing to a vehicle without drag"):
+        preset("racer", **{name: weather})
+    felt = preset("racer", flapping_kg_m=1e-6, **{name: weather})
+    assert name.removesuffix("_m_s") in felt.terms()
 
 
 @pytest.mark.parametrize(

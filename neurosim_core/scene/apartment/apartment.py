@@ -70,7 +70,7 @@ def make_apartment(config: ApartmentConfig) -> Scene:
         for index, room in enumerate(plan.rooms)
     ]
     return assembly.finish(
-        f"apartment with {config.rooms} rooms, seed {config.seed}",
+        f"apartment with {config.rooms} room{'s' * (config.rooms > 1)}, seed {config.seed}",
         ambient=Ambient(up=(0.3, 0.3, 0.31), down=(0.23, 0.22, 0.21)),
         inside_m=max(space.roomiest(_FLIGHT_HEIGHT_M) for space in spaces)[1],
     )
