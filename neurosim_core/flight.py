@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import itertools
+import shutil
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,17 +35,21 @@ from neurosim_core.sim.render_group import render_terms
 from neurosim_core.sim.rollout import run_model
 from neurosim_core.sim.state import State, make_state
 from neurosim_core.vehicle import DynamicsError
-from neurosim_core.view.overview import FlightSummary, Track, save_overview
+from neurosim_core.view.overview import FlightSummary, Track
+from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import open_rerun
 from neurosim_core.view.rerun_shapes import scene_shapes
 
 _LIBRARIES = {"h5py": "record", "rerun": "view", "matplotlib": "view"}
 """What a recording needs, and the extra that brings it."""
+_ROOM_BYTES = 32_000_000
+"""When less is left on the disk, flight.rrd gives its place to flight.h5 [bytes]."""
+_CHECK_S = 1.0
 
 
 @dataclass(kw_only=True, eq=False)
-class Report:
+class FlightReport:
     """What is told about a flight besides its packets."""
 
     setup_s: float = 0.0
@@ -59,12 +65,22 @@ class Report:
     tracking_errors_m: list[float] = field(default_factory=list)
     """Distance from the path at every odometry packet [m]."""
     interrupted: bool = False
-    failure: DynamicsError | None = None
+    failure: DynamicsError | OSError | None = None
+    """What ended the flight early."""
 
     @property
     def real_time_factor(self) -> float:
         """Simulated time over wall-clock time."""
         return self.simulated_ns / NS_PER_S / self.flight_s if self.flight_s > 0.0 else 0.0
+
+    def note(self, model: Model, packet: Packet) -> None:
+        """Take one packet."""
+        self.packet_count += 1
+        if isinstance(packet, Collision):
+            self.collisions.append(packet)
+        elif isinstance(packet, Odometry):
+            wanted = model.path.evaluate([packet.stamp_ns]).position[0]
+            self.tracking_errors_m.append(float(np.linalg.norm(packet.position - wanted)))
 
 
 def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
@@ -92,10 +108,12 @@ def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
 
 def fly(
     config: SimulationConfig, folder: Path, *, rerun: bool = True, console: Console | None = None
-) -> Report:
+) -> FlightReport:
     """Fly a configuration and leave config.yaml, flight.h5, flight.rrd and overview.png in a folder.
 
-    What cannot be written because an extra is not installed is left out, and said.
+    What cannot be written because an extra is not installed is left out, and said. When the disk is nearly
+    full, flight.rrd is given up, which can be made again from flight.h5. When flight.h5 cannot grow any more,
+    the flight ends, and the report says up to when it is kept.
 
     Args:
         config: What to fly.
@@ -105,62 +123,62 @@ def fly(
 
     Raises:
         DynamicsError: The integration failed; the recording holds everything up to there.
+        OSError: The folder cannot be written to, or the disk is full.
     """
     console = console or Console()
-    report = Report()
+    report = FlightReport()
     begin = time.perf_counter()
-    with console.status("preparing") as status:
+    with _new_folder(folder), console.status("preparing") as status:
         model = make_model(config, on_phase=lambda phase: status.update(f"preparing: {phase}"))
         status.update("preparing: kernels (compiled on the first run, then cached)")
         state = make_state(model)
         packets = run_model(model, state)
         first = next(packets, None)  # builds all kernels; there is none without sensors
+        (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
     report.setup_s = time.perf_counter() - begin
     report.setup_wall_s = dict(state.wall_s)
     _print_plan(console, model)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(to_yaml(config, comments=True), encoding="utf-8")
 
     summary = FlightSummary(describe_sensors(config.sensors))
     stop = threading.Event()
     begin = time.perf_counter()
-    with (
-        stop_at_signals(stop),
-        _sinks(model, folder, rerun=rerun, console=console) as sinks,
-        _progress(console) as progress,
-    ):
-        task = progress.add_task("flying", total=model.duration_ns, rate="", factor="")
+    with stop_at_signals(stop), _Files(model, folder, rerun=rerun, console=console) as files:
         try:
-            for packet in packets if first is None else itertools.chain([first], packets):
-                if stop.is_set():
-                    report.interrupted = True
-                    break
-                for sink in sinks:
-                    sink(packet)
-                summary.log(packet)
-                _note(report, model, packet)
-                report.flight_s = time.perf_counter() - begin
-                if packet.stamp_ns > report.simulated_ns:
-                    report.simulated_ns = packet.stamp_ns
-                    progress.update(
-                        task,
-                        completed=packet.stamp_ns,
-                        rate=f"{summary.event_count / report.simulated_ns * 1e3:.2f} M events/s",
-                        factor=f"{report.real_time_factor:.2f} x real time",
-                    )
+            with _progress(console) as progress:
+                task = progress.add_task("flying", total=model.duration_ns, rate="", factor="")
+                for packet in packets if first is None else itertools.chain([first], packets):
+                    if stop.is_set():
+                        report.interrupted = True
+                        break
+                    files.write(packet)
+                    summary.log(packet)
+                    report.note(model, packet)
+                    report.flight_s = time.perf_counter() - begin
+                    if packet.stamp_ns > report.simulated_ns:
+                        report.simulated_ns = packet.stamp_ns
+                        progress.update(
+                            task,
+                            completed=packet.stamp_ns,
+                            rate=f"{summary.event_count / report.simulated_ns * 1e3:.2f} M events/s",
+                            factor=f"{report.real_time_factor:.2f} x real time",
+                        )
+            files.close()
         except DynamicsError as error:
             report.failure = error
+        except OSError as error:
+            report.failure = OSError(f"{error}; flight.h5 is kept up to {files.kept_ns / NS_PER_S:.3f} s")
     report.flight_s = time.perf_counter() - begin
     report.event_count = summary.event_count
     if _has("matplotlib", console, "overview.png"):
-        save_overview(
-            folder / "overview.png",
-            scene=model.scene,
-            track=summary.track() if report.tracking_errors_m else _planned_track(model, state.stamp_ns),
-            snapshot=summary.snapshot(),
-            event_count=report.event_count,
-            real_time_factor=report.real_time_factor,
-        )
+        track = None if report.tracking_errors_m else _planned_track(model, state.stamp_ns)
+        factor = report.real_time_factor
+        try:
+            save_overview(
+                folder / "overview.png", summary, scene=model.scene, track=track, real_time_factor=factor
+            )
+        except OSError as error:
+            (folder / "overview.png").unlink(missing_ok=True)
+            console.print(f"overview.png is left out: {error}", style="yellow", markup=False)
     print_report(console, model, state, report, folder)
     if report.failure is not None:
         raise report.failure
@@ -187,61 +205,138 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     with Recording(recorded) as source:
         header = source.header
         settings = yaml.safe_load(header.config_yaml)
-        recording = open_rerun(save or made)
-        if "conversion" in settings:  # of a video, which has neither vehicle nor scene
-            logger = RerunLogger(recording, vehicles={"video": header.sensors})
-        else:
+        vehicle, scene = "video", None  # a conversion of a video has neither vehicle nor scene
+        if "conversion" not in settings:
             config = load_config(settings)
-            logger = RerunLogger(
-                recording,
-                vehicles={next(iter(config.vehicles)): header.sensors},
-                scene=scene_shapes(load_scene(config.scene), make_bodies(config.bodies)),
-                links=bool(config.links),
-            )
-        with logger:
-            logger.log_path(header.path_position)
-            for packet in source.packets():
-                logger.log(packet)
+            vehicle = next(iter(config.vehicles))
+            scene = scene_shapes(load_scene(config.scene), make_bodies(config.bodies))
+        recording = open_rerun(save or made)
+        try:
+            with RerunLogger(recording, vehicles={vehicle: header.sensors}, scene=scene) as logger:
+                logger.log_path(header.path_position)
+                for packet in source.packets():
+                    logger.log(packet)
+        except BaseException:
+            (save or made).unlink(missing_ok=True)  # the next call must not take it for the whole
+            raise
     return save or made
 
 
 @contextlib.contextmanager
-def _sinks(
-    model: Model, folder: Path, *, rerun: bool, console: Console
-) -> Iterator[list[Callable[[Packet], None]]]:
-    """Open everything that packets go to, and close it whatever happens."""
-    config = model.config
-    with contextlib.ExitStack() as stack:
-        sinks: list[Callable[[Packet], None]] = []
+def _new_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and try to write in it; remove it again if the block fails."""
+    made = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(f"cannot write to {folder}: {error.strerror}") from None
+    try:
+        yield
+    except BaseException:
+        if made and not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+
+
+class _Files:
+    """The files that the packets of a flight are written to. A context manager."""
+
+    def __init__(self, model: Model, folder: Path, *, rerun: bool, console: Console) -> None:
+        config = model.config
+        self._model, self._folder, self._console = model, folder, console
+        self._recording: RecordingWriter | None = None
+        self._rerun: RerunLogger | None = None
+        self._checked_s = time.monotonic()
         stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
         path_position = model.path.evaluate(stamps).position
+        sensors = describe_sensors(config.sensors)
         if _has("h5py", console, "flight.h5"):
             header = RecordingHeader(
                 config_yaml=to_yaml(config),
                 seed=config.seed,
                 version=__version__,
                 scene=model.scene.name,
-                sensors=describe_sensors(config.sensors),
+                sensors=sensors,
                 path_stamp_ns=stamps,
                 path_position=path_position,
             )
-            sinks.append(stack.enter_context(RecordingWriter(folder / "flight.h5", header)).write)
+            self._recording = RecordingWriter(folder / "flight.h5", header)
         if rerun and _has("rerun", console, "flight.rrd"):
-            logger = RerunLogger(
+            self._rerun = RerunLogger(
                 open_rerun(folder / "flight.rrd"),
-                vehicles={next(iter(config.vehicles)): describe_sensors(config.sensors)},
+                vehicles={next(iter(config.vehicles)): sensors},
                 scene=scene_shapes(model.scene, model.bodies),
             )
-            logger.log_path(path_position)
-            sinks.append(stack.enter_context(logger).log)
-            sinks.append(lambda packet: _log_clearance(logger, model, packet))
-        yield sinks
+            self._rerun.log_path(path_position)
 
+    @property
+    def kept_ns(self) -> int:
+        """Up to which stamp the packets are in flight.h5 [ns]."""
+        return 0 if self._recording is None else self._recording.kept_ns
 
-def _log_clearance(logger: RerunLogger, model: Model, packet: Packet) -> None:
-    if isinstance(packet, Odometry):
-        clearance_m = float(model.free_space.clearance(packet.position)[0])
-        logger.log_scalar("clearance", packet.stamp_ns, clearance_m)
+    def write(self, packet: Packet) -> None:
+        """Write one packet to all files.
+
+        Raises:
+            OSError: flight.h5 cannot be written.
+        """
+        if self._rerun is not None:
+            self._rerun.log(packet)
+            if isinstance(packet, Odometry):
+                clearance_m = float(self._model.free_space.clearance(packet.position)[0])
+                self._rerun.log_scalar("clearance", packet.stamp_ns, clearance_m)
+            if time.monotonic() - self._checked_s >= _CHECK_S:
+                self._check_disk()
+        if self._recording is not None:
+            self._recording.write(packet)
+
+    def close(self) -> None:
+        """Close all files. Closing twice is allowed.
+
+        Raises:
+            OSError: flight.h5 cannot be written.
+        """
+        if self._rerun is not None:
+            self._check_disk()
+        recording, self._recording = self._recording, None
+        logger, self._rerun = self._rerun, None
+        if logger is not None:
+            logger.close()
+        if recording is not None:
+            self._recording = recording
+            recording.close()
+
+    def __enter__(self) -> _Files:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):  # it has been told
+            self.close()
+
+    def _check_disk(self) -> None:
+        """Give flight.rrd up if it cannot be written, or takes the last room from flight.h5."""
+        assert self._rerun is not None
+        self._checked_s = time.monotonic()
+        why = ""
+        try:
+            self._rerun.flush()
+        except OSError as error:
+            why = str(error)
+        if shutil.disk_usage(self._folder).free < _ROOM_BYTES:
+            why = f"less than {_ROOM_BYTES / 1e6:g} MB are left on the disk"
+        if why and self._recording is not None:
+            self._rerun.abandon()
+            self._rerun = None
+            (self._folder / "flight.rrd").unlink(missing_ok=True)
+            self._console.print(
+                f"flight.rrd is given up: {why}; `neurosim view {self._folder} --save FILE.rrd` makes it "
+                "from flight.h5",
+                style="yellow",
+                markup=False,
+                soft_wrap=True,
+            )
 
 
 def _planned_track(model: Model, end_ns: int) -> Track:
@@ -260,15 +355,6 @@ def _has(library: str, console: Console, product: str) -> bool:
         return True
     console.print(f"{product} is left out: {install_hint(_LIBRARIES[library])}", style="yellow", markup=False)
     return False
-
-
-def _note(report: Report, model: Model, packet: Packet) -> None:
-    report.packet_count += 1
-    if isinstance(packet, Collision):
-        report.collisions.append(packet)
-    elif isinstance(packet, Odometry):
-        wanted = model.path.evaluate([packet.stamp_ns]).position[0]
-        report.tracking_errors_m.append(float(np.linalg.norm(packet.position - wanted)))
 
 
 def _progress(console: Console) -> Progress:
@@ -306,7 +392,7 @@ def _print_plan(console: Console, model: Model) -> None:
     )
 
 
-def print_report(console: Console, model: Model, state: State, report: Report, folder: Path) -> None:
+def print_report(console: Console, model: Model, state: State, report: FlightReport, folder: Path) -> None:
     """Print what was flown, what was compiled in, and where the time went."""
     simulated_s = report.simulated_ns / NS_PER_S
     facts = Table(show_header=False, box=None, pad_edge=False)
@@ -394,7 +480,7 @@ def _describe_left_out(counts: Mapping[str, int]) -> str:
     return f"{counts['ticks left out']:,} ticks without a render{advice}"
 
 
-def _describe_collisions(report: Report) -> str:
+def _describe_collisions(report: FlightReport) -> str:
     if not report.collisions:
         return "none"
     first = report.collisions[0]

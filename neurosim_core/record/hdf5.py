@@ -98,6 +98,9 @@ class RecordingWriter:
         self._buffer_bytes = buffer_bytes
         self._streams: dict[str, _Stream] = {}
         self._order = 0
+        self._newest_ns = 0
+        self.kept_ns = 0
+        """The file holds the packets up to this stamp, whatever happens [ns]."""
         self._pending_bytes = 0
         self._flushed_bytes = _FIRST_FLUSH_BYTES
         self._flushed_s = time.monotonic()
@@ -136,6 +139,7 @@ class RecordingWriter:
         stream = self._streams.get(packet.sensor) or self._open_stream(packet)
         self._pending_bytes += stream.append(packet, self._order)
         self._order += 1
+        self._newest_ns = max(self._newest_ns, packet.stamp_ns)
         due = time.monotonic() - self._flushed_s >= self._flush_interval_s
         if due or self._pending_bytes >= min(self._buffer_bytes, self._flushed_bytes):
             self.flush()
@@ -154,6 +158,7 @@ class RecordingWriter:
             stream.commit()
         self._file.flush()
         self._disk.seal()
+        self.kept_ns = self._newest_ns
         self._flushed_bytes += self._pending_bytes
         self._pending_bytes = 0
         self._flushed_s = time.monotonic()
@@ -197,7 +202,7 @@ class RecordingWriter:
         name = packet.sensor
         if not name or "/" in name:
             raise ValueError(f"a packet needs a sensor name without '/', got {name!r}")
-        group = self._described.get(name) or self._file["sensors"].create_group(name)
+        group = self._described.get(name) or self._file["sensors"].require_group(name)
         stream = self._streams[name] = _Stream(group, packet)
         if isinstance(packet, Events) and self._root_camera in (None, name):
             self._root_camera = name

@@ -1,6 +1,7 @@
 """Pictures for people: Rerun, live or to a file, and one overview of a flight."""
 
-from neurosim_core.view.overview import FlightSummary, Snapshot, Track, save_overview
+from neurosim_core.view.overview import FlightSummary, Snapshot, Track
+from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.pictures import event_classes, event_picture
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import open_rerun

@@ -263,13 +263,30 @@ class RerunLogger:
             table.send()
 
     def flush(self) -> None:
-        """Send what waits, and wait until it has left."""
+        """Send what waits, and wait until it has left.
+
+        Raises:
+            OSError: The file cannot be written, such as on a full disk.
+        """
         self.send()
-        self._recording.flush()
+        try:
+            self._recording.flush()
+        except RuntimeError as error:
+            raise OSError(f"Rerun cannot write its recording: {error}") from None
 
     def close(self) -> None:
-        """Flush and disconnect from the file or viewer."""
-        self.flush()
+        """Flush and disconnect from the file or viewer.
+
+        Raises:
+            OSError: As `flush`.
+        """
+        try:
+            self.flush()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Disconnect without sending what waits."""
         self._recording.disconnect()
 
     def __enter__(self) -> RerunLogger:

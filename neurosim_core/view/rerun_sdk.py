@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 TIMELINE = "sim_time"
 """The only timeline: simulated time."""
-_QUIET = "warn,re_log_encoding::rrd::file_sink=error"
-"""What Rerun says: no warning of files without a footer, which are meant."""
+_QUIET = "warn,re_log_encoding=off,re_sdk::recording_stream=off"
+"""What Rerun says: nothing of files that it cannot write, which `RerunLogger.flush` raises, or that have no
+footer, which are meant."""
 
 
 def import_rerun() -> ModuleType:

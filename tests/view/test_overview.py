@@ -10,9 +10,8 @@ import pytest
 import trimesh
 from test_plan import make_scene
 
-from neurosim_core.packets import Events, Image, Odometry
-from neurosim_core.record import SensorDescription
-from neurosim_core.view.overview import FlightSummary, Snapshot, Track, save_overview
+from neurosim_core.packets import Events, Image, ImuSample, Odometry
+from neurosim_core.view import FlightSummary, save_overview
 
 MS = 1_000_000
 WIDTH, HEIGHT = 40, 30
@@ -66,12 +65,11 @@ def test_snapshot_holds_exactly_the_window_before_the_picture():
             summary.log(picture(packet.stamp_ns, 90 if k == 3 else 10))
         summary.log(packet)
     snapshot = summary.snapshot()
-    assert snapshot is not None
     assert snapshot.stamp_ns == 40 * MS  # the one with the greater contrast
     t = np.concatenate([p.t for p in packets])
-    assert snapshot.events is not None
-    assert snapshot.events.t.tolist() == t[(t > 20_000) & (t <= 40_000)].tolist()
-    assert (snapshot.event_width, snapshot.event_height) == (WIDTH, HEIGHT)
+    view = snapshot.events["dvs"]
+    assert view.events.t.tolist() == t[(t > 20_000) & (t <= 40_000)].tolist()
+    assert (view.width, view.height, view.window_ns) == (WIDTH, HEIGHT, 20 * MS)
     assert summary.event_count == 800
 
 
@@ -90,41 +88,36 @@ def test_moment_with_more_events_and_wider_view_is_chosen():
             summary.log(events(rng, k, count))
             summary.log(picture(stamp_ns, 50))
             summary.log(Image(stamp_ns=stamp_ns, sensor="z", data=depth, encoding="32FC1"))
-        snapshot = summary.snapshot()
-        assert snapshot is not None
-        assert snapshot.stamp_ns == wanted_ns
+        assert summary.snapshot().stamp_ns == wanted_ns
 
 
-def test_only_the_first_camera_of_a_kind_is_shown():
+def test_every_camera_of_a_kind_is_shown(tmp_path):
+    """Two event cameras and two others: each has a panel, and nothing else has."""
     rng = np.random.default_rng(0)
-    described = SensorDescription(
-        name="right",
-        kind="event_camera",
-        rate_hz=1.0,
-        position=np.zeros(3),
-        orientation=np.array([0, 0, 0, 1.0]),
-    )
-    summary = FlightSummary((described,))
-    summary.log(events(rng, 0, 7, sensor="left"))
-    summary.log(events(rng, 0, 5, sensor="right"))
+    summary = FlightSummary()
+    summary.log(events(rng, 0, 70, sensor="left"))
+    summary.log(events(rng, 0, 50, sensor="right"))
     summary.log(picture(10 * MS, 10, sensor="a"))
     summary.log(picture(10 * MS, 90, sensor="b"))
     snapshot = summary.snapshot()
-    assert snapshot is not None
-    assert snapshot.events is not None
-    assert len(snapshot.events.t) == 5
-    assert snapshot.rgb is not None
-    assert snapshot.rgb.sensor == "a"
+    assert {name: len(view.events.t) for name, view in snapshot.events.items()} == {"left": 70, "right": 50}
+    assert list(snapshot.packets) == ["a", "b"]
+    found = draw(tmp_path / "o.png", summary)
+    assert found.shape == (900, 1600, 3)
+    for x in (40, 520):
+        for y in (124, 508):
+            panel = found[y : y + 312, x : x + 416]
+            assert (panel != 255).any(axis=-1).mean() > 0.05, (x, y)
 
 
 def test_memory_is_bounded(monkeypatch):
     """Events: those of one window. Odometry: at most so many rows, evenly spread over the whole flight."""
-    monkeypatch.setattr("neurosim_core.view.overview._TRACK_ROWS", 200)
+    monkeypatch.setattr("neurosim_core.view.overview._ROWS_MAX", 200)
     rng = np.random.default_rng(0)
     summary = FlightSummary()
     for k in range(100):
         summary.log(events(rng, k, 10))
-        assert len(summary._recent) <= 2
+        assert len(summary._recent["dvs"]) <= 2
     for k in range(450):
         summary.log(odometry(k, period_ns=MS))
     track = summary.track()
@@ -153,9 +146,7 @@ def room() -> trimesh.Trimesh:
 
 
 def draw(path, summary: FlightSummary, **options) -> np.ndarray:
-    save_overview(
-        path, scene=make_scene(room()), track=summary.track(), snapshot=summary.snapshot(), **options
-    )
+    save_overview(path, summary, scene=make_scene(room()), **options)
     with PIL.Image.open(path) as image:
         return np.asarray(image.convert("RGB"))
 
@@ -171,7 +162,7 @@ def test_picture_has_its_size_and_its_parts(tmp_path):
         summary.log(picture((k + 1) * 10 * MS, 90))
         depth = np.geomspace(1.0, 10.0, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
         summary.log(Image(stamp_ns=(k + 1) * 10 * MS, sensor="z", data=depth, encoding="32FC1"))
-    found = draw(tmp_path / "o.png", summary, event_count=2000, real_time_factor=0.5)
+    found = draw(tmp_path / "o.png", summary, real_time_factor=0.5)
     assert found.shape == (900, 1600, 3)
     panels = {
         "title": (slice(20, 90), slice(40, 500)),
@@ -204,17 +195,25 @@ def test_flight_without_cameras_or_motion_is_drawn(tmp_path):
     assert draw(tmp_path / "b.png", summary).shape == (900, 1600, 3)
     for _ in range(3):
         summary.log(odometry(0))
-    empty = Snapshot(stamp_ns=0, depth=Image(data=np.full((4, 4), np.inf, np.float32), encoding="32FC1"))
-    save_overview(tmp_path / "c.png", scene=make_scene(room()), track=summary.track(), snapshot=empty)
+    nothing = np.full((4, 4), np.inf, np.float32)
+    summary.log(Image(stamp_ns=0, sensor="z", data=nothing, encoding="32FC1"))
+    assert draw(tmp_path / "c.png", summary).shape == (900, 1600, 3)
+
+
+def test_numbers_are_collected_by_field():
+    summary = FlightSummary()
+    for k in range(5):
+        summary.log(
+            ImuSample(stamp_ns=k, sensor="imu", specific_force=np.full(3, k), angular_rate=np.arange(3.0))
+        )
+    force, rate = summary.series()
+    assert (force.sensor, force.field.name, force.field.unit) == ("imu", "specific_force", "m/s^2")
+    assert force.stamp_ns.tolist() == [0, 1, 2, 3, 4]
+    assert force.values[:, 2].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert rate.values.shape == (5, 3)
 
 
 def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    none = Track(
-        stamp_ns=np.zeros(0, np.int64),
-        position=np.zeros((0, 3)),
-        velocity=np.zeros((0, 3)),
-        heading=np.zeros((0, 2)),
-    )
     with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
-        save_overview(tmp_path / "o.png", scene=make_scene(room()), track=none, snapshot=None)
+        save_overview(tmp_path / "o.png", FlightSummary(), scene=make_scene(room()))
