@@ -258,7 +258,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _serve(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.live.simulator import serve
+    from neurosim_core.live.serve import serve
 
     config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
     return serve(config, record=arguments.record, overwrite=arguments.overwrite)
@@ -278,7 +278,7 @@ def _fly(arguments: argparse.Namespace) -> int:
 
 def _up(arguments: argparse.Namespace) -> int:
     from neurosim_core.config import load_config
-    from neurosim_core.live.stack import up
+    from neurosim_core.live.up import up
 
     config = load_config(arguments.config, overrides=_live_overrides(arguments), options=_options(arguments))
     return up(config, viewer=arguments.viewer, record=arguments.record, overwrite=arguments.overwrite)

@@ -32,7 +32,6 @@ from neurosim_core.bench.machine import StealTime, describe_machine
 from neurosim_core.bench.processes import NeurosimProcess, own_runtime
 from neurosim_core.bench.report import Plot, Table, save_files
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
-from neurosim_core.live.floor import measure_floor
 from neurosim_core.live.probe import ProbeError, answer_images
 from neurosim_core.overrides import set_options
 
@@ -80,12 +79,6 @@ class LoopResult:
     """Images that gave way to newer ones before the controller looked."""
     unfelt_count: int
     """Commands sent that no image showed: a newer one took their place, or the measurement was over."""
-    wake_median_s: float = float("nan")
-    """The floor: from writing into a pipe to having it in another process that slept, at this rate [s]."""
-    wake_p99_s: float = float("nan")
-    message_median_s: float = float("nan")
-    """The same of 40 bytes through Cortex [s]."""
-    message_p99_s: float = float("nan")
 
 
 def loop_config(
@@ -257,31 +250,8 @@ def sweep(
     for config in configs:
         if on_case is not None:
             on_case(config.live.mode, config.control.rate_hz)
-        result = measure_loop(config, seconds=seconds)
-        results.append(with_floor(result, seconds=seconds) if result.mode == "streaming" else result)
+        results.append(measure_loop(config, seconds=seconds))
     return results
-
-
-def with_floor(result: LoopResult, *, seconds: float) -> LoopResult:
-    """Return a result with what this machine allows at its rate.
-
-    Args:
-        result: In real time, where messages come at the rate that was asked for.
-        seconds: How long to measure [wall-clock s].
-
-    Raises:
-        FloorError: The other process was silent.
-    """
-    with own_runtime():
-        trace = measure_floor(result.requested_hz, seconds=seconds)
-    wake_s, message_s = 1e-9 * trace.wake_ns, 1e-9 * trace.message_ns
-    return dataclasses.replace(
-        result,
-        wake_median_s=_quantile(wake_s, 0.5),
-        wake_p99_s=_quantile(wake_s, 0.99),
-        message_median_s=_quantile(message_s, 0.5),
-        message_p99_s=_quantile(message_s, 0.99),
-    )
 
 
 def print_sweep(results: Sequence[LoopResult], console: Console) -> None:
@@ -319,31 +289,6 @@ def print_sweep(results: Sequence[LoopResult], console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    _print_floor(results, console)
-
-
-def _print_floor(results: Sequence[LoopResult], console: Console) -> None:
-    """Print the transport beside what this machine takes to wake another process at the same rate."""
-    paced = [result for result in results if result.mode == "streaming"]
-    if not paced:
-        return
-    table = rich.table.Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("streaming\n[Hz]", justify="right")
-    for name in ("transport", "40 B through\nCortex", "8 B through\na pipe"):
-        table.add_column(f"{name} [ms]", justify="right")
-        table.add_column("its p99", justify="right")
-    for r in paced:
-        times_s = (r.transport_median_s, r.transport_p99_s, r.message_median_s, r.message_p99_s)
-        cells = [f"{1e3 * time_s:.3f}" for time_s in (*times_s, r.wake_median_s, r.wake_p99_s)]
-        table.add_row(f"{r.requested_hz:g}", *cells)
-    console.print(table, highlight=False)
-    above = [
-        f"{r.requested_hz:g} Hz"
-        for r in paced
-        if r.message_median_s >= TRANSPORT_BAR_S[0] or r.message_p99_s >= TRANSPORT_BAR_S[1]
-    ]
-    if above:
-        console.print(f"the machine: 40 B alone are above the bar at {', '.join(above)}", highlight=False)
 
 
 def _ms(seconds: float) -> str:

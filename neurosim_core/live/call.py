@@ -1,32 +1,32 @@
-"""Asking a running simulator: `neurosim call reset | step | pause | resume | set | status`."""
+"""Requests to a running simulator: `neurosim call reset | step | pause | resume | set | status`."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import yaml
 from rich.console import Console
+from rich.markdown import Markdown
 from rich.markup import escape
-from rich.table import Table
 
 from cortex import Node, ServiceTimeout, ServiceUnavailable, latest
 from cortex.messages import Parameters, Reset, SimulatorReply, SimulatorStatus, Step, Trigger
 from neurosim_core.clock import NS_PER_S
-from neurosim_core.live.requests import STEP_DEADLINE_S
+from neurosim_core.live.services import STEP_DEADLINE_S
 from neurosim_core.live.topics import SERVICES, STATUS
 
 GRACE_S = 1.0
-"""So much longer than steps may take do we wait to hear that they were not over [s]."""
+"""How much longer than the steps may take the client waits to hear that they were not over [s]."""
 
 
 def call(arguments: argparse.Namespace) -> int:
-    """Ask a simulator for what the command line says, and print what it answers.
+    """Send the request of a command line, and print the answer.
 
     Args:
-        arguments: As `neurosim call` parses them: `what`, `timeout` [s], and what belongs to the request.
+        arguments: As `neurosim call` parses them: `what`, `timeout` [s], and the arguments of the request.
 
     Returns:
         0 if it was done, 1 if it was refused.
@@ -35,28 +35,22 @@ def call(arguments: argparse.Namespace) -> int:
         ValueError: A value of the command line is not allowed.
         RuntimeError: There is no simulator, or it does not answer in time.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     timeout_s = arguments.timeout
     if not timeout_s > 0.0:
         raise ValueError(f"--timeout must be > 0, got {timeout_s}")
     if arguments.what == "status":
-        print_status(_status(timeout_s), console)
+        console.print(Markdown(describe_status(_status(timeout_s))))
         return 0
     service, request = _request(arguments)
-    if isinstance(request, Step):
-        timeout_s += GRACE_S
-    reply = _ask(service, request, timeout_s)
+    reply = _ask(service, request, timeout_s + GRACE_S * isinstance(request, Step))
     at = f"{reply.phase} at {reply.stamp_ns / NS_PER_S:g} s"
-    if reply.accepted:
-        changed = (
-            [f"{key} = {value}" for key, value in request.to_dict().items()]
-            if isinstance(request, Parameters)
-            else []
-        )
-        console.print("; ".join([*changed, at]), markup=False, soft_wrap=True)
-        return 0
-    console.print(f"[red]refused[/] ({at}): {escape(reply.reason)}", soft_wrap=True)
-    return 1
+    if not reply.accepted:
+        console.print(f"[red]refused[/] ({at}): {escape(reply.reason)}")
+        return 1
+    changed = request.to_dict() if isinstance(request, Parameters) else {}
+    console.print("; ".join([*(f"{key} = {value}" for key, value in changed.items()), at]), markup=False)
+    return 0
 
 
 def parameters_of(settings: Sequence[str]) -> Parameters:
@@ -80,59 +74,67 @@ def parameters_of(settings: Sequence[str]) -> Parameters:
     return Parameters.of(values)
 
 
-def print_status(status: SimulatorStatus, console: Console) -> None:
-    """Print how a simulator is doing: the run, its vehicles, its sensors."""
-    run = Table(box=None, pad_edge=False, show_header=False)
-    run.add_column(style="dim", min_width=12)
-    run.add_column()
-    run.add_row("phase", escape(f"{status.phase} ({status.reason})" if status.reason else status.phase))
-    run.add_row("time", f"{status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods")
-    if status.mode == "lockstep":
-        wanted = "lockstep"
-    else:
-        wanted = f"of {status.real_time_factor_wanted:g}" if status.real_time_factor_wanted else "at most"
-    run.add_row("speed", f"{status.real_time_factor:.2f} x real time ({wanted})")
-    run.add_row("a period", f"{_ms(status.step_median_ns)} (99 %: {_ms(status.step_p99_ns)})")
-    if status.mode == "streaming":
-        run.add_row("late by", f"{_ms(status.late_median_ns)} (99 %: {_ms(status.late_p99_ns)})")
-        run.add_row(
-            "overruns", f"{status.overrun_count:,}; held back by {status.slipped_ns / NS_PER_S:.3f} s"
-        )
-    for vehicle in status.vehicles:
-        if vehicle.undelivered_count:
-            lost = f"{vehicle.undelivered_count:,} messages on other topics than those of sensors"
-            run.add_row("by readers", f"{escape(vehicle.name)} lost {lost}")
-        if vehicle.clamped_count:
-            run.add_row(
-                "clamped", f"{vehicle.clamped_count:,} commands to {escape(vehicle.name)}, out of range"
-            )
-    console.print(run)
+def describe_status(
+    status: SimulatorStatus,
+    *,
+    rates_hz: Mapping[tuple[str, str], float] | None = None,
+    lost: Mapping[tuple[str, str], int] | None = None,
+) -> str:
+    """Return a status as Markdown: the run, its vehicles, its sensors.
 
-    vehicles = _table("vehicle", "flown by", "commands", "age", "refused", "superseded", "lost", "fail-safe")
-    for vehicle in status.vehicles:
-        fail_safe = f"{vehicle.fail_safe_count}, flies now" if vehicle.fail_safe else vehicle.fail_safe_count
-        vehicles.add_row(
-            vehicle.name,
-            vehicle.command_mode or "nobody yet",
-            f"{vehicle.command_count:,}",
-            _ms(vehicle.command_age_ns),
-            *(f"{n:,}" for n in (vehicle.refused_count, vehicle.superseded_count, vehicle.lost_count)),
-            str(fail_safe),
-        )
-    sensors = _table("sensor", "state", "readers", "published", "dropped", "by link", "by reader", "late")
+    Args:
+        status: The status.
+        rates_hz: Messages a second of simulated time [Hz], by vehicle and sensor, if known.
+        lost: Messages that a viewer has not received, by vehicle and sensor, if known.
+    """
+    wanted = f" of {status.real_time_factor_wanted:g}" if status.real_time_factor_wanted else ""
+    lines = [
+        f"**{status.phase}**{f': {status.reason}' if status.reason else ''}",
+        f"{status.mode}, {status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods, "
+        f"{status.real_time_factor:.2f}{wanted} x real time",
+        f"step {_ms(status.step_median_ns)} (p99 {_ms(status.step_p99_ns)}), "
+        f"late {_ms(status.late_median_ns)} (p99 {_ms(status.late_p99_ns)}), "
+        f"{status.overrun_count:,} overruns, delayed by {status.slipped_ns / NS_PER_S:.3f} s",
+    ]
+    vehicles = [
+        {
+            "vehicle": vehicle.name,
+            "mode": "**fail-safe**" if vehicle.fail_safe else vehicle.command_mode or "no command yet",
+            "taken": vehicle.command_count,
+            "age": _ms(vehicle.command_age_ns),
+            "refused": vehicle.refused_count,
+            "replaced": vehicle.superseded_count,
+            "lost": vehicle.lost_count,
+            "fail-safe": vehicle.fail_safe_count,
+            "by reader": vehicle.undelivered_count,
+        }
+        for vehicle in status.vehicles
+    ]
+    sensors = []
     for sensor in status.sensors:
-        sensors.add_row(
-            f"{sensor.vehicle}/{sensor.name}",
-            "on" if sensor.active else "off",
-            *(f"{n:,}" for n in (sensor.subscriber_count, sensor.published_count, sensor.dropped_count)),
-            f"{sensor.injected_lost_count:,}",
-            f"{sensor.undelivered_count:,}",
-            _ms(sensor.late_p99_ns),
-        )
-    for table in (vehicles, sensors):
-        if table.row_count:
-            console.print()
-            console.print(table)
+        key = (sensor.vehicle, sensor.name)
+        row: dict[str, object] = {"sensor": "/".join(key), "state": "on" if sensor.active else "off"}
+        if rates_hz is not None:
+            row["Hz"] = f"{rates_hz[key]:.0f}" if key in rates_hz else "-"
+        row |= {
+            "readers": sensor.subscriber_count,
+            "published": sensor.published_count,
+            "dropped": sensor.dropped_count,
+            "by link": sensor.injected_lost_count,
+            "by reader": sensor.undelivered_count,
+        }
+        if lost is not None:
+            row["lost here"] = lost.get(key, 0)
+        sensors.append(row | {"late": _ms(sensor.late_p99_ns)})
+    return "\n\n".join(["  \n".join(lines), *(_table(rows) for rows in (vehicles, sensors) if rows)])
+
+
+def _table(rows: Sequence[Mapping[str, object]]) -> str:
+    """Return a table in Markdown; the first two columns are text, the others numbers."""
+    heads = list(rows[0])
+    align = [":--", ":--", *["--:"] * (len(heads) - 2)]
+    cells = ([f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in row.values()] for row in rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in (heads, align, *cells))
 
 
 def _request(arguments: argparse.Namespace) -> tuple[str, Any]:
@@ -152,7 +154,6 @@ def _request(arguments: argparse.Namespace) -> tuple[str, Any]:
 
 
 def _ask(service: str, request: Any, timeout_s: float) -> SimulatorReply:
-    """Ask, and return the answer."""
     request_type, reply_type = SERVICES[service]
     with Node("call") as node:
         try:
@@ -163,7 +164,7 @@ def _ask(service: str, request: Any, timeout_s: float) -> SimulatorReply:
                 "--timeout waits longer"
             ) from None
         except ServiceUnavailable:
-            raise RuntimeError(_nobody(timeout_s)) from None
+            raise RuntimeError(_no_simulator(timeout_s)) from None
     return reply
 
 
@@ -173,20 +174,11 @@ def _status(timeout_s: float) -> SimulatorStatus:
         try:
             return statuses.recv(timeout_s)
         except TimeoutError:
-            raise RuntimeError(_nobody(timeout_s)) from None
+            raise RuntimeError(_no_simulator(timeout_s)) from None
 
 
-def _nobody(timeout_s: float) -> str:
+def _no_simulator(timeout_s: float) -> str:
     return f"no simulator answers (waited {timeout_s:g} s): start one with `neurosim serve`"
-
-
-def _table(name: str, *columns: str) -> Table:
-    """Return a table whose first column is a name, and whose last ones are numbers."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column(name)
-    for index, column in enumerate(columns):
-        table.add_column(column, justify="right" if index else "left")
-    return table
 
 
 def _ms(duration_ns: int) -> str:

@@ -1,4 +1,4 @@
-"""Settings of a simulator that flies for controllers outside of its process (`neurosim serve`)."""
+"""Settings of a simulator with controllers in other processes (`neurosim serve`), and of simulated links."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ class LiveConfig(Settings):
     """How time passes, and what happens when a controller or the machine is too slow."""
 
     mode: LiveMode = "streaming"
-    """streaming: time goes on whether commands come or not, and each is held until the next. lockstep: every
-    control period waits for its command, so a flight is the same to the last bit on any machine."""
+    """streaming: time passes whether commands arrive or not; each command is held until the next. lockstep:
+    every control period waits for its command, so that a flight is bit-identical on every machine."""
     real_time_factor: Annotated[float, Field(ge=0.0, le=1000.0)] = 1.0
-    """streaming: how much faster than the wall clock time passes; 0: as fast as it can."""
+    """streaming: simulated over wall-clock time; 0: as fast as possible."""
     overrun: Literal["slow", "drop"] = "slow"
-    """streaming: what gives way when the machine is too slow. slow: time; drop: camera frames. Both are
-    counted in /status."""
+    """streaming: what gives way when the machine is too slow. slow: time; drop: camera frames. /status counts
+    both."""
     command_timeout_s: Annotated[float, Field(gt=0.0, le=1e6)] = 0.2
-    """A command older than this is stale [simulated s], and the fail-safe takes over until the next one."""
+    """Age at which a command is stale [simulated s]; the fail-safe then flies until the next command."""
     fail_safe: FailSafe = "hover"
     """hover: stay where the command became stale; cut: rotors at their lowest speed; hold: keep the stale
     command."""
     command_deadline_s: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
-    """lockstep: how long to wait for a command before the run ends with an error [wall-clock s]. The first
-    command of a run is waited for without limit."""
+    """lockstep: longest wait for a command before the run ends with an error [wall-clock s]. The wait for the
+    first command of a run has no limit."""
     command_every: Annotated[int, Field(ge=1)] = 1
-    """lockstep: control periods for each command; 4 with a control rate of 200 Hz waits for 50 commands a
+    """lockstep: control periods for each command; 4 at a control rate of 200 Hz waits for 50 commands a
     second, and the inner loops still run at 200 Hz."""
     run_on: bool = True
-    """Go on after `duration_s`, until stopped. false: end there."""
+    """Continue after `duration_s`, until stopped. false: end there."""
 
 
 class LinkConfig(Settings):
-    """What a message meets between the simulator and its controller, in simulated time; seeded.
+    """What a simulated link does to messages between simulator and controller, in simulated time; seeded.
 
-    Messages of a link stay in their order: one that is held up holds up those behind it.
+    A link keeps the order of its messages: a delayed message delays those behind it.
     """
 
     latency_s: Seconds = 0.0
@@ -55,15 +55,15 @@ class LinkConfig(Settings):
     bandwidth_bytes_s: Annotated[float, Field(gt=0.0)] | None = None
     """Bytes a second; a message occupies the link for its size over this. null: unlimited."""
     queue_s: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
-    """Longest that a message may wait for bandwidth [s]; one that would wait longer is lost at once."""
+    """Longest wait for bandwidth [s]; a message that would wait longer is lost at once."""
     clock_offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
-    """What the sensor's clock is ahead of simulated time at stamp 0 [s]; not for `command`."""
+    """How far the sensor's clock is ahead of simulated time at stamp 0 [s]; not for `command`."""
     clock_drift_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
     """How much faster the sensor's clock runs [1e-6]; not for `command`."""
 
     @property
     def delivers_at_once(self) -> bool:
-        """Whether messages arrive when they are sent, all of them."""
+        """Whether every message arrives when it is sent."""
         return not (self.latency_s or self.jitter_s or self.loss or self.bandwidth_bytes_s)
 
     def clock_ns(self, stamp_ns: int) -> int:
@@ -71,3 +71,7 @@ class LinkConfig(Settings):
         if not (self.clock_offset_s or self.clock_drift_ppm):
             return stamp_ns
         return stamp_ns + round(self.clock_offset_s * 1e9) + round(stamp_ns * (self.clock_drift_ppm * 1e-6))
+
+
+NO_LINK = LinkConfig()
+"""A link that does nothing."""

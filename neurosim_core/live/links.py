@@ -1,12 +1,13 @@
-"""What messages meet between the simulator and its controller: delay, loss, bandwidth, in simulated time.
+"""Simulated links between the simulator and its controllers: delay, loss and bandwidth, in simulated time.
 
-All times are whole nanoseconds and all random numbers are addressed by (seed, link, message number), so what
-a link does to message n depends on nothing but the settings, the seed and the messages before it.
+All times are integer nanoseconds, and all random numbers are addressed by (seed, link, message number): what
+a link does to message n depends on the settings, the seed and the messages before it, and on nothing else.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import fields
 from fractions import Fraction
 from typing import Any
 
@@ -14,29 +15,30 @@ import numpy as np
 
 from neurosim_core.clock import NS_PER_S, to_ns
 from neurosim_core.live.config import LinkConfig
-from neurosim_core.packets import Delivery
+from neurosim_core.packets import Delivery, Packet
 from neurosim_core.random import stream_id
 
 
 class Link:
-    """One direction of one stream: messages go in when they are sent, and come out when they arrive.
+    """One direction of one stream: a queue of messages in the order sent. Not thread-safe.
 
     A message waits until those before it have left, occupies the link for size / bandwidth, and then travels
     for latency + jitter. It never arrives before one that was sent earlier. A lost message occupies the link
-    as any other, since it is lost on the way, but holds nobody up by its jitter. One that would wait too long
-    to leave is lost without occupying the link. `len` says how many messages are under way.
+    like any other, but its jitter delays no other message. A message that would wait longer than `queue_s` is
+    lost without occupying the link.
 
     Attributes:
-        lost_count: Messages that will never arrive, since the beginning or the last reset.
+        config: The settings for messages sent from now on.
+        lost_count: Messages lost since the last reset.
     """
 
     def __init__(self, config: LinkConfig, *, seed: int, name: str) -> None:
         """Make an empty link.
 
         Args:
-            config: Its settings; those of the sensor's clock are not looked at.
+            config: Its settings; those of the sensor's clock have no effect here.
             seed: Seed of jitter and loss, 0 <= seed < 2^64.
-            name: What travels on it, such as "command"; links of other names draw other numbers.
+            name: What travels on it, such as "command"; links of other names draw other random numbers.
         """
         self._name = name
         self._stream = stream_id(f"link/{name}")
@@ -44,7 +46,7 @@ class Link:
         self.configure(config)
 
     def reset(self, *, seed: int) -> None:
-        """Forget everything that was sent; message numbers start again at 0, with the numbers of `seed`."""
+        """Forget all messages; message numbers start again at 0, with the random numbers of `seed`."""
         self._seed = seed
         self._sent_count = 0
         self._sent_ns = 0
@@ -55,7 +57,8 @@ class Link:
         self._begin_burst(0)
 
     def configure(self, config: LinkConfig) -> None:
-        """Change the settings for messages that are sent from now on; those under way stay as they are."""
+        """Change the settings for messages sent from now on; those in flight keep their arrival time."""
+        self.config = config
         self._latency_ns = to_ns(config.latency_s)
         self._jitter_ns = to_ns(config.jitter_s)
         self._queue_ns = to_ns(config.queue_s)
@@ -64,28 +67,32 @@ class Link:
         self._ns_per_byte = None if rate is None else NS_PER_S / Fraction(rate)
         self._begin_burst(self._busy_until_ns)
 
-    def send(self, item: Any, *, stamp_ns: int, size_bytes: int) -> Delivery:
+    def send(self, item: Any, *, stamp_ns: int, size_bytes: int) -> Delivery | None:
         """Send a message.
 
         Args:
             item: The message; kept until it is due.
-            stamp_ns: When it is sent [ns], not before the one sent last.
-            size_bytes: What it takes of the bandwidth [bytes].
+            stamp_ns: When it is sent [ns], not before the message sent last.
+            size_bytes: The bandwidth it takes [bytes].
 
         Returns:
-            What becomes of it; `delivered_ns` is -1 if it is lost.
+            What happens to it; `delivered_ns` is -1 if it is lost. None if the link does nothing and no
+            earlier message delays this one.
 
         Raises:
             ValueError: It is sent before an earlier message.
         """
         if stamp_ns < self._sent_ns:
             raise ValueError(
-                f"link {self._name!r}: stamp_ns must be at least {self._sent_ns}, as the message before, "
+                f"link {self._name!r}: stamp_ns must be >= {self._sent_ns}, the stamp of the message before, "
                 f"got {stamp_ns}"
             )
+        self._sent_ns = stamp_ns
+        if self.is_free(stamp_ns):
+            self._pending.append((stamp_ns, item))
+            return None
         number = self._sent_count
         self._sent_count += 1
-        self._sent_ns = stamp_ns
         delay_ns, lost = self._latency_ns, self._wait_ns(stamp_ns) > self._queue_ns
         left_ns = stamp_ns if lost else self._occupy(stamp_ns, size_bytes)
         if self._jitter_ns or self._lost_below:
@@ -107,8 +114,12 @@ class Link:
             size_bytes=size_bytes,
         )
 
+    def is_free(self, stamp_ns: int) -> bool:
+        """Return whether a message sent at a time [ns] arrives at once."""
+        return self.config.delivers_at_once and self._last_delivered_ns <= stamp_ns
+
     def due(self, stamp_ns: int) -> list[tuple[int, Any]]:
-        """Take what has arrived by a time [ns]: pairs of arrival [ns] and message, in the order sent."""
+        """Take the messages that have arrived by a time [ns]: pairs of arrival [ns] and message, in order."""
         arrived = []
         while self._pending and self._pending[0][0] <= stamp_ns:
             arrived.append(self._pending.popleft())
@@ -116,19 +127,20 @@ class Link:
 
     @property
     def next_due_ns(self) -> int | None:
-        """When the next message arrives [ns]; None if there is none under way."""
+        """When the next message arrives [ns]; None if none is in flight."""
         return self._pending[0][0] if self._pending else None
 
     def __len__(self) -> int:
+        """Messages in flight."""
         return len(self._pending)
 
     def _begin_burst(self, start_ns: int) -> None:
-        """Begin to count the bytes that follow each other without a gap: so no rounding adds up."""
+        """Count the bytes that follow each other without a gap, so that no rounding accumulates."""
         self._burst_start_ns = start_ns
         self._burst_bytes = 0
 
     def _wait_ns(self, stamp_ns: int) -> int:
-        """How long a message that is sent now waits for those before it [ns]."""
+        """Return how long a message sent now waits for those before it [ns]."""
         return 0 if self._ns_per_byte is None else max(self._busy_until_ns - stamp_ns, 0)
 
     def _occupy(self, stamp_ns: int, size_bytes: int) -> int:
@@ -145,3 +157,9 @@ class Link:
         """Two words of 64 random bits for a message: Philox 4x64-10, keyed by seed and link."""
         words = np.random.Philox(key=self._stream << 64 | self._seed, counter=number).random_raw(2)
         return int(words[0]), int(words[1])
+
+
+def payload_bytes(packet: Packet) -> int:
+    """Return the bandwidth that a packet takes: its arrays and its stamp [bytes]."""
+    values = (getattr(packet, field.name) for field in fields(packet))
+    return 8 + sum(value.nbytes for value in values if isinstance(value, np.ndarray))

@@ -1,129 +1,100 @@
-"""Pictures that are copied once: from the renderer into the shared memory in which their readers find them.
+"""Pictures that a CUDA device writes into the shared memory in which their readers find them.
 
-The thread that renders asks for room, and fills it; the one that flies publishes the packet when it is due,
-and nothing is left to copy. One picture at a time, so that a reader never has less room than without.
-
-A CUDA device fills it by itself: the shared memory is pinned as long as pictures are written there.
+In lockstep the engine acquires memory for a picture before it renders, the device copies the picture there,
+and to publish it copies nothing more. The memory of the topic is pinned for that. One picture of a topic at a
+time.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
 import weakref
 from collections.abc import Callable
 from typing import Any
 
-import warp as wp
 from numpy.typing import NDArray
 
 from cortex import Loan, Publisher
-from neurosim_core.runtime.pinned import PinError, PinnedMapping
+from neurosim_core.live.engine import PinError, PinnedMapping
 
 _logger = logging.getLogger(__name__)
 _BYTES_MIN = 1 << 16
-"""Smaller pictures are copied: that takes less time than to write in place."""
+"""Smaller pictures are copied, which takes less time than to write them in place [bytes]."""
 
 
 class PictureLoan:
-    """The slot that the next picture of one topic is written into. For any thread.
+    """The slot of one topic that its next picture is written into. Not thread-safe.
 
     Attributes:
-        settle: Waits until pictures are there that the device may still be writing; None: they always are.
+        settle: Waits until the device has written the pictures that were handed out.
     """
 
-    def __init__(self, publisher: Publisher[Any], *, device: str = "cpu") -> None:
-        """Lend the slots of a publisher of images.
+    def __init__(self, publisher: Publisher[Any], *, device: str, settle: Callable[[], object]) -> None:
+        """Use the slots of a publisher of images.
 
         Args:
             publisher: Whose slots.
-            device: Who writes into them; for a CUDA device they are pinned.
+            device: The CUDA device that writes into them.
+            settle: See above.
         """
+        self.settle = settle
         self._publisher = publisher
         self._device = device
-        self._is_cuda = bool(wp.get_device(device).is_cuda)
-        self._refuses = False
-        """The device cannot write into shared memory."""
+        self._can_pin = True
         self._pinned: PinnedMapping | None = None
-        """The ring that was lent from last."""
-        self.settle: Callable[[], object] | None = None
-        self._lock = threading.Lock()
         self._loan: Loan | None = None
-        self._room: weakref.ref[NDArray[Any]] | None = None
-        """What was lent; dead as soon as nobody can write there any more."""
+        self._buffer: weakref.ref[NDArray[Any]] | None = None
+        """What was acquired; dead as soon as nobody can write there any more."""
 
-    def lend(self, picture: NDArray[Any]) -> NDArray[Any] | None:
-        """Return room for a picture, to be filled; None if there is none, or another is under way.
-
-        Does not wait, nor for one that is being published to a reader that makes no room.
+    def acquire(self, picture: NDArray[Any]) -> NDArray[Any] | None:
+        """Return memory for a picture; None if there is none, or another picture is in flight.
 
         Args:
-            picture: Of the shape and dtype that is needed, shape [H, W] or [H, W, C].
+            picture: Of the shape and dtype needed, shape [H, W] or [H, W, C].
         """
-        if picture.nbytes < _BYTES_MIN or self._refuses:
+        if picture.nbytes < _BYTES_MIN or not self._can_pin or not self.release():
             return None
-        if not self._lock.acquire(blocking=False):
+        height, width, channels = picture.shape if picture.ndim == 3 else (*picture.shape, 1)
+        loan = self._publisher.try_loan(
+            {"data": picture.dtype}, height=height, width=width, channels=channels
+        )
+        if loan is None:
             return None
-        try:
-            if not self._give_back():
-                return None
-            height, width, channels = picture.shape if picture.ndim == 3 else (*picture.shape, 1)
-            self._loan = self._publisher.try_loan(
-                {"data": picture.dtype}, height=height, width=width, channels=channels
-            )
-            if self._loan is None:
-                return None
-            if self._is_cuda and not self._pin(self._loan.memory):
-                self._loan.drop()
-                self._loan = None
-                return None
-            room: NDArray[Any] = self._loan.draft.data.reshape(picture.shape)
-            self._room = weakref.ref(room)
-            return room
-        finally:
-            self._lock.release()
-
-    def drop(self) -> None:
-        """Give back the room of a picture that was thrown away; not while somebody can still write there."""
-        with self._lock:
-            self._give_back()
-
-    def close(self) -> None:
-        """Give back the room, and let go of the memory: the topic is about to be closed."""
-        with self._lock:
-            self._give_back()
-            self._unpin()
+        if not self._pin(loan.memory):
+            loan.drop()
+            return None
+        self._loan = loan
+        buffer: NDArray[Any] = loan.draft.data.reshape(picture.shape)
+        self._buffer = weakref.ref(buffer)
+        return buffer
 
     def holds(self, data: NDArray[Any]) -> bool:
-        """Return whether that is the room that was lent last, and not published yet."""
-        return self._loan is not None and self._room is not None and self._room() is data
-
-    def wait_for(self, data: NDArray[Any]) -> None:
-        """Let the device write the picture, if that is in the room that was lent last."""
-        if self.settle is not None and self.holds(data):
-            self.settle()
+        """Return whether an array is the memory acquired last, and not published yet."""
+        return self._buffer is not None and self._buffer() is data
 
     def publish(self, message: Any) -> bool:
-        """Publish the picture that was lent room for.
+        """Publish the picture in the memory acquired last; return what `Loan.publish` does."""
+        assert self._loan is not None
+        self.settle()
+        loan, self._loan, self._buffer = self._loan, None, None
+        return loan.publish(message)
 
-        Args:
-            message: Its image, with the room as data.
+    def release(self) -> bool:
+        """Give the memory back if nobody can write there any more; return whether none is held now."""
+        if self._loan is not None:
+            if self._buffer is not None and self._buffer() is not None:
+                return False
+            self._loan.drop()
+            self._loan = self._buffer = None
+        return True
 
-        Returns:
-            As `Loan.publish`.
-
-        Raises:
-            Closed: The publisher was closed.
-        """
-        with self._lock:
-            assert self._loan is not None
-            if self.settle is not None:
-                self.settle()
-            loan, self._loan, self._room = self._loan, None, None
-            return loan.publish(message)
+    def close(self) -> None:
+        """Give the memory back and unpin it; call it before the publisher closes."""
+        self.release()
+        self._unpin()
 
     def _pin(self, memory: Any) -> bool:
-        """Have the device know the ring that is lent from; return whether it does. The lock is held."""
+        """Pin the mapping of a loan, unless it is pinned already; return whether that worked."""
         if self._pinned is not None and self._pinned.memory is memory:
             return True
         self._unpin()
@@ -132,25 +103,13 @@ class PictureLoan:
         try:
             self._pinned = PinnedMapping(memory, self._device)
         except PinError as error:
-            _logger.warning(
-                "%s: pictures are copied once more: shared memory cannot be pinned: %s",
-                self._publisher.topic,
-                str(error),  # the error itself holds the memory
-            )
-            self._refuses = True
-            return False
-        return True
+            topic = self._publisher.topic
+            # the text, as the error itself keeps the memory alive
+            _logger.warning("%s: shared memory cannot be pinned, pictures are copied: %s", topic, str(error))
+            self._can_pin = False
+        return self._can_pin
 
     def _unpin(self) -> None:
         pinned, self._pinned = self._pinned, None
         if pinned is not None:
             pinned.close()
-
-    def _give_back(self) -> bool:
-        """Return whether nothing is lent, having dropped what nobody can publish; the lock is held."""
-        if self._loan is not None:
-            if self._room is not None and self._room() is not None:
-                return False
-            self._loan.drop()
-            self._loan = self._room = None
-        return True

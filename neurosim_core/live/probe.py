@@ -1,4 +1,4 @@
-"""What the benchmarks of the live stack measure with: nodes that note when messages come."""
+"""Nodes that note when messages arrive, for the benchmarks of the live stack."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from neurosim_core.bench.loop_trace import LoopTrace, command_speed
 from neurosim_core.live.topics import STATUS, command_topic, stream_topic
 
 Check = Callable[[], None]
-"""Raises if there is nothing left to wait for."""
+"""Called about five times a second during a wait; raises if the wait is pointless."""
 
 _SMALL_DEPTH = 8192
-"""Small messages that may wait until the probe looks."""
+"""Queue of small messages."""
 _WAIT_S = 0.2
 _START_S = 180.0
-"""Longest wait for the first message: a scene is loaded, and kernels are compiled."""
+"""Longest wait for the first message: a scene is loaded, and kernels are compiled [s]."""
 _SILENCE_S = 30.0
-"""Longest wait for any other."""
+"""Longest wait for any other [s]."""
 _IMAGES_MIN = 10
-"""A measurement goes on until it has as many images."""
+"""Least number of images of a measurement."""
 
 
 class ProbeError(RuntimeError):
-    """What was to be measured did not happen; the message says what was waited for."""
+    """Messages did not arrive; the text names the topic."""
 
 
 def answer_images(
@@ -45,21 +45,21 @@ def answer_images(
     check: Check,
     spin_s: float = 0.0,
 ) -> LoopTrace:
-    """Be a controller that answers each image with a numbered command, and note when that happens.
+    """Answer each image with a numbered command, and note the times.
 
     Args:
-        vehicle: Whose images and rotors.
+        vehicle: Name of the vehicle.
         camera: Name of its camera.
-        hover_rad_s: Speed of its rotors that carries it [rad/s].
-        rotor_count: How many it has.
-        seconds: How long to measure [wall-clock s].
-        warm_up_s: How long to fly before that [wall-clock s].
-        watch_rotors: Listen to the rotors all the time, not only before the measurement.
-        check: Called about five times a second while nothing comes.
-        spin_s: How long to look for an image before sleeping (`Subscriber.look_out`) [s].
+        hover_rad_s: Rotor speed at hover [rad/s].
+        rotor_count: Number of rotors.
+        seconds: Duration of the measurement [wall-clock s].
+        warm_up_s: Duration of the flight before it [wall-clock s].
+        watch_rotors: Subscribe to rotor speeds during the measurement, too.
+        check: See `Check`.
+        spin_s: How long to poll for an image before sleeping (`Subscriber.look_out`) [s].
 
     Raises:
-        ProbeError: Nothing came for a long time.
+        ProbeError: No message arrived for a long time.
     """
     sent: list[int] = []
     answered: list[int] = []
@@ -67,7 +67,7 @@ def answer_images(
     reports: list[tuple[int, int, float]] = []
     with Node("loop probe") as node:
         pictures = node.subscriber(stream_topic(vehicle, camera), Image, policy=latest())
-        rotors = _listen_to_rotors(node, vehicle)
+        rotors = _subscribe_rotors(node, vehicle)
         commands = node.publisher(command_topic(vehicle, "motor_speeds"), MotorCommand)
 
         def command(stamp_ns: int) -> None:
@@ -78,8 +78,8 @@ def answer_images(
             sent.append(time.monotonic_ns())
             commands.publish(message)
 
-        _meet(commands, check)
-        first, _ = _receive(rotors, check, _START_S)  # from here on commands are taken
+        _wait_for_simulator(commands, check)
+        first, _ = _receive(rotors, check, _START_S)
         reports.append(_report(first))
         command(first.stamp_ns)
         begin, image_bytes, end_ns, warm_ns = 0, 0, 0, 0
@@ -87,10 +87,10 @@ def answer_images(
         watching = True
 
         def idle() -> None:
-            """Answer what the rotors say where an image was lost: in lockstep nothing would go on."""
+            """Answer rotor speeds if an image was lost: lockstep would not go on."""
             nonlocal rotors, watching
             if not watching:
-                rotors, watching = _listen_to_rotors(node, vehicle), True
+                rotors, watching = _subscribe_rotors(node, vehicle), True
             reports.extend(_reports(rotors))
             if reports[-1][0] > answered[-1]:
                 command(reports[-1][0])
@@ -104,7 +104,7 @@ def answer_images(
                 command(image.stamp_ns)
             images.append((image.stamp_ns, info.publish_ns, info.publish_ns + info.latency_ns))
             if watching:
-                reports += _reports(rotors)  # while the simulator is busy with the next image
+                reports += _reports(rotors)  # while the simulator computes the next image
             if not warm_ns:
                 warm_ns = images[0][2] + round(warm_up_s * 1e9)
             if not end_ns and images[-1][2] >= warm_ns:
@@ -135,22 +135,21 @@ def answer_images(
     )
 
 
-def _listen_to_rotors(node: Node, vehicle: str) -> Subscriber[RotorSpeeds]:
+def _subscribe_rotors(node: Node, vehicle: str) -> Subscriber[RotorSpeeds]:
     topic = stream_topic(vehicle, "rotor_speeds")
     return node.subscriber(topic, RotorSpeeds, policy=keep_last(_SMALL_DEPTH))
 
 
-def _meet(publisher: Publisher[Any], check: Check) -> None:
-    """Wait until a simulator listens."""
+def _wait_for_simulator(publisher: Publisher[Any], check: Check) -> None:
     deadline_s = time.monotonic() + _START_S
     while not publisher.wait_for_subscribers(1, timeout_s=_WAIT_S):
         check()
         if time.monotonic() > deadline_s:
-            raise ProbeError(f"nobody took commands from {publisher.topic} within {_START_S:g} s")
+            raise ProbeError(f"{publisher.topic} had no subscriber within {_START_S:g} s")
 
 
 def _receive(subscriber: Subscriber[Any], check: Check, limit_s: float) -> tuple[Any, Any]:
-    """Take the next message, and what is known of it."""
+    """Return the next message and its info."""
     deadline_s = time.monotonic() + limit_s
     while True:
         try:
@@ -162,14 +161,13 @@ def _receive(subscriber: Subscriber[Any], check: Check, limit_s: float) -> tuple
 
 
 def _reports(rotors: Subscriber[RotorSpeeds]) -> list[tuple[int, int, float]]:
-    """Take what has arrived: stamp, number, speed of the first rotor."""
+    """Return what has arrived: stamp [ns], sequence, speed of the first rotor [rad/s]."""
     found: list[tuple[int, int, float]] = []
     while True:
         try:
-            message = rotors.recv(0.0)
+            found.append(_report(rotors.recv(0.0)))
         except TimeoutError:
             return found
-        found.append(_report(message))
 
 
 def _report(message: RotorSpeeds) -> tuple[int, int, float]:
@@ -178,56 +176,40 @@ def _report(message: RotorSpeeds) -> tuple[int, int, float]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreamTrace:
-    """How an IMU and an event camera came in; times are of CLOCK_MONOTONIC, stamps of the simulation."""
+    """What a `StreamProbe` has noted."""
 
     imu_stamp_ns: NDArray[np.int64]
-    """Stamp of each sample [ns], shape [samples]."""
+    """Stamps of the samples [ns], shape [samples]."""
     imu_received_ns: NDArray[np.int64]
-    """When each sample was in the receiver's hands [ns], shape [samples]."""
+    """When they arrived, by `time.monotonic_ns` [ns], shape [samples]."""
     imu_lost_count: int
-    """Samples that never came: numbers that are missing."""
     packet_count: int
     """Packets of events."""
     event_count: int
     packet_lost_count: int
-    """Packets of events that never came."""
     event_dropped_count: int
-    """Events that did not fit into the simulator's buffer."""
+    """Events that the simulator dropped."""
     status: SimulatorStatus
-    """The last that was heard."""
+    """The last one."""
     resident_bytes: NDArray[np.int64]
-    """Memory of each process that was watched, about once a second, shape [times, processes]; -1: unknown."""
+    """Memory of each watched process, about once a second, shape [times, processes]; -1: unknown."""
     resident_s: NDArray[np.float64]
     """When, since the first sample [s], shape [times]."""
 
 
-class _Gaps:
-    """Counts numbers that are missing from a sequence."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._next: int | None = None
-
-    def see(self, sequence: int) -> None:
-        if self._next is not None:
-            self.count += max(0, sequence - self._next)
-        self._next = sequence + 1
-
-
 class StreamProbe:
-    """Listens to an IMU and to an event camera; to be there before time begins."""
+    """Notes the samples of an IMU and the packets of an event camera. A context manager."""
 
     def __init__(self, *, vehicle: str, imu: str, camera: str) -> None:
-        """Subscribe."""
+        """Subscribe; before time begins."""
         self._node = Node("stream probe")
+        topic = stream_topic(vehicle, camera)
         self._imu = self._node.subscriber(stream_topic(vehicle, imu), Imu, policy=keep_last(_SMALL_DEPTH))
-        self._packets = self._events = self._dropped = 0
-        self._camera_gaps = _Gaps()
-        self._status: SimulatorStatus | None = None
-        self._camera = self._node.subscriber(
-            stream_topic(vehicle, camera), Events, self._on_events, policy=keep_last(256)
-        )
+        self._events = self._node.subscriber(topic, Events, self._on_events, policy=keep_last(256))
         self._node.subscriber(STATUS, SimulatorStatus, self._on_status, policy=latest())
+        self._sequences: list[int] = []
+        self._event_count = self._dropped_count = 0
+        self._status: SimulatorStatus | None = None
 
     def __enter__(self) -> StreamProbe:
         return self
@@ -236,53 +218,54 @@ class StreamProbe:
         self._node.close()
 
     def _on_events(self, events: Events) -> None:
-        self._packets += 1
-        self._events += len(events.t)
-        self._dropped += events.dropped_count
-        self._camera_gaps.see(events.sequence)
+        self._sequences.append(events.sequence)
+        self._event_count += len(events.t)
+        self._dropped_count += events.dropped_count
 
     def _on_status(self, status: SimulatorStatus) -> None:
         self._status = status
 
     def listen(self, seconds: float, *, resident: Callable[[], list[int]], check: Check) -> StreamTrace:
-        """Note what comes.
+        """Note what arrives.
 
         Args:
             seconds: How long, from the first sample of the IMU on [wall-clock s].
-            resident: Returns the memory of the processes to watch [bytes].
-            check: Called about five times a second while nothing comes.
+            resident: Returns the memory of the watched processes [bytes].
+            check: See `Check`.
 
         Raises:
-            ProbeError: Nothing came for a long time.
+            ProbeError: No message arrived for a long time.
         """
-        stamps: list[int] = []
-        times: list[int] = []
+        samples: list[tuple[int, int, int]] = []
         memory: list[list[int]] = []
-        memory_s: list[float] = []
-        gaps = _Gaps()
-        next_ns = 0
-        while not times or times[-1] < times[0] + seconds * 1e9:
-            sample, info = _receive(self._imu, check, _SILENCE_S if times else _START_S)
-            gaps.see(sample.sequence)
-            stamps.append(sample.stamp_ns)
-            times.append(info.publish_ns + info.latency_ns)
-            if times[-1] >= next_ns:
+        memory_ns: list[int] = []
+        while not samples or samples[-1][1] < samples[0][1] + seconds * 1e9:
+            sample, info = _receive(self._imu, check, _SILENCE_S if samples else _START_S)
+            received_ns = info.publish_ns + info.latency_ns
+            samples.append((sample.stamp_ns, received_ns, sample.sequence))
+            if not memory_ns or received_ns >= memory_ns[-1] + 1_000_000_000:
                 memory.append(resident())
-                memory_s.append((times[-1] - times[0]) * 1e-9)
-                next_ns = times[-1] + 1_000_000_000
+                memory_ns.append(received_ns)
         memory.append(resident())
-        memory_s.append((times[-1] - times[0]) * 1e-9)
+        memory_ns.append(samples[-1][1])
         if self._status is None:
             raise ProbeError(f"{STATUS} was silent for {seconds:g} s")
+        stamps, times, sequences = np.array(samples, dtype=np.int64).T
+        packets = self._sequences[:]
         return StreamTrace(
-            imu_stamp_ns=np.array(stamps, dtype=np.int64),
-            imu_received_ns=np.array(times, dtype=np.int64),
-            imu_lost_count=gaps.count,
-            packet_count=self._packets,
-            event_count=self._events,
-            packet_lost_count=self._camera_gaps.count,
-            event_dropped_count=self._dropped,
+            imu_stamp_ns=stamps,
+            imu_received_ns=times,
+            imu_lost_count=_gaps(sequences.tolist()),
+            packet_count=len(packets),
+            event_count=self._event_count,
+            packet_lost_count=_gaps(packets),
+            event_dropped_count=self._dropped_count,
             status=self._status,
             resident_bytes=np.array(memory, dtype=np.int64),
-            resident_s=np.array(memory_s),
+            resident_s=1e-9 * (np.array(memory_ns) - times[0]),
         )
+
+
+def _gaps(sequences: list[int]) -> int:
+    """Return how many numbers are missing."""
+    return sequences[-1] - sequences[0] + 1 - len(sequences) if sequences else 0

@@ -1,4 +1,4 @@
-"""Recording a live run: a thread of its own writes, a bounded queue is in between."""
+"""Recording a live run: a thread writes, and a bounded queue connects it to the thread that flies."""
 
 from __future__ import annotations
 
@@ -17,29 +17,25 @@ import numpy as np
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.flight import new_folder
-from neurosim_core.install import install_hint
-from neurosim_core.live.channel import payload_bytes
+from neurosim_core.live.engine import Model
+from neurosim_core.live.links import payload_bytes
 from neurosim_core.packets import Packet
-from neurosim_core.record import RecordingHeader, RecordingWriter, describe_sensors
-from neurosim_core.simulation import Model
+from neurosim_core.record import FlightHeader, FlightWriter, describe_sensors
 
 QUEUE_BYTES = 16_000_000
-"""Most that waits to be written [bytes], besides one packet for each thread that brings some.
-
-gzip writes it in 0.2 s: little enough to be written when somebody who has pressed Ctrl-C waits for it."""
-HURRY_S = 1.0
-"""How long what waits may take to be written when the run was stopped [s]."""
-PATIENCE_S = 30.0
-"""How long it may when the run came to its own end [s]."""
+"""Most that waits to be written [bytes]: gzip writes it in 0.2 s."""
+STOPPED_S = 1.0
+"""How long the writing may go on when the run was stopped [s]."""
+ENDED_S = 30.0
+"""How long it may go on when the run came to its own end [s]."""
 CLOSE_FILES_S = 0.3
-"""How long it may take to close the files after that [s]."""
+"""How long the closing of the files may take after that [s]."""
 SETTINGS = "settings.jsonl"
-"""File in the folder of a recording that says which settings were changed when; see `Recorder.change`."""
-_POLL_S = 0.05
+"""File in the folder of a recording that says which settings changed when; see `Recorder.change`."""
 
 
 def open_folders(folder: Path, vehicles: list[str], *, overwrite: bool) -> dict[str, Path]:
-    """Return the folder of each vehicle's recording: that of the run, or one in it for each of several.
+    """Return the folder of each vehicle: that of the run, or one inside it for each of several vehicles.
 
     Raises:
         FileExistsError: There is a recording already, and it may not be replaced.
@@ -55,30 +51,28 @@ class _Entry(NamedTuple):
     """A packet that waits to be written."""
 
     run: int
-    name: str
-    """Of the file."""
+    file: str
     config: SimulationConfig
-    """What held when the file began."""
+    """The settings that held when the file began."""
     vehicle: str
     packet: Packet
 
 
 class Recorder:
-    """Writes what the vehicles of a run measure to flight.h5, and after a reset to flight-2.h5, ...
+    """Writes what the vehicles measure to flight.h5, and after a reset to flight-2.h5, ...
 
-    `write` waits where the disk is too slow, so nothing is lost: the caller takes the time for its own. Once
-    the run is stopped nobody waits for longer than a deadline: what is not written then is counted.
+    `write` waits for a slow disk, so that nothing is lost. When the run is stopped, packets that are not
+    written by a deadline are counted.
 
     Attributes:
         stop: Set when the run is to end soon.
-        unwritten_count: Packets that were not written, as the disk was too slow at the end.
     """
 
     def __init__(self, folders: Mapping[str, Path], models: Mapping[str, Model]) -> None:
-        """Make the folders, leave config.yaml in each, and start to wait for packets.
+        """Make the folders, write config.yaml to each, and start the thread.
 
         Args:
-            folders: Where to, by vehicle.
+            folders: Folder of each vehicle.
             models: What is flown, by vehicle.
 
         Raises:
@@ -86,61 +80,56 @@ class Recorder:
             ImportError: h5py is not installed.
         """
         if importlib.util.find_spec("h5py") is None:
-            raise ImportError(f"h5py is not installed: {install_hint('record')}")
-        self._models = models
-        self._folders = folders
+            raise ImportError("h5py is not installed: pip install h5py")
         for name, folder in folders.items():
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "config.yaml").write_text(to_yaml(models[name].config, comments=True), "utf-8")
-            for later in folder.glob("flight-*.h5"):  # of a run that is replaced
-                later.unlink()
-            (folder / SETTINGS).unlink(missing_ok=True)
+            for old in (*folder.glob("flight-*.h5"), folder / SETTINGS):  # of a recording that is replaced
+                old.unlink(missing_ok=True)
         self.stop = threading.Event()
-        self.unwritten_count = 0
-        self._run_count = 0
-        self._file_count = 0
+        self._models = models
+        self._folders = folders
+        self._run_count = self._file_count = 0
         self._configs = {name: model.config for name, model in models.items()}
-        """Settings that hold now, by vehicle."""
-        self._begun = dict(self._configs)
-        """Those that held when the files of this run began."""
+        self._first_configs = dict(self._configs)
+        """The settings that held when the files of this run began."""
         self._changes: dict[str, list[dict[str, Any]]] = {name: [] for name in folders}
         self._deadline_s: float | None = None
         self._queue: deque[_Entry] = deque()
         self._queue_bytes = 0
         self._changed = threading.Condition()
-        self._closed = False
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
+    @property
+    def _file(self) -> str:
+        return "flight.h5" if self._file_count <= 1 else f"flight-{self._file_count}.h5"
+
     def begin(self, seeds: Mapping[str, int], *, replace: bool) -> None:
-        """Begin a new file for each vehicle with the next packet.
+        """Begin a new file for each vehicle with its next packet.
 
         Args:
-            seeds: Seed of the sensor noise, by vehicle.
-            replace: What was recorded since the last time is not worth a file.
+            seeds: Seed of each vehicle.
+            replace: Replace the last file: its run had not begun.
         """
         self._run_count += 1
         self._file_count += not (replace and self._file_count)
-        self._begun = {
-            name: config.model_copy(update={"seed": seeds[name]}) for name, config in self._configs.items()
-        }
-        for (
-            vehicle,
-            changes,
-        ) in self._changes.items():  # those of a file that is replaced are in its settings now
-            kept = [change for change in changes if change["file"] != self._file_name()]
-            if kept != changes:
-                self._changes[vehicle] = kept
-                self._write_changes(vehicle)
+        for name, config in self._configs.items():
+            self._first_configs[name] = config.model_copy(update={"seed": seeds[name]})
+            kept = [change for change in self._changes[name] if change["file"] != self._file]
+            if kept != self._changes[name]:
+                self._changes[name] = kept
+                self._write_changes(name)
 
     def change(self, config: SimulationConfig, *, stamp_ns: int) -> None:
-        """Note that settings have changed: in settings.jsonl for open files, and in those that begin later.
+        """Note that settings have changed: in settings.jsonl, and in files that begin later.
 
-        Each line is a JSON object: `file`, `stamp_ns` from which on it holds, `key`, `value` and `before`.
+        Each line of the file is a JSON object: `file`, `stamp_ns` from which on it holds, `key`, `value` and
+        `before`.
 
         Args:
-            config: What holds now.
+            config: The settings that hold now.
             stamp_ns: Simulated time [ns].
 
         Raises:
@@ -148,61 +137,46 @@ class Recorder:
         """
         for vehicle, before in self._configs.items():
             now = self._configs[vehicle] = config.of(vehicle)
-            old, new = _flat(before.model_dump(mode="json")), _flat(now.model_dump(mode="json"))
-            changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
-            for key in changed:
-                values = {"key": key, "value": new.get(key), "before": old.get(key)}
-                self._changes[vehicle].append({"file": self._file_name(), "stamp_ns": stamp_ns, **values})
-            if changed:
-                self._write_changes(vehicle)
+            old, new = (dict(_items(c.model_dump(mode="json"))) for c in (before, now))
+            for key in sorted(old.keys() | new.keys()):
+                if old.get(key) != new.get(key):
+                    values = {"key": key, "value": new.get(key), "before": old.get(key)}
+                    self._changes[vehicle].append({"file": self._file, "stamp_ns": stamp_ns, **values})
+            self._write_changes(vehicle)
 
     def write(self, vehicle: str, packet: Packet) -> None:
-        """Hand a packet over; waits while too much is waiting, until the run is to end.
+        """Queue a packet; wait while too much is queued, unless the run is to end.
 
         Raises:
             OSError: The disk is full or gone.
             ValueError: A packet could not be written.
         """
-        size = payload_bytes(packet)
         with self._changed:
             while self._queue_bytes > QUEUE_BYTES and self._failure is None and not self.stop.is_set():
-                self._changed.wait(_POLL_S)
-            self.check()
-            self._queue.append(
-                _Entry(self._run_count, self._file_name(), self._begun[vehicle], vehicle, packet)
-            )
-            self._queue_bytes += size
+                self._changed.wait(0.05)
+            self._check()
+            first = self._first_configs[vehicle]
+            self._queue.append(_Entry(self._run_count, self._file, first, vehicle, packet))
+            self._queue_bytes += payload_bytes(packet)
             self._changed.notify_all()
 
-    def check(self) -> None:
-        """Raise what went wrong with the writing.
+    def close(self) -> None:
+        """Write what is queued, close the files and end the thread; give up at a deadline. Once.
 
         Raises:
+            TimeoutError: Packets were not written in time; the message says how many.
             OSError, ValueError: As for `write`.
         """
-        if self._failure is not None:
-            raise self._failure
-
-    def close(self) -> None:
-        """Write what waits, close the files and end the thread; give up at a deadline.
-
-        Raises:
-            TimeoutError: Not everything was written in time; says how much was not.
-            OSError, ValueError: As for `write`, if that has not been told yet.
-        """
+        limit_s = STOPPED_S if self.stop.is_set() else ENDED_S
         with self._changed:
-            if self._closed:
+            if self._deadline_s is not None:
                 return
-            self._closed = True
-            limit_s = HURRY_S if self.stop.is_set() else PATIENCE_S
             self._deadline_s = time.monotonic() + limit_s
             self._changed.notify_all()
         self._thread.join(limit_s + CLOSE_FILES_S)
-        with self._changed:
-            self.check()
-            hangs = self._thread.is_alive()
-            self.unwritten_count += len(self._queue) + hangs  # and the one that is being written
-            count = self.unwritten_count
+        self._check()
+        hangs = self._thread.is_alive()
+        count = len(self._queue) + hangs  # and the one that is being written
         if count:
             still = "; it hangs, and the files are not closed" if hangs else ""
             raise TimeoutError(
@@ -210,11 +184,14 @@ class Recorder:
                 f"{limit_s:g} s{still}"
             )
 
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
     def _run(self) -> None:
-        """Write until closed; for the thread."""
         try:
             with contextlib.ExitStack() as files:
-                writers: dict[str, tuple[int, RecordingWriter]] = {}
+                writers: dict[str, tuple[int, FlightWriter]] = {}
                 while (entry := self._next()) is not None:
                     run, writer = writers.get(entry.vehicle, (0, None))
                     if writer is None or run != entry.run:
@@ -225,52 +202,44 @@ class Recorder:
                     writer.write(entry.packet)
                 for _, writer in writers.values():
                     writer.close(complete=not self._queue)
-        except Exception as error:  # told to whoever brings packets
+        except Exception as error:  # raised again in the thread that flies
             with self._changed:
                 self._failure = error
                 self._changed.notify_all()
 
     def _next(self) -> _Entry | None:
+        """Wait for the next packet; None to end."""
         with self._changed:
-            if self._deadline_s is not None and time.monotonic() > self._deadline_s:
-                return None
-            while not self._queue:
-                if self._closed:
-                    return None
+            while not self._queue and self._deadline_s is None:
                 self._changed.wait()
+            if not self._queue or (self._deadline_s is not None and time.monotonic() > self._deadline_s):
+                return None
             entry = self._queue.popleft()
             self._queue_bytes -= payload_bytes(entry.packet)
             self._changed.notify_all()
             return entry
 
-    def _open(self, entry: _Entry) -> RecordingWriter:
-        model, config = self._models[entry.vehicle], entry.config
+    def _open(self, entry: _Entry) -> FlightWriter:
+        model = self._models[entry.vehicle]
         stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
-        header = RecordingHeader(
-            config_yaml=to_yaml(config),
-            seed=config.seed,
+        header = FlightHeader(
+            config_yaml=to_yaml(entry.config),
+            seed=entry.config.seed,
             version=__version__,
             scene=model.scene.name,
-            sensors=describe_sensors(config.sensors),
+            sensors=describe_sensors(entry.config.sensors),
             path_stamp_ns=stamps,
             path_position=model.path.evaluate(stamps).position,
         )
-        return RecordingWriter(self._folders[entry.vehicle] / entry.name, header)
-
-    def _file_name(self) -> str:
-        return "flight.h5" if self._file_count <= 1 else f"flight-{self._file_count}.h5"
+        return FlightWriter(self._folders[entry.vehicle] / entry.file, header)
 
     def _write_changes(self, vehicle: str) -> None:
         text = "".join(json.dumps(change) + "\n" for change in self._changes[vehicle])
         (self._folders[vehicle] / SETTINGS).write_text(text, "utf-8")
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings by dotted key."""
-    return dict(_items(values, prefix))
-
-
-def _items(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+def _items(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield nested settings by dotted key."""
     for key, value in values.items():
         if isinstance(value, Mapping):
             yield from _items(value, f"{prefix}{key}.")

@@ -2,49 +2,46 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 
 from cortex import Node
-from cortex.messages import Clock, CommandRanges, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
+from cortex.messages import Clock, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.live import topics
 from neurosim_core.live.config import LiveConfig
-from neurosim_core.live.craft import Craft
 from neurosim_core.live.pacing import Timings
-from neurosim_core.vehicle.command_ranges import command_ranges
-from neurosim_core.vehicle.multirotor import MultirotorConfig
+from neurosim_core.live.vehicle import VehicleNode
+from neurosim_core.vehicle import MultirotorConfig
 
 STATUS_INTERVAL_S = 0.2
+UPDATE_INTERVAL_S = 0.02
+"""How often subscribers are counted, at most [s]."""
+SETTLE_S = 0.1
+"""For so long no subscriber may come or go before time begins [s]."""
+SETTLE_MAX_S = 2.0
 
 
-class Board:
+class StatusPublisher:
     """The topics /simulation, /clock and /status.
 
     Attributes:
-        on_status: Called with every status; None: nobody but subscribers wants to know.
+        on_status: Called with every status; None: only subscribers get it.
     """
 
     def __init__(self, node: Node) -> None:
-        """Open the topics.
-
-        Args:
-            node: Whose they are.
-        """
+        """Open the topics on a node."""
         self.on_status: Callable[[SimulatorStatus], None] | None = None
         self._simulation = node.publisher(topics.SIMULATION, Simulation, latch=True)
         self._clock = node.publisher(topics.CLOCK, Clock)
         self._status = node.publisher(topics.STATUS, SimulatorStatus)
-        self._clock_listeners = 0
-        self._told_s = 0.0
-        self._told_phase = ""
+        self._clock_subscriber_count = 0
+        self._published_s = 0.0
+        self._phase = ""
 
     def announce(self, config: SimulationConfig) -> None:
-        """Say what is flown, and with which settings: at the beginning, and when they have changed."""
-        airframes = [config.of(name).vehicle.airframe() for name in config.vehicles]
-        ranges = [command_ranges(airframe) for airframe in airframes]
+        """Publish what is flown, with which settings."""
         self._simulation.publish(
             Simulation(
                 config=to_yaml(config),
@@ -52,54 +49,90 @@ class Board:
                 vehicles=list(config.vehicles),
                 mode=config.live.mode,
                 control_rate_hz=config.control.rate_hz,
-                thrust_max_n=[_thrust_max_n(airframe) for airframe in airframes],
-                command_ranges=[CommandRanges(**dataclasses.asdict(each)) for each in ranges],
+                thrust_max_n=[_thrust_max_n(config.of(name).vehicle.airframe()) for name in config.vehicles],
             )
         )
 
-    def look(self) -> int:
-        """See who listens to the clock; return how many."""
-        self._clock_listeners = self._clock.subscriber_count
-        return self._clock_listeners
+    def update_subscribers(self) -> int:
+        """Return how many subscribers the clock has now."""
+        self._clock_subscriber_count = self._clock.subscriber_count
+        return self._clock_subscriber_count
 
-    def strike(self, stamp_ns: int, live: LiveConfig, *, sequence: int) -> None:
-        """Say what time it is, if anybody listens: at a tick [ns]."""
-        if not self._clock_listeners:
+    def publish_clock(self, stamp_ns: int, live: LiveConfig, *, sequence: int) -> None:
+        """Publish the time at a tick [ns], if there are subscribers."""
+        if not self._clock_subscriber_count:
             return
         factor = live.real_time_factor if live.mode == "streaming" else 0.0
         self._clock.publish(
             Clock(stamp_ns=stamp_ns, wall_ns=time.time_ns(), real_time_factor=factor, sequence=sequence)
         )
 
-    def tell(self, phase: str, status: Callable[[], SimulatorStatus], *, at_once: bool = False) -> None:
-        """Say how it is going, if it is time or the phase has changed, and somebody listens.
+    def publish_status(
+        self, phase: str, make: Callable[[], SimulatorStatus], *, at_once: bool = False
+    ) -> None:
+        """Publish a status, if it is time or the phase has changed, and there are subscribers.
 
         Args:
             phase: As in the message.
-            status: Makes the message.
+            make: Makes the message.
             at_once: It is time.
         """
         now_s = time.monotonic()
-        if not at_once and phase == self._told_phase and now_s - self._told_s < STATUS_INTERVAL_S:
+        if not at_once and phase == self._phase and now_s - self._published_s < STATUS_INTERVAL_S:
             return
-        self._told_s, self._told_phase = now_s, phase
+        self._published_s, self._phase = now_s, phase
         if self.on_status is None and not self._status.subscriber_count:
             return
-        message = status()
+        message = make()
         self._status.publish(message)
         if self.on_status is not None:
             self.on_status(message)
 
 
-class Meter:
-    """What is measured besides what the vehicles count.
+class SubscriberMonitor:
+    """Counts the subscribers of all topics: a sensor without any is not computed."""
+
+    def __init__(self, vehicles: Sequence[VehicleNode], status: StatusPublisher) -> None:
+        self._vehicles = vehicles
+        self._status = status
+        self._counts: tuple[int, ...] = ()
+        self._changed_s = self._updated_s = 0.0
+
+    def update(self) -> None:
+        """Count, if the last time is long enough ago."""
+        if time.monotonic() - self._updated_s >= UPDATE_INTERVAL_S:
+            self._update()
+
+    def settle(self, wait: Callable[[float], bool]) -> None:
+        """Wait until no subscriber comes or goes: the sender of the first command may have just subscribed.
+
+        Args:
+            wait: Waits for a time [s]; ends the wait by returning True.
+        """
+        give_up_s = time.monotonic() + SETTLE_MAX_S
+        while time.monotonic() < give_up_s:
+            self._update()
+            left_s = self._changed_s + SETTLE_S - time.monotonic()
+            if left_s <= 0.0 or wait(min(left_s, SETTLE_S / 10)):
+                return
+
+    def _update(self) -> None:
+        self._updated_s = time.monotonic()
+        vehicles = (count for vehicle in self._vehicles for count in vehicle.update_subscribers())
+        counts = (self._status.update_subscribers(), *vehicles)
+        if counts != self._counts:
+            self._counts, self._changed_s = counts, self._updated_s
+
+
+class RunStats:
+    """What a run measures besides what its vehicles count.
 
     Attributes:
-        step_times: To compute a control period, since the last status [ns].
+        step_times: Time to compute a control period, since the last status [ns].
         late_times: How late the wall clock was at its end [ns].
         step_count: Control periods since the beginning of the run.
-        overrun_count: Those that took longer than they had.
-        slipped_ns: By how much the run was held back [ns].
+        overrun_count: Control periods that were computed after their end.
+        slipped_ns: By how much the run was delayed [ns].
     """
 
     def __init__(self) -> None:
@@ -112,15 +145,13 @@ class Meter:
         """Begin a new run at stamp 0."""
         self.step_times.take()
         self.late_times.take()
-        self.step_count = 0
-        self.overrun_count = 0
-        self.slipped_ns = 0
+        self.step_count = self.overrun_count = self.slipped_ns = 0
         self._stamp_ns = 0
         self._wall_ns = time.monotonic_ns()
 
-    def status(
+    def make_status(
         self,
-        crafts: Sequence[Craft],
+        vehicles: Sequence[VehicleNode],
         dropped: Mapping[tuple[str, str], int],
         config: SimulationConfig,
         *,
@@ -131,21 +162,20 @@ class Meter:
         """Return the message, and begin to measure anew.
 
         Args:
-            crafts: The vehicles.
+            vehicles: All vehicles.
             dropped: Frames that were not rendered, by vehicle and sensor.
-            config: Settings that hold.
+            config: The settings that hold.
             stamp_ns: Simulated time [ns].
             phase: As in the message.
-            reason: As in the message; where it is empty, topics are named whose readers hold up the run.
+            reason: As in the message; if empty, it names topics whose reliable readers hold up the run.
         """
         now_ns = time.monotonic_ns()
-        elapsed_ns = max(now_ns - self._wall_ns, 1)
-        factor = max(stamp_ns - self._stamp_ns, 0) / elapsed_ns
+        factor = max(stamp_ns - self._stamp_ns, 0) / max(now_ns - self._wall_ns, 1)
         self._stamp_ns, self._wall_ns = stamp_ns, now_ns
         steps, late = self.step_times.take(), self.late_times.take()
         self._sequence += 1
         streaming = config.live.mode == "streaming"
-        held_up = [topic for craft in crafts for topic in craft.outlet.take_held_up()]
+        held_up = [topic for vehicle in vehicles for topic in vehicle.publisher.take_held_up()]
         if held_up and not reason:
             reason = f"reliable readers do not keep up with {', '.join(held_up)}"
         return SimulatorStatus(
@@ -163,51 +193,49 @@ class Meter:
             late_p99_ns=late.p99_ns,
             overrun_count=self.overrun_count,
             slipped_ns=self.slipped_ns,
-            sensors=[entry for craft in crafts for entry in _sensors(craft, dropped)],
-            vehicles=[_vehicle(craft, stamp_ns) for craft in crafts],
+            sensors=[entry for vehicle in vehicles for entry in _sensors(vehicle, dropped)],
+            vehicles=[_vehicle(vehicle, stamp_ns) for vehicle in vehicles],
             sequence=self._sequence - 1,
         )
 
 
-def _sensors(craft: Craft, dropped: Mapping[tuple[str, str], int]) -> list[SensorStatus]:
-    active = craft.outlet.active()
+def _sensors(vehicle: VehicleNode, dropped: Mapping[tuple[str, str], int]) -> list[SensorStatus]:
+    active = vehicle.publisher.active()
     entries = []
-    for name in craft.model.config.sensors:
-        stream = craft.outlet.streams[name]
-        lost = stream.channel.lost_count
+    for name in vehicle.config.sensors:
+        topic = vehicle.publisher.topics[name]
+        lost = topic.link.lost_count
         entries.append(
             SensorStatus(
-                vehicle=craft.name,
+                vehicle=vehicle.name,
                 name=name,
                 active=name in active,
-                subscriber_count=stream.subscriber_count,
-                published_count=stream.published_count,
-                dropped_count=dropped.get((craft.name, name), 0) + lost,
+                subscriber_count=topic.subscriber_count,
+                published_count=topic.published_count,
+                dropped_count=dropped.get((vehicle.name, name), 0) + lost,
                 injected_lost_count=lost,
-                undelivered_count=stream.undelivered_count,
-                late_p99_ns=stream.late_times.take().p99_ns,
+                undelivered_count=topic.undelivered_count,
+                late_p99_ns=topic.late_times.take().p99_ns,
             )
         )
     return entries
 
 
-def _vehicle(craft: Craft, stamp_ns: int) -> VehicleStatus:
-    helm, counts = craft.helm, craft.inbox.counts
+def _vehicle(vehicle: VehicleNode, stamp_ns: int) -> VehicleStatus:
+    hold, counts = vehicle.hold, vehicle.subscriber.counts
     return VehicleStatus(
-        name=craft.name,
-        command_mode="" if helm.holds is None else helm.holds.mode,
-        command_count=helm.counts.taken,
+        name=vehicle.name,
+        command_mode="" if hold.command is None else hold.command.mode,
+        command_count=hold.taken_count,
         refused_count=counts.refused,
-        superseded_count=counts.superseded + helm.counts.superseded,
-        lost_count=counts.lost + helm.channel.lost_count,
-        command_age_ns=helm.age_ns(stamp_ns),
-        fail_safe=helm.fail_safe,
-        fail_safe_count=helm.counts.fail_safe,
-        collision_count=craft.state.counts["collisions"],
-        undelivered_count=craft.outlet.other_undelivered_count,
-        refused_reason=craft.inbox.refusal if counts.refused else "",
-        clamped_count=counts.clamped,
-        clamped_reason=craft.inbox.clamping if counts.clamped else "",
+        superseded_count=counts.superseded + hold.superseded_count,
+        lost_count=counts.lost + hold.link.lost_count,
+        command_age_ns=hold.age_ns(stamp_ns),
+        fail_safe=hold.fail_safe is not None,
+        fail_safe_count=hold.fail_safe_count,
+        collision_count=vehicle.engine.counts.collisions,
+        undelivered_count=vehicle.publisher.other_undelivered_count,
+        refused_reason=vehicle.subscriber.refusal if counts.refused else "",
     )
 
 

@@ -7,11 +7,11 @@
 /VEHICLE/rotor_speeds             RotorSpeeds with it (latched)
 /VEHICLE/path                     Path, as planned (latched)
 /VEHICLE/collision                Collision
-/VEHICLE/SENSOR                   Events, Image, Imu or Odometry
+/VEHICLE/SENSOR                   Events, Image, Imu, Odometry, or a type derived from the sensor's packets
 /VEHICLE/SENSOR/info              CameraInfo of a camera (latched)
-/VEHICLE/SENSOR/transform         Transform: where the sensor sits, if not at the body itself (latched)
+/VEHICLE/SENSOR/transform         Transform: the pose of a sensor that is not at the body itself (latched)
 /VEHICLE/LINK/delivery            Delivery: what a simulated link did to each message
-/VEHICLE/command/MODE             what the vehicle is told to do; see COMMANDS
+/VEHICLE/command/MODE             commands of one mode; see COMMANDS
 /reset /step /pause /resume /set_parameters    services; see SERVICES
 """
 
@@ -31,6 +31,7 @@ from cortex.messages import (
     Trigger,
     VelocityCommand,
 )
+from neurosim_core.record.header import SensorDescription
 
 SIMULATION = "/simulation"
 STATUS = "/status"
@@ -68,12 +69,12 @@ def info_topic(vehicle: str, sensor: str) -> str:
 
 
 def transform_topic(vehicle: str, sensor: str) -> str:
-    """Topic of where a sensor sits."""
+    """Topic of the pose of a sensor on its vehicle."""
     return f"/{vehicle}/{sensor}/transform"
 
 
 def delivery_topic(vehicle: str, link: str) -> str:
-    """Topic of what a simulated link does."""
+    """Topic of what a simulated link does to each message."""
     return f"/{vehicle}/{link}/delivery"
 
 
@@ -87,8 +88,8 @@ def body_frame(vehicle: str) -> str:
     return f"{vehicle}/base_link"
 
 
-def sensor_frame(vehicle: str, sensor: str, kind: str) -> str:
-    """Name of a sensor's frame; that of a camera is its optical frame, that of odometry the body."""
-    if kind == "odometry":
+def sensor_frame(vehicle: str, sensor: SensorDescription) -> str:
+    """Name of a sensor's frame: the optical frame of a camera, the body frame for odometry."""
+    if sensor.kind == "odometry":
         return body_frame(vehicle)
-    return f"{vehicle}/{sensor}" if kind == "imu" else f"{vehicle}/{sensor}_optical_frame"
+    return f"{vehicle}/{sensor.name}" + ("" if sensor.intrinsics is None else "_optical_frame")

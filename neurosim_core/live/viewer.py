@@ -1,7 +1,7 @@
 """`neurosim view`: shows what a running simulator publishes, in Rerun.
 
-It subscribes to every sensor it shows, and so makes the simulator compute it. Of pictures it takes the
-newest, of everything else all, and counts what it misses.
+It subscribes to every sensor that it shows, and so makes the simulator compute it. Of pictures it takes the
+newest, of everything else all messages, and it counts those that it misses.
 """
 
 from __future__ import annotations
@@ -19,23 +19,21 @@ from pathlib import Path
 
 from rich.console import Console
 
-from cortex import Node, Subscriber, latest
-from cortex import messages as msg
-from cortex.schema import TypeMismatch
+from cortex import Node, Subscriber, TypeMismatch, latest
+from cortex.messages import Simulation
 from neurosim_core.config import ConfigError
-from neurosim_core.live import topics
-from neurosim_core.live.scene_loader import SceneLoader
-from neurosim_core.live.show import Show
+from neurosim_core.live.session import LiveSession, SceneLoader, ViewOptions
+from neurosim_core.live.topics import SIMULATION
 from neurosim_core.signals import stop_at_signals
+from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
-from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
-from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded, without_display
+from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
 
 POLL_S = 0.01
 SEND_S = 0.1
-"""How often what has been collected is sent to Rerun [s]."""
+"""How often the viewer gets what has been logged [s]."""
 OVER_S = 0.3
-"""How long after the end of a flight its last messages may take [s]."""
+"""How long the last messages may take after the end of a flight [s]."""
 EVENT_WINDOW_MAX_S = 10.0
 _WITHOUT_WINDOW = "`neurosim view --web` serves a page, `neurosim view --save FILE.rrd` writes a file"
 
@@ -54,7 +52,7 @@ def view(
 
     Args:
         how: native (a window), web (a page for the browsers of this machine) or save (files).
-        save: File to write, with "save", which must not be there yet; after a reset NAME-2.rrd, ...
+        save: File to write, with "save", which must not exist yet; after a reset NAME-2.rrd, ...
         only: Sensors to show; None: all.
         event_window_s: Time in one picture of events [s].
         image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
@@ -65,66 +63,12 @@ def view(
         0 if the flight is over and saved, or the window was closed; 130 if interrupted.
 
     Raises:
-        ValueError: An argument is not what it must be, there is no display, or no such sensor.
-        FileExistsError: The file is there already.
+        ValueError: An argument is not allowed, there is no display, or no such sensor.
+        FileExistsError: The file exists already.
         OSError: The file cannot be written, or the port is taken.
         ViewerEnded: The viewer failed.
         ImportError: Rerun is not installed.
     """
-    _check(how, save=save, only=only, event_window_s=event_window_s, image_rate_hz=image_rate_hz, port=port)
-    import_rerun()
-    console = Console(highlight=False, soft_wrap=True)
-
-    def say(text: str) -> None:
-        console.print(text, markup=False)
-
-    stop, scene = threading.Event(), SceneLoader(say)
-    with stop_at_signals(stop), contextlib.ExitStack() as stack:
-        outlet: RerunTarget
-        if save is not None:
-            outlet = FileTarget(save, say)
-        else:
-            viewer = stack.enter_context(
-                RerunViewer(web=how == "web", port=port, waiting=lambda: not stop.is_set())
-            )
-            outlet = ViewerTarget(viewer)
-            if how == "web":
-                say(f"open {viewer.page_url}")
-                if open_browser and not without_display():
-                    webbrowser.open(viewer.page_url)
-        node = stack.enter_context(Node("viewer"))
-        try:
-            status = watch(
-                node,
-                outlet,
-                scene,
-                stop=stop,
-                say=say,
-                only=only,
-                event_window_s=event_window_s,
-                image_rate_hz=image_rate_hz,
-                to_the_end=save is not None,
-            )
-        except ViewerEnded as error:
-            if how == "web":
-                raise
-            raise ViewerEnded(f"{error}\n{_WITHOUT_WINDOW}") from None
-    if scene.loading:  # it cannot be stopped, and the interpreter aborts if a thread is in foreign code
-        sys.stdout.flush()
-        os._exit(status)
-    return status
-
-
-def _check(
-    how: str,
-    *,
-    save: Path | None,
-    only: Sequence[str] | None,
-    event_window_s: float,
-    image_rate_hz: float,
-    port: int,
-) -> None:
-    """Refuse arguments of `view` that are not what they must be."""
     if how not in ("native", "web", "save"):
         raise ValueError(f"unknown way to view {how!r}, known: native, web, save")
     if (how == "save") != (save is not None):
@@ -136,36 +80,64 @@ def _check(
     if not 1e-4 <= event_window_s <= EVENT_WINDOW_MAX_S:
         raise ValueError(f"the event window must be 0.0001 to {EVENT_WINDOW_MAX_S:g} s, got {event_window_s}")
     if not 0.0 < image_rate_hz <= 1000.0:
-        raise ValueError(f"the image rate must be above 0, at most 1000 Hz, got {image_rate_hz}")
+        raise ValueError(f"the image rate must be > 0 and <= 1000 Hz, got {image_rate_hz}")
     if not 0 <= port <= 65535:
         raise ValueError(f"a port is 0 to 65535, got {port}")
-    if how == "native" and without_display():
+    if how == "native" and _has_no_display():
         raise ValueError(f"there is no display to open a window on: {_WITHOUT_WINDOW}")
+    import_rerun()
+    console = Console(highlight=False, soft_wrap=True)
+
+    def say(text: str) -> None:
+        console.print(text, markup=False)
+
+    options = ViewOptions(only=only, event_window_ns=round(event_window_s * 1e9), image_rate_hz=image_rate_hz)
+    stop, scene = threading.Event(), SceneLoader(say)
+    with stop_at_signals(stop), contextlib.ExitStack() as stack:
+        outlet: Outlet
+        if save is not None:
+            outlet = FileOutlet(save, say)
+        else:
+            viewer = stack.enter_context(
+                RerunViewer(web=how == "web", port=port, waiting=lambda: not stop.is_set())
+            )
+            outlet = ViewerOutlet(viewer)
+            if how == "web":
+                say(f"open {viewer.page_url}")
+                if open_browser and not _has_no_display():
+                    webbrowser.open(viewer.page_url)
+        node = stack.enter_context(Node("viewer"))
+        try:
+            status = watch(node, outlet, scene, options, stop=stop, say=say, to_the_end=save is not None)
+        except ViewerEnded as error:
+            if how == "web":
+                raise
+            raise ViewerEnded(f"{error}\n{_WITHOUT_WINDOW}") from None
+    if scene.is_loading:  # the thread cannot be stopped, and the interpreter aborts if it is in native code
+        sys.stdout.flush()
+        os._exit(status)
+    return status
 
 
 def watch(
     node: Node,
-    outlet: RerunTarget,
+    outlet: Outlet,
     scene: SceneLoader,
+    options: ViewOptions,
     *,
     stop: threading.Event,
     say: Callable[[str], None],
-    only: Sequence[str] | None = None,
-    event_window_s: float = 0.02,
-    image_rate_hz: float = 15.0,
     to_the_end: bool = False,
 ) -> int:
-    """Show one simulator after the other.
+    """Show one simulator after another.
 
     Args:
-        node: What to listen through.
-        outlet: Where recordings are opened.
+        node: Subscribes.
+        outlet: Opens recordings.
         scene: Loads the scenes.
+        options: What to show.
         stop: Ends it.
-        say: Told what a user should know.
-        only: Sensors to show; None: all.
-        event_window_s: Time in one picture of events [s].
-        image_rate_hz: Most images of a sensor a second, by the wall clock [Hz].
+        say: Called with what a user should know.
         to_the_end: Return when a simulator has left after the end of its flight.
 
     Returns:
@@ -175,61 +147,48 @@ def watch(
         ValueError: There is no such sensor.
         ViewerEnded: The viewer failed.
     """
-    announcements = node.subscriber(topics.SIMULATION, msg.Simulation, policy=latest())
+    announcements = node.subscriber(SIMULATION, Simulation, policy=latest())
     number = itertools.count(1)
     source, send_s, over_s, present = 0, 0.0, math.inf, False
-    show: Show | None = None
+    session: LiveSession | None = None
     say("waiting for a simulator (neurosim serve)")
-    with contextlib.ExitStack() as shown:
+    with contextlib.ExitStack() as stack:
         while not stop.wait(POLL_S):
             now_s = time.monotonic()
             if not outlet.check():
                 return 0
-            found = _announced(announcements, say) if show is None or show.settled else None
+            found = _receive(announcements, say)
             if found is not None and found[1] != source:
                 simulation, source = found
-                shown.close()
-                show, present = None, True
+                stack.close()
+                session, present = None, True
                 try:
-                    show = Show(
-                        node,
-                        simulation,
-                        source,
-                        outlet,
-                        number=number,
-                        only=only,
-                        event_window_ns=round(event_window_s * 1e9),
-                        image_rate_hz=image_rate_hz,
-                        say=say,
-                        scene=scene,
-                    )
+                    session = LiveSession(node, simulation, outlet, scene, options, number=number, say=say)
                 except ConfigError as error:
                     say(f"cannot read the settings of this simulator (version {simulation.version}): {error}")
                     continue
-                shown.enter_context(show)
-                names = "; ".join(f"{name}: {', '.join(s)}" for name, s in show.sensors.items())
+                stack.enter_context(session)
+                names = "; ".join(f"{name}: {', '.join(s)}" for name, s in session.sensors.items())
                 say(f"showing {names} ({simulation.mode})")
-            elif found is not None and show is not None:
-                show.change(found[0])
-            if show is None:
+            if session is None:
                 continue
-            show.read()
+            session.read()
             if now_s >= send_s:
                 send_s = now_s + SEND_S
-                show.send()
+                session.send()
             if present != (present := source in announcements.sources()) and not present:
                 say("the simulator is gone; waiting for the next one (neurosim serve)")
-            over = to_the_end and not present and show.phase == "ended"
+            over = to_the_end and not present and session.phase == "ended"
             over_s = min(over_s, now_s) if over else math.inf
             if now_s - over_s >= OVER_S:
                 return 0
     return 130
 
 
-def _announced(
-    announcements: Subscriber[msg.Simulation], say: Callable[[str], None]
-) -> tuple[msg.Simulation, int] | None:
-    """The newest announcement and who sent it; None if there is none."""
+def _receive(
+    announcements: Subscriber[Simulation], say: Callable[[str], None]
+) -> tuple[Simulation, int] | None:
+    """Return the newest announcement and its publisher; None if there is none."""
     try:
         simulation, info = announcements.recv_with_info(0.0)
     except TimeoutError:
@@ -238,3 +197,7 @@ def _announced(
         say(f"a simulator of another version, which cannot be shown:\n{error}")
         return None
     return simulation, info.source
+
+
+def _has_no_display() -> bool:
+    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

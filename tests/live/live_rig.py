@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from processes import SOON_S, wait_for
 
-from cortex import Loan, Node, Publisher, Subscriber, reliable
+from cortex import Node, Publisher, Subscriber, reliable
 from cortex.messages import Odometry, Parameters, SimulatorReply, SimulatorStatus
 from neurosim_core.config import SimulationConfig, VehicleConfig, load_config
 from neurosim_core.live.config import LiveConfig
+from neurosim_core.live.messages import command_of
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import COMMANDS, SERVICES, command_topic
-from neurosim_core.live.translate import command_of
 from neurosim_core.simulation import Model, make_fleet
 
 IMU = {"kind": "imu", "rate_hz": 400.0, "accelerometer_noise_density": 0.01}
@@ -165,24 +165,6 @@ class LiveRig:
 
         wait_for(look)
         return found[0]
-
-
-def loans_of(publisher: Publisher[Any], shape: tuple[int, ...]) -> list[Loan]:
-    """Every loan that a publisher has left for pictures of bytes; somebody must listen."""
-    loans: list[Loan] = []
-    dims = dict(zip(("height", "width", "channels"), shape, strict=True))
-    while (loan := publisher.try_loan({"data": "u1"}, **dims)) is not None:
-        loans.append(loan)
-        assert len(loans) < 1000
-    return loans
-
-
-def count_free(publisher: Publisher[Any], shape: tuple[int, ...]) -> int:
-    """How many pictures of a shape can be lent room for at once."""
-    loans = loans_of(publisher, shape)
-    for loan in loans:
-        loan.drop()
-    return len(loans)
 
 
 def drain(subscriber: Subscriber[Any], timeout_s: float = 0.2, *, least: int = 0) -> list[Any]:

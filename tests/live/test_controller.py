@@ -22,9 +22,9 @@ from cortex.messages import Odometry, RotorSpeeds, Simulation, SimulatorStatus
 from neurosim_core.config import load_config, to_yaml
 from neurosim_core.control import PathFollower
 from neurosim_core.live import controller
-from neurosim_core.live.controller import PathPilot, fly
+from neurosim_core.live.controller import PathController, fly
+from neurosim_core.live.messages import setpoint_of
 from neurosim_core.live.topics import COMMANDS, SIMULATION, STATUS, command_topic, stream_topic
-from neurosim_core.live.translate import setpoint_of
 from neurosim_core.simulation import plan_paths
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import preset
@@ -97,14 +97,16 @@ def stage(shared_runtime) -> Iterator[Stage]:
 
 
 @pytest.fixture
-def start_pilot(shared_runtime) -> Iterator[Callable[..., PathPilot]]:
+def start_pilot(shared_runtime) -> Iterator[Callable[..., PathController]]:
     """Starts pilots in threads, and ends them."""
     with contextlib.ExitStack() as stack:
         node = stack.enter_context(Node("controller"))
 
-        def start(vehicle: str = "drone", *, mode: Any = "motor_speeds", **options: Any) -> PathPilot:
+        def start(vehicle: str = "drone", *, mode: Any = "motor_speeds", **options: Any) -> PathController:
             follower = PathFollower(PATH, VEHICLE, mode=mode)
-            pilot = PathPilot(node, vehicle, follower, **{"lockstep": True, "rotor_speed": HOVER, **options})
+            pilot = PathController(
+                node, vehicle, follower, **{"lockstep": True, "rotor_speed": HOVER, **options}
+            )
             thread = threading.Thread(target=pilot.run)
             thread.start()
             stack.callback(thread.join, SOON_S)

@@ -5,18 +5,15 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from live_rig import IMU, LiveRig, count_free, drain, make_config, models_of
+from live_rig import IMU, LiveRig, drain, make_config, models_of
 from processes import SOON_S, wait_for
-from rich.console import Console
 
-from cortex import Node
 from cortex.messages import (
     Clock,
     Collision,
@@ -35,12 +32,10 @@ from cortex.messages import (
 )
 from cortex.messages import Delivery as DeliveryMessage
 from neurosim_core.config import load_config
-from neurosim_core.live import cameras
-from neurosim_core.live import simulator as simulator_module
-from neurosim_core.live.console import print_end
-from neurosim_core.live.simulator import Simulator
+from neurosim_core.live.engine import FlownBatch, VehicleEngine
+from neurosim_core.live.serve import summarise
 from neurosim_core.packets import Delivery
-from neurosim_core.record import Recording
+from neurosim_core.record import Flight
 from neurosim_core.simulation import make_state, observe, step
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
@@ -270,8 +265,8 @@ def test_only_what_is_listened_to_is_rendered():
     with LiveRig(make_config(**LOCKSTEP)) as rig:
         odometry = rig.listen("/drone/odometry", Odometry)
         states = rig.fly(odometry, 8)
-        craft = rig.simulator.crafts[0]
-        assert craft.state.counts["renders"] == 0
+        state = rig.simulator.vehicles[0].engine.state
+        assert state.counts["renders"] == 0
         pictures = rig.listen("/drone/rgb", Image)
         status = rig.wait_for_status(lambda status: status.sensors[2].active)
         assert [(s.name, s.active, s.subscriber_count) for s in status.sensors] == [
@@ -283,17 +278,17 @@ def test_only_what_is_listened_to_is_rendered():
         rig.send(rig.hover(), stamp_ns=states[-1].stamp_ns)
         rig.fly(odometry, 8)
         assert [picture.stamp_ns for picture in drain(pictures, least=2)] == [60 * MS, 80 * MS]
-        assert craft.state.counts["renders"] == 2  # no event camera looks
+        assert state.counts["renders"] == 2  # no event camera looks
         pictures.close()
         rig.wait_for_status(lambda status: not status.sensors[2].active)
-        rig.send(rig.hover(), stamp_ns=craft.state.stamp_ns)
+        rig.send(rig.hover(), stamp_ns=state.stamp_ns)
         rig.fly(odometry, 8)
-        assert craft.state.counts["renders"] == 2
+        assert state.counts["renders"] == 2
 
 
 def test_who_subscribes_and_then_commands_gets_stamp_0(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("neurosim_core.live.audience.SETTLE_S", 3.0)  # time to subscribe on a busy machine
-    monkeypatch.setattr("neurosim_core.live.audience.SETTLE_MAX_S", SOON_S)
+    monkeypatch.setattr("neurosim_core.live.status.SETTLE_S", 3.0)  # time to subscribe on a busy machine
+    monkeypatch.setattr("neurosim_core.live.status.SETTLE_MAX_S", SOON_S)
     with LiveRig(make_config(**LOCKSTEP)) as rig:
         rig.send(rig.hover(), stamp_ns=0)
         events = rig.node.subscriber("/drone/events", Events)
@@ -343,7 +338,7 @@ def test_factor_0_does_not_wait():
         assert rig.join() == 0
         assert time.monotonic() - begin_s < SOON_S
         assert rig.simulator.stamp_ns == 1000 * MS
-        assert rig.simulator._meter.overrun_count == 0
+        assert rig.simulator._stats.overrun_count == 0
 
 
 @pytest.mark.parametrize("fail_safe", ["hover", "cut", "hold"])
@@ -380,19 +375,15 @@ def test_the_fail_safe_ends_with_the_next_command():
 
 
 def _with_slow_cameras(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    """Let cameras take so long for what they see, in the thread that flies or in one of their own."""
+    """Let the rendering of a batch with frames take longer."""
+    render = VehicleEngine.render
 
-    def slow(look: Callable[..., Any]) -> Callable[..., Any]:
-        def see(model: Any, state: Any, batch: Any) -> Any:
-            job = cameras.Job(vehicle="drone", model=model, state=state, batch=batch)
-            if cameras._shows_anything(job):
-                time.sleep(seconds)
-            return look(model, state, batch)
+    def slow(self: VehicleEngine, flown: FlownBatch) -> Any:
+        if flown.frame_counts:
+            time.sleep(seconds)
+        return render(self, flown)
 
-        return see
-
-    for name in ("see", "see_each"):
-        monkeypatch.setattr(cameras, name, slow(getattr(cameras, name)))
+    monkeypatch.setattr(VehicleEngine, "render", slow)
 
 
 def test_slow_cameras_slow_time_down(monkeypatch: pytest.MonkeyPatch):
@@ -426,103 +417,63 @@ def test_slow_cameras_lose_frames_where_time_matters_more(monkeypatch: pytest.Mo
     assert all(second.start_ns == first.stamp_ns for first, second in itertools.pairwise(windows))
 
 
-def test_slow_cameras_of_the_thread_that_flies_lose_frames_too(monkeypatch: pytest.MonkeyPatch):
-    """As on CUDA: time goes on, and what would come too late is left out."""
-    monkeypatch.setattr(simulator_module, "sees_inline", lambda device: True)
-    _with_slow_cameras(monkeypatch, 0.08)
-    with LiveRig(make_config(**{"live.overrun": "drop"})) as rig:
-        pictures = rig.listen("/drone/rgb", Image)
-        rig.send(rig.hover())
-        found = [pictures.recv(SOON_S) for _ in range(3)]
-        dropped = rig.wait_for_status(lambda s: s.sensors[2].dropped_count > 2)
-    assert [p.sequence for p in found] == [p.stamp_ns // (20 * MS) for p in found]
-    assert found[-1].sequence > 2
-    assert dropped.sensors[2].name == "rgb"
-
-
-def test_what_is_left_out_at_the_end_is_counted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_what_is_left_out_at_the_end_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Every picture of the flight is in the recording, or the last status says that it is missing."""
     _with_slow_cameras(monkeypatch, 0.05)
     told: list[SimulatorStatus] = []
     with LiveRig(make_config(**{"live.overrun": "drop"}), record=tmp_path) as rig:
-        rig.simulator.board.on_status = told.append
+        rig.simulator.status.on_status = told.append
         rig.send(rig.hover())
         running = rig.wait_for_status(lambda s: s.sensors[2].dropped_count)
         rig.stop.set()
         assert rig.join() == 0
-        flown_ns = rig.simulator.crafts[0].state.stamp_ns
-    with Recording(tmp_path / "flight.h5") as flight:
+        flown_ns = rig.simulator.vehicles[0].engine.state.stamp_ns
+    with Flight(tmp_path / "flight.h5") as flight:
         packets = list(flight.packets())
     pictures = [p.stamp_ns for p in packets if p.sensor == "rgb"]
     dropped = told[-1].sensors[2].dropped_count
     assert dropped >= running.sensors[2].dropped_count
     assert len(pictures) + dropped == flown_ns // (20 * MS) + 1
     assert [p.stamp_ns for p in packets if p.sensor == "odometry"][-1] == flown_ns
-    print_end(Console(), told[-1], None)
-    assert f"{sum(s.dropped_count for s in told[-1].sensors)} frames were left out" in capsys.readouterr().out
+    frames = sum(s.dropped_count for s in told[-1].sensors)
+    assert any(f"{frames} frames were dropped" in line for line in summarise(told[-1]))
 
 
-def test_the_picture_in_work_at_the_end_is_published(monkeypatch: pytest.MonkeyPatch):
-    see, reached, told = cameras.see_each, threading.Event(), []
+@pytest.mark.parametrize(("give_up_s", "stamps_ms"), [(SOON_S, [0, 20]), (0.0, [0])])
+def test_the_end_of_a_run_waits_for_the_picture_in_work_for_a_limited_time(
+    monkeypatch: pytest.MonkeyPatch, give_up_s: float, stamps_ms: list[int]
+):
+    render, reached, told = VehicleEngine.render, threading.Event(), []
 
-    def held(model: Any, state: Any, batch: Any) -> Any:
-        if batch.until_ns == 20 * MS:
+    def held(self: VehicleEngine, flown: FlownBatch) -> Any:
+        if flown.end_ns == 20 * MS:
             reached.set()
-            assert rig.stop.wait(SOON_S)
-        return see(model, state, batch)
+            assert release.wait(SOON_S)
+        return render(self, flown)
 
-    monkeypatch.setattr(cameras, "see_each", held)
-    give_up = cameras.Cameras.give_up
-    monkeypatch.setattr(cameras.Cameras, "give_up", lambda self: give_up(self, SOON_S))
+    monkeypatch.setattr(VehicleEngine, "render", held)
+    monkeypatch.setattr("neurosim_core.live.cameras.GIVE_UP_S", give_up_s)
     with LiveRig(make_config()) as rig:
-        rig.simulator.board.on_status = told.append
+        release = rig.stop if give_up_s else threading.Event()
+        rig.simulator.status.on_status = told.append
         pictures = rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())
         assert reached.wait(SOON_S)
         rig.stop.set()
         assert rig.join() == 0
-        flown_ns = rig.simulator.crafts[0].state.stamp_ns
-        assert [m.stamp_ns for m in drain(pictures, least=2)] == [0, 20 * MS]
-    assert told[-1].sensors[2].dropped_count == flown_ns // (20 * MS) - 1
-
-
-def test_a_picture_that_does_not_end_is_not_touched(monkeypatch: pytest.MonkeyPatch):
-    """Ctrl-C while the end of a run waits for it: the run ends, and leaves the events to the thread."""
-    see, give_up, reached, done = (
-        cameras.see_each,
-        cameras.Cameras.give_up,
-        threading.Event(),
-        threading.Event(),
-    )
-
-    def held(model: Any, state: Any, batch: Any) -> Any:
-        if batch.until_ns == 20 * MS:  # the second window has begun
-            reached.set()
-            assert done.wait(SOON_S)
-        return see(model, state, batch)
-
-    monkeypatch.setattr(cameras, "see_each", held)
-    monkeypatch.setattr(cameras.Cameras, "give_up", lambda self: give_up(self, 0.0))
-    live = {"live.run_on": False, "live.real_time_factor": 0.0}
-    with LiveRig(make_config(duration_s=0.025, **live)) as rig:
-        events = rig.listen("/drone/events", Events)
-        rig.send(rig.hover())
-        assert reached.wait(SOON_S)
-        wait_for(lambda: rig.simulator.phase == "ended")
-        rig.stop.set()
-        assert rig.join() == 0
-        assert [m.stamp_ns for m in drain(events, 0.05, least=1)] == [10 * MS]
-        done.set()
+        assert [m.stamp_ns for m in drain(pictures, least=len(stamps_ms))] == [MS * t for t in stamps_ms]
+        release.set()
+    shown = told[-1].stamp_ns // (20 * MS) + 1
+    assert told[-1].sensors[2].dropped_count in (shown - len(stamps_ms), shown - len(stamps_ms) + 1)
 
 
 def test_cameras_that_fail_end_it(monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any) -> Any:
         raise ValueError("no picture")
 
-    monkeypatch.setattr(cameras, "see_each", fail)
+    monkeypatch.setattr(VehicleEngine, "render", fail)
     with LiveRig(make_config()) as rig:
+        rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())
         assert rig.join() is None
         error, rig.error = rig.error, None
@@ -591,7 +542,7 @@ def test_a_paused_run_shows_all_its_pictures(monkeypatch: pytest.MonkeyPatch):
     with LiveRig(make_config(**{"live.real_time_factor": 0.0})) as rig:
         pictures = rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())
-        stream = rig.simulator.crafts[0].outlet.streams["rgb"]
+        stream = rig.simulator.vehicles[0].publisher.topics["rgb"]
         assert pictures.recv(SOON_S).stamp_ns == 0
         end_ns = rig.call("/pause", Trigger()).stamp_ns
         assert stream.published_count == end_ns // (20 * MS) + 1
@@ -604,7 +555,7 @@ def test_a_paused_run_shows_all_its_pictures(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_pause_ends_steps_that_wait_for_a_command(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(simulator_module, "FIRST_STEP_S", 4 * SOON_S)
+    monkeypatch.setattr("neurosim_core.live.simulator.FIRST_STEP_S", 4 * SOON_S)
     with LiveRig(make_config(**LOCKSTEP)) as rig:
         rig.call("/pause", Trigger())
         rig.wait_for_status(lambda status: status.phase == "paused")  # "waiting" is said before, too
@@ -624,7 +575,7 @@ def test_steps_before_the_first_command_are_refused(monkeypatch: pytest.MonkeyPa
         rig.call("/pause", Trigger())
         reply = rig.call("/step", Step(count=5))
         assert not reply.accepted
-        assert reply.reason == "nobody has sent drone a command yet: time begins with the first"
+        assert reply.reason == "no command for drone has come yet: time begins with the first"
         assert reply.phase == "paused"
 
 
@@ -691,7 +642,7 @@ def test_parameters_change_while_it_runs():
         odometry = rig.listen("/drone/odometry", Odometry)
         states = rig.fly(odometry, 2)
         assert rig.set({"live.fail_safe": "cut"}).accepted
-        assert rig.simulator.crafts[0].helm.live.fail_safe == "cut"
+        assert rig.simulator.vehicles[0].hold.live.fail_safe == "cut"
         assert rig.set({"links.odometry.latency_s": 0.008}).accepted
         rig.send(rig.hover(), stamp_ns=states[-1].stamp_ns)
         assert odometry.recv(SOON_S).stamp_ns == 15 * MS  # at tick 5
@@ -710,7 +661,7 @@ def test_gains_change_in_flight():
         assert rig.set({"control.gains.position_gain_per_s2": 2.0}).accepted
         rig.send(row, mode="position", stamp_ns=states[-1].stamp_ns)
         after = odometry.recv(SOON_S)
-        changed = rig.simulator.crafts[0].model
+        changed = rig.simulator.vehicles[0].engine.model
     state = make_state(before)
     for _ in range(3):
         step(before, state, row, mode="position")
@@ -722,24 +673,6 @@ def test_gains_change_in_flight():
 
 
 # Ends
-
-
-def test_room_for_a_picture_is_given_back_before_the_topics_close():
-    """One that the flight did not come to, as it ended before: else closing would wait for it."""
-    config = make_config()
-    like = np.zeros((160, 150, 3), np.uint8)
-    with Node("simulator") as node, Node("viewer") as viewer:
-        simulator = Simulator(config, node, models=models_of(config))
-        try:
-            outlet = simulator.crafts[0].outlet
-            publisher = outlet.streams["rgb"].publisher
-            viewer.subscriber("/drone/rgb", Image)
-            assert publisher.wait_for_subscribers(1, SOON_S)
-            assert outlet.streams["rgb"].loan.lend(like) is not None
-            free = count_free(publisher, like.shape)
-        finally:
-            simulator.close()
-        assert count_free(publisher, like.shape) == free + 1
 
 
 def test_a_collision_ends_the_run_until_the_reset():
@@ -835,7 +768,7 @@ def test_what_is_recorded_is_what_was_published(tmp_path: Path, mode: str):
             rig.send(rig.hover())
         assert rig.join() == 0
         samples, pictures, windows = drain(imu, least=37), drain(rgb, least=6), drain(events, least=10)
-    with Recording(tmp_path / "flight" / "flight.h5") as flight:
+    with Flight(tmp_path / "flight" / "flight.h5") as flight:
         packets: dict[str, list[Any]] = {}
         for packet in flight.packets():
             packets.setdefault(packet.sensor, []).append(packet)
@@ -886,7 +819,7 @@ def test_a_recording_is_not_replaced_unasked_and_resets_begin_new_files(tmp_path
             pass
         rig.call("/reset", Reset(seed=5))
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["flight-2.h5", "flight.h5"]
-    with Recording(tmp_path / "flight.h5") as flight:
+    with Flight(tmp_path / "flight.h5") as flight:
         stamps = [p.stamp_ns for p in flight.packets() if p.sensor == "odometry"]
         assert stamps == [0, PERIOD_NS]
         assert flight.header.seed == 4
@@ -895,29 +828,6 @@ def test_a_recording_is_not_replaced_unasked_and_resets_begin_new_files(tmp_path
     with LiveRig(config, record=tmp_path, overwrite=True):
         pass
     assert not (tmp_path / "flight-2.h5").exists()
-
-
-def test_serve_says_what_it_does(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
-    config = make_config(**{"live.real_time_factor": 0.0, "live.run_on": False})
-    monkeypatch.setattr(simulator_module, "make_fleet", lambda config, on_phase: models_of(config))
-    begin = simulator_module.Simulator._begin
-    command = simulator_module.Command(mode="motor_speeds", setpoint=np.full(4, 500.0))
-
-    def begin_and_command(self: Any, beginning: Any) -> None:
-        begin(self, beginning)
-        for craft in self.crafts:
-            monkeypatch.setattr(craft.inbox, "wait", lambda fits, **options: command)
-
-    monkeypatch.setattr(simulator_module.Simulator, "_begin", begin_and_command)
-    assert simulator_module.serve(config, record=tmp_path / "out") == 0
-    said = capsys.readouterr().out
-    assert "/drone/: imu, odometry, rgb, events, rotor_speeds" in said
-    assert "waiting for the first command on /drone/command/*: `neurosim fly` sends them" in said
-    assert "ended: the 1 s are over" in said
-    assert "simulated 1.000 s: 200 control periods, 1 commands" in said
-    assert (tmp_path / "out" / "flight.h5").exists()
 
 
 def test_status_is_told_about_five_times_a_second():

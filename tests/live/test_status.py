@@ -16,20 +16,13 @@ from processes import SOON_S
 from rich.console import Console
 
 from cortex import reliable
-from cortex.messages import Image, Imu, Reset, Simulation, SimulatorStatus
+from cortex.messages import Image, Imu, Reset, Simulation
 from neurosim_core.config import load_config
-from neurosim_core.live import cameras
-from neurosim_core.live.console import StatusLine, print_end
-from neurosim_core.record import Recording
+from neurosim_core.live.engine import VehicleEngine
+from neurosim_core.live.serve import StatusLine, summarise
+from neurosim_core.record import Flight
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
-
-
-def said(status: SimulatorStatus) -> str:
-    """What the console says at the end."""
-    text = io.StringIO()
-    print_end(Console(file=text, width=200), status, None)
-    return text.getvalue()
 
 
 def test_a_reader_that_is_too_slow_is_named_and_its_losses_are_counted():
@@ -43,7 +36,7 @@ def test_a_reader_that_is_too_slow_is_named_and_its_losses_are_counted():
     assert status.phase == "running"
     assert status.reason == "reliable readers do not keep up with /drone/imu"
     count = status.sensors[0].undelivered_count
-    assert f"{count:,} messages were lost by reliable readers that were too slow" in said(status)
+    assert f"{count:,} messages were lost by reliable readers that were too slow[/]" in summarise(status)[-1]
 
 
 def test_the_line_names_who_holds_it_up():
@@ -56,7 +49,6 @@ def test_the_line_names_who_holds_it_up():
     text = io.StringIO()
     with StatusLine(Console(file=text, force_terminal=True, width=200)) as line:
         line.show(status)
-        assert line._line is not None
         shown = str(line._line.status)
     assert "7 lost" in shown
     assert "reliable readers do not keep up with /drone/imu" in shown
@@ -64,14 +56,14 @@ def test_the_line_names_who_holds_it_up():
 
 def test_pictures_that_come_late_are_said_to(monkeypatch: pytest.MonkeyPatch):
     """A camera that takes 30 ms for each look is late by about that; the IMU beside it is not."""
-    see = cameras.see_each
+    render = VehicleEngine.render
 
     def slow(*arguments: Any) -> Any:
-        packets = see(*arguments)
+        packets = render(*arguments)
         threading.Event().wait(0.03)
         return packets
 
-    monkeypatch.setattr(cameras, "see_each", slow)
+    monkeypatch.setattr(VehicleEngine, "render", slow)
     with LiveRig(make_config()) as rig:
         pictures = rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())
@@ -98,7 +90,7 @@ def test_changed_settings_are_announced_and_recorded(tmp_path: Path):
     assert "imu" not in load_config(yaml.safe_load(first.config)).links
     for simulation in (second, late):
         assert load_config(yaml.safe_load(simulation.config)).links["imu"].clock_offset_s == 0.003
-    with Recording(tmp_path / "flight.h5") as flight:
+    with Flight(tmp_path / "flight.h5") as flight:
         held = load_config(yaml.safe_load(flight.header.config_yaml))
     assert (held.links["imu"].clock_offset_s, held.live.fail_safe, held.seed) == (0.003, "hover", 5)
     (line,) = (tmp_path / "settings.jsonl").read_text().splitlines()

@@ -22,6 +22,7 @@ import PIL.Image
 import pytest
 import trimesh
 from fake_simulator import HEIGHT, MS, ROTORS, WIDTH, FakeSimulator, make_events
+from neurosim_core.live.scene_loader import SceneLoader
 from processes import SOON_S, wait_for
 from rerun_file import Rows, read, scalars
 
@@ -29,7 +30,6 @@ from cortex import Node
 from cortex import messages as msg
 from neurosim_core.live import show as show_module
 from neurosim_core.live import viewer as viewer_module
-from neurosim_core.live.scene_loader import SceneLoader
 from neurosim_core.live.viewer import view, watch
 from neurosim_core.packets import EventArrays
 from neurosim_core.view import FileTarget, event_picture

@@ -14,9 +14,8 @@ from processes import SOON_S, wait_for
 from cortex import Node, ServiceUnavailable
 from cortex.messages import Parameters, Reset, SimulatorReply, Step, Trigger
 from neurosim_core.config import SimulationConfig
-from neurosim_core.live import requests
-from neurosim_core.live.parameters import CHANGEABLE, change
-from neurosim_core.live.requests import Request, Requests, Steps
+from neurosim_core.live import services
+from neurosim_core.live.services import CHANGEABLE, Request, Services, Steps, change_parameters
 from neurosim_core.live.topics import SERVICES
 
 
@@ -27,7 +26,7 @@ class Counter:
         self.rung = threading.Event()
         self.config = make_config()
         self.caller = caller
-        self.requests = Requests(
+        self.services = Services(
             node,
             step_node,
             config=lambda: self.config,
@@ -44,7 +43,7 @@ class Counter:
 
     def take(self) -> Request:
         """Wait for a request."""
-        return wait_for(self.requests.take)
+        return wait_for(self.services.take)
 
 
 @pytest.fixture
@@ -52,15 +51,15 @@ def counter(shared_runtime: Path) -> Iterator[Counter]:
     with Node("services") as node, Node("steps") as step_node, Node("caller") as caller:
         counter = Counter(node, step_node, caller)
         yield counter
-        counter.requests.close()
+        counter.services.close()
 
 
 def test_a_request_is_answered_by_the_loop(counter: Counter):
     replies: list[SimulatorReply] = []
-    assert not counter.requests
+    assert not counter.services
     thread = counter.call("/reset", Reset(seed=5), replies)
     assert counter.rung.wait(SOON_S)
-    assert counter.requests
+    assert counter.services
     request = counter.take()
     assert (request.service, request.message.seed) == ("/reset", 5)
     request.answer()
@@ -78,15 +77,15 @@ def test_a_refusal_says_why(counter: Counter):
 
 
 def test_no_answer_is_a_refusal_in_time(shared_runtime: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(requests, "ANSWER_DEADLINE_S", 0.05)
+    monkeypatch.setattr(services, "ANSWER_DEADLINE_S", 0.05)
     with Node("services") as node, Node("steps") as step_node, Node("caller") as caller:
         counter = Counter(node, step_node, caller)
         replies: list[SimulatorReply] = []
         counter.call("/resume", Trigger(), replies).join(SOON_S)
         assert not replies[0].accepted
         assert replies[0].reason == "no answer within 0.05 s; it will not be done"
-        assert counter.requests.take() is None  # nobody waits for it
-        counter.requests.close()
+        assert counter.services.take() is None  # nobody waits for it
+        counter.services.close()
 
 
 def test_steps_do_not_hold_up_the_others(counter: Counter):
@@ -106,7 +105,7 @@ def test_close_answers_who_waits(counter: Counter):
     replies: list[SimulatorReply] = []
     thread = counter.call("/step", Step(count=3), replies)
     counter.take()
-    counter.requests.close()
+    counter.services.close()
     thread.join(SOON_S)
     assert replies[0].reason == "the simulator has ended"
     wait_for(lambda: not counter.caller.client("/step", Step, SimulatorReply).available())
@@ -120,7 +119,7 @@ def test_parameters_are_checked_before_the_loop_hears_of_them(counter: Counter):
     counter.call("/set_parameters", Parameters.of(values), replies).join(SOON_S)
     assert "live.fail_safe" in replies[0].reason
     assert "'hover', 'cut' or 'hold'" in replies[0].reason
-    assert not counter.requests
+    assert not counter.services
     thread = counter.call("/set_parameters", Parameters.of({"live.fail_safe": "cut"}), replies)
     request = counter.take()
     assert request.config is not None
@@ -152,7 +151,7 @@ def test_steps_stop_for_a_reason_or_when_nobody_waits():
     assert not steps
     assert request.wait(0.0) == "reset"
     left = Request("/step", Step(count=2))
-    assert left.take()
+    assert left.future.set_running_or_notify_cancel()
     steps.start(left)
     steps.check()
     assert steps
@@ -170,7 +169,7 @@ def test_steps_end_with_the_patience_of_who_asked_for_them(counter: Counter):
         replies: list[SimulatorReply] = []
         thread = counter.call("/step", Step(count=1000, timeout_s=0.05), replies)
         while thread.is_alive():
-            request = counter.requests.take()
+            request = counter.services.take()
             if request is not None:
                 steps.start(request)
                 break
@@ -186,7 +185,7 @@ def test_what_is_being_done_when_the_time_is_over_is_waited_for():
     """Else a client would be told that a reset that happens has not happened."""
     request = Request("/reset", Reset())
     reasons: list[str] = []
-    assert request.take()
+    assert request.future.set_running_or_notify_cancel()
     late = threading.Timer(0.3, request.answer)
     late.start()
     reasons.append(request.wait(0.2))
@@ -197,10 +196,10 @@ def test_what_is_being_done_when_the_time_is_over_is_waited_for():
 def test_what_nobody_waits_for_is_not_begun():
     request = Request("/reset", Reset())
     assert request.wait(0.0) == "no answer within 0 s; it will not be done"
-    assert not request.take()
-    assert not request.answer()
+    assert not request.future.set_running_or_notify_cancel()
+    request.answer()
     hopeless = Request("/reset", Reset())
-    assert hopeless.take()
+    assert hopeless.future.set_running_or_notify_cancel()
     assert hopeless.wait(0.0) == "no answer within 0 s; it may still be done"
 
 
@@ -217,7 +216,7 @@ def test_what_nobody_waits_for_is_not_begun():
 )
 def test_a_parameter_is_changed(key: str, value: float, read: Any):
     config = make_config(links={"imu": {"loss": 0.5}})
-    changed = change(config, {key: value})
+    changed = change_parameters(config, {key: value})
     assert read(changed) == value
     assert changed.sensors == config.sensors
     assert isinstance(changed, SimulationConfig)
@@ -225,14 +224,14 @@ def test_a_parameter_is_changed(key: str, value: float, read: Any):
 
 @pytest.mark.parametrize("key", ["scene.seed", "live.mode", "live", "links.imu", "control.rate_hz", "x"])
 def test_what_cannot_be_changed_is_refused_with_what_can(key: str):
-    with pytest.raises(ValueError, match="cannot be changed while it runs") as caught:
-        change(make_config(), {key: 1})
+    with pytest.raises(ValueError, match="cannot be changed during a run") as caught:
+        change_parameters(make_config(), {key: 1})
     assert all(name in str(caught.value) for name in CHANGEABLE)
 
 
 def test_a_misspelt_key_is_answered_with_the_one_that_was_meant():
     with pytest.raises(ValueError, match=r"did you mean live\.real_time_factor\?"):
-        change(make_config(), {"live.realtime_factor": 1.0})
+        change_parameters(make_config(), {"live.realtime_factor": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -241,9 +240,9 @@ def test_a_misspelt_key_is_answered_with_the_one_that_was_meant():
 )
 def test_values_that_are_not_allowed_are_refused(key: str, value: float):
     with pytest.raises(ValueError, match=key.rsplit(".", 1)[0]):
-        change(make_config(), {key: value})
+        change_parameters(make_config(), {key: value})
 
 
 def test_a_key_without_a_value_is_refused():
     with pytest.raises(ValueError, match=r"live\.overrun: no value"):
-        change(make_config(), {"live.overrun": None})
+        change_parameters(make_config(), {"live.overrun": None})

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from neurosim_core.config import SimulationConfig, load_config
-from neurosim_core.live import stack
-from neurosim_core.live.supervisor import Part
+from neurosim_core.live import up as up_module
+from neurosim_core.live.up import Part
 
 
 @pytest.fixture
@@ -21,18 +21,17 @@ def up(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[dict[str, Part], 
     def up(config: SimulationConfig, **options: Any) -> tuple[dict[str, Part], SimulationConfig]:
         seen: dict[str, Any] = {}
 
-        def run_together(parts: Sequence[Part], *, folder: str, **_: Any) -> int:
+        def run_together(parts: Sequence[Part], **_: Any) -> int:
             seen["parts"] = {part.name: part for part in parts}
-            seen["folder"] = Path(folder)
             files = {part.command[4] for part in parts if part.name != "viewer"}
             (file,) = files  # they read the same
             seen["config"] = load_config(file)
-            assert Path(file).parent == seen["folder"]
+            seen["folder"] = Path(file).parent
             return 7
 
-        monkeypatch.setattr(stack, "run_together", run_together)
+        monkeypatch.setattr(up_module, "run_together", run_together)
         defaults = {"viewer": "none", "record": None, "overwrite": False}
-        assert stack.up(config, **{**defaults, **options}) == 7
+        assert up_module.up(config, **{**defaults, **options}) == 7
         assert not seen["folder"].exists()
         return seen["parts"], seen["config"]
 
@@ -80,9 +79,9 @@ def test_all_end_with_the_simulator_and_a_flight_in_lockstep_with_its_controller
         "controller": at_its_end,
         "viewer": "go on",
     }
-    assert {name for name, part in parts.items() if part.prefixed} == {"controller", "viewer"}
+    assert {name for name, part in parts.items() if part.is_prefixed} == {"controller", "viewer"}
     assert "the flight goes on" in parts["viewer"].advice
-    assert "fail-safe" in parts["controller"].advice_if_failed
+    assert "fail-safe" in parts["controller"].advice
 
 
 @pytest.mark.parametrize(
@@ -106,21 +105,21 @@ def test_the_viewer_suits_the_display(monkeypatch, viewer, display, platform, wa
     if display is not None:
         monkeypatch.setenv(display, ":0")
     monkeypatch.setattr(sys, "platform", platform)
-    assert stack.arguments_of(viewer) == wanted
+    assert up_module.viewer_options(viewer) == wanted
 
 
 def test_a_file_that_is_there_is_refused_before_anything_runs(monkeypatch, tmp_path):
-    monkeypatch.setattr(stack, "run_together", None)
+    monkeypatch.setattr(up_module, "run_together", None)
     file = tmp_path / "live.rrd"
     file.write_bytes(b"mine")
     with pytest.raises(FileExistsError, match=r"live.rrd is there already: name another file"):
-        stack.up(SimulationConfig(), viewer=str(file), record=None, overwrite=False)
+        up_module.up(SimulationConfig(), viewer=str(file), record=None, overwrite=False)
     with pytest.raises(OSError, match="there is no folder"):
-        stack.up(SimulationConfig(), viewer=str(tmp_path / "no" / "f.rrd"), record=None, overwrite=False)
+        up_module.up(SimulationConfig(), viewer=str(tmp_path / "no" / "f.rrd"), record=None, overwrite=False)
 
 
 @pytest.mark.parametrize("viewer", ["rerun", "", "live.mp4", "Native"])
 def test_an_unknown_viewer_is_refused_before_anything_runs(monkeypatch, viewer):
-    monkeypatch.setattr(stack, "run_together", None)
+    monkeypatch.setattr(up_module, "run_together", None)
     with pytest.raises(ValueError, match=rf"native, web, none or a file that ends in .rrd, got '{viewer}'"):
-        stack.up(SimulationConfig(), viewer=viewer, record=None, overwrite=False)
+        up_module.up(SimulationConfig(), viewer=viewer, record=None, overwrite=False)

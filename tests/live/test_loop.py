@@ -22,10 +22,10 @@ from cortex.messages import Events, Imu, MotorCommand, Odometry, Reset, RotorSpe
 from neurosim_core.config import load_config, to_yaml
 from neurosim_core.control import PathFollower
 from neurosim_core.live import controller
-from neurosim_core.live.controller import PathPilot
+from neurosim_core.live.controller import PathController
+from neurosim_core.live.messages import command_of, to_packet
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import COMMANDS, command_topic, stream_topic
-from neurosim_core.live.translate import command_of, to_packet
 from neurosim_core.packets import Packet
 from neurosim_core.simulation import (
     Model,
@@ -290,12 +290,12 @@ def test_rough_air_and_a_noisy_camera_fly_as_in_one_process(rough, shared_runtim
 @contextlib.contextmanager
 def piloting(
     node: Node, model: Model, vehicle: str = "drone", *, nap: Callable[[], float] = lambda: 0.0
-) -> Iterator[PathPilot]:
+) -> Iterator[PathController]:
     """A pilot in a thread, which sleeps before it looks."""
     follower = PathFollower(model.path, model.airframe, model.config.control.gains)
     hover = np.full(4, model.airframe.hover_rotor_speed_rad_s)
     done = threading.Event()
-    with PathPilot(node, vehicle, follower, lockstep=True, rotor_speed=hover) as pilot:
+    with PathController(node, vehicle, follower, lockstep=True, rotor_speed=hover) as pilot:
 
         def run() -> None:
             while not done.wait(nap()):

@@ -1,0 +1,224 @@
+"""`neurosim serve`: a simulator, and what it prints on the console."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.status import Status
+from rich.table import Table
+
+from cortex import Node, latest
+from cortex.messages import Simulation, SimulatorStatus
+from neurosim_core.config import SimulationConfig
+from neurosim_core.live.simulator import Simulator
+from neurosim_core.live.topics import SIMULATION, command_topic
+from neurosim_core.live.vehicle import VehicleNode
+from neurosim_core.signals import stop_at_signals
+
+_SWITCH_S = 2e-4
+"""Longest turn of one Python thread while another one waits [s]: 5 ms by default, a whole control period."""
+LOOK_S = 0.3
+"""How long the discovery of another simulator takes at most [s]."""
+GONE_S = 2.0
+"""After this a simulator that was killed is no longer connected [s]."""
+_SLOW_STATUSES = 5
+"""Statuses in a row, five a second, after which a run is called slow."""
+
+
+def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bool = False) -> int:
+    """Simulate for controllers in other processes until interrupted.
+
+    Args:
+        config: What to fly, and how.
+        record: Folder to record to.
+        overwrite: Replace a recording that exists.
+
+    Returns:
+        The exit status: 0 done, 1 ended with an error, 130 interrupted.
+
+    Raises:
+        ValueError: The scene cannot be loaded, no path exists, or there is no such device.
+        OSError: There is a recording already, or it cannot be written.
+        RuntimeError: Another simulator runs in this domain.
+    """
+    console = Console(highlight=False, soft_wrap=True)
+    stop = threading.Event()
+    with Node("simulator") as node:
+        require_single_instance(node)
+        with console.status("preparing") as preparing:
+            simulator = Simulator(
+                config,
+                node,
+                record=record,
+                overwrite=overwrite,
+                on_phase=lambda phase: preparing.update(f"preparing: {phase}"),
+            )
+        gc.collect()
+        gc.freeze()  # a collection of everything that exists now would delay time by a tenth of a second
+        sys.setswitchinterval(_SWITCH_S)
+        with stop_at_signals(stop, on_stop=node.stop_waiting), simulator:
+            print_plan(console, simulator.vehicles, config)
+            with StatusLine(console) as line:
+                simulator.status.on_status = line.show
+                code = simulator.run(stop)
+            if line.last is not None:
+                for text in summarise(line.last):
+                    console.print(text)
+            for vehicle in simulator.vehicles:
+                if count := vehicle.engine.counts.redone_intervals:
+                    console.print(f"{vehicle.name}: adaptive steps replaced {count:,} fixed ones")
+            if record is not None:
+                console.print(f"recorded to {record}/")
+    return 130 if stop.is_set() else code
+
+
+def require_single_instance(node: Node) -> None:
+    """Check that no other simulator runs in the domain of a node: two would fly each other's vehicles.
+
+    Raises:
+        RuntimeError: There is one.
+    """
+    with node.subscriber(SIMULATION, Simulation, policy=latest()) as others:
+        if not others.wait_for_publisher(LOOK_S):
+            return
+        deadline_s = time.monotonic() + GONE_S
+        while time.monotonic() < deadline_s:
+            if not others.publisher_count:
+                return
+            time.sleep(0.02)
+    raise RuntimeError(
+        f"a simulator runs in domain {node.domain} already: end it, or set CORTEX_DOMAIN to another number "
+        "for all processes that belong together"
+    )
+
+
+def print_plan(console: Console, vehicles: Sequence[VehicleNode], config: SimulationConfig) -> None:
+    """Print what is simulated, on which topics, and what it waits for."""
+    model, live = vehicles[0].engine.model, config.live
+    if live.mode == "lockstep":
+        pace = "lockstep: every control period waits for its command"
+    elif live.real_time_factor:
+        pace = f"streaming at {live.real_time_factor:g} x real time"
+    else:
+        pace = "streaming as fast as possible"
+    console.print(
+        f"[bold]{model.scene.name}[/], {len(model.scene.faces):,} triangles, on {model.device}; "
+        f"{config.control.rate_hz:g} control periods a second, {pace}"
+    )
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for vehicle in vehicles:
+        names = dict.fromkeys([*vehicle.config.sensors, "odometry", "rotor_speeds"])
+        table.add_row(vehicle.config.vehicle.preset, f"/{vehicle.name}/: {', '.join(names)}")
+    console.print(table)
+    commands = ", ".join(command_topic(vehicle.name, "*") for vehicle in vehicles)
+    console.print(f"waiting for the first command on {commands}: `neurosim fly` sends them")
+
+
+class StatusLine:
+    """A line that is updated with each status on a terminal, and further lines for events. A context manager.
+
+    Attributes:
+        last: The newest status; None if there was none.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.last: SimulatorStatus | None = None
+        self._slow_count = 0
+        self._console = console
+        self._line = Status("", console=console, refresh_per_second=5)
+
+    def show(self, status: SimulatorStatus) -> None:
+        """Update the line, and print what has changed."""
+        before, self.last = self.last, status
+        self._line.update(_summary(status))
+        for text in (*changes(before, status), *self._slowness(before, status)):
+            self._console.print(f"[yellow]{text}[/]")
+
+    def _slowness(self, before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
+        """Return once in a run that it has been slower than wanted for a second."""
+        wanted = status.real_time_factor_wanted
+        if before is None or status.step_count < before.step_count:
+            self._slow_count = 0
+            return []
+        slow = before.phase == status.phase == "running" and status.real_time_factor < 0.9 * wanted
+        self._slow_count = self._slow_count + 1 if slow or self._slow_count > _SLOW_STATUSES else 0
+        if self._slow_count != _SLOW_STATUSES:
+            return []
+        return [
+            f"this machine reaches {status.real_time_factor:.2f} x real time, not {wanted:g}: time is "
+            "delayed (live.overrun: drop drops pictures instead); fewer, slower or smaller cameras help"
+        ]
+
+    def __enter__(self) -> StatusLine:
+        if self._console.is_terminal:
+            self._line.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._line.stop()
+
+
+def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str]:
+    """Return what has changed between two statuses that a user wants to know, a line each."""
+    lines = []
+    if status.phase == "ended" and (before is None or before.phase != "ended"):
+        lines.append(f"ended: {status.reason}")
+    if before is None or before.phase == "ended" or status.step_count < before.step_count:
+        return lines
+    if status.phase == "waiting" and status.reason and not before.reason and status.step_count:
+        lines.append(f"waiting {status.reason}")
+    for was, now in zip(before.vehicles, status.vehicles, strict=False):
+        if now.fail_safe_count > was.fail_safe_count:
+            lines.append(f"{now.name}: no command has come in time; the fail-safe flies")
+        if was.fail_safe and not now.fail_safe:
+            lines.append(f"{now.name}: commands arrive again")
+    return lines
+
+
+def summarise(status: SimulatorStatus) -> list[str]:
+    """Return the totals of a run since its last reset, a line each."""
+    taken, lost, refused, collisions = (
+        sum(getattr(vehicle, f"{name}_count") for vehicle in status.vehicles)
+        for name in ("command", "lost", "refused", "collision")
+    )
+    lines = [
+        f"simulated {status.stamp_ns / 1e9:.3f} s: {status.step_count:,} control periods, {taken:,} commands "
+        f"({lost:,} lost, {refused:,} refused), {collisions:,} collisions"
+    ]
+    if status.mode == "streaming":
+        dropped = sum(sensor.dropped_count for sensor in status.sensors)
+        lines.append(
+            f"{status.overrun_count:,} overruns, time was delayed by {status.slipped_ns / 1e9:.3f} s, "
+            f"{dropped:,} frames were dropped or lost"
+        )
+    if undelivered := _undelivered(status):
+        lines.append(f"[yellow]{undelivered:,} messages were lost by reliable readers that were too slow[/]")
+    return lines
+
+
+def _undelivered(status: SimulatorStatus) -> int:
+    return sum(entry.undelivered_count for entry in (*status.sensors, *status.vehicles))
+
+
+def _summary(status: SimulatorStatus) -> str:
+    text = f"{status.phase} {status.reason}" if status.phase != "running" else "running"
+    parts = [f"{text}, {status.stamp_ns / 1e9:.2f} s"]
+    if status.phase == "running":
+        parts.append(f"{status.real_time_factor:.2f} x real time")
+        if status.mode == "streaming":
+            parts.append(f"late {status.late_p99_ns / 1e6:.2f} ms (p99)")
+        lost = sum(v.lost_count for v in status.vehicles) + sum(s.dropped_count for s in status.sensors)
+        parts.append(f"{lost + _undelivered(status):,} lost")
+        if status.reason:
+            parts.append(f"[yellow]{status.reason}[/]")
+        if any(vehicle.fail_safe for vehicle in status.vehicles):
+            parts.append("[red]fail-safe[/]")
+    return ", ".join(parts)
