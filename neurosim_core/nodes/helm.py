@@ -72,6 +72,8 @@ class Helm:
         self.counts = HelmCounts()
         self._since_ns = 0
         self._instead: Command | None = None
+        self._first: Command | None = None
+        """Where it hovers before the first command."""
 
     def reset(self, *, seed: int) -> None:
         """Forget all commands and begin again."""
@@ -79,7 +81,7 @@ class Helm:
         self.holds = None
         self.counts = HelmCounts()
         self._since_ns = 0
-        self._instead = None
+        self._instead = self._first = None
 
     @property
     def fail_safe(self) -> bool:
@@ -100,7 +102,7 @@ class Helm:
             observe: Gives the state of the vehicle at the tick.
 
         Returns:
-            Mode and setpoint; the setpoint is None as long as no command has come.
+            Mode and setpoint; the setpoint is None as long as no command has come and it does not hover.
         """
         arrived: list[tuple[int, Any]] = self.channel.due(stamp_ns)
         if arrived:
@@ -110,7 +112,10 @@ class Helm:
             self.counts.superseded += len(arrived) - 1
             self._instead = None
         if self.holds is None:
-            return "motor_speeds", None
+            if self.live.begin == "command" or self.live.mode == "lockstep":
+                return "motor_speeds", None
+            self._first = self._first or _hover(observe())
+            return self._first.mode, self._first.setpoint
         if not self.fail_safe and self.age_ns(stamp_ns) > round(self.live.command_timeout_s * 1e9):
             self.counts.fail_safe += 1
             self._instead = self._give_up(self.holds, observe)
@@ -126,5 +131,9 @@ class Helm:
             return stale
         if self.live.fail_safe == "cut":
             return Command(mode="motor_speeds", setpoint=self._lowest)
-        state = observe()
-        return Command(mode="position", setpoint=np.array([*state.position, heading_rad(state.orientation)]))
+        return _hover(observe())
+
+
+def _hover(state: Odometry) -> Command:
+    """Return the command to stay where a vehicle is."""
+    return Command(mode="position", setpoint=np.array([*state.position, heading_rad(state.orientation)]))

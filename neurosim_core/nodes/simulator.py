@@ -212,12 +212,14 @@ class Simulator:
     def _receive(self) -> bool:
         """Take in the commands of a control period; False if something else has to be done first.
 
-        The first commands of a run begin its time, once those who came with them are connected.
+        The first commands of a run begin its time, once those who came with them are connected; with
+        `live.begin: hover` it begins at once.
         """
         live, first = self.config.live, self._tick == 0
         if live.mode == "streaming" and (self._flown or not first):
             return True  # taken in at the end of the period before
-        for craft in self.crafts:
+        hovers = live.mode == "streaming" and live.begin == "hover"
+        for craft in () if hovers else self.crafts:
             if craft.answers_ns is not None and self._tick % live.command_every == 0:
                 command = self._wait_for_command(craft)
                 if command is None:

@@ -903,7 +903,9 @@ def test_a_simulator_that_vanishes_is_an_error_in_diagnostics(monkeypatch):
 
         def told(name):
             found = statuses(diagnostics).get(name)
-            level = {s.name.partition(": ")[2]: s.level for s in diagnostics.messages()[-1:] for s in s.status}
+            level = {
+                s.name.partition(": ")[2]: s.level for s in diagnostics.messages()[-1:] for s in s.status
+            }
             return found and (level[name], found["message"])
 
         rig.update_until(lambda: told("bridge") == (b"\1", "no Cortex topics: no simulator runs"))

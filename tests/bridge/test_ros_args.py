@@ -196,11 +196,22 @@ def test_the_command_does_what_launch_asks(dds_domain: int, runtime: Path) -> No
     """Through DDS, without rclpy: node, namespace and topic are as they were remapped."""
     ros = DdsBackend(distro="jazzy", node_name="listener")
     got: list[bytes] = []
-    arguments = ("-r", "__node:=eye", "-r", "__ns:=/sim", "-r", "/sim/drone/imu:=/gyro", "-p", "exclude:=['*/x']")
+    arguments = (
+        "-r",
+        "__node:=eye",
+        "-r",
+        "__ns:=/sim",
+        "-r",
+        "/sim/drone/imu:=/gyro",
+        "-p",
+        "exclude:=['*/x']",
+    )
     try:
         with Node("simulator") as simulator:
             sent = simulator.publisher("/drone/imu", msg.Imu)
-            with BridgeProcess("-v", "--backend", "dds", "--distro", "jazzy", "--ros-args", *arguments) as bridge:
+            with BridgeProcess(
+                "-v", "--backend", "dds", "--distro", "jazzy", "--ros-args", *arguments
+            ) as bridge:
                 bridge.wait_for("/drone/imu -> /gyro")
                 assert "/sim/eye: dds" in bridge.said
                 ros.subscription("/gyro", "sensor_msgs/msg/Imu", Qos(), got.append)

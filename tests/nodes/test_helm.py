@@ -44,6 +44,17 @@ def test_nothing_holds_before_the_first_command():
     assert helm.age_ns(500 * MS) == 0
 
 
+def test_it_may_hover_where_it_starts_until_the_first_command():
+    helm = make_helm(begin="hover", command_timeout_s=0.2)
+    for stamp_ns in (0, 500 * MS):
+        mode, setpoint = held(helm, stamp_ns)
+        assert (mode, setpoint.tolist()) == ("position", pytest.approx([1.0, 2.0, 3.0, 0.7]))
+    assert (helm.fail_safe, helm.counts.fail_safe) == (False, 0)
+    helm.send(command(1.0), stamp_ns=600 * MS)
+    assert held(helm, 600 * MS)[0] == "rates"
+    assert held(make_helm(begin="hover", mode="lockstep"), 0) == ("motor_speeds", None)
+
+
 def test_a_command_holds_until_the_next():
     helm = make_helm()
     helm.send(command(1.0), stamp_ns=0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from live_rig import IMU, LiveRig, count_free, drain, make_config, models_of
+from live_rig import IMU, ODOMETRY, LiveRig, count_free, drain, make_config, models_of
 from processes import SOON_S, wait_for
 from rich.console import Console
 
@@ -334,6 +334,17 @@ def test_an_answer_counts_from_the_next_tick_on():
             m.stamp_ns for m in iter(lambda: speeds.recv(SOON_S), None) if m.speed[0] > rig.hover()[0] + 1
         )
     assert felt >= state.stamp_ns + 2 * PERIOD_NS
+
+
+def test_time_may_begin_with_a_hover():
+    """Before anybody has sent a command everything flows, and the vehicle stays where it starts."""
+    with LiveRig(make_config(sensors={"odometry": ODOMETRY}, **{"live.begin": "hover"})) as rig:
+        states = rig.listen("/drone/odometry", Odometry)
+        first, *_, last = [states.recv(SOON_S) for _ in range(50)]
+        assert last.stamp_ns > first.stamp_ns
+        np.testing.assert_allclose(last.position, first.position, atol=0.02)
+        rig.send([0.0, 0.0, 1.0, 0.0], mode="velocity")
+        wait_for(lambda: states.recv(SOON_S).velocity[2] > 0.5)
 
 
 def test_factor_0_does_not_wait():
