@@ -26,12 +26,12 @@ from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Wherea
 from cortex_ros2_bridge.routes import (
     CORTEX_TYPES,
     INFO,
-    SHARED,
     Route,
     Seen,
     look,
     make_routes,
     odometry_of,
+    shared_topics,
     unfit,
     vehicle_of,
 )
@@ -49,7 +49,6 @@ UNFIT_S = 5.0
 """So long after the first topics are seen, settings that fit none of them are said [s]."""
 TWICE_S = 12.0
 """So long others may publish our topics too: DDS forgets a bridge that was killed after 10 s [s]."""
-TF_STATIC = "/tf_static"
 
 Key = tuple[str, str, str, str]
 
@@ -126,7 +125,8 @@ class Bridge:
         self.problems: list[str] = []
         self._backend = backend
         self._node = node
-        self._frames = config.frames
+        self._frames = config.frame_names
+        self._tf_static = config.ros_topic("/tf_static")
         self._lock = threading.RLock()
         self._closed = False
         self._seen: Seen | None = None
@@ -142,16 +142,15 @@ class Bridge:
         self._static = StaticTransforms(self._frames)
         self._resources = contextlib.ExitStack()
         self._static_publisher: RosPublisher | None = None
+        about = config.ros_topic(diagnostics.TOPIC)
         self._diagnostics = self._ros_publishers.take(
-            self._resources,
-            diagnostics.TOPIC,
-            lambda: backend.publisher(diagnostics.TOPIC, diagnostics.TYPE, QOS["default"]),
+            self._resources, about, lambda: backend.publisher(about, diagnostics.TYPE, QOS["default"])
         )
         self._diagnosed_s = time.monotonic()
         self._unfit_s: float | None = None
         self._twice_s: float | None = None
         self._notes: list[str] = []
-        self._was_routed = False
+        self._was_routed = self._had_routes = False
         self._failed_s: float | None = None
         self._failure = ""
 
@@ -193,6 +192,17 @@ class Bridge:
                 self._look_at_others(seen, now_s)
                 self._diagnose(now_s - self._diagnosed_s)
                 self._diagnosed_s = now_s
+
+    def reconfigure(self, config: BridgeConfig) -> None:
+        """Go on with other settings; routes that they change or leave out are closed, and opened anew."""
+        with self._lock:
+            seen = self._seen or Seen()
+            wanted = {route.key: route for route in make_routes(seen, config)[0]}
+            there = {topic.topic for topic in seen.topics} | {name for name, _ in seen.services}
+            for key, link in list(self._links.items()):
+                if link.route.cortex_topic in there and wanted.get(key) != link.route:
+                    self._close_link(key)
+            self.config, self._seen = config, None
 
     def routes(self) -> list[Route]:
         """Return the routes that are open now."""
@@ -250,6 +260,7 @@ class Bridge:
         if not count and self._was_routed:
             logger.info("the Cortex side has gone; its routes stay open for %g s", GONE_S)
         self._was_routed = count > 0
+        self._had_routes |= self._was_routed
 
     def _make_way(self, routes: Iterable[Route]) -> None:
         """Close routes whose Cortex side has gone, if others need their ROS topics in another way."""
@@ -294,7 +305,7 @@ class Bridge:
             lambda: self._backend.publisher(route.ros_topic, route.ros_type, route.qos),
         )
         feed = self._feed(route.cortex_topic, route.cortex_type, stack)
-        if route.ros_topic == TF_STATIC:
+        if route.ros_topic == self._tf_static:
             tally = Tally(str(route))
             source = route.cortex_topic
             self._tap(feed, lambda message: self._take_transform(source, message, tally), lambda: True, stack)
@@ -411,13 +422,14 @@ class Bridge:
 
     def _of_another_bridge(self, now_s: float) -> list[str]:
         """Say that others publish what we do: then ROS gets every message twice, and Cortex every command."""
-        ours = {route.ros_topic for route in self.routes() if route.direction == "out"} - SHARED
+        ours = {route.ros_topic for route in self.routes() if route.direction == "out"}
+        ours -= shared_topics(self.config)
         twice = sorted({t.topic for t in self._backend.topics() if t.publisher_count and t.topic in ours})
         if not twice:
             self._twice_s = None
             return []
         self._twice_s = now_s if self._twice_s is None else self._twice_s
-        twins = [n for n in self._node.nodes() if n.node != self._node.id and n.name == self.config.node]
+        twins = [n for n in self._node.nodes() if n.node != self._node.id and n.name == self._node.name]
         if not twins and now_s - self._twice_s < TWICE_S:
             return []
         who = ", ".join(f"{twin.name}, process {twin.pid} on {twin.host}" for twin in twins)
@@ -458,8 +470,9 @@ class Bridge:
     def _keep_static(self) -> None:
         """Forget the transforms of routes that are closed."""
         routes = self.routes()
-        sources = {r.cortex_topic for r in routes if r.ros_topic == TF_STATIC}
-        self._static.keep(sources, {vehicle_of(r.cortex_topic) for r in routes if r.ros_topic == "/tf"})
+        sources = {r.cortex_topic for r in routes if r.ros_topic == self._tf_static}
+        moving = self.config.ros_topic("/tf")
+        self._static.keep(sources, {vehicle_of(r.cortex_topic) for r in routes if r.ros_topic == moving})
 
     def _whereabouts_of(self, vehicle: str) -> Whereabouts:
         if vehicle not in self._vehicles:
@@ -488,12 +501,14 @@ class Bridge:
             if self._static_publisher is None:
                 self._static_publisher = self._ros_publishers.take(
                     self._resources,
-                    TF_STATIC,
-                    lambda: self._backend.publisher(TF_STATIC, "tf2_msgs/msg/TFMessage", QOS["latched"]),
+                    self._tf_static,
+                    lambda: self._backend.publisher(
+                        self._tf_static, "tf2_msgs/msg/TFMessage", QOS["latched"]
+                    ),
                 )
             self._static_publisher.publish(self._static.message())
         except BackendError as error:
-            logger.warning("%s: %s", TF_STATIC, error)
+            logger.warning("%s: %s", self._tf_static, error)
 
     def _tell_failure(self, error: Exception) -> None:
         """Say a mistake once a second at most, and on /diagnostics."""
@@ -509,11 +524,18 @@ class Bridge:
         """Publish how everything is doing."""
         failure, self._failure = self._failure, ""
         wrong = self.problems + self._notes + ([self._backend.trouble] if self._backend.trouble else [])
+        gone = [link for link in self._links.values() if link.gone_s is not None]
+        missing = "" if self._was_routed else "no Cortex topics: no simulator runs"
+        if missing and self._had_routes:
+            missing = "the Cortex side has gone"
+        level = diagnostics.WARN if wrong or missing else diagnostics.OK
+        if failure or (missing and self._had_routes):
+            level = diagnostics.ERROR
         statuses = [
             diagnostics.Status(
                 name="bridge",
-                level=diagnostics.ERROR if failure else diagnostics.WARN if wrong else diagnostics.OK,
-                message="; ".join([failure, *wrong] if failure else wrong) or f"{len(self._links)} routes",
+                level=level,
+                message="; ".join(filter(None, [failure, missing, *wrong])) or f"{len(self._links)} routes",
                 values=(
                     ("backend", self._backend.name),
                     ("distro", self._backend.distro),
@@ -524,6 +546,13 @@ class Bridge:
         ]
         for link in self._links.values():
             now = link.tally.totals()
+            if link in gone:
+                statuses.append(
+                    diagnostics.Status(
+                        name=str(link.route), level=diagnostics.STALE, message="its Cortex topic has gone"
+                    )
+                )
+                continue
             statuses.append(
                 diagnostics.route_status(
                     str(link.route),

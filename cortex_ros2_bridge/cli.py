@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import functools
 import gc
 import importlib.metadata
 import logging
@@ -12,13 +14,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import yaml
 
 from cortex import Node
 from cortex_ros2_bridge.config import (
+    ROOTED,
+    SETTINGS,
     BridgeConfig,
     check_cortex_domain,
     check_distro,
@@ -26,9 +30,14 @@ from cortex_ros2_bridge.config import (
     load,
 )
 from cortex_ros2_bridge.options import OPTIONS
-from cortex_ros2_bridge.routes import ROOTED, Route, Seen, known_options, look, make_routes, unfit
+from cortex_ros2_bridge.ros_args import RosArguments, split
+from cortex_ros2_bridge.routes import Route, Seen, known_options, look, make_routes, unfit
+
+logger = logging.getLogger(__name__)
 
 INTERRUPTED = 130
+_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides")
+"""Parameters that ROS gives to every node, without a meaning for this one."""
 LIST_S = 1.5
 """How long `--list` and `--print-config` look for nodes [s]."""
 SETTLED_S = 0.3
@@ -55,13 +64,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from cortex_ros2_bridge import bench
 
         return bench.main(arguments[1:])
-    options = _parser().parse_args(arguments)
-    _log_to_console(verbose=options.verbose)
     try:
-        config = _config(options)
+        arguments, ros = split(arguments)
+        options = _parser().parse_args(arguments)
+        _log_to_console(logging.DEBUG if options.verbose else ros.log_level or logging.INFO)
+        make, given = _settings(options, ros)
         if options.list or options.print_config:
-            return _show(config, as_yaml=options.print_config)
-        return _bridge(config)
+            return _show(make(given), as_yaml=options.print_config)
+        return _bridge(make, given, beside=options.beside)
     except KeyboardInterrupt:
         return INTERRUPTED
     except (ValueError, OSError, ImportError, RuntimeError) as error:
@@ -95,13 +105,32 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--list", action="store_true", help="print which topic would go where, and exit")
     parser.add_argument("--print-config", action="store_true", help="print all settings as YAML, and exit")
     parser.add_argument("--verbose", "-v", action="store_true", help="say when topics are subscribed to, too")
-    # `ros2 launch` appends these to every node.
-    parser.add_argument("--ros-args", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--beside", action="store_true", help="run although another bridge publishes the same topics"
+    )
     return parser
 
 
-def _config(options: argparse.Namespace) -> BridgeConfig:
-    config = load(options.config)
+def _settings(
+    options: argparse.Namespace, ros: RosArguments
+) -> tuple[Callable[[Mapping[str, Any]], BridgeConfig], dict[str, Any]]:
+    """Return what makes settings of ROS parameters, and the parameters that are given."""
+    for argument in ros.useless:
+        logger.warning("--ros-args: %s has no effect", argument)
+    first = _config(options, ros, {})
+    given = {}
+    for name, value in ros.parameters_of(first.node, first.namespace).items():
+        key = name.partition(".")[0]
+        if key in SETTINGS:
+            given[name] = value
+        elif key not in _EVERY_NODE:
+            logger.warning("no parameter is called %s, known: %s", name, ", ".join(SETTINGS))
+    return functools.partial(_config, options, ros), given
+
+
+def _config(options: argparse.Namespace, ros: RosArguments, parameters: Mapping[str, Any]) -> BridgeConfig:
+    """Return settings: those of the file, over them parameters, over them options, over them remappings."""
+    config = load(options.config, parameters)
     checks: dict[str, Callable[[str, object], Any]] = {
         "backend": lambda _, value: value,
         "distro": check_distro,
@@ -113,7 +142,9 @@ def _config(options: argparse.Namespace) -> BridgeConfig:
         for name, check in checks.items()
         if (value := getattr(options, name)) is not None
     }
-    return dataclasses.replace(config, **changes)
+    config = dataclasses.replace(config, **changes)
+    node, namespace = ros.names(config.node, config.namespace)
+    return dataclasses.replace(config, node=node, namespace=namespace, ros=ros)
 
 
 def _version() -> str:
@@ -123,28 +154,71 @@ def _version() -> str:
         return "of a source tree"
 
 
-def _bridge(config: BridgeConfig) -> int:
-    """Bridge until interrupted."""
+def _bridge(
+    make: Callable[[Mapping[str, Any]], BridgeConfig], given: Mapping[str, Any], *, beside: bool
+) -> int:
+    """Bridge until interrupted.
+
+    Args:
+        make: Makes settings of ROS parameters.
+        given: The parameters.
+        beside: Run although another bridge publishes the same topics.
+    """
+    config = make(given)
     stop = _stop_at_signals(forced=not config.backend.endswith(".mcap"))
     from cortex_ros2_bridge.backend.choose import open_backend
     from cortex_ros2_bridge.bridge import Bridge
+    from cortex_ros2_bridge.parameters import Parameters
 
-    backend = open_backend(
-        config.backend, node_name=config.node, namespace=config.namespace, distro=config.distro
-    )
-    try:
-        with Node(config.node, domain=config.cortex_domain) as node, Bridge(config, backend, node) as bridge:
+    with contextlib.ExitStack() as stack:
+        node = stack.enter_context(Node(_identity(config), domain=config.cortex_domain))
+        if not beside:
+            _refuse_second(node)
+        backend = open_backend(
+            config.backend, node_name=config.node, namespace=config.namespace, distro=config.distro
+        )
+        try:
+            bridge = stack.enter_context(Bridge(config, backend, node))
+            parameters = Parameters(bridge, backend, make, given)
+            stack.callback(parameters.close)
             where = getattr(backend, "directory", None)
             into = f" into {where}/ (rosbag2)" if where is not None else ""
             how = f"{backend.name}{into}, {backend.distro}"
-            _say(f"/{config.node}: {how}; waiting for Cortex topics, Ctrl-C ends")
+            _say(f"{config.namespace}/{config.node}: {how}; waiting for Cortex topics, Ctrl-C ends")
             gc.collect()
             gc.freeze()  # what is there stays; the collector need not look at it again and again
             sys.setswitchinterval(SWITCH_S)
             bridge.run(stop)
-    finally:
-        backend.close()
+        finally:
+            stack.close()
+            backend.close()
     return 0
+
+
+def _identity(config: BridgeConfig) -> str:
+    """Return what a bridge is called in Cortex: two of one name publish the same topics."""
+    if config.backend.endswith(".mcap"):
+        return f"{config.node} into {config.backend}"
+    return f"{config.node} in ROS domain {os.environ.get('ROS_DOMAIN_ID') or '0'}, {config.namespace or '/'}"
+
+
+def _refuse_second(node: Node) -> None:
+    """Raise `RuntimeError` if a living bridge of this host, or any of another one, has the same name."""
+    node.wait_for_registry(LIST_S)
+    begin_s = time.monotonic()
+    while True:
+        records = node.nodes()
+        host = next(record.host for record in records if record.node == node.id)
+        twins = [record for record in records if record.node != node.id and record.name == node.name]
+        for twin in twins:
+            if twin.host != host or os.path.exists(f"/proc/{twin.pid}"):
+                raise RuntimeError(
+                    f"another bridge runs already ({twin.name}; process {twin.pid} on {twin.host}): ROS "
+                    "would get everything twice. End it, give this one a --namespace, or say --beside"
+                )
+        if time.monotonic() - begin_s > SETTLED_S:
+            return
+        time.sleep(0.02)
 
 
 def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
@@ -198,16 +272,16 @@ def _row(route: Route) -> tuple[str, str, str, str]:
 
 def to_yaml(config: BridgeConfig, routes: Sequence[Route]) -> str:
     """Return settings as YAML that `load` reads back, with the routes that there are now as entries."""
-    settings: dict[str, Any] = {
-        name.name: getattr(config, name.name) for name in dataclasses.fields(BridgeConfig)
-    }
+    settings: dict[str, Any] = {name: getattr(config, name) for name in SETTINGS}
     settings |= {"include": list(config.include), "exclude": list(config.exclude)}
     settings |= {"rename": dict(config.rename), "frames": dataclasses.asdict(config.frames)}
     settings["routes"] = [
         {
             "cortex": route.cortex_topic,
             "type": route.ros_type,
-            "ros": route.ros_topic.removeprefix("" if route.ros_topic in ROOTED else config.namespace),
+            "ros": route.ros_topic
+            if route.ros_topic in ROOTED
+            else route.ros_topic.removeprefix(config.namespace),
             "qos": dataclasses.asdict(route.qos),
             "options": {
                 name: route.options.get(name, OPTIONS[name].default) for name in sorted(known_options(route))
@@ -221,15 +295,15 @@ def to_yaml(config: BridgeConfig, routes: Sequence[Route]) -> str:
     )
 
 
-def _log_to_console(*, verbose: bool) -> None:
-    """Print what the bridge logs, a line each."""
+def _log_to_console(level: int) -> None:
+    """Print what the bridge logs from a level on, a line each."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
     for name in ("cortex", "cortex_ros2_bridge"):
         logger = logging.getLogger(name)
         logger.handlers[:] = [handler]
         logger.propagate = False
-    logging.getLogger("cortex_ros2_bridge").setLevel(logging.DEBUG if verbose else logging.INFO)
+    logging.getLogger("cortex_ros2_bridge").setLevel(level)
 
 
 def _say(text: str) -> None:

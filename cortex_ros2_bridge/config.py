@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -16,6 +16,7 @@ from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.backend.names import check_node_name
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.options import OPTIONS, check_option
+from cortex_ros2_bridge.ros_args import RosArguments, nest
 from cortex_ros2_bridge.typestore import DISTROS
 
 _ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -30,6 +31,8 @@ QOS: Mapping[str, Qos] = MappingProxyType(
     }
 )
 """Quality of service by the names that YAML may use."""
+ROOTED = frozenset({"/clock", "/tf", "/tf_static", "/diagnostics"})
+"""ROS topics that every node expects under these very names: a namespace goes before them on request only."""
 
 
 class ConfigError(ValueError):
@@ -51,6 +54,8 @@ class RouteChange:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the conversion, see README.md."""
     enabled: bool = True
+    label: str = ""
+    """Name of the entry among ROS parameters: `routes.LABEL.qos`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +72,8 @@ class BridgeConfig:
     """Name of the ROS node."""
     namespace: str = ""
     """Goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics."""
+    isolate: bool = False
+    """Whether the namespace goes before these, too, and before the names of frames."""
     frames: FrameNames = field(default_factory=FrameNames)
     """Names of frames in ROS."""
     defaults: bool = True
@@ -79,13 +86,31 @@ class BridgeConfig:
     """Beginnings of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
     routes: tuple[RouteChange, ...] = ()
     """Changes, in order; later ones win."""
+    ros: RosArguments = field(default_factory=RosArguments)
+    """What followed `--ros-args`; no setting of the file."""
+
+    def ros_topic(self, name: str) -> str:
+        """Return the full name of a topic or service in ROS: with its namespace, and remapped."""
+        full = name if name in ROOTED and not self.isolate else self.namespace + name
+        return self.ros.remap(full, self.node, self.namespace)
+
+    @property
+    def frame_names(self) -> FrameNames:
+        """Names of frames, with the namespace before them where it isolates."""
+        if not self.isolate or self.frames.prefix or not self.namespace:
+            return self.frames
+        return replace(self.frames, prefix=f"{self.namespace.strip('/')}/")
 
 
-def load(source: str | Path | Mapping[str, Any] | None) -> BridgeConfig:
+def load(
+    source: str | Path | Mapping[str, Any] | None, parameters: Mapping[str, Any] | None = None
+) -> BridgeConfig:
     """Read settings and check them.
 
     Args:
         source: A YAML file, a mapping with the same keys, or None for the defaults.
+        parameters: ROS parameters by their dotted names, such as {"frames.map": "world"}; they win. Entries
+            of `routes` have labels here: {"routes.imu.cortex": "/drone/imu", "routes.imu.qos": "latched"}.
 
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is not what it must be.
@@ -101,7 +126,7 @@ def load(source: str | Path | Mapping[str, Any] | None) -> BridgeConfig:
     else:
         raw = source
     try:
-        return _bridge_config({} if raw is None else raw)
+        return _bridge_config(_merged({} if raw is None else raw, nest(parameters or {})))
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}" if isinstance(source, str | Path) else str(error)) from None
 
@@ -162,13 +187,39 @@ def qos_changes(key: str, value: object) -> dict[str, Any]:
     return dict(changes)
 
 
+def _merged(raw: object, parameters: Mapping[str, Any]) -> object:
+    """Return settings with parameters put in."""
+    if not parameters or not isinstance(raw, Mapping):
+        return raw
+    given = dict(raw)
+    for key, value in parameters.items():
+        if key == "routes" and isinstance(value, Mapping):
+            entries = [dict(entry) if isinstance(entry, Mapping) else entry for entry in given.get(key) or []]
+            labelled = {entry.get("label"): entry for entry in entries if isinstance(entry, dict)}
+            for label, changes in value.items():
+                if label not in labelled:
+                    labelled[label] = {"label": label}
+                    entries.append(labelled[label])
+                for name, change in changes.items() if isinstance(changes, Mapping) else ():
+                    before = labelled[label].get(name)
+                    if isinstance(before, Mapping) and isinstance(change, Mapping):
+                        change = {**before, **change}
+                    labelled[label][name] = change
+            given[key] = entries
+        elif isinstance(value, Mapping) and isinstance(given.get(key), Mapping):
+            given[key] = {**given[key], **value}
+        else:
+            given[key] = value
+    return given
+
+
 def _bridge_config(raw: object) -> BridgeConfig:
     given = dict(_mapping("the settings", raw))
     if "domain" in given and "cortex_domain" not in given:
         given["cortex_domain"] = given.pop("domain")  # its old name, which is easily taken for that of ROS
-    _refuse_unknown("", given, _CHECKS)
+    _refuse_unknown("", given, SETTINGS)
     return BridgeConfig(
-        **{key: _CHECKS[key](key, value) for key, value in given.items() if value is not None}
+        **{key: SETTINGS[key](key, value) for key, value in given.items() if value is not None}
     )
 
 
@@ -251,6 +302,8 @@ def _route_change(key: str, value: object) -> RouteChange:
         checked["qos"] = qos_changes(f"{key}.qos", given["qos"])
     if given.get("options") is not None:
         checked["options"] = _options(f"{key}.options", given["options"])
+    if given.get("label") is not None:
+        checked["label"] = _text(f"{key}.label", given["label"])
     if given.get("enabled") is not None:
         checked["enabled"] = _flag(f"{key}.enabled", given["enabled"])
     return RouteChange(**checked)
@@ -306,13 +359,14 @@ def _ros_name(key: str, value: object) -> str:
     return text
 
 
-_CHECKS: Mapping[str, Callable[[str, object], Any]] = {
+SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
     "backend": _text,
     "distro": check_distro,
     "cortex_domain": check_cortex_domain,
     "node": _node_name,
     "namespace": check_namespace,
     "frames": _frame_names,
+    "isolate": _flag,
     "defaults": _flag,
     "include": _patterns,
     "exclude": _patterns,

@@ -13,7 +13,7 @@ from cortex_ros2_bridge.tally import Totals
 TOPIC = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
-OK, WARN, ERROR = 0, 1, 2
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels, as in diagnostic_msgs/DiagnosticStatus."""
 
 

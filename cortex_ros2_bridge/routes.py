@@ -30,8 +30,6 @@ CORTEX_TYPES: Mapping[str, type[Any]] = {
 }
 """The standard messages of Cortex by the names that discovery shows."""
 
-ROOTED = frozenset({"/clock", "/tf", "/tf_static", "/diagnostics"})
-"""ROS topics that every node expects under these very names: no namespace goes before them."""
 SHARED = frozenset({"/tf", "/tf_static", "/diagnostics"})
 """ROS topics that several routes may publish on."""
 INFO = "/info"
@@ -53,6 +51,8 @@ class Route:
     qos: Qos = field(default_factory=Qos)
     options: Mapping[str, Any] = field(default_factory=dict)
     """Of the conversion."""
+    label: str = ""
+    """Its name among ROS parameters, if the settings give one."""
 
     @property
     def key(self) -> tuple[str, str, str, str]:
@@ -205,7 +205,12 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
             routes.append(_changed(route, fitting, config, images))
             _note_options(route, config, unused)
     problems += _useless(seen, config) + _useless_options(config, unused)
-    return _without_conflicts(routes, problems), problems
+    return _without_conflicts(routes, problems, shared_topics(config)), problems
+
+
+def shared_topics(config: BridgeConfig) -> frozenset[str]:
+    """Return the ROS topics on which several routes may publish."""
+    return frozenset(config.ros_topic(name) for name in SHARED)
 
 
 def known_options(route: Route) -> frozenset[str]:
@@ -346,12 +351,13 @@ def _changed(
         config: All settings.
         images: ROS topics of the images that have been named so far, by Cortex topic; added to.
     """
-    name, named = route.ros_topic, False
+    name, named, label = route.ros_topic, False, ""
     qos: dict[str, Any] = {}
     options: dict[str, Any] = {}
     for change in changes:
         qos |= change.qos
         options |= change.options
+        label = change.label if change.type is not None else label
         if change.ros is not None and (change.type is not None or _is_main(route)):
             name, named = change.ros.format(topic=route.cortex_topic), True
     if named and route.ros_type == "sensor_msgs/msg/Image":
@@ -361,10 +367,12 @@ def _changed(
     if not named:
         old = max((o for o in config.rename if name == o or name.startswith(o + "/")), key=len, default=None)
         name = name if old is None else config.rename[old] + name[len(old) :]
-    if name not in ROOTED:
-        name = config.namespace + name
     return dataclasses.replace(
-        route, ros_topic=name, qos=dataclasses.replace(route.qos, **qos), options=options
+        route,
+        ros_topic=config.ros_topic(name),
+        qos=dataclasses.replace(route.qos, **qos),
+        options=options,
+        label=label,
     )
 
 
@@ -373,7 +381,7 @@ def _is_main(route: Route) -> bool:
     return next(rule for rule in RULES if rule.cortex_type == route.cortex_type).ros_type == route.ros_type
 
 
-def _without_conflicts(routes: Iterable[Route], problems: list[str]) -> list[Route]:
+def _without_conflicts(routes: Iterable[Route], problems: list[str], shared: frozenset[str]) -> list[Route]:
     """Leave out what ROS would not allow or what would make a circle, and say so."""
     kept: dict[str, Route] = {}
     found: dict[tuple[str, str, str, str], Route] = {}
@@ -390,7 +398,7 @@ def _without_conflicts(routes: Iterable[Route], problems: list[str]) -> list[Rou
             other is not None
             and other.direction == "out"
             and other.cortex_topic != route.cortex_topic
-            and route.ros_topic not in SHARED
+            and route.ros_topic not in shared
         ):
             reason = f"{other} has that topic already; rename one of them"
         elif other is not None and other.qos != route.qos:

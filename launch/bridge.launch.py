@@ -2,7 +2,8 @@
 
     ros2 launch neurosim bridge.launch.py namespace:=/neurosim config:=bridge.yaml
 
-`ros2 launch neurosim bridge.launch.py --show-args` explains the arguments. Nothing here imports rclpy.
+`ros2 launch neurosim bridge.launch.py --show-args` explains the arguments. It is a ROS node: `PushRosNamespace`,
+`SetRemap` and `SetParameter` around an include of this file hold for it. Nothing here imports rclpy itself.
 """
 
 from __future__ import annotations
@@ -15,8 +16,14 @@ from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
 
+try:
+    from launch_ros.actions import Node
+except ImportError:  # launch alone: names can then be set by arguments only
+    Node = None
+
 ARGUMENTS = {
     "config": ("", "settings of the bridge (YAML); none: all standard topics"),
+    "params_file": ("", "ROS parameters of the bridge (YAML); they win over `config`"),
     "namespace": ("", "goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics"),
     "backend": ("auto", "auto, rclpy or dds; or the name of a bag to write, such as run.mcap"),
     "distro": ("", "ROS distribution for the backend dds; none: ROS_DISTRO"),
@@ -28,11 +35,25 @@ ARGUMENTS = {
 def actions(context: Any) -> list[Any]:
     """Return the processes for the given arguments."""
     values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    command = [values["python"], "-m", "cortex_ros2_bridge", "--backend", values["backend"]]
-    for name in ("config", "namespace", "distro"):
+    arguments = ["-m", "cortex_ros2_bridge", "--backend", values["backend"]]
+    for name in ("config", "distro"):
         if values[name]:
-            command += [f"--{name}", values[name]]
-    return [ExecuteProcess(cmd=command, name="cortex_bridge", output="screen")]
+            arguments += [f"--{name}", values[name]]
+    if Node is not None:
+        node = Node(
+            executable=values["python"],
+            arguments=arguments,
+            name="cortex_bridge",
+            namespace=values["namespace"],
+            parameters=[values["params_file"]] if values["params_file"] else [],
+            output="screen",
+        )
+        return [node]
+    if values["namespace"]:
+        arguments += ["--namespace", values["namespace"]]
+    if values["params_file"]:
+        arguments += ["--ros-args", "--params-file", values["params_file"]]
+    return [ExecuteProcess(cmd=[values["python"], *arguments], name="cortex_bridge", output="screen")]
 
 
 def generate_launch_description() -> LaunchDescription:

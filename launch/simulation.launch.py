@@ -2,6 +2,8 @@
 
     ros2 launch neurosim simulation.launch.py scene:=house.yaml rviz:=true
 
+The vehicle hovers until somebody commands it; `controller:=path` flies its path.
+
 `ros2 launch neurosim simulation.launch.py --show-args` explains the arguments. When the simulator ends, all
 ends. Nothing here imports rclpy.
 """
@@ -30,9 +32,13 @@ ARGUMENTS = {
     "lockstep": ("false", "wait for the command of every control period instead of running in real time"),
     "factor": ("", "how much faster than real time; none: as in the settings"),
     "record": ("", "directory to record everything to"),
-    "controller": ("false", "fly the path with the controller that comes along"),
+    "controller": (
+        "hover",
+        "hover: hover until the first command; path: fly the path; none: time begins with the first command",
+    ),
     "namespace": ("", "goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics"),
     "bridge_config": ("", "settings of the bridge (YAML); none: all standard topics"),
+    "params_file": ("", "ROS parameters of the bridge (YAML)"),
     "backend": ("auto", "of the bridge: auto, rclpy or dds"),
     "distro": ("", "ROS distribution for the backend dds; none: ROS_DISTRO"),
     "rviz": ("false", "open RViz"),
@@ -42,6 +48,10 @@ ARGUMENTS = {
     "python": (sys.executable, "the Python that neurosim is installed for"),
 }
 """Defaults and explanations."""
+
+BRIDGE = ("namespace", "params_file", "backend", "distro", "python")
+"""Arguments that the bridge has, too."""
+CONTROLLERS = ("hover", "path", "none")
 
 HERE = Path(__file__).resolve().parent
 RVIZ_CONFIG = HERE.parent / "rviz" / "neurosim.rviz"
@@ -55,6 +65,9 @@ def actions(context: Any) -> list[Any]:
     serve += ["--lockstep"] if _is_true("lockstep", values) else []
     serve += ["--factor", values["factor"]] if values["factor"] else []
     serve += ["--record", values["record"]] if values["record"] else []
+    if values["controller"] not in CONTROLLERS:
+        raise ValueError(f"controller must be {' or '.join(CONTROLLERS)}, got {values['controller']!r}")
+    serve += ["--set", "live.begin=hover"] if values["controller"] == "hover" else []
     found: list[Any] = [
         ExecuteProcess(
             cmd=serve, name="simulator", output="screen", on_exit=Shutdown(reason="the simulator has ended")
@@ -63,11 +76,11 @@ def actions(context: Any) -> list[Any]:
             PythonLaunchDescriptionSource(str(HERE / "bridge.launch.py")),
             launch_arguments={
                 "config": values["bridge_config"],
-                **{name: values[name] for name in ("namespace", "backend", "distro", "python")},
+                **{name: values[name] for name in BRIDGE},
             }.items(),
         ),
     ]
-    if _is_true("controller", values):
+    if values["controller"] == "path":
         found.append(ExecuteProcess(cmd=[*neurosim, "fly"], name="controller", output="screen"))
     if _is_true("rerun", values):
         found.append(ExecuteProcess(cmd=[*neurosim, "view"], name="rerun", output="screen"))

@@ -103,6 +103,7 @@ def describe_status(
             "taken": vehicle.command_count,
             "age": _ms(vehicle.command_age_ns),
             "refused": vehicle.refused_count,
+            "clamped": vehicle.clamped_count,
             "replaced": vehicle.superseded_count,
             "lost": vehicle.lost_count,
             "fail-safe": vehicle.fail_safe_count,

@@ -21,6 +21,7 @@ from neurosim_core.live.messages import setpoint_of
 from neurosim_core.live.topics import COMMANDS, command_topic
 from neurosim_core.packets import Delivery, Odometry
 from neurosim_core.vehicle import MultirotorConfig
+from neurosim_core.vehicle.command_ranges import CommandRanges
 
 log = logging.getLogger(__name__)
 
@@ -54,11 +55,13 @@ class CommandCounts(NamedTuple):
     """Commands that a subscriber did not return since its last reset."""
 
     refused: int = 0
-    """Numbers that are not finite, or of a wrong shape."""
+    """Numbers that are not finite, of a wrong shape, or out of range where that is refused."""
     superseded: int = 0
     """Replaced by a newer command, or answers to a state that no control period waits for."""
     lost: int = 0
     """Never arrived."""
+    clamped: int = 0
+    """Out of range, and flown as the nearest command within it."""
 
 
 class CommandSubscriber:
@@ -67,28 +70,33 @@ class CommandSubscriber:
     Attributes:
         missed: The last command that did not fit what was waited for; None if there was none.
         refusal: Why the last command was refused; empty if none was.
+        clamping: What of the last command that was clamped was out of range; empty if none was.
     """
 
-    def __init__(self, node: Node, vehicle: str, *, rotor_count: int, lockstep: bool) -> None:
+    def __init__(
+        self, node: Node, vehicle: str, *, rotor_count: int, ranges: CommandRanges, lockstep: bool
+    ) -> None:
         """Subscribe.
 
         Args:
             node: Owner of the subscriptions.
             vehicle: Name of the vehicle.
             rotor_count: Numbers in a command of rotor speeds.
+            ranges: What the vehicle can be asked for; its controller clamps what is beyond.
             lockstep: Every command counts, and a sender that floods is held up.
         """
         policy = reliable(timeout_s=0.1) if lockstep else keep_last()
         self.vehicle = vehicle
         self.missed: Command | None = None
-        self.refusal = ""
+        self.refusal = self.clamping = ""
+        self._ranges = ranges
         self._widths = {mode: len(MODES[mode].layout) for mode in COMMANDS} | {"motor_speeds": rotor_count}
         self._subscribers: dict[CommandMode, Subscriber[Any]] = {
             cast(CommandMode, mode): node.subscriber(command_topic(vehicle, mode), message, policy=policy)
             for mode, message in COMMANDS.items()
         }
         self._sources: dict[CommandMode, set[int]] = {mode: set() for mode in self._subscribers}
-        self._refused = self._superseded = 0
+        self._refused = self._superseded = self._clamped = 0
         self._before = CommandCounts()
         self._last_mode = next(iter(self._subscribers))
         self._spins = lockstep
@@ -187,19 +195,33 @@ class CommandSubscriber:
                 self._refuse(str(error))
                 continue
             setpoint = setpoint_of(mode, message)
-            reason = _error_in(mode, setpoint, self._widths[mode])
+            reason = _error_in(mode, setpoint, self._widths[mode]) or self._excess(mode, setpoint)
             if not reason:
                 return Command(mode=mode, setpoint=setpoint, stamp_ns=message.stamp_ns)
             self._refuse(reason)
         return None
 
+    def _excess(self, mode: CommandMode, setpoint: NDArray[np.float64]) -> str:
+        """Return what is out of range where that is refused; else count it, and the controller clamps it."""
+        excess = self._ranges.excess(mode, setpoint.tolist())
+        if not excess or self._ranges.refuse:
+            return excess
+        self._clamped += 1
+        self.clamping = excess
+        self._log("clamped", self._clamped, excess)
+        return ""
+
     def _refuse(self, reason: str) -> None:
         self._refused += 1
         self.refusal = reason
+        self._log("refused", self._refused, reason)
+
+    def _log(self, what: str, count: int, reason: str) -> None:
+        """Log at most once a second."""
         now_s = time.monotonic()
         if now_s - self._logged_s >= _LOG_INTERVAL_S:
             self._logged_s = now_s
-            log.warning("%s: refused a command (%d so far): %s", self.vehicle, self._refused, reason)
+            log.warning("%s: %s a command (%d so far): %s", self.vehicle, what, count, reason)
 
     def _totals(self) -> CommandCounts:
         counters = [subscriber.counters for subscriber in self._subscribers.values()]
@@ -207,6 +229,7 @@ class CommandSubscriber:
             refused=self._refused,
             superseded=self._superseded + sum(c.overtaken for c in counters),
             lost=sum(c.lost for c in counters),
+            clamped=self._clamped,
         )
 
 
@@ -256,6 +279,7 @@ class CommandHold:
         self.link.reset(seed=seed)
         self.command: Command | None = None
         self.fail_safe: Command | None = None
+        self._first: Command | None = None
         self.taken_count = self.superseded_count = self.fail_safe_count = 0
         self._since_ns = 0
 
@@ -273,7 +297,7 @@ class CommandHold:
             observe: Returns the state of the vehicle at the tick.
 
         Returns:
-            Mode and setpoint; the setpoint is None before the first command.
+            Mode and setpoint; the setpoint is None before the first command, unless the vehicle hovers then.
         """
         arrived = self.link.due(stamp_ns)
         if arrived:
@@ -283,7 +307,10 @@ class CommandHold:
             self.superseded_count += len(arrived) - 1
             self.fail_safe = None
         if self.command is None:
-            return "motor_speeds", None
+            if self.live.begin == "command" or self.live.mode == "lockstep":
+                return "motor_speeds", None
+            self._first = self._first or _hover(observe())
+            return self._first.mode, self._first.setpoint
         if self.fail_safe is None and self.age_ns(stamp_ns) > round(self.live.command_timeout_s * 1e9):
             self.fail_safe_count += 1
             self.fail_safe = self._make_fail_safe(self.command, observe)
@@ -299,5 +326,9 @@ class CommandHold:
             return stale
         if self.live.fail_safe == "cut":
             return Command(mode="motor_speeds", setpoint=self._lowest)
-        state = observe()
-        return Command(mode="position", setpoint=np.array([*state.position, heading_rad(state.orientation)]))
+        return _hover(observe())
+
+
+def _hover(state: Odometry) -> Command:
+    """Return the command to stay where a vehicle is."""
+    return Command(mode="position", setpoint=np.array([*state.position, heading_rad(state.orientation)]))

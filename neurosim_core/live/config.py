@@ -30,6 +30,9 @@ class LiveConfig(Settings):
     fail_safe: FailSafe = "hover"
     """hover: stay where the command became stale; cut: rotors at their lowest speed; hold: keep the stale
     command."""
+    begin: Literal["command", "hover"] = "command"
+    """streaming: when time begins. command: with the first command; hover: at once, and each vehicle hovers
+    where it starts until its first command."""
     command_deadline_s: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
     """lockstep: longest wait for a command before the run ends with an error [wall-clock s]. The wait for the
     first command of a run has no limit."""

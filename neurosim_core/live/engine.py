@@ -12,33 +12,33 @@ from numpy.typing import NDArray
 from neurosim_core import packets as pkt
 from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
-from neurosim_core.pinned import PinError, PinnedMapping
-from neurosim_core.schedule import batch_end_ns
-from neurosim_core.simulation import (
+from neurosim_core.runtime.pinned import PinError, PinnedMapping
+from neurosim_core.sim import (
     COLLISION,
     Batch,
-    Begun,
     Model,
+    PendingStep,
     StartState,
     State,
+    acquire_rooms,
     begin_step,
     end_step,
     finish,
-    fly_period,
     free_lanes,
-    lend_rooms,
+    integrate_period,
     load_scene,
     make_fleet,
     make_state,
     observe,
     plan_paths,
     prepare_step,
-    see,
+    render_batch,
+    select_cameras,
     settle,
-    skip,
-    want,
+    skip_batch,
     warm_up,
 )
+from neurosim_core.sim.schedule import batch_end_ns
 
 __all__ = [
     "COLLISION",
@@ -97,12 +97,12 @@ class FlownBatch(NamedTuple):
     def frame_counts(self) -> Counter[str]:
         """Frames that it has to render: instants of an event camera, pictures of other cameras."""
         counts: Counter[str] = Counter()
-        for index, cast in enumerate(self.state.casts):
-            boundaries = [b for b in self.batch.boundaries if index in b.casts]
-            for name in self.batch.wanted.intersection(cast.events):
+        for index, group in enumerate(self.state.groups):
+            boundaries = [b for b in self.batch.boundaries if index in b.groups]
+            for name in self.batch.wanted.intersection(group.frames):
                 counts[name] += len(boundaries)
-            for name in self.batch.wanted.intersection(cast.images):
-                counts[name] += sum(cast.images[name].rate.has_tick(b.stamp_ns) for b in boundaries)
+            for name in self.batch.wanted.intersection(group.images):
+                counts[name] += sum(group.images[name].rate.has_tick(b.stamp_ns) for b in boundaries)
         return +counts
 
 
@@ -137,12 +137,12 @@ class VehicleEngine:
             acquire: Gives memory for pictures, in lockstep on a CUDA device.
         """
         self.model = model
-        self.camera_names = frozenset(name for cast in model.casts for name in cast.names)
+        self.camera_names = frozenset(name for group in model.groups for name in group.names)
         self.writes_in_place = lockstep and bool(wp.get_device(model.device).is_cuda)
         self._lockstep = lockstep
         self._acquire = acquire
         period_ns = model.schedule.control.stamp_ns(1)
-        slowest_ns = max((cast.rate.stamp_ns(1) for cast in model.casts), default=0)
+        slowest_ns = max((group.rate.stamp_ns(1) for group in model.groups), default=0)
         least, most = _PENDING_PERIODS
         self.period_count_max = min(max(-(-slowest_ns // period_ns), least), most)
         batch_ns = batch_end_ns(model.schedule, 0, period_ns)
@@ -164,7 +164,7 @@ class VehicleEngine:
         pending = 1 if self._lockstep else self._batches_per_period * (self.period_count_max + _SPARE_PERIODS)
         return make_state(
             self.model,
-            lane_count=1,
+            in_flight=1,
             flight_lane_count=pending,
             borrow_pictures=self._lockstep,
             late_pictures=self.writes_in_place,
@@ -180,10 +180,11 @@ class VehicleEngine:
     def configure(self, model: Model) -> None:
         """Go on with other settings: gains and links."""
         if model.config.control.gains != self.model.config.control.gains:
-            self.state.pilots.clear()
+            self.state.controllers.clear()
+            self.state.commands.clear()
         self.model = model
 
-    def begin_step(self, mode: CommandMode, setpoint: NDArray[Any] | None) -> Begun:
+    def begin_step(self, mode: CommandMode, setpoint: NDArray[Any] | None) -> PendingStep:
         """Launch a control period, without waiting for a CUDA device; `end_step` has to follow.
 
         Raises:
@@ -191,7 +192,7 @@ class VehicleEngine:
         """
         return begin_step(self.model, self.state, setpoint, mode=mode)
 
-    def end_step(self, pending: Begun) -> list[Packet]:
+    def end_step(self, pending: PendingStep) -> list[Packet]:
         """Wait for a control period, and return what its sensors yield in the order of time."""
         return end_step(self.model, self.state, pending)
 
@@ -202,11 +203,11 @@ class VehicleEngine:
 
     def acquire_buffers(self) -> None:
         """Acquire the memory for the pictures of the control period that was planned."""
-        lend_rooms(self.state)
+        acquire_rooms(self.state)
 
     def forget_plan(self) -> None:
         """Forget the control period that was planned: its pictures go elsewhere."""
-        self.state.ahead = None
+        self.state.planned = None
 
     def settle(self) -> None:
         """Wait until the device has written all pictures that `end_step` has returned."""
@@ -219,7 +220,7 @@ class VehicleEngine:
             DynamicsError: The integration failed.
             RuntimeError: Too many batches wait: see `can_fly`.
         """
-        packets, batches = fly_period(self.model, self.state, setpoint, mode=mode)
+        packets, batches = integrate_period(self.model, self.state, setpoint, mode=mode)
         return packets, [FlownBatch(self.state, batch) for batch in batches]
 
     def can_fly(self, *, drop: bool) -> bool:
@@ -233,16 +234,16 @@ class VehicleEngine:
 
     def render(self, flown: FlownBatch) -> list[Packet]:
         """Render the oldest batch that waits, in a thread other than the one that flies."""
-        return see(self.model, flown.state, flown.batch)
+        return render_batch(self.model, flown.state, flown.batch)
 
     def skip(self, flown: FlownBatch) -> None:
         """Drop the oldest batch that waits: the sequence of each camera shows the gap."""
-        skip(self.model, flown.state, flown.batch)
+        skip_batch(self.model, flown.state, flown.batch)
 
     def choose_cameras(self, names: Collection[str]) -> None:
         """Render these cameras, from the next control period on."""
         if self.state.wanted != (names := self.camera_names.intersection(names)):
-            want(self.model, self.state, names)
+            select_cameras(self.model, self.state, names)
 
     def observe(self) -> Odometry:
         """Return the true state at the end of what was flown."""

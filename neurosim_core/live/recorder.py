@@ -17,10 +17,11 @@ import numpy as np
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.flight import new_folder
+from neurosim_core.install import install_hint
 from neurosim_core.live.engine import Model
 from neurosim_core.live.links import payload_bytes
 from neurosim_core.packets import Packet
-from neurosim_core.record import FlightHeader, FlightWriter, describe_sensors
+from neurosim_core.record import RecordingHeader, RecordingWriter, describe_sensors
 
 QUEUE_BYTES = 16_000_000
 """Most that waits to be written [bytes]: gzip writes it in 0.2 s."""
@@ -80,7 +81,7 @@ class Recorder:
             ImportError: h5py is not installed.
         """
         if importlib.util.find_spec("h5py") is None:
-            raise ImportError("h5py is not installed: pip install h5py")
+            raise ImportError(f"h5py is not installed: {install_hint('record')}")
         for name, folder in folders.items():
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "config.yaml").write_text(to_yaml(models[name].config, comments=True), "utf-8")
@@ -191,7 +192,7 @@ class Recorder:
     def _run(self) -> None:
         try:
             with contextlib.ExitStack() as files:
-                writers: dict[str, tuple[int, FlightWriter]] = {}
+                writers: dict[str, tuple[int, RecordingWriter]] = {}
                 while (entry := self._next()) is not None:
                     run, writer = writers.get(entry.vehicle, (0, None))
                     if writer is None or run != entry.run:
@@ -219,10 +220,10 @@ class Recorder:
             self._changed.notify_all()
             return entry
 
-    def _open(self, entry: _Entry) -> FlightWriter:
+    def _open(self, entry: _Entry) -> RecordingWriter:
         model = self._models[entry.vehicle]
         stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
-        header = FlightHeader(
+        header = RecordingHeader(
             config_yaml=to_yaml(entry.config),
             seed=entry.config.seed,
             version=__version__,
@@ -231,7 +232,7 @@ class Recorder:
             path_stamp_ns=stamps,
             path_position=model.path.evaluate(stamps).position,
         )
-        return FlightWriter(self._folders[entry.vehicle] / entry.file, header)
+        return RecordingWriter(self._folders[entry.vehicle] / entry.file, header)
 
     def _write_changes(self, vehicle: str) -> None:
         text = "".join(json.dumps(change) + "\n" for change in self._changes[vehicle])

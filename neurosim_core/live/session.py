@@ -22,7 +22,7 @@ from neurosim_core.live.messages import message_type, setpoint_of, to_packet
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_outlet import Outlet
+from neurosim_core.view.rerun_targets import RerunTarget
 from neurosim_core.view.rerun_shapes import SceneShapes, scene_shapes
 
 DRAIN_MAX = 1000
@@ -154,7 +154,7 @@ class LiveSession:
         self,
         node: Node,
         simulation: msg.Simulation,
-        outlet: Outlet,
+        outlet: RerunTarget,
         scene: SceneLoader,
         options: ViewOptions,
         *,

@@ -252,10 +252,12 @@ class Simulator:
     def _receive_commands(self, *, every: int) -> bool:
         """Take the commands that begin a control period; False if something else has to be done first.
 
-        The first commands of a run begin its time, when the subscribers that came with them are connected.
+        The first commands of a run begin its time, when the subscribers that came with them are connected;
+        with `live.begin: hover` it begins at once.
         """
-        first = self._tick == 0
-        for vehicle in self.vehicles:
+        first, live = self._tick == 0, self.config.live
+        hovers = live.mode == "streaming" and live.begin == "hover"
+        for vehicle in () if hovers else self.vehicles:
             if vehicle.awaited_ns is not None and self._tick % every == 0:
                 command = self._wait_for_command(vehicle)
                 if command is None:

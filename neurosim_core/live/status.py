@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 
 from cortex import Node
-from cortex.messages import Clock, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
+from cortex.messages import Clock, CommandRanges, SensorStatus, Simulation, SimulatorStatus, VehicleStatus
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.live import topics
@@ -14,6 +15,7 @@ from neurosim_core.live.config import LiveConfig
 from neurosim_core.live.pacing import Timings
 from neurosim_core.live.vehicle import VehicleNode
 from neurosim_core.vehicle import MultirotorConfig
+from neurosim_core.vehicle.command_ranges import command_ranges
 
 STATUS_INTERVAL_S = 0.2
 UPDATE_INTERVAL_S = 0.02
@@ -42,6 +44,8 @@ class StatusPublisher:
 
     def announce(self, config: SimulationConfig) -> None:
         """Publish what is flown, with which settings."""
+        airframes = [config.of(name).vehicle.airframe() for name in config.vehicles]
+        ranges = [command_ranges(airframe) for airframe in airframes]
         self._simulation.publish(
             Simulation(
                 config=to_yaml(config),
@@ -49,7 +53,8 @@ class StatusPublisher:
                 vehicles=list(config.vehicles),
                 mode=config.live.mode,
                 control_rate_hz=config.control.rate_hz,
-                thrust_max_n=[_thrust_max_n(config.of(name).vehicle.airframe()) for name in config.vehicles],
+                thrust_max_n=[_thrust_max_n(airframe) for airframe in airframes],
+                command_ranges=[CommandRanges(**dataclasses.asdict(each)) for each in ranges],
             )
         )
 
@@ -236,6 +241,8 @@ def _vehicle(vehicle: VehicleNode, stamp_ns: int) -> VehicleStatus:
         collision_count=vehicle.engine.counts.collisions,
         undelivered_count=vehicle.publisher.other_undelivered_count,
         refused_reason=vehicle.subscriber.refusal if counts.refused else "",
+        clamped_count=counts.clamped,
+        clamped_reason=vehicle.subscriber.clamping if counts.clamped else "",
     )
 
 

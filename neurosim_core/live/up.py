@@ -23,7 +23,7 @@ from rich.text import Text
 from neurosim_core.config import SimulationConfig, to_yaml
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.signals import INTERRUPTED_LINE
-from neurosim_core.view.rerun_outlet import check_new_file
+from neurosim_core.view.rerun_targets import check_new_file
 
 GRACE_S = 1.5
 """How long a process may take to end after SIGINT before it is killed [s]."""

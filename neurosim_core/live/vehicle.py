@@ -17,6 +17,7 @@ from neurosim_core.live.config import NO_LINK
 from neurosim_core.live.engine import FlownBatch, Model, StartState, State, VehicleEngine
 from neurosim_core.live.publisher import PacketPublisher
 from neurosim_core.packets import Packet
+from neurosim_core.vehicle.command_ranges import command_ranges
 
 
 class VehicleNode:
@@ -48,7 +49,13 @@ class VehicleNode:
         link = config.links.get("command", NO_LINK)
         rotor_count = model.airframe.rotor_count
         self.name = name
-        self.subscriber = CommandSubscriber(node, name, rotor_count=rotor_count, lockstep=lockstep)
+        self.subscriber = CommandSubscriber(
+            node,
+            name,
+            rotor_count=rotor_count,
+            ranges=command_ranges(model.airframe),
+            lockstep=lockstep,
+        )
         self.hold = CommandHold(config.live, link, airframe=model.airframe, seed=config.seed)
         self.publisher = PacketPublisher(node, name, model, record=record)
         if not link.delivers_at_once:

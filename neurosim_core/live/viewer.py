@@ -25,7 +25,7 @@ from neurosim_core.config import ConfigError
 from neurosim_core.live.session import LiveSession, SceneLoader, ViewOptions
 from neurosim_core.live.topics import SIMULATION
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_outlet import FileOutlet, Outlet, ViewerOutlet, check_new_file
+from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
 
@@ -94,14 +94,14 @@ def view(
     options = ViewOptions(only=only, event_window_ns=round(event_window_s * 1e9), image_rate_hz=image_rate_hz)
     stop, scene = threading.Event(), SceneLoader(say)
     with stop_at_signals(stop), contextlib.ExitStack() as stack:
-        outlet: Outlet
+        outlet: RerunTarget
         if save is not None:
-            outlet = FileOutlet(save, say)
+            outlet = FileTarget(save, say)
         else:
             viewer = stack.enter_context(
                 RerunViewer(web=how == "web", port=port, waiting=lambda: not stop.is_set())
             )
-            outlet = ViewerOutlet(viewer)
+            outlet = ViewerTarget(viewer)
             if how == "web":
                 say(f"open {viewer.page_url}")
                 if open_browser and not _has_no_display():
@@ -121,7 +121,7 @@ def view(
 
 def watch(
     node: Node,
-    outlet: Outlet,
+    outlet: RerunTarget,
     scene: SceneLoader,
     options: ViewOptions,
     *,

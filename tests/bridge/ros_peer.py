@@ -92,9 +92,9 @@ class Peer:
         self.node.destroy_publisher(publisher)
         return str(getattr(found[0], "topic_type_hash", None))  # Humble has none
 
-    def call(self, name: str) -> Any:
-        """Call a service of type Trigger."""
-        kind = _class("std_srvs/srv/Trigger")
+    def call(self, name: str, type_name: str = "std_srvs/srv/Trigger") -> Any:
+        """Call a service with an empty request; return the fields of its response, as text where nested."""
+        kind = _class(type_name)
         client = self.node.create_client(kind, name)
         if not client.wait_for_service(SOON_S):
             return None
@@ -102,7 +102,10 @@ class Peer:
         deadline = time.monotonic() + SOON_S
         while not future.done() and time.monotonic() < deadline:
             time.sleep(0.01)
-        return [future.result().success, future.result().message] if future.done() else None
+        if not future.done():
+            return None
+        values = [getattr(future.result(), field) for field in future.result().get_fields_and_field_types()]
+        return [value if isinstance(value, bool | int | str) else str(value) for value in values]
 
 
 def main() -> None:

@@ -251,7 +251,7 @@ def test_a_mistake_in_the_bridge_is_said_and_does_not_end_it(monkeypatch, caplog
         with rig.backend.listening("/diagnostics") as (diagnostics,):
             rig.update_until(lambda: len(diagnostics.sent) > 1)
         then, now = (message.status[0] for message in diagnostics.messages()[:2])
-        assert (then.level, now.level) == (b"\2", b"\0")
+        assert (then.level, now.level) == (b"\2", b"\1")  # no simulator runs
         assert "ZeroDivisionError: it cannot be" in then.message
 
 
@@ -786,9 +786,9 @@ def test_another_bridge_is_said_and_named(monkeypatch, caplog):
         ]
         rig.updates_during()
         assert "ROS gets all of it twice" not in caplog.text
-        with Node("cortex_bridge"):
+        with Node("bridge"):
             rig.update_until(lambda: "ROS gets all of it twice" in caplog.text)
-        assert f"another bridge (cortex_bridge, process {os.getpid()} on" in caplog.text
+        assert f"another bridge (bridge, process {os.getpid()} on" in caplog.text
         assert "publishes /drone/gyro and 1 more of our topics too" in caplog.text
         monkeypatch.setattr(bridge_module, "TWICE_S", 0.0)
         rig.update_until(lambda: "another node publishes /drone/gyro" in caplog.text)
@@ -897,11 +897,33 @@ def test_diagnostics_say_how_each_route_is_doing(monkeypatch):
     assert "finite" in found[ROTORS]["message"]
 
 
+def test_a_simulator_that_vanishes_is_an_error_in_diagnostics(monkeypatch):
+    monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
+    with rig_of() as rig, rig.backend.listening("/diagnostics") as (diagnostics,):
+
+        def told(name):
+            found = statuses(diagnostics).get(name)
+            level = {
+                s.name.partition(": ")[2]: s.level for s in diagnostics.messages()[-1:] for s in s.status
+            }
+            return found and (level[name], found["message"])
+
+        rig.update_until(lambda: told("bridge") == (b"\1", "no Cortex topics: no simulator runs"))
+        with Node("short-lived") as simulator:
+            simulator.publisher("/drone/imu", msg.Imu)
+            rig.update_until(lambda: told("bridge") == (b"\0", "1 routes"))
+            assert told(IMU) == (b"\0", "idle")
+        rig.update_until(lambda: told("bridge") == (b"\2", "the Cortex side has gone"))
+        assert told(IMU) == (b"\3", "its Cortex topic has gone")
+
+
 def test_a_backend_that_fails_is_told_or_ends_the_bridge(monkeypatch):
     monkeypatch.setattr(bridge_module, "DIAGNOSTICS_INTERVAL_S", 0.01)
     with rig_of() as rig, rig.backend.listening("/diagnostics") as (diagnostics,):
         rig.backend.trouble = "it was restarted"
-        rig.update_until(lambda: statuses(diagnostics).get("bridge", {}).get("message") == "it was restarted")
+        rig.update_until(
+            lambda: "it was restarted" in statuses(diagnostics).get("bridge", {}).get("message", "")
+        )
         assert diagnostics.messages()[-1].status[0].level == b"\1"
         rig.backend.failure = "it is dead"
         with pytest.raises(BackendError, match="it is dead"):

@@ -218,7 +218,7 @@ def test_a_bag_of_what_flew(simulator, tmp_path):
 
 def taken_by_bridge(node: Node, topic: str) -> int:
     """Messages that the bridge has taken from a Cortex topic."""
-    (bridge,) = [record.node for record in node.nodes() if record.name == "cortex_bridge"]
+    (bridge,) = [record.node for record in node.nodes() if record.name.startswith("cortex_bridge into ")]
     return sum(s.received for s in node.ask_stats(bridge, SOON_S).subscribers if s.topic == topic)
 
 

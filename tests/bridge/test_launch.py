@@ -38,6 +38,9 @@ class ExecuteProcess(Action): ...
 class IncludeLaunchDescription(Action): ...
 
 
+class Node(Action): ...
+
+
 class OpaqueFunction(Action): ...
 
 
@@ -66,6 +69,15 @@ def fake_launch(monkeypatch):
     launch.launch_description_sources.PythonLaunchDescriptionSource = lambda path: path
     for module in (launch, launch.actions, launch.substitutions, launch.launch_description_sources):
         monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+@pytest.fixture
+def fake_launch_ros(fake_launch, monkeypatch):
+    """A `launch_ros` beside it."""
+    package, actions = types.ModuleType("launch_ros"), types.ModuleType("launch_ros.actions")
+    actions.Node = Node
+    monkeypatch.setitem(sys.modules, "launch_ros", package)
+    monkeypatch.setitem(sys.modules, "launch_ros.actions", actions)
 
 
 def load(path):
@@ -104,12 +116,34 @@ def test_the_bridge_with_all_its_arguments(fake_launch):
     command = commands(run(path, **given))["cortex_bridge"]
     options = _parser().parse_args(command[3:])
     assert {name: getattr(options, name) for name in given} == given
+    command = commands(run(path, params_file="p.yaml"))["cortex_bridge"]
+    assert command[-3:] == ["--ros-args", "--params-file", "p.yaml"]
+
+
+def test_the_bridge_is_a_node_where_launch_ros_is(fake_launch_ros):
+    """So that namespaces, remappings and parameters around it hold for it."""
+    (node,) = run(
+        ROOT / "launch" / "bridge.launch.py", namespace="/sim", distro="humble", params_file="p.yaml"
+    )
+    assert isinstance(node, Node)
+    assert node.keywords == {
+        "executable": sys.executable,
+        "arguments": ["-m", "cortex_ros2_bridge", "--backend", "auto", "--distro", "humble"],
+        "name": "cortex_bridge",
+        "namespace": "/sim",
+        "parameters": ["p.yaml"],
+        "output": "screen",
+    }
 
 
 def test_the_simulation_alone(fake_launch):
-    """By default the simulator and the bridge; everything ends with the simulator."""
+    """By default the simulator, which hovers, and the bridge; everything ends with the simulator."""
     actions = run(ROOT / "launch" / "simulation.launch.py")
-    assert commands(actions) == {"simulator": [sys.executable, "-m", "neurosim_core", "serve"]}
+    assert commands(actions) == {
+        "simulator": [sys.executable, "-m", "neurosim_core", "serve", "--set", "live.begin=hover"]
+    }
+    none = commands(run(ROOT / "launch" / "simulation.launch.py", controller="none"))
+    assert none == {"simulator": [sys.executable, "-m", "neurosim_core", "serve"]}
     assert isinstance(actions[0].keywords["on_exit"], Shutdown)
     include = actions[1]
     assert Path(include.arguments[0]) == ROOT / "launch" / "bridge.launch.py"
@@ -124,7 +158,7 @@ def test_the_simulation_with_everything(fake_launch):
         lockstep="true",
         factor="2.0",
         record="out",
-        controller="True",
+        controller="path",
         namespace="/neurosim",
         bridge_config="bridge.yaml",
         backend="dds",
@@ -144,6 +178,7 @@ def test_the_simulation_with_everything(fake_launch):
         "namespace": "/neurosim",
         "backend": "dds",
         "distro": "",
+        "params_file": "",
         "python": "python3",
     }
     config = Path(found["rviz"][found["rviz"].index("-d") + 1])
@@ -162,7 +197,7 @@ def test_simulator_arguments_are_those_of_the_command(fake_launch):
             lockstep="1",
             factor="2",
             record="a",
-            controller="1",
+            controller="path",
             rerun="1",
         )
     )
@@ -173,12 +208,14 @@ def test_simulator_arguments_are_those_of_the_command(fake_launch):
 def test_an_argument_that_is_neither_true_nor_false(fake_launch):
     with pytest.raises(ValueError, match="rviz must be true or false, got 'yes please'"):
         run(ROOT / "launch" / "simulation.launch.py", rviz="yes please")
+    with pytest.raises(ValueError, match="controller must be hover or path or none, got 'true'"):
+        run(ROOT / "launch" / "simulation.launch.py", controller="true")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_no_launch_file_imports_rclpy(path):
     """They run where only `launch` is installed."""
-    allowed = {"__future__", "launch", "pathlib", "sys", "tempfile", "typing"}
+    allowed = {"__future__", "launch", "launch_ros", "pathlib", "sys", "tempfile", "typing"}
     for node in ast.walk(ast.parse(path.read_text())):
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
         names += [node.module] if isinstance(node, ast.ImportFrom) else []

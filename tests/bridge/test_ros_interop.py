@@ -167,3 +167,7 @@ def test_services_of_a_real_node(bridge: BridgeProcess, ros_node: RosNode) -> No
         simulator.service("/pause", msg.Trigger, msg.SimulatorReply, pause)
         assert ros_node.do("call", name="/pause") == [True, ""]
         assert ros_node.do("call", name="/pause") == [False, "again"]
+        (listed,) = ros_node.do(
+            "call", name="/cortex_bridge/list_parameters", type_name="rcl_interfaces/srv/ListParameters"
+        )
+        assert "'frames.map'" in listed

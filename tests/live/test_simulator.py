@@ -35,7 +35,7 @@ from neurosim_core.config import load_config
 from neurosim_core.live.engine import FlownBatch, VehicleEngine
 from neurosim_core.live.serve import summarise
 from neurosim_core.packets import Delivery
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 from neurosim_core.simulation import make_state, observe, step
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
@@ -331,6 +331,17 @@ def test_an_answer_counts_from_the_next_tick_on():
     assert felt >= state.stamp_ns + 2 * PERIOD_NS
 
 
+def test_time_may_begin_with_a_hover():
+    """Before anybody has sent a command everything flows, and the vehicle stays where it starts."""
+    with LiveRig(make_config(sensors={"odometry": ODOMETRY}, **{"live.begin": "hover"})) as rig:
+        states = rig.listen("/drone/odometry", Odometry)
+        first, *_, last = [states.recv(SOON_S) for _ in range(50)]
+        assert last.stamp_ns > first.stamp_ns
+        np.testing.assert_allclose(last.position, first.position, atol=0.02)
+        rig.send([0.0, 0.0, 1.0, 0.0], mode="velocity")
+        wait_for(lambda: states.recv(SOON_S).velocity[2] > 0.5)
+
+
 def test_factor_0_does_not_wait():
     with LiveRig(make_config(**{"live.real_time_factor": 0.0, "live.run_on": False})) as rig:
         begin_s = time.monotonic()
@@ -428,7 +439,7 @@ def test_what_is_left_out_at_the_end_is_counted(monkeypatch: pytest.MonkeyPatch,
         rig.stop.set()
         assert rig.join() == 0
         flown_ns = rig.simulator.vehicles[0].engine.state.stamp_ns
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         packets = list(flight.packets())
     pictures = [p.stamp_ns for p in packets if p.sensor == "rgb"]
     dropped = told[-1].sensors[2].dropped_count
@@ -768,7 +779,7 @@ def test_what_is_recorded_is_what_was_published(tmp_path: Path, mode: str):
             rig.send(rig.hover())
         assert rig.join() == 0
         samples, pictures, windows = drain(imu, least=37), drain(rgb, least=6), drain(events, least=10)
-    with Flight(tmp_path / "flight" / "flight.h5") as flight:
+    with Recording(tmp_path / "flight" / "flight.h5") as flight:
         packets: dict[str, list[Any]] = {}
         for packet in flight.packets():
             packets.setdefault(packet.sensor, []).append(packet)
@@ -819,7 +830,7 @@ def test_a_recording_is_not_replaced_unasked_and_resets_begin_new_files(tmp_path
             pass
         rig.call("/reset", Reset(seed=5))
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["flight-2.h5", "flight.h5"]
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         stamps = [p.stamp_ns for p in flight.packets() if p.sensor == "odometry"]
         assert stamps == [0, PERIOD_NS]
         assert flight.header.seed == 4

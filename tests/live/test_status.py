@@ -20,7 +20,7 @@ from cortex.messages import Image, Imu, Reset, Simulation
 from neurosim_core.config import load_config
 from neurosim_core.live.engine import VehicleEngine
 from neurosim_core.live.serve import StatusLine, summarise
-from neurosim_core.record import Flight
+from neurosim_core.record import Recording
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
 
@@ -90,7 +90,7 @@ def test_changed_settings_are_announced_and_recorded(tmp_path: Path):
     assert "imu" not in load_config(yaml.safe_load(first.config)).links
     for simulation in (second, late):
         assert load_config(yaml.safe_load(simulation.config)).links["imu"].clock_offset_s == 0.003
-    with Flight(tmp_path / "flight.h5") as flight:
+    with Recording(tmp_path / "flight.h5") as flight:
         held = load_config(yaml.safe_load(flight.header.config_yaml))
     assert (held.links["imu"].clock_offset_s, held.live.fail_safe, held.seed) == (0.003, "hover", 5)
     (line,) = (tmp_path / "settings.jsonl").read_text().splitlines()
