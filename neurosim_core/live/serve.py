@@ -185,13 +185,13 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str
 
 def summarise(status: SimulatorStatus) -> list[str]:
     """Return the totals of a run since its last reset, a line each."""
-    taken, lost, refused, collisions = (
+    taken, lost, refused, clamped, collisions = (
         sum(getattr(vehicle, f"{name}_count") for vehicle in status.vehicles)
-        for name in ("command", "lost", "refused", "collision")
+        for name in ("command", "lost", "refused", "clamped", "collision")
     )
     lines = [
         f"simulated {status.stamp_ns / 1e9:.3f} s: {status.step_count:,} control periods, {taken:,} commands "
-        f"({lost:,} lost, {refused:,} refused), {collisions:,} collisions"
+        f"({lost:,} lost, {refused:,} refused, {clamped:,} clamped to their range), {collisions:,} collisions"
     ]
     if status.mode == "streaming":
         dropped = sum(sensor.dropped_count for sensor in status.sensors)

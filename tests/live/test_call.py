@@ -43,7 +43,7 @@ STATUS_NOW = SimulatorStatus(
         SensorStatus("red", "events", True, 2, 1357, 3, 1, 12, 98_500_000),
         SensorStatus("red", "rgb", False, 0, 0, 0, 0),
     ],
-    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13)],
+    vehicles=[VehicleStatus("red", "velocity", 4321, 5, 6, 7, 8_000_000, True, 9, 1, 13, "", 4)],
 )
 
 
@@ -142,7 +142,7 @@ def test_status(shared_runtime, capsys):
         "running",
         "streaming, 1.234 s, 2,468 control periods, 0.49 of 0.5 x real time",
         "step 1.25 ms (p99 3.75 ms), late 0.06 ms (p99 0.21 ms), 17 overruns, delayed by 0.345 s",
-        "vehicle mode taken age refused replaced lost fail-safe by reader",
+        "vehicle mode taken age refused clamped replaced lost fail-safe by reader",
         "red fail-safe 4,321 8.00 ms 5 6 7 9 13",
         "sensor state readers published dropped by link by reader late",
         "red/events on 2 1,357 3 1 12 98.50 ms",

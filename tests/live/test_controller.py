@@ -25,7 +25,7 @@ from neurosim_core.live import controller
 from neurosim_core.live.controller import PathController, fly
 from neurosim_core.live.messages import setpoint_of
 from neurosim_core.live.topics import COMMANDS, SIMULATION, STATUS, command_topic, stream_topic
-from neurosim_core.simulation import plan_paths
+from neurosim_core.sim import plan_paths
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import preset
 

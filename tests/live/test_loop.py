@@ -27,7 +27,7 @@ from neurosim_core.live.messages import command_of, to_packet
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import COMMANDS, command_topic, stream_topic
 from neurosim_core.packets import Packet
-from neurosim_core.simulation import (
+from neurosim_core.sim import (
     Model,
     finish,
     make_fleet,
@@ -276,7 +276,7 @@ def test_rough_air_and_a_noisy_camera_fly_as_in_one_process(rough, shared_runtim
     state = make_state(rough)
     expected = list(run_model(rough, state))
     assert {"gusts", "turbulence", "ground"} <= set(state.vehicle.terms)
-    noisy = state.casts[0].events["events"].camera.terms
+    noisy = state.groups[0].frames["events"].camera.terms
     assert noisy == ("spread", "low_pass", "refractory", "leak", "spontaneous")
     assert state.counts["ticks left out"] > 100
     assert sum(len(p.t) for p in expected if p.sensor == "events") > 1000
