@@ -24,6 +24,7 @@ from neurosim_core.sim import (
     begin_step,
     end_step,
     finish,
+    forget_controllers,
     free_lanes,
     integrate_period,
     load_scene,
@@ -180,8 +181,7 @@ class VehicleEngine:
     def configure(self, model: Model) -> None:
         """Go on with other settings: gains and links."""
         if model.config.control.gains != self.model.config.control.gains:
-            self.state.controllers.clear()
-            self.state.commands.clear()
+            forget_controllers(self.state)
         self.model = model
 
     def begin_step(self, mode: CommandMode, setpoint: NDArray[Any] | None) -> PendingStep:

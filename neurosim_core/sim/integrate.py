@@ -53,6 +53,12 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
     return state.commands[mode]
 
 
+def forget_controllers(state: State) -> None:
+    """Have controllers of outside commands made anew, with other gains; the path controller stays."""
+    state.controllers.clear()
+    state.commands.clear()
+
+
 def checked_command(model: Model, state: State, command: ArrayLike, mode: CommandMode) -> Any:
     """Return setpoints of the host as rows of the mode, shape [N, width].
 

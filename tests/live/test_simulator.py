@@ -36,7 +36,7 @@ from neurosim_core.live.engine import FlownBatch, VehicleEngine
 from neurosim_core.live.serve import summarise
 from neurosim_core.packets import Delivery
 from neurosim_core.record import Recording
-from neurosim_core.sim import make_state, observe, step
+from neurosim_core.sim import forget_controllers, make_state, observe, step
 
 pytestmark = pytest.mark.usefixtures("shared_runtime")
 
@@ -677,7 +677,7 @@ def test_gains_change_in_flight():
     for _ in range(3):
         step(before, state, row, mode="position")
     assert same(states[-1], observe(state))
-    state.controllers.clear()
+    forget_controllers(state)
     step(changed, state, row, mode="position")
     assert same(after, observe(state))
     assert changed.config.control.gains.position_gain_per_s2 == 2.0

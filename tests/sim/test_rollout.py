@@ -660,14 +660,14 @@ def test_gains_can_change_between_two_periods(outside_model):
     softer = gains.model_copy(update={"position_gain_per_s2": 0.2 * gains.position_gain_per_s2})
     control = model.config.control.model_copy(update={"gains": softer})
     other = dataclasses.replace(model, config=model.config.model_copy(update={"control": control}))
-    changed.controllers.clear(), changed.commands.clear()
+    sim.forget_controllers(changed)
     for _ in range(8):
         sim.step(other, changed, setpoint, mode="position")
         sim.step(model, steady, setpoint, mode="position")
     fresh = sim.make_state(model)
     for period in range(12):
         if period == 4:
-            fresh.controllers.clear(), fresh.commands.clear()
+            sim.forget_controllers(fresh)
         sim.step(model if period < 4 else other, fresh, setpoint, mode="position")
     assert sim.observe(changed).position.tobytes() == sim.observe(fresh).position.tobytes()
     assert sim.observe(changed).position.tobytes() != sim.observe(steady).position.tobytes()
