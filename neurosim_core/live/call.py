@@ -105,7 +105,7 @@ def describe_status(
             "refused": vehicle.refused_count,
             "replaced": vehicle.superseded_count,
             "lost": vehicle.lost_count,
-            "fail-safe": vehicle.fail_safe_count,
+            "stale": vehicle.fail_safe_count,
             "by reader": vehicle.undelivered_count,
         }
         for vehicle in status.vehicles
