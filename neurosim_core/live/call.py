@@ -106,7 +106,7 @@ def describe_status(
             "clamped": vehicle.clamped_count,
             "replaced": vehicle.superseded_count,
             "lost": vehicle.lost_count,
-            "fail-safe": vehicle.fail_safe_count,
+            "stale": vehicle.fail_safe_count,
             "by reader": vehicle.undelivered_count,
         }
         for vehicle in status.vehicles

@@ -160,16 +160,22 @@ class PathController:
         with contextlib.suppress(TimeoutError):
             while odometry.sequence not in self._speeds:
                 speeds = self._rotor_speeds.recv(max(deadline_s - time.monotonic(), 0.0))
+                if speeds.sequence < max(self._speeds, default=0):  # a new run
+                    self._speeds.clear()
                 self._speeds[speeds.sequence] = self._newest = speeds.speed
             self._misses = 0
             speed = self._speeds[odometry.sequence]
-            self._speeds = {n: ahead for n, ahead in self._speeds.items() if n > odometry.sequence}
+            self._forget(odometry.sequence)
             return speed
         self._misses += 1
         self.missing_count += 1
-        self._speeds.clear()
+        self._forget(odometry.sequence)
         self._warn(f"no rotor speeds came with the odometry of {odometry.stamp_ns} ns; using the newest")
         return self._newest
+
+    def _forget(self, sequence: int) -> None:
+        """Forget rotor speeds up to a sequence."""
+        self._speeds = {number: speed for number, speed in self._speeds.items() if number > sequence}
 
     def _warn(self, text: str) -> None:
         """Log a warning, once a second at most."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -22,12 +21,9 @@ from neurosim_core.live.pacing import Timings
 from neurosim_core.packets import Delivery, Image, Odometry, Packet
 from neurosim_core.record import describe_sensors
 
-HELD_UP_NS = 50_000_000
-"""Time that reliable readers may cost between two statuses without being named [ns]."""
-
 
 class Topic:
-    """A publisher, and what its reliable readers cost.
+    """A publisher, and what its reliable readers lost.
 
     Attributes:
         publisher: Where messages go.
@@ -40,20 +36,17 @@ class Topic:
 
     def publish(self, message: Any, send: Callable[[Any], bool] | None = None) -> None:
         """Publish a message with `send`, by default as usual; count it if a reliable reader loses it."""
-        begin_ns = time.monotonic_ns()
         if not (send or self.publisher.publish)(message):
             self.undelivered_count += 1
-        self._held_ns += time.monotonic_ns() - begin_ns
 
-    def take_held_up(self) -> bool:
-        """Return whether readers have lost messages or cost much time since the last call."""
-        held = self._held_ns > HELD_UP_NS or self.undelivered_count > self._told_count
-        self._held_ns, self._told_count = 0, self.undelivered_count
-        return held
+    def take_lost(self) -> bool:
+        """Return whether readers have lost messages since the last call."""
+        lost, self._told_count = self.undelivered_count > self._told_count, self.undelivered_count
+        return lost
 
     def reset(self) -> None:
         """Count from 0."""
-        self.undelivered_count = self._told_count = self._held_ns = 0
+        self.undelivered_count = self._told_count = 0
 
 
 class PacketTopic(Topic):
@@ -341,9 +334,9 @@ class PacketPublisher:
         sensors = [self.topics[name] for name in self._sensor_names]
         return sum(topic.undelivered_count for topic in self._all() if topic not in sensors)
 
-    def take_held_up(self) -> list[str]:
-        """Return the topics whose reliable readers have held up the run since the last call."""
-        return [topic.publisher.topic for topic in self._all() if topic.take_held_up()]
+    def take_lossy_topics(self) -> list[str]:
+        """Return the topics whose reliable readers have lost messages since the last call."""
+        return [topic.publisher.topic for topic in self._all() if topic.take_lost()]
 
     @property
     def next_due_ns(self) -> int | None:

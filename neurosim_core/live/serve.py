@@ -10,12 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.markdown import Markdown
 from rich.status import Status
 from rich.table import Table
 
 from cortex import Node, latest
 from cortex.messages import Simulation, SimulatorStatus
 from neurosim_core.config import SimulationConfig
+from neurosim_core.live.call import describe_status
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import SIMULATION, command_topic
 from neurosim_core.live.vehicle import VehicleNode
@@ -68,8 +70,7 @@ def serve(config: SimulationConfig, *, record: Path | None = None, overwrite: bo
                 simulator.status.on_status = line.show
                 code = simulator.run(stop)
             if line.last is not None:
-                for text in summarise(line.last):
-                    console.print(text)
+                console.print(Markdown(describe_status(line.last)))
             for vehicle in simulator.vehicles:
                 if count := vehicle.engine.counts.redone_intervals:
                     console.print(f"{vehicle.name}: adaptive steps replaced {count:,} fixed ones")
@@ -183,29 +184,10 @@ def changes(before: SimulatorStatus | None, status: SimulatorStatus) -> list[str
     return lines
 
 
-def summarise(status: SimulatorStatus) -> list[str]:
-    """Return the totals of a run since its last reset, a line each."""
-    taken, lost, refused, clamped, collisions = (
-        sum(getattr(vehicle, f"{name}_count") for vehicle in status.vehicles)
-        for name in ("command", "lost", "refused", "clamped", "collision")
-    )
-    lines = [
-        f"simulated {status.stamp_ns / 1e9:.3f} s: {status.step_count:,} control periods, {taken:,} commands "
-        f"({lost:,} lost, {refused:,} refused, {clamped:,} clamped to their range), {collisions:,} collisions"
-    ]
-    if status.mode == "streaming":
-        dropped = sum(sensor.dropped_count for sensor in status.sensors)
-        lines.append(
-            f"{status.overrun_count:,} overruns, time was delayed by {status.slipped_ns / 1e9:.3f} s, "
-            f"{dropped:,} frames were dropped or lost"
-        )
-    if undelivered := _undelivered(status):
-        lines.append(f"[yellow]{undelivered:,} messages were lost by reliable readers that were too slow[/]")
-    return lines
-
-
-def _undelivered(status: SimulatorStatus) -> int:
-    return sum(entry.undelivered_count for entry in (*status.sensors, *status.vehicles))
+def count_lost(status: SimulatorStatus) -> int:
+    """Return the commands, frames and messages that were lost since the last reset."""
+    lost = sum(vehicle.lost_count + vehicle.undelivered_count for vehicle in status.vehicles)
+    return lost + sum(sensor.dropped_count + sensor.undelivered_count for sensor in status.sensors)
 
 
 def _summary(status: SimulatorStatus) -> str:
@@ -215,8 +197,7 @@ def _summary(status: SimulatorStatus) -> str:
         parts.append(f"{status.real_time_factor:.2f} x real time")
         if status.mode == "streaming":
             parts.append(f"late {status.late_p99_ns / 1e6:.2f} ms (p99)")
-        lost = sum(v.lost_count for v in status.vehicles) + sum(s.dropped_count for s in status.sensors)
-        parts.append(f"{lost + _undelivered(status):,} lost")
+        parts.append(f"{count_lost(status):,} lost")
         if status.reason:
             parts.append(f"[yellow]{status.reason}[/]")
         if any(vehicle.fail_safe for vehicle in status.vehicles):

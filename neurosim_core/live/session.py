@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -46,49 +45,6 @@ class ViewOptions:
     """Time in one picture of events [ns]."""
     image_rate_hz: float = 15.0
     """Most images of a sensor a second, by the wall clock [Hz]."""
-
-
-class SceneLoader:
-    """Loads scenes in a thread, each only once."""
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        """Load nothing yet; `say` is called if a scene cannot be loaded."""
-        self._say = say
-        self._key: Any = None
-        self._shapes: SceneShapes | None = None
-        self._lock = threading.Lock()
-        self._threads: list[threading.Thread] = []
-
-    @property
-    def is_loading(self) -> bool:
-        """Whether a scene is being loaded."""
-        return any(thread.is_alive() for thread in self._threads)
-
-    def load(self, config: SimulationConfig) -> None:
-        """Begin to load a scene, unless it is the one that was loaded last."""
-        key = config.scene, config.bodies
-        with self._lock:
-            if key == self._key:
-                return
-            self._key, self._shapes = key, None
-        thread = threading.Thread(target=self._load, args=key, name="load scene", daemon=True)
-        self._threads.append(thread)
-        thread.start()
-
-    def shapes(self) -> SceneShapes | None:
-        """Return the scene; None if it is not loaded yet, or cannot be."""
-        with self._lock:
-            return self._shapes
-
-    def _load(self, scene: Any, bodies: Any) -> None:
-        try:
-            shapes = scene_shapes(load_scene(scene), make_bodies(bodies))
-        except (ValueError, OSError) as error:
-            self._say(f"warning: shown without the scene: {error}")
-            return
-        with self._lock:
-            if (scene, bodies) == self._key:
-                self._shapes = shapes
 
 
 class RunTracker:
@@ -155,7 +111,6 @@ class LiveSession:
         node: Node,
         simulation: msg.Simulation,
         outlet: RerunTarget,
-        scene: SceneLoader,
         options: ViewOptions,
         *,
         number: Iterator[int],
@@ -167,7 +122,6 @@ class LiveSession:
             node: Subscribes.
             simulation: Announcement of the simulator.
             outlet: Opens recordings.
-            scene: Loads the scene.
             options: What to show.
             number: Numbers of recordings.
             say: Called with what a user should know.
@@ -188,14 +142,12 @@ class LiveSession:
         self._number = number
         self._options = options
         self._say = say
-        self._scene = scene
-        self._shapes: SceneShapes | None = None
+        self._shapes = _load_scene(config, say)
         self._paths: dict[str, Any] = {}
         self._command_ns: dict[str, int] = {}
         self._tracker = RunTracker()
         self._statuses: deque[msg.SimulatorStatus] = deque()
         self._streams: list[_Stream] = []
-        scene.load(config)
         self._logger = self._open()
         self._subscribe("", topics.STATUS, msg.SimulatorStatus, self._log_status)
         for vehicle in self._vehicles:
@@ -220,9 +172,6 @@ class LiveSession:
                     if run == "next":
                         self._begin_again()
                 stream.log(message)
-        if self._shapes is None and (shapes := self._scene.shapes()) is not None:
-            self._shapes = shapes
-            self._logger.log_scene(shapes)
 
     def send(self) -> None:
         """Send what has been logged."""
@@ -366,6 +315,15 @@ class LiveSession:
             overtaken = counters.overtaken if stream.subscriber.policy.depth > 1 else 0
             lost[stream.vehicle, stream.sensor] += counters.lost + overtaken
         return lost
+
+
+def _load_scene(config: SimulationConfig, say: Callable[[str], None]) -> SceneShapes | None:
+    """Return the scene; None if it cannot be loaded, which is said."""
+    try:
+        return scene_shapes(load_scene(config.scene), make_bodies(config.bodies))
+    except (ValueError, OSError) as error:
+        say(f"warning: shown without the scene: {error}")
+        return None
 
 
 def _shown(config: SimulationConfig, only: Sequence[str] | None) -> dict[str, tuple[SensorDescription, ...]]:

@@ -246,7 +246,6 @@ class Simulator:
         self._is_flown = False
         self._take_commands(end_ns)  # before this stamp is published: its answers count from the next tick on
         self._publish_end(end_ns)
-        streaming.yield_to_readers(end_ns, period_ns)
         self._end_period(end_ns)
 
     def _receive_commands(self, *, every: int) -> bool:

@@ -180,9 +180,9 @@ class RunStats:
         steps, late = self.step_times.take(), self.late_times.take()
         self._sequence += 1
         streaming = config.live.mode == "streaming"
-        held_up = [topic for vehicle in vehicles for topic in vehicle.publisher.take_held_up()]
-        if held_up and not reason:
-            reason = f"reliable readers do not keep up with {', '.join(held_up)}"
+        lossy = [topic for vehicle in vehicles for topic in vehicle.publisher.take_lossy_topics()]
+        if lossy and not reason:
+            reason = f"reliable readers do not keep up with {', '.join(lossy)}"
         return SimulatorStatus(
             stamp_ns=stamp_ns,
             wall_ns=time.time_ns(),

@@ -22,7 +22,7 @@ from rich.console import Console
 from cortex import Node, Subscriber, TypeMismatch, latest
 from cortex.messages import Simulation
 from neurosim_core.config import ConfigError
-from neurosim_core.live.session import LiveSession, SceneLoader, ViewOptions
+from neurosim_core.live.session import LiveSession, ViewOptions
 from neurosim_core.live.topics import SIMULATION
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
@@ -92,7 +92,7 @@ def view(
         console.print(text, markup=False)
 
     options = ViewOptions(only=only, event_window_ns=round(event_window_s * 1e9), image_rate_hz=image_rate_hz)
-    stop, scene = threading.Event(), SceneLoader(say)
+    stop = threading.Event()
     with stop_at_signals(stop), contextlib.ExitStack() as stack:
         outlet: RerunTarget
         if save is not None:
@@ -108,21 +108,17 @@ def view(
                     webbrowser.open(viewer.page_url)
         node = stack.enter_context(Node("viewer"))
         try:
-            status = watch(node, outlet, scene, options, stop=stop, say=say, to_the_end=save is not None)
+            status = watch(node, outlet, options, stop=stop, say=say, to_the_end=save is not None)
         except ViewerEnded as error:
             if how == "web":
                 raise
             raise ViewerEnded(f"{error}\n{_WITHOUT_WINDOW}") from None
-    if scene.is_loading:  # the thread cannot be stopped, and the interpreter aborts if it is in native code
-        sys.stdout.flush()
-        os._exit(status)
     return status
 
 
 def watch(
     node: Node,
     outlet: RerunTarget,
-    scene: SceneLoader,
     options: ViewOptions,
     *,
     stop: threading.Event,
@@ -134,7 +130,6 @@ def watch(
     Args:
         node: Subscribes.
         outlet: Opens recordings.
-        scene: Loads the scenes.
         options: What to show.
         stop: Ends it.
         say: Called with what a user should know.
@@ -163,7 +158,7 @@ def watch(
                 stack.close()
                 session, present = None, True
                 try:
-                    session = LiveSession(node, simulation, outlet, scene, options, number=number, say=say)
+                    session = LiveSession(node, simulation, outlet, options, number=number, say=say)
                 except ConfigError as error:
                     say(f"cannot read the settings of this simulator (version {simulation.version}): {error}")
                     continue

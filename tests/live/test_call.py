@@ -138,16 +138,17 @@ def test_status(shared_runtime, capsys):
             stop.set()
             thread.join()
     rows = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert [row for row in rows if row and not row.startswith("\u2500")] == [
+    assert rows[:3] == [
         "running",
         "streaming, 1.234 s, 2,468 control periods, 0.49 of 0.5 x real time",
         "step 1.25 ms (p99 3.75 ms), late 0.06 ms (p99 0.21 ms), 17 overruns, delayed by 0.345 s",
-        "vehicle mode taken age refused clamped replaced lost fail-safe by reader",
-        "red fail-safe 4,321 8.00 ms 5 6 7 9 13",
-        "sensor state readers published dropped by link by reader late",
+    ]
+    for row in (
+        "red fail-safe 4,321 8.00 ms 5 4 6 7 9 13",
         "red/events on 2 1,357 3 1 12 98.50 ms",
         "red/rgb off 0 0 0 0 0 0.00 ms",
-    ]
+    ):
+        assert row in rows
 
 
 def test_settings_are_read_as_yaml():

@@ -87,7 +87,7 @@ class Stage:
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rotor speeds that are on their way come, however busy the machine."""
-    monkeypatch.setitem(controller._PATIENCE_S, "lockstep", SOON_S)
+    monkeypatch.setitem(controller._ROTORS_S, "lockstep", SOON_S)
 
 
 @pytest.fixture
@@ -182,7 +182,7 @@ def test_the_path_is_taken_at_the_odometrys_stamp(stage, start_pilot):
 
 def test_missing_rotor_speeds_are_said_and_replaced(stage, start_pilot, caplog, monkeypatch):
     """By hover before any have come, else by the newest; after some misses nobody waits for them any more."""
-    monkeypatch.setitem(controller._PATIENCE_S, "streaming", 0.3)
+    monkeypatch.setitem(controller._ROTORS_S, "streaming", 0.3)
     begin_s = time.monotonic()
     pilot = start_pilot(lockstep=False)
     stage.send(1, rotors=False)
@@ -208,7 +208,7 @@ def test_missing_rotor_speeds_are_said_and_replaced(stage, start_pilot, caplog, 
 
 def test_in_streaming_the_newest_counts(stage, start_pilot, monkeypatch):
     """A pilot that is slow answers what is new when it looks again."""
-    monkeypatch.setitem(controller._PATIENCE_S, "streaming", SOON_S)
+    monkeypatch.setitem(controller._ROTORS_S, "streaming", SOON_S)
     start_pilot(lockstep=False, delay_s=0.3)
     stage.odometry.wait_for_subscribers(timeout_s=SOON_S)
     stage.rotor_speeds.wait_for_subscribers(timeout_s=SOON_S)

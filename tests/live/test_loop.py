@@ -83,7 +83,7 @@ Law = Callable[[Any], np.ndarray]
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rotor speeds that are on their way come, however busy the machine: without them the bits differ."""
-    monkeypatch.setitem(controller._PATIENCE_S, "lockstep", SOON_S)
+    monkeypatch.setitem(controller._ROTORS_S, "lockstep", SOON_S)
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,10 @@ class Listener:
             speed = self._speeds.recv(SOON_S).speed if name == "odometry" else ()
             if message.sequence != self._before.get(name):
                 self._before[name] = message.sequence
-                yield to_packet(message, name, rotor_speed=speed)
+                packet = to_packet(message, name)
+                if name == "odometry":
+                    packet = dataclasses.replace(packet, rotor_speed=np.asarray(speed))
+                yield packet
 
 
 @contextlib.contextmanager
