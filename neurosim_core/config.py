@@ -12,12 +12,12 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from neurosim_core.control import Se3Config
 from neurosim_core.live.config import LinkConfig, LiveConfig
 from neurosim_core.mistakes import explain, suggestion
+from neurosim_core.registry import kinds, on_change
 from neurosim_core.render.renderer import RenderConfig, RendererName
 from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
-from neurosim_core.registry import kinds, on_change
 from neurosim_core.sensors.base import SensorConfig
 from neurosim_core.sensors.depth import DepthSensorConfig
 from neurosim_core.sensors.event_camera import EventSensorConfig
@@ -95,7 +95,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 if TYPE_CHECKING:
     AnySensor = SensorConfig
 else:
-    AnySensor = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]
+    AnySensor = Annotated[tuple(kinds("sensor").values()), Field(discriminator="kind")]
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
 Sensors = dict[Name, AnySensor]
@@ -246,9 +246,10 @@ def _take_new_kinds(seam: str) -> None:
     """Let settings name kinds of sensors that were registered after this module was imported."""
     if seam != "sensor":
         return
-    known = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]  # noqa: UP007
-    FleetMember.model_fields["sensors"].annotation = dict[Name, known] | None  # type: ignore[valid-type]
-    SimulationConfig.model_fields["sensors"].annotation = dict[Name, known]  # type: ignore[valid-type]
+    known: Any = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]  # noqa: UP007
+    sensors: Any = dict[Name, known]
+    FleetMember.model_fields["sensors"].annotation = sensors | None
+    SimulationConfig.model_fields["sensors"].annotation = sensors
     for settings in (FleetMember, SimulationConfig):
         settings.model_rebuild(force=True)
 

@@ -26,8 +26,8 @@ from neurosim_core.install import install_hint
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
-from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.event_camera import EventSensorConfig
+from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, load_scene, make_model

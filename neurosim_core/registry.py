@@ -91,8 +91,8 @@ def on_change(listener: Callable[[str], None]) -> None:
 def load_plugins() -> None:
     """Import every module of `neurosim_core.sensors`, and those that entry points name, once in a process.
 
-    A foreign module that cannot be imported is left out with a warning: one broken package must not take the others
-    down.
+    A foreign module that cannot be imported is left out with a warning: one broken package must not take the
+    others down.
     """
     global _loaded
     if _loaded:

@@ -12,7 +12,7 @@ import warp as wp
 from neurosim_core.bench.throughput_result import LOOP, LOOP_AT_ONCE, Comparison
 from neurosim_core.bench.throughput_stages import FRAME_US, Views, make_camera, make_naive, seconds_per_call
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.runtime.cuda import GraphCache, Fence, make_stream, use_stream
+from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_stream
 
 _AHEAD = 2
 """Frames whose renders are launched before the count of one is read: more of them are no faster."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from neurosim_core import packets as pkt
 from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
+from neurosim_core.registry import find
 from neurosim_core.runtime.pinned import PinError, PinnedMapping
 from neurosim_core.sim import (
     COLLISION,
@@ -61,13 +62,6 @@ __all__ = [
 AcquireBuffer = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Gives memory for a picture: called with camera, stamp [ns] and an array of its shape and dtype."""
 
-_PACKETS: Mapping[str, type[Packet]] = {
-    "event_camera": pkt.Events,
-    "rgb": pkt.Image,
-    "depth": pkt.Image,
-    "imu": pkt.ImuSample,
-    "odometry": pkt.Odometry,
-}
 _PENDING_PERIODS = (2, 100)
 """Bounds of how far the cameras may lag behind the flight, in control periods."""
 _SPARE_PERIODS = 32
@@ -78,9 +72,10 @@ def packet_type(kind: str) -> type[Packet]:
     """Return the packet that sensors of a kind yield.
 
     Raises:
-        KeyError: There is no such kind.
+        ValueError: There is no such kind.
     """
-    return _PACKETS[kind]
+    found: type[Packet] = find("sensor", kind).packet_type  # type: ignore[attr-defined]
+    return found
 
 
 class FlownBatch(NamedTuple):

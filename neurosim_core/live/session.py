@@ -21,8 +21,8 @@ from neurosim_core.live.messages import message_type, setpoint_of, to_packet
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_targets import RerunTarget
 from neurosim_core.view.rerun_shapes import SceneShapes, scene_shapes
+from neurosim_core.view.rerun_targets import RerunTarget
 
 DRAIN_MAX = 1000
 """Messages of one stream that are taken before those of the next."""

@@ -25,8 +25,8 @@ from neurosim_core.config import ConfigError
 from neurosim_core.live.session import LiveSession, ViewOptions
 from neurosim_core.live.topics import SIMULATION
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
 from neurosim_core.view.rerun_sdk import import_rerun
+from neurosim_core.view.rerun_targets import FileTarget, RerunTarget, ViewerTarget, check_new_file
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
 
 POLL_S = 0.01

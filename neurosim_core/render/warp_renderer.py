@@ -75,11 +75,12 @@ ONE_WORLD = RenderWorlds()
 
 
 class WarpRenderer:
-    """Renders K instants of one lens in N worlds per launch. `render` neither allocates nor waits for a device.
+    """Renders K instants of one lens in N worlds per launch.
 
     Instants are [world, K] in this order in all arrays: instant k of world n is row n K + k. On a device they
     are launched in the order world, tile, instant, pixel: the instants of a tile, which see the same
-    triangles, run side by side. Outputs that are not requested are None. See `outputs.RenderOutputs` for what they are.
+    triangles, run side by side. `render` neither allocates nor waits for a device. Outputs that are not
+    requested are None. See `outputs.RenderOutputs` for what they are.
 
     Attributes:
         log_radiance: float32, shape [N K, H, W].

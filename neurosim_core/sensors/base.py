@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
 from numpy.typing import NDArray
 from pydantic import Field
@@ -35,7 +35,7 @@ class RenderRequest(NamedTuple):
     rate_hz: float
     """How often [Hz]."""
     every_instant: bool = False
-    """It has to see all instants that are rendered in its group, in order, and sets the clock of the group."""
+    """It has to see all instants that are rendered in its group, in order; its rate is that of the group."""
     max_displacement_px: float | None = None
     """Adaptive sampling: an instant is rendered only where something would move further than this [px]."""
     required: Rate | None = None
@@ -44,6 +44,13 @@ class RenderRequest(NamedTuple):
 
 class SensorConfig(Settings):
     """Settings of a sensor. Subclasses add `kind: Literal["..."]` and are registered under that kind."""
+
+    packet_type: ClassVar[type[Packet]]
+    """Class of its packets."""
+
+    if TYPE_CHECKING:
+        kind: str
+        """The kind under which it is registered; a field of every subclass."""
 
     @property
     def clock(self) -> Rate:
@@ -127,6 +134,7 @@ class ImageSensorConfig(CameraConfig):
     rate_hz: RateHz = 20.0
     """Pictures a second [Hz]."""
 
+    packet_type: ClassVar[type[Packet]] = Image
     output: ClassVar[str]
     """What it takes pictures of, one of `render.outputs.OUTPUTS`."""
     encoding: ClassVar[ImageEncoding]
@@ -186,12 +194,14 @@ class WorldFrameSensor(Protocol):
     of a step says which is the present one.
     """
 
-    terms: Sequence[str]
-    results: Any
-    """What it found in the last step, on the device."""
+    terms: tuple[str, ...]
+
+    @property
+    def results(self) -> Any:
+        """What it found in the last step, on the device."""
 
     def begin(self, mask: Any, parity: int) -> None:
-        """Let some worlds take frame 0 as their reference, device array of int32, shape [N]; launches only."""
+        """Let worlds whose mask (int32, shape [N]) is not 0 take frame 0 as their reference; launches only."""
 
     def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
         """Return offsets of a step on the device; whoever makes a graph with them keeps them."""

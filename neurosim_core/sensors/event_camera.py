@@ -47,6 +47,8 @@ class EventSensorConfig(FrameSensorConfig):
     """How many packets of events are sent a second [Hz]; each holds the events of its whole window. null: the
     highest rate up to 100 Hz that divides the sampling rate."""
 
+    packet_type = Events
+
     @property
     def clock(self) -> Rate:
         """When log radiance is rendered for it."""

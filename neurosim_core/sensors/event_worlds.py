@@ -111,7 +111,7 @@ class WorldEventCamera:
         self._base = self._empty((world_count, pixel_count), wp.float32)
         self._last = [self._empty((world_count, pixel_count), wp.float32) for _ in range(2)]
         self._crossed = [self._empty((world_count, pixel_count), wp.vec2i) for _ in range(2)]
-        self.terms = tuple(sorted({term for config in configs for term in terms_of(config)}))
+        self.terms: tuple[str, ...] = tuple(sorted({term for config in configs for term in terms_of(config)}))
         """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
         self._thresholds: Any = wp.array(
             [(config.threshold_on, config.threshold_off) for config in configs],

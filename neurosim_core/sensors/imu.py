@@ -86,6 +86,8 @@ class ImuSensorConfig(ImuConfig):
 
     kind: Literal["imu"] = "imu"
 
+    packet_type = ImuSample
+
     def make(self, context: SamplerContext) -> "ImuSampler":
         """Return the sensor at work."""
         return ImuSampler(self, context)
@@ -369,7 +371,7 @@ class ImuSampler(Sampler):
 
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> ImuSample:
         """Return one sample as a packet."""
-        return ImuSample(**header, **rows)
+        return ImuSample(**header, **dict[str, Any](rows))
 
 
 def _terms(config: ImuConfig) -> tuple[str, ...]:

@@ -24,6 +24,8 @@ class OdometrySensorConfig(StateSensorConfig):
     rate_hz: RateHz = 200.0
     """Samples a second [Hz]."""
 
+    packet_type = Odometry
+
     def make(self, context: SamplerContext) -> "OdometrySampler":
         """Return the sensor at work."""
         return OdometrySampler(context)
@@ -59,7 +61,13 @@ class OdometrySampler(Sampler):
 
     def __init__(self, context: SamplerContext) -> None:
         state = context.vehicle.arrays
-        sources = (state.position, state.orientation, state.velocity, state.body_rate, state.rotor_speed)
+        sources: tuple[Any, ...] = (
+            state.position,
+            state.orientation,
+            state.velocity,
+            state.body_rate,
+            state.rotor_speed,
+        )
         copies: list[Any] = [
             wp.zeros((context.slot_count, *source.shape), dtype=source.dtype, device=source.device)
             for source in sources
@@ -82,4 +90,4 @@ class OdometrySampler(Sampler):
 
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Odometry:
         """Return one sample as a packet."""
-        return Odometry(**header, **rows)
+        return Odometry(**header, **dict[str, Any](rows))

@@ -23,8 +23,8 @@ class Range(Packet):
     display: ClassVar[str] = "time series"
 
     distance_m: Annotated[float, FieldSpec(unit="m")]
-    """Distance to the nearest surface in the field of view [m]; -inf: nearer than the sensor can measure, inf:
-    farther, or nothing there (ROS REP 117)."""
+    """Distance to the nearest surface in the field of view [m]; -inf: nearer than the sensor can measure;
+    inf: farther, or nothing there (ROS REP 117)."""
     field_of_view_rad: Annotated[float, FieldSpec(unit="rad", constant=True)]
     """Width of the field of view [rad]."""
     range_min_m: Annotated[float, FieldSpec(unit="m", constant=True)]
@@ -51,6 +51,7 @@ class RangeFinderConfig(ImageSensorConfig):
     range_max_m: Annotated[float, Field(gt=0.0)] = 40.0
     """Longest distance that it measures [m]."""
 
+    packet_type = Range
     output = "depth"
     encoding = "32FC1"
 

@@ -1,4 +1,4 @@
-"""How the cameras of a rig share the work of rendering: one ray answers all that share pose, lens and clock."""
+"""How cameras share the work of rendering: one ray answers all that share pose, lens and clock."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
     """
     if mode not in state.commands:
         if mode == "motor_speeds":
-            array = state.vehicle.arrays.rotor_speed_command
+            array: Any = state.vehicle.arrays.rotor_speed_command
         else:
             state.controllers[mode] = make_controller(
                 mode,
@@ -148,7 +148,7 @@ def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[]
 
 
 def integrate(state: State, batch: Batch) -> None:
-    """Move the vehicles of all worlds from boundary to boundary and sample what is due there; launches only."""
+    """Move the vehicles of all worlds from boundary to boundary, and sample what is due; launches only."""
     device, count = state.vehicle.device, state.world_count
     wp.launch(begin_batch, dim=count, inputs=[state.fleet], device=device)
     elapsed_ns = 0

@@ -32,7 +32,7 @@ class Start:
 
 
 def begin_of_paths(scenes: SceneTable) -> dict[str, NDArray[np.float64]]:
-    """Return where the vehicle of each world begins as configured, by name of the quantity, shape [N, ...]."""
+    """Return where the vehicle of each world begins as configured, by name, shape [N, ...]."""
     begins = [model.path.evaluate([0]) for model in scenes.models]
     half_yaw = [0.5 * begin.yaw[0] for begin in begins]
     of_scene: dict[str, NDArray[np.float64]] = {

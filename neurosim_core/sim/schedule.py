@@ -97,7 +97,7 @@ def _due(mark: int, sampler_count: int, group_count: int) -> tuple[bool, tuple[i
 
 @dataclass(frozen=True, kw_only=True)
 class Period:
-    """A control period, relative to its begin. Periods that are alike are equal: the same launches fly them."""
+    """A control period, relative to its begin. The same launches fly periods that are equal."""
 
     boundaries: tuple[Boundary, ...]
     """Stamps are relative to the begin of the period."""

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,no-untyped-call,call-overload"
-"""What changes during a run: the vehicles of all worlds, the buffers of their sensors, how far both have come."""
+"""What changes during a run: the vehicles of all worlds, the buffers of their sensors, and the progress."""
 
 from __future__ import annotations
 
@@ -345,8 +345,8 @@ def _make_groups(
     for index, group in enumerate(model.groups if model.scene_on_device is not None else ()):
         if not on_host and group.max_displacement_px is not None:
             raise ValueError(
-                f"max_displacement_px of {', '.join(group.frame_sensors)} is for single runs: it chooses what "
-                "to render for one vehicle, on the host"
+                f"max_displacement_px of {', '.join(group.frame_sensors)} is for single runs: it chooses "
+                "what to render for one vehicle, on the host"
             )
         lenses, lens_of_world = lens_tables(group, worlds.rigs)
         rooms = {} if on_host else _frame_capacities(group, worlds)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,arg-type,valid-type"
-"""The states of the vehicles of all worlds at the boundaries of batches, on the device until they are read."""
+"""The states of all vehicles at the boundaries of batches, on the device until they are read."""
 
 import math
 from typing import Any, NamedTuple
@@ -300,6 +300,6 @@ def make_surfaces(
     surfaces = Surfaces()
     surfaces.fields, surfaces.scene = fields, scene
     surfaces.radius_m = radius_m
-    surfaces.ground_height_m = -math.inf if ground_height_m is None else ground_height_m
+    surfaces.ground_height_m = wp.float64(-math.inf if ground_height_m is None else ground_height_m)
     surfaces.holds = int(holds)
     return surfaces

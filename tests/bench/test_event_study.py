@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from neurosim_core.sensors.rig import EventSensorConfig
 
 from neurosim_core.bench import events as study_of
 from neurosim_core.bench.chapter import Chapter
 from neurosim_core.bench.events import measure_events
 from neurosim_core.bench.events_chapter import events_chapter
 from neurosim_core.bench.events_result import EventStudy, Score, falls, saving, timing_gain
-from neurosim_core.sensors.rig import EventSensorConfig
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 from matplotlib.figure import Figure
+from neurosim_core.simulation import make_model, refit
 
 from neurosim_core.bench import commands, throughput
 from neurosim_core.bench import step as step_bench
@@ -36,7 +37,6 @@ from neurosim_core.bench.throughput_result import (
 )
 from neurosim_core.bench.throughput_scene import hall
 from neurosim_core.sensors.events import EventCamera, EventCameraConfig
-from neurosim_core.simulation import make_model, refit
 
 THRESHOLD = 0.2
 

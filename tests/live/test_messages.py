@@ -21,6 +21,7 @@ from neurosim_core.live.config import LinkConfig
 from neurosim_core.live.messages import command_of, message_type, setpoint_of, to_message, to_packet
 from neurosim_core.live.topics import COMMANDS
 from neurosim_core.packets import Axes, Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.sensors.odometry import OdometrySensorConfig
 
 HEADER: dict[str, Any] = {"stamp_ns": 5_000_000, "sequence": 7, "sensor": "x"}
 
@@ -147,7 +148,7 @@ def test_a_new_packet_is_published_under_the_topic_of_its_sensor(
 ):
     """Odometry stands in for a sensor of a new kind: nothing in the live stack knows its packets."""
     config = make_config(sensors={"scanner": ODOMETRY | {"rate_hz": 200.0}}, **{"live.mode": "lockstep"})
-    monkeypatch.setitem(engine._PACKETS, "odometry", RangeScan)
+    monkeypatch.setattr(OdometrySensorConfig, "packet_type", RangeScan)
     end_step = engine.VehicleEngine.end_step
 
     def with_scans(self: engine.VehicleEngine, pending: Any) -> list[Packet]:

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from neurosim_core.runtime import cuda
 from neurosim_core.runtime.cuda import (
-    GraphCache,
-    HostCopy,
     BufferPool,
     Fence,
+    GraphCache,
+    HostCopy,
     RecordedLaunch,
     make_stream,
-    use_stream,
     size_class,
+    use_stream,
 )
 
 
@@ -29,7 +28,7 @@ def _add(step: float, values: wp.array[float]) -> None:
 @pytest.mark.parametrize("capacity", [1, 2, 64])
 def test_replays_do_what_the_launches_do(device, monkeypatch, capacity):
     """Keys that alternate, come late or are forgotten meanwhile: the sum of all steps, every time."""
-    monkeypatch.setattr(streams, "_GRAPH_COUNT_MAX", capacity)
+    monkeypatch.setattr(cuda, "_GRAPH_COUNT_MAX", capacity)
     values = wp.zeros(3, dtype=float, device=device)
     graphs = GraphCache(device)
     calls = []
@@ -138,7 +137,7 @@ def test_a_block_comes_back_when_its_last_view_is_gone(device):
 
 
 def test_who_keeps_too_much_gets_copies(device, monkeypatch):
-    monkeypatch.setattr(streams, "_POOLED_BYTES_MAX", 1300)
+    monkeypatch.setattr(cuda, "_POOLED_BYTES_MAX", 1300)
     blocks = BufferPool(device)
     kept = []
     for number in range(6):
@@ -153,7 +152,7 @@ def test_who_keeps_too_much_gets_copies(device, monkeypatch):
 
 
 def test_who_reads_one_after_the_other_gets_no_copies_of_large_blocks(device, monkeypatch):
-    monkeypatch.setattr(streams, "_POOLED_BYTES_MAX", 50)
+    monkeypatch.setattr(cuda, "_POOLED_BYTES_MAX", 50)
     blocks = BufferPool(device)
     rows = None
     for _ in range(5):

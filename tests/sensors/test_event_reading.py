@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from late_device import LateDevice, install
 
-from neurosim_core.runtime import cuda
 from neurosim_core.packets import Events
+from neurosim_core.runtime import cuda
 from neurosim_core.sensors.event_config import ShotNoiseConfig
 from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.event_pixels import Pixels

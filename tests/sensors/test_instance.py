@@ -14,7 +14,9 @@ LENS = {"width": 64, "height": 48, "horizontal_fov_rad": 1.2}
 @pytest.mark.parametrize("traversal", ["embree", "warp"])
 def test_the_board_is_where_its_projection_is(tmp_path, traversal):
     room = write_room(tmp_path / "room.glb")
-    sensors = {"labels": {"kind": "instance", "lens": LENS, "mount": {"position_m": [0, 0, 0]}, "rate_hz": 20}}
+    sensors = {
+        "labels": {"kind": "instance", "lens": LENS, "mount": {"position_m": [0, 0, 0]}, "rate_hz": 20}
+    }
     render = {"lighting": {"mode": "unshadowed"}, "cpu_traversal": traversal}
     packets = fly_in_room(room, sensors, render=render)
     assert [packet.stamp_ns for packet in packets] == [0, 50_000_000, 100_000_000]

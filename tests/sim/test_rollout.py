@@ -134,7 +134,9 @@ def test_terms_are_those_that_the_kernels_have(settings):
         model = sim.make_model(ns.load_config({**settings, "render": render}))
         (cast,) = sim.make_state(model).groups
         found[walk is None] = set(render_group.render_terms(cast))
-    assert found[False] - found[True] == {"candidate_group"} | ({"by_tile"} if settings["device"] == "cpu" else set())
+    assert found[False] - found[True] == {"candidate_group"} | (
+        {"by_tile"} if settings["device"] == "cpu" else set()
+    )
     assert not found[True] & {"candidate_group", "by_tile", "fallback"}
 
 

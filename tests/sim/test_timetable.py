@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurosim_core.clock import Rate
-from neurosim_core.sim.schedule import Schedule, boundaries
-from neurosim_core.sim.schedule import Timetable
+from neurosim_core.sim.schedule import Schedule, Timetable, boundaries
 
 RATES = [20.0, 30.0, 50.0, 100.0, 200.0, 250.0, 333.0, 400.0, 1000.0]
 

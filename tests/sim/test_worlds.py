@@ -13,13 +13,11 @@ from world_rig import RIG, assert_same, commands_of, fly_alone, room, scene_of, 
 
 import neurosim_core as ns
 from neurosim_core.packets import Collision, Events
-from neurosim_core.render import launch
-from neurosim_core.sim import StartState
-from neurosim_core.vehicle.status import STATUS_TERMS
-from neurosim_core.render import warp_renderer
+from neurosim_core.render import launch, warp_renderer
 from neurosim_core.sensors import event_worlds
-from neurosim_core.sim import Simulation
+from neurosim_core.sim import Simulation, StartState
 from neurosim_core.sim import simulation as worlds_module
+from neurosim_core.vehicle.status import STATUS_TERMS
 
 
 @pytest.fixture(scope="module")
