@@ -193,7 +193,6 @@ class LiveSession:
             scene=self._shapes,
             event_window_ns=self._options.event_window_ns,
             image_rate_max_hz=self._options.image_rate_hz,
-            links=self._has_links,
             compress=self._outlet.compress,
             live=True,
             keep_layout=number > 1,
