@@ -7,9 +7,7 @@ import atexit
 import gc
 import logging
 import os
-import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +17,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
-from neurosim_core.install import install_hint
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
@@ -185,8 +182,8 @@ def _add_view(commands: _Commands) -> None:
         metavar="HZ",
         help="live: most images a second [Hz]; events have a limit of their own",
     )
-    view.add_argument("--port", type=int, default=0, help="live, --web: port of the page (default: any)")
-    view.add_argument("--no-browser", action="store_true", help="live, --web: print the address only")
+    view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
+    view.add_argument("--no-browser", action="store_true", help="--web: print the address only")
     view.set_defaults(command=_view)
 
 
@@ -330,9 +327,6 @@ def _view(arguments: argparse.Namespace) -> int:
     if arguments.save is not None:
         print(f"wrote {file}")
         return 0
-    beside = str(Path(sys.executable).parent)  # a virtual environment need not be active
-    viewer = shutil.which("rerun", path=os.pathsep.join([beside, *os.get_exec_path()]))
-    if viewer is None:
-        raise ImportError(f"the Rerun viewer is not installed: {install_hint('view')}")
-    options = ["--web-viewer", "--bind", "127.0.0.1"] if arguments.web else []
-    return subprocess.run([viewer, str(file), *options], check=False).returncode
+    from neurosim_core.view.rerun_viewer import show_file
+
+    return show_file(file, web=arguments.web, port=arguments.port, open_browser=not arguments.no_browser)

@@ -1,4 +1,4 @@
-"""The Rerun viewer as a process of ours: a window, or a server of its page and data for this machine only.
+"""The Rerun viewer as a child process: a window, or a server of its page and data for this machine only.
 
 `rerun.serve_grpc` would do the second in this process, but listens on every network.
 """
@@ -14,22 +14,22 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.parse
+import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from neurosim_core.install import install_hint
-from neurosim_core.view.rerun_sdk import import_rerun, open_rerun
-
-if TYPE_CHECKING:
-    import rerun as rr
+from neurosim_core.signals import stop_at_signals
+from neurosim_core.view.rerun_sdk import RerunStream, import_rerun, open_rerun
 
 HOST = "127.0.0.1"
 _START_S = 20.0
 _END_S = 0.5
+_POLL_S = 0.1
 _WINDOW_MEMORY = "2GB"
 _SERVER_MEMORY = "1GB"
 _PR_SET_PDEATHSIG = 1
@@ -42,12 +42,20 @@ class ViewerEnded(RuntimeError):
 class RerunViewer:
     """A viewer that recordings can be opened in. A context manager that ends it."""
 
-    def __init__(self, *, web: bool, port: int = 0, waiting: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        *,
+        web: bool,
+        port: int = 0,
+        file: Path | None = None,
+        waiting: Callable[[], bool] = lambda: True,
+    ) -> None:
         """Start the viewer and wait until it listens.
 
         Args:
             web: Serve a page instead of opening a window.
             port: Port of the page; 0: any that is free.
+            file: A Rerun file to show from the beginning.
             waiting: Asked now and then whether to go on waiting.
 
         Raises:
@@ -57,7 +65,8 @@ class RerunViewer:
         """
         import_rerun()
         page_port, data_port = _free_ports(port if web else 0, 0)
-        options = ["--bind", HOST, "--port", str(data_port), "--server-memory-limit", _SERVER_MEMORY]
+        options = [] if file is None else [str(file)]
+        options += ["--bind", HOST, "--port", str(data_port), "--server-memory-limit", _SERVER_MEMORY]
         if web:
             options += ["--serve-web", "--web-viewer-port", str(page_port)]
         else:
@@ -87,15 +96,15 @@ class RerunViewer:
             self.close()
             raise
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str) -> RerunStream:
         """Open a recording in the viewer, which shows it at once.
 
         Args:
             name: What the viewer calls it.
         """
-        recording = open_rerun(name=name)
-        recording.connect_grpc(self.data_url)
-        return recording
+        stream = open_rerun(name=name)
+        stream.recording.connect_grpc(self.data_url)
+        return stream
 
     @property
     def ended(self) -> bool:
@@ -146,6 +155,40 @@ class RerunViewer:
         self._words.seek(0)
         lines = self._words.read().decode(errors="replace").strip().splitlines()
         return "\n".join(lines[-5:])
+
+
+def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True) -> int:
+    """Show a Rerun file until the window is closed or this process is interrupted.
+
+    Args:
+        file: A file that ends in .rrd.
+        web: Serve a page instead of opening a window.
+        port: Port of the page; 0: any that is free.
+        open_browser: Open the page.
+
+    Returns:
+        0 if the window was closed, 130 if interrupted.
+
+    Raises:
+        ValueError: There is no display to open a window on.
+        OSError, ImportError, ViewerEnded: As `RerunViewer`.
+    """
+    has_display = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+    if not web and not has_display:
+        raise ValueError("there is no display to open a window on: `neurosim view FILE --web` serves a page")
+    stop = threading.Event()
+    with (
+        stop_at_signals(stop),
+        RerunViewer(web=web, port=port, file=file, waiting=lambda: not stop.is_set()) as viewer,
+    ):
+        if web:
+            print(f"open {viewer.page_url}", flush=True)
+            if open_browser and has_display:
+                webbrowser.open(viewer.page_url)
+        while not stop.wait(_POLL_S) and not viewer.ended:
+            pass
+        viewer.check()
+    return 130 if stop.is_set() else 0
 
 
 def _executable() -> str:
