@@ -1,4 +1,4 @@
-"""The Rerun viewer as a process of ours: a window, or a server of its page and data for this machine only.
+"""The Rerun viewer as a child process: a window, or a server of its page and data for this machine only.
 
 `rerun.serve_grpc` would do the second in this process, but listens on every network.
 """
@@ -21,23 +21,17 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_sdk import import_rerun, open_rerun
-
-if TYPE_CHECKING:
-    import rerun as rr
+from neurosim_core.view.rerun_sdk import RerunStream, import_rerun, open_rerun
 
 HOST = "127.0.0.1"
 _START_S = 20.0
 _END_S = 0.5
+_POLL_S = 0.1
 _WINDOW_MEMORY = "2GB"
 _SERVER_MEMORY = "1GB"
-_FILE_MEMORY = "75%"
-_SHOW_S = 0.2
-"""How often a viewer of a file is looked after [s]."""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -61,7 +55,7 @@ class RerunViewer:
         Args:
             web: Serve a page instead of opening a window.
             port: Port of the page; 0: any that is free.
-            file: A recording to show, all of it; None: what `open` is given, the newest of it.
+            file: A Rerun file to show from the beginning.
             waiting: Asked now and then whether to go on waiting.
 
         Raises:
@@ -71,13 +65,12 @@ class RerunViewer:
         """
         import_rerun()
         page_port, data_port = _free_ports(port if web else 0, 0)
-        options = ["--bind", HOST, "--port", str(data_port)]
-        options += ["--server-memory-limit", _SERVER_MEMORY if file is None else _FILE_MEMORY]
+        options = [] if file is None else [str(file)]
+        options += ["--bind", HOST, "--port", str(data_port), "--server-memory-limit", _SERVER_MEMORY]
         if web:
             options += ["--serve-web", "--web-viewer-port", str(page_port)]
         else:
-            options += ["--memory-limit", _WINDOW_MEMORY if file is None else _FILE_MEMORY]
-            options += ["--hide-welcome-screen", "--expect-data-soon"]
+            options += ["--memory-limit", _WINDOW_MEMORY, "--hide-welcome-screen", "--expect-data-soon"]
         self.data_url = f"rerun+http://{HOST}:{data_port}/proxy"
         """Where recordings are sent to."""
         self.page_url = ""
@@ -87,7 +80,7 @@ class RerunViewer:
             self.page_url = f"http://{HOST}:{page_port}/?{query}"
         self._words = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
         self._process = subprocess.Popen(
-            [_executable(), *([] if file is None else [str(file)]), *options],
+            [_executable(), *options],
             stdin=subprocess.DEVNULL,
             stdout=self._words,
             stderr=self._words,
@@ -96,23 +89,22 @@ class RerunViewer:
             preexec_fn=_end_with_parent(),
         )
         try:
-            if web or file is None:
-                self._wait_for(data_port, waiting)
+            self._wait_for(data_port, waiting)
             if web:
                 self._wait_for(page_port, waiting)
         except BaseException:
             self.close()
             raise
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str) -> RerunStream:
         """Open a recording in the viewer, which shows it at once.
 
         Args:
             name: What the viewer calls it.
         """
-        recording = open_rerun(name=name)
-        recording.connect_grpc(self.data_url)
-        return recording
+        stream = open_rerun(name=name)
+        stream.recording.connect_grpc(self.data_url)
+        return stream
 
     @property
     def ended(self) -> bool:
@@ -166,23 +158,24 @@ class RerunViewer:
 
 
 def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True) -> int:
-    """Show a file of Rerun until the window is closed or a signal comes; the viewer ends with this process.
+    """Show a Rerun file until the window is closed or this process is interrupted.
 
     Args:
-        file: What to show.
+        file: A file that ends in .rrd.
         web: Serve a page instead of opening a window.
         port: Port of the page; 0: any that is free.
-        open_browser: Open the page, where there is a display.
+        open_browser: Open the page.
 
     Returns:
         0 if the window was closed, 130 if interrupted.
 
     Raises:
-        ValueError: There is no display for a window.
-        ImportError, OSError, ViewerEnded: As `RerunViewer`.
+        ValueError: There is no display to open a window on.
+        OSError, ImportError, ViewerEnded: As `RerunViewer`.
     """
-    if not web and without_display():
-        raise ValueError("there is no display to open a window on: --web serves a page")
+    has_display = sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
+    if not web and not has_display:
+        raise ValueError("there is no display to open a window on: `neurosim view FILE --web` serves a page")
     stop = threading.Event()
     with (
         stop_at_signals(stop),
@@ -190,17 +183,12 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
     ):
         if web:
             print(f"open {viewer.page_url}", flush=True)
-            if open_browser and not without_display():
+            if open_browser and has_display:
                 webbrowser.open(viewer.page_url)
-        while not stop.wait(_SHOW_S) and not viewer.ended:
+        while not stop.wait(_POLL_S) and not viewer.ended:
             pass
         viewer.check()
     return 130 if stop.is_set() else 0
-
-
-def without_display() -> bool:
-    """Return whether no window can be opened here."""
-    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _executable() -> str:
