@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
@@ -95,7 +97,9 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 if TYPE_CHECKING:
     AnySensor = SensorConfig
 else:
-    AnySensor = Annotated[tuple(kinds("sensor").values()), Field(discriminator="kind")]
+    AnySensor = Annotated[
+        functools.reduce(operator.or_, kinds("sensor").values()), Field(discriminator="kind")
+    ]
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
 Sensors = dict[Name, AnySensor]
@@ -246,7 +250,9 @@ def _take_new_kinds(seam: str) -> None:
     """Let settings name kinds of sensors that were registered after this module was imported."""
     if seam != "sensor":
         return
-    known: Any = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]  # noqa: UP007
+    known: Any = Annotated[
+        functools.reduce(operator.or_, kinds("sensor").values()), Field(discriminator="kind")
+    ]
     sensors: Any = dict[Name, known]
     FleetMember.model_fields["sensors"].annotation = sensors | None
     SimulationConfig.model_fields["sensors"].annotation = sensors

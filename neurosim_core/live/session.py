@@ -134,9 +134,6 @@ class LiveSession:
         self.sensors = {name: [s.name for s in sensors] for name, sensors in self._vehicles.items()}
         self.phase = ""
         self._rotor_counts = {n: config.of(n).vehicle.airframe().rotor_count for n in config.vehicles}
-        self._has_links = any(
-            not link.delivers_at_once for name in config.vehicles for link in config.of(name).links.values()
-        )
         self._node = node
         self._outlet = outlet
         self._number = number

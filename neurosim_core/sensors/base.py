@@ -201,7 +201,7 @@ class WorldFrameSensor(Protocol):
         """What it found in the last step, on the device."""
 
     def begin(self, mask: Any, parity: int) -> None:
-        """Let worlds whose mask (int32, shape [N]) is not 0 take frame 0 as their reference; launches only."""
+        """Let worlds whose mask (int32, [N]) is not 0 take frame 0 as their reference; launches only."""
 
     def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
         """Return offsets of a step on the device; whoever makes a graph with them keeps them."""

@@ -12,6 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from neurosim_core.control import CommandMode, make_controller
+from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.runtime.cuda import use_stream
@@ -72,13 +73,19 @@ def checked_command(model: Model, state: State, command: ArrayLike, mode: Comman
     return state.controllers[mode].checked(command)
 
 
-def set_command(model: Model, state: State, command: ArrayLike | None, mode: CommandMode) -> None:
+Command = Setpoint | ArrayLike | None
+"""What an outside controller commands: a setpoint, a row of its mode, or None: what holds now."""
+
+
+def set_command(model: Model, state: State, command: Command, mode: CommandMode) -> None:
     """Have the next batch begin with a setpoint, which becomes rotor speeds at the state of the vehicle then.
 
     The batch before has been read: what it took from the host is free.
     """
     if command is None:
         return
+    if isinstance(command, Setpoint):
+        command, mode = command.row(), command.mode
     rows = checked_command(model, state, command, mode)
     state.commands[mode].stage(rows)
     state.command_mode = mode

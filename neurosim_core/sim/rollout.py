@@ -15,13 +15,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
-from numpy.typing import ArrayLike
-
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.sim.cameras import launch_cameras, plan_ahead, read_cameras
 from neurosim_core.sim.integrate import (
+    Command,
     in_order,
     launch_flight,
     plan_batch,
@@ -73,18 +72,16 @@ def run_model(model: Model, state: State) -> Iterator[Packet]:
     yield from finish(state)
 
 
-def step(
-    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
-) -> list[Packet]:
+def step(model: Model, state: State, command: Command, *, mode: CommandMode = "motor_speeds") -> list[Packet]:
     """Hold a command of an outside controller until the next tick of the control clock.
 
     Args:
         model: What does not change.
         state: Moved on by one control period.
-        command: Setpoint row of the mode (`control.modes.MODES`), by default rotor speeds [rad/s], shape [R].
-            Modes above it are turned into rotor speeds once, at the beginning of the period. None: the rotor
-            speeds that hold now.
-        mode: What the command is.
+        command: A setpoint (`control.setpoints`), or a row of the mode (`control.modes.MODES`), by default
+            rotor speeds [rad/s], shape [R]. Modes above it are turned into rotor speeds once, at the
+            beginning of the period. None: the rotor speeds that hold now.
+        mode: What a row is.
 
     Returns:
         What the sensors yield in (stamp, next stamp], in the order of time; the first call also yields stamp
@@ -107,7 +104,7 @@ class PendingStep(NamedTuple):
 
 
 def begin_step(
-    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+    model: Model, state: State, command: Command, *, mode: CommandMode = "motor_speeds"
 ) -> PendingStep:
     """Begin a control period like `step`, without waiting for a CUDA device.
 
@@ -162,7 +159,7 @@ def warm_up(model: Model) -> None:
 
 
 def integrate_period(
-    model: Model, state: State, command: ArrayLike | None, *, mode: CommandMode = "motor_speeds"
+    model: Model, state: State, command: Command, *, mode: CommandMode = "motor_speeds"
 ) -> tuple[list[Packet], list[Batch]]:
     """Fly one control period like `step`, and leave the cameras for later.
 

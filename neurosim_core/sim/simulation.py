@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
+from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.sim.inputs import as_device_array, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch
@@ -202,8 +203,8 @@ class Simulation:
         from CUDA's default stream, which PyTorch uses unless told otherwise.
 
         Args:
-            commands: Setpoints of the mode (`control.modes.MODES`), shape [N, width] or, on the host, one row
-                for all. NumPy, PyTorch, Warp or what else has DLPack, float32 or float64. They are copied.
+            commands: A setpoint (`control.setpoints`), or rows of the mode (`control.modes.MODES`), shape
+                [N, width] or, on the host, one row for all. NumPy, PyTorch, Warp or what else has DLPack, float32 or float64. They are copied.
                 None: the rotor speeds that hold now.
             mode: What they are; turned into rotor speeds once, at the begin of the step.
 
@@ -216,6 +217,8 @@ class Simulation:
                 looked at: a vehicle whose command is not finite is held (`Observation.status`).
         """
         self._require_reset()
+        if isinstance(commands, Setpoint):
+            commands, mode = commands.row(), commands.mode
         if commands is not None:
             self._take_commands(commands, mode)
         return self._advance(closed_loop=False)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from neurosim_core.runtime import cuda
 from neurosim_core.runtime.cuda import (
     BufferPool,
     Fence,

@@ -1,0 +1,26 @@
+"""One import gives every public name, and costs nothing before one is used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import neurosim_core as ns
+
+
+@pytest.mark.parametrize("name", ns.__all__)
+def test_every_public_name_is_there(name):
+    assert getattr(ns, name) is not None
+
+
+def test_an_unknown_name_is_said():
+    with pytest.raises(AttributeError, match="no attribute 'Simulations', known: "):
+        ns.Simulations  # noqa: B018
+
+
+def test_the_import_loads_nothing_heavy():
+    heavy = ("warp", "numpy", "scipy", "trimesh", "torch", "rerun", "pydantic")
+    code = f"import sys, neurosim_core; print([name for name in {heavy} if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
