@@ -204,8 +204,8 @@ class Simulation:
 
         Args:
             commands: A setpoint (`control.setpoints`), or rows of the mode (`control.modes.MODES`), shape
-                [N, width] or, on the host, one row for all. NumPy, PyTorch, Warp or what else has DLPack, float32 or float64. They are copied.
-                None: the rotor speeds that hold now.
+                [N, width] or, on the host, one row for all. NumPy, PyTorch, Warp or what else has DLPack,
+                float32 or float64. They are copied. None: the rotor speeds that hold now.
             mode: What they are; turned into rotor speeds once, at the begin of the step.
 
         Returns:

@@ -1,0 +1,98 @@
+"""A sensor of your own, in a file of your own: a downward optical proximity switch for landing.
+
+Run it: it flies the sensor, prints how often the switch was closed, and leaves a recording with the readings that
+`neurosim view` shows. To install such a sensor as a package, name its module in an entry point of the group
+`neurosim.plugins`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+import neurosim_core as ns
+from neurosim_core.packets import FieldSpec
+from neurosim_core.sensors.base import Sampler, SamplerContext, StateSensorConfig
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proximity(ns.Packet):
+    """What the switch reads: its recording, plot and messages follow from these fields."""
+
+    closed: bool
+    """Whether the vehicle is lower than the threshold."""
+    height_m: Annotated[float, FieldSpec(unit="m")]
+    """Height of the vehicle above z = 0 [m]."""
+
+
+@ns.register("sensor", "proximity")
+class ProximityConfig(StateSensorConfig):
+    """A switch that closes below a height."""
+
+    kind: Literal["proximity"] = "proximity"
+    rate_hz: float = 100.0
+    """Readings a second [Hz]."""
+    threshold_m: float = 1.0
+    """Height below which it closes [m]."""
+
+    packet_type = Proximity
+
+    def make(self, context: SamplerContext) -> ProximitySampler:
+        """Return the switch at work."""
+        return ProximitySampler(self.threshold_m, context)
+
+
+class ProximitySampler(Sampler):
+    """Copies the heights of the vehicles of all worlds on the device; the host compares them."""
+
+    def __init__(self, threshold_m: float, context: SamplerContext) -> None:
+        vehicle = context.vehicle
+        self._threshold_m = threshold_m
+        self._position = vehicle.arrays.position
+        shape = (context.slot_count, vehicle.count)
+        self.arrays = {"position": wp.zeros(shape, dtype=wp.vec3d, device=vehicle.device)}
+
+    def measure(self, slot: int) -> None:
+        """Copy the present positions into a slot."""
+        count = self._position.shape[0]
+        wp.copy(self.arrays["position"].flatten(), self._position, dest_offset=slot * count, count=count)
+
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Proximity:
+        """Return one sample as a packet."""
+        height_m = float(rows["position"][2])
+        return Proximity(closed=height_m < self._threshold_m, height_m=height_m, **header)
+
+
+def main(out: Path | None = None) -> int:
+    """Fly a descent; return how many readings said that the switch was closed."""
+    config = ns.load_config(
+        {
+            "duration_s": 2.0,
+            "device": "cpu",
+            "scene": {"kind": "apartment", "rooms": 1},
+            "path": {"kind": "tour"},
+            "sensors": {"proximity": {"kind": "proximity", "threshold_m": 1.2}},
+        }
+    )
+    readings = [packet for packet in ns.run(config) if isinstance(packet, Proximity)]
+    closed = sum(reading.closed for reading in readings)
+    heights = np.array([reading.height_m for reading in readings])
+    print(f"{len(readings)} readings, {closed} closed, heights {heights.min():.2f} to {heights.max():.2f} m")
+    if out is not None:
+        from neurosim_core.flight import fly
+
+        fly(config, out)
+    return closed
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, help="folder for a recording")
+    main(parser.parse_args().out)

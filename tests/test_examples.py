@@ -1,0 +1,54 @@
+"""The examples run, and end on the number that they should."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def load(name: str):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_sensor_of_an_outside_package_is_flown_recorded_and_shown(tmp_path):
+    from neurosim_core.record import Recording
+
+    example = load("custom_sensor")
+    closed = example.main(tmp_path)
+    assert 0 < closed < 201
+    with Recording(tmp_path / "flight.h5") as flight:
+        readings = list(flight.packets("proximity"))
+    assert (len(readings), sum(reading.closed for reading in readings)) == (201, closed)
+    assert [reading.closed for reading in readings] == [reading.height_m < 1.2 for reading in readings]
+    assert (tmp_path / "flight.rrd").stat().st_size > 10_000
+
+
+def test_a_kind_that_is_taken_is_refused():
+    import neurosim_core as ns
+    from neurosim_core.sensors.base import StateSensorConfig
+
+    with pytest.raises(
+        ValueError, match="the sensor kind 'imu' is taken by neurosim_core.sensors.imu.ImuSensorConfig"
+    ):
+
+        @ns.register("sensor", "imu")
+        class Other(StateSensorConfig):
+            pass
+
+
+def test_an_unknown_seam_or_kind_is_said():
+    from neurosim_core import registry
+
+    with pytest.raises(ValueError, match="unknown seam 'sensors', known: sensor, vehicle"):
+        registry.kinds("sensors")
+    with pytest.raises(ValueError, match="unknown sensor kind 'sonar', known: \\['depth', 'event_camera'"):
+        registry.find("sensor", "sonar")
