@@ -46,6 +46,8 @@ def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
     table = _table(seam)
 
     def add(cls: Registered) -> Registered:
+        if not cls.__module__.startswith("neurosim_core."):
+            load_plugins()  # a kind of our own is taken, whoever comes first
         known = table.get(kind)
         if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ def load(name: str):
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
 
@@ -36,9 +38,8 @@ def test_a_kind_that_is_taken_is_refused():
     import neurosim_core as ns
     from neurosim_core.sensors.base import StateSensorConfig
 
-    with pytest.raises(
-        ValueError, match="the sensor kind 'imu' is taken by neurosim_core.sensors.imu.ImuSensorConfig"
-    ):
+    taken = r"the sensor kind 'imu' is taken by neurosim_core\.sensors\.imu\.ImuSensorConfig"
+    with pytest.raises(ValueError, match=taken):
 
         @ns.register("sensor", "imu")
         class Other(StateSensorConfig):
@@ -50,5 +51,5 @@ def test_an_unknown_seam_or_kind_is_said():
 
     with pytest.raises(ValueError, match="unknown seam 'sensors', known: sensor, vehicle"):
         registry.kinds("sensors")
-    with pytest.raises(ValueError, match="unknown sensor kind 'sonar', known: \\['depth', 'event_camera'"):
+    with pytest.raises(ValueError, match=r"unknown sensor kind 'sonar', known: \['depth', 'event_camera'"):
         registry.find("sensor", "sonar")
