@@ -1,8 +1,7 @@
-"""A sensor of your own, in a file of your own: a downward optical proximity switch for landing.
+"""Fly a sensor of your own, from a file of your own: a switch that closes near the ground.
 
-Run it: it flies the sensor, prints how often the switch was closed, and leaves a recording with the readings that
-`neurosim view` shows. To install such a sensor as a package, name its module in an entry point of the group
-`neurosim.plugins`.
+It prints how often the switch was closed, and with --out leaves a recording that `neurosim view` shows. To
+install such a sensor as a package, name its module in an entry point of the group `neurosim.plugins`.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ def main(out: Path | None = None) -> int:
             "device": "cpu",
             "scene": {"kind": "apartment", "rooms": 1},
             "path": {"kind": "tour"},
-            "sensors": {"proximity": {"kind": "proximity", "threshold_m": 1.2}},
+            "sensors": {"proximity": {"kind": "proximity", "threshold_m": 1.45}},
         }
     )
     readings = [packet for packet in ns.run(config) if isinstance(packet, Proximity)]
