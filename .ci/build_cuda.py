@@ -28,13 +28,13 @@ from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement import rule_kernels
 from neurosim_core.sensors.event_noise import make_scan
 from neurosim_core.sensors.event_noise_model import TERMS
+from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.trajectory import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
 from neurosim_core.vehicle.integrator import make_kernels as make_flight
-from neurosim_core.worlds.scan import make_noisy_scan
 
 ARCHITECTURES = (80, 90)
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}

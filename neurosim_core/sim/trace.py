@@ -270,8 +270,8 @@ class Trace:
             setattr(self._rows_on_host, name, copy.mapped())
 
     def fetch(self, first: int, count: int) -> None:
-        """Launch the copy of some slots to the host: by one kernel, three times as fast as four copies."""
-        if self._is_cuda:
+        """Launch the copy of some slots to the host, after `bring_to_host`: by one kernel, not four copies."""
+        if self._is_cuda and self._copies:
             wp.launch(
                 _copy_rows,
                 dim=(count, *self.states.shape[1:]),
