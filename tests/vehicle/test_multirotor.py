@@ -49,7 +49,15 @@ def test_derivatives_equal_rotorpys(name, aero, device):
     rotorpy = pytest.importorskip("rotorpy.vehicles.multirotor")
     table = dict(importlib.import_module(f"rotorpy.vehicles.{name}_params").quad_params, k_flap=1e-4)
     wind = (3.0, -2.0, 1.0)
-    config = preset(name, **({"flapping_kg_m": 1e-4, "wind_m_s": wind} if aero else NO_AERO))
+    config = preset(
+        name,
+        mass_kg=table["mass"],
+        inertia_kg_m2=tuple(map(tuple, np.diag([table["Ixx"], table["Iyy"], table["Izz"]]).tolist())),
+        rotor_position_m=tuple(tuple(p.tolist()) for p in table["rotor_pos"].values()),
+        torque_coefficient_n_m_s2=table["k_m"],
+        motor_time_constant_s=table["tau_m"],
+        **({"flapping_kg_m": 1e-4, "wind_m_s": wind, "rotor_drag_kg": table["k_d"]} if aero else NO_AERO),
+    )
     oracle = rotorpy.Multirotor(table, aero=aero)
     states = random_states(config, 50)
     vehicle = Multirotor(config, count=50, device=device)

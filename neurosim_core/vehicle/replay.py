@@ -1,0 +1,265 @@
+"""Replay of a flight log: does a vehicle turn and push as the real one did, given the commands that it got?
+
+The log is cut into windows. Each begins with the measured body rate and is flown open loop with the logged
+commands. What differs from one specimen to the next is estimated from the flight before the window only: the
+thrust for a command, which falls with the battery, and a steady torque, as of a battery that sits off centre.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from neurosim_core.vehicle.aerodynamics import quadratic_weights
+from neurosim_core.vehicle.multirotor import Multirotor, MultirotorConfig, MultirotorState
+
+Array = NDArray[np.float64]
+
+PWM_MAX = 65535.0
+PWM_THRUST_N = (0.067673604, 0.091492681)
+"""Thrust of a rotor [N] by the duty cycle, linear and squared.
+
+Reference: Crazyflie firmware, power_distribution_quadrotor.c, pwmToThrustB and pwmToThrustA.
+"""
+_G_M_S2 = 9.80665  # the unit of the log's accelerometer
+_STEP_S = 1e-3
+_STRIDE = 50  # samples from the beginning of a window to that of the next
+_PAST_S = 3.0  # flight before a window that it is calibrated on
+_PAST_MIN_S = 0.5
+_TILT_S = 3.0  # how slowly the mean direction of the specific force corrects the integrated attitude
+_FORCE_S = 0.02  # the accelerometer is averaged over this where it tells the air speed
+_FORCE_EVERY = 10
+_FLYING_PWM = 15_000.0
+_FORCE_MAX_M_S2 = 25.0  # more is a crash
+_APART = 300  # samples around what is no flight that are left out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlightLog:
+    """What a Crazyflie measured, at 1 kHz, with the commands that it gave to its motors."""
+
+    specific_force: Array
+    """Accelerometer in B, without its offset at rest [m/s^2], shape [n, 3]."""
+    body_rate: Array
+    """Gyroscope in B [rad/s], shape [n, 3]."""
+    pwm: Array
+    """Commands to front left, front right, rear right, rear left, 0 to 65535, shape [n, 4]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replay:
+    """How far a replay is from its log, over all windows."""
+
+    window_count: int
+    rate_rms_rad_s: Array
+    """RMS of the error of the body rate about x, y, z [rad/s], shape [3]."""
+    unchanged_rms_rad_s: Array
+    """The same of the guess that the body rate stays as it was when the window began, shape [3]."""
+    force_error: float
+    """RMS of the error of the specific force along body z, as a share of the RMS of what was measured."""
+
+
+def read_crazyflie_log(path: str | Path) -> FlightLog:
+    """Read a log of time [s], accelerometer [g], gyroscope [deg/s] and the commands of motors m1 to m4.
+
+    Args:
+        path: CSV file, or the same compressed by gzip (.gz); lines that begin with # are skipped.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It has not 11 columns of numbers, or its time does not increase.
+    """
+    raw = Path(path).read_bytes()
+    text = gzip.decompress(raw) if str(path).endswith(".gz") else raw
+    rows = np.loadtxt(io.BytesIO(text), delimiter=",", comments="#", ndmin=2)
+    if rows.shape[1] != 11 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0.0).all():
+        raise ValueError(
+            f"{path}: a log has rows of increasing time, 3 accelerations, 3 rates and 4 motor commands, got "
+            f"{len(rows)} rows of {rows.shape[1]} columns"
+        )
+    stamps_s = np.arange(rows[0, 0], rows[-1, 0], _STEP_S)
+    measured = np.stack([np.interp(stamps_s, rows[:, 0], column) for column in rows[:, 1:7].T], axis=1)
+    held = rows[np.searchsorted(rows[:, 0], stamps_s, side="right") - 1, 7:]
+    force = measured[:, :3] * _G_M_S2
+    resting = np.logical_and.accumulate((held == 0.0).all(axis=1))
+    if resting.sum() > 100:
+        force[:, :2] -= force[resting, :2].mean(axis=0)
+    return FlightLog(specific_force=force, body_rate=np.radians(measured[:, 3:]), pwm=held[:, (3, 0, 1, 2)])
+
+
+def rotor_thrust_n(pwm: Array) -> Array:
+    """Return the steady thrust of rotors [N] for commands to their motors, with the firmware's battery."""
+    duty = pwm / PWM_MAX
+    return duty * (PWM_THRUST_N[0] + duty * PWM_THRUST_N[1])
+
+
+def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -> Replay:
+    """Fly a vehicle open loop through every window of a log in which the real one flew.
+
+    The air speed at the beginning of a window is what the accelerometer says in the plane of the rotors, by
+    the rotor drag of the vehicle; its tilt is the integral of the gyroscope.
+
+    Args:
+        log: Of a Crazyflie.
+        config: The vehicle; rotors front left, front right, rear right, rear left, with rotor drag.
+        window_s: Length of a window [s].
+
+    Raises:
+        ValueError: The vehicle has not these rotors or no rotor drag, or the log has no such flight.
+    """
+    position = np.array(config.rotor_position_m)
+    corners = [[1, 1], [1, -1], [-1, -1], [-1, 1]]
+    if np.sign(position[:, :2]).tolist() != corners or config.rotor_drag_kg == 0.0:
+        raise ValueError(
+            "the vehicle must have rotor drag, and rotors front left, front right, rear right, rear left, got "
+            f"rotor_drag_kg = {config.rotor_drag_kg:g} and rotor_position_m = {config.rotor_position_m}"
+        )
+    size = round(window_s / _STEP_S)
+    flying = _flying(log)
+    flown = np.concatenate([[0], np.cumsum(flying)])
+    past = round(_PAST_S / _STEP_S)
+    first = np.arange(past, len(flying) - size, _STRIDE)
+    first = first[flown[first + size] - flown[first] == size]
+    first = first[flown[first] - flown[first - past] >= _PAST_MIN_S / _STEP_S]
+    if len(first) == 0:
+        raise ValueError(f"the log has no {window_s:g} s of flight after {_PAST_MIN_S:g} s of it")
+
+    begin = _states(log, config)
+    scale, lift = _calibrate(log, config, begin, flying, first, past)
+    vehicle = Multirotor(config, count=len(first))
+    gain = (lift * scale[:, None], scale)
+    start = MultirotorState(*(rows[first] for rows in begin))
+    vehicle.reset(**start._replace(rotor_speed=_speeds(config, start.rotor_speed, *gain))._asdict())
+    rates, forces, measured_forces = [], [], []
+    for sample in range(size):
+        now = first + sample
+        rates.append(vehicle.state.body_rate - log.body_rate[now])
+        if sample % _FORCE_EVERY == 0:
+            forces.append(_specific_force(vehicle)[:, 2])
+            measured_forces.append(log.specific_force[now, 2])
+        command = np.sqrt(rotor_thrust_n(log.pwm[now]) / config.thrust_coefficient_n_s2)
+        vehicle.step(_speeds(config, command, *gain), round(_STEP_S * 1e9))
+    unchanged = [log.body_rate[first] - log.body_rate[first + sample] for sample in range(size)]
+    pushed, felt = np.array(forces), np.array(measured_forces)
+    return Replay(
+        window_count=len(first),
+        rate_rms_rad_s=np.sqrt((np.array(rates) ** 2).mean(axis=(0, 1))),
+        unchanged_rms_rad_s=np.sqrt((np.array(unchanged) ** 2).mean(axis=(0, 1))),
+        force_error=float(np.sqrt(((pushed - felt) ** 2).mean() / (felt**2).mean())),
+    )
+
+
+def _flying(log: FlightLog) -> NDArray[np.bool_]:
+    """Return which samples are of flight, and not near a start, a landing or a crash, shape [n]."""
+    grounded = log.pwm.min(axis=1) < _FLYING_PWM
+    crashed = np.linalg.norm(log.specific_force, axis=1) > _FORCE_MAX_M_S2
+    near = np.convolve(grounded | crashed, np.ones(2 * _APART + 1), mode="same")
+    return np.asarray(near < 0.5)
+
+
+def _lag(rows: Array, time_constant_s: float) -> Array:
+    """Return rows [n, k] after a first-order lag that begins at rest in the first."""
+    if time_constant_s == 0.0:
+        return rows
+    keep = float(np.exp(-_STEP_S / time_constant_s))
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], rows, axis=0, zi=keep * rows[:1])[0])
+
+
+def _states(log: FlightLog, config: MultirotorConfig) -> MultirotorState:
+    """Return the state at every sample as far as the log tells it; the velocity is that of still air."""
+    command = np.sqrt(rotor_thrust_n(log.pwm) / config.thrust_coefficient_n_s2)
+    speed = _lag(command, config.motor_time_constant_s)
+    up = _up(log)
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    turned = axis / np.maximum(sine, 1e-9) * np.arctan2(sine, up[:, 2:])
+    orientation = Rotation.from_rotvec(turned)
+    force = _lag(log.specific_force, _FORCE_S)
+    drag_1_s = config.rotor_drag_kg * speed.sum(axis=1) / config.mass_kg
+    air = np.where(_flying(log)[:, None], -force / np.maximum(drag_1_s, 1e-3)[:, None], 0.0) * [1.0, 1.0, 0.0]
+    return MultirotorState(
+        position=np.zeros_like(air),
+        velocity=orientation.apply(air),
+        orientation=orientation.as_quat(),
+        body_rate=log.body_rate,
+        rotor_speed=speed,
+    )
+
+
+def _up(log: FlightLog) -> Array:
+    """Return world z in B, shape [n, 3]: the gyroscope integrated, and drawn slowly to the specific force."""
+    length = np.linalg.norm(log.specific_force, axis=1, keepdims=True)
+    towards = (log.specific_force / np.maximum(length, 1e-9)).tolist()
+    rates = log.body_rate.tolist()
+    up = np.empty_like(log.body_rate)
+    x, y, z = towards[0]
+    share = _STEP_S / _TILT_S
+    for sample, ((p, q, r), (a, b, c)) in enumerate(zip(rates, towards, strict=True)):
+        x, y, z = (
+            x + _STEP_S * (r * y - q * z) + share * (a - x),
+            y + _STEP_S * (p * z - r * x) + share * (b - y),
+            z + _STEP_S * (q * x - p * y) + share * (c - z),
+        )
+        norm = (x * x + y * y + z * z) ** 0.5
+        x, y, z = x / norm, y / norm, z / norm
+        up[sample] = x, y, z
+    return up
+
+
+def _specific_force(vehicle: Multirotor) -> Array:
+    """Return what an accelerometer at the centre of mass reads now, in B [m/s^2], shape [N, 3]."""
+    felt = vehicle.acceleration.linear + np.array([0.0, 0.0, vehicle.config.gravity_m_s2])
+    return np.asarray(Rotation.from_quat(vehicle.state.orientation).inv().apply(felt))
+
+
+def _calibrate(
+    log: FlightLog,
+    config: MultirotorConfig,
+    states: MultirotorState,
+    flying: NDArray[np.bool_],
+    first: NDArray[np.int64],
+    past: int,
+) -> tuple[Array, Array]:
+    """Return what makes the model agree, in the mean, with the flight before each window.
+
+    Returns:
+        Factor of the thrust for a command, shape [N], and the thrust to add to each rotor before that factor,
+        which gives the missing torque and no thrust [N], shape [N, 4].
+    """
+    vehicle = Multirotor(config, count=len(flying))
+    vehicle.reset(**states._asdict())
+    drawn = np.where(flying, _specific_force(vehicle)[:, 2], 0.0)
+    measured = np.where(flying, log.specific_force[:, 2], 0.0)
+    turning = np.gradient(log.body_rate, _STEP_S, axis=0) - vehicle.acceleration.angular
+
+    def over_past(rows: Array) -> Array:
+        total = np.concatenate([np.zeros((1, *rows.shape[1:])), np.cumsum(rows, axis=0)])
+        return np.asarray(total[first] - total[first - past])
+
+    scale = over_past(measured) / over_past(drawn)
+    count = over_past(flying.astype(np.float64))
+    missing = over_past(np.where(flying[:, None], turning, 0.0)) / count[:, None]
+    torque = missing @ np.array(config.inertia_kg_m2).T
+    weights = quadratic_weights(
+        np.array(config.rotor_position_m),
+        np.array(config.rotor_direction),
+        thrust=config.thrust_coefficients_n_s2,
+        torque=config.torque_coefficients_n_m_s2,
+    )
+    mix = weights.T / config.thrust_coefficients_n_s2  # thrusts of rotors to thrust and torque
+    lift = np.linalg.solve(mix, np.concatenate([np.zeros((len(torque), 1)), torque], axis=1).T).T
+    return scale, lift / scale[:, None]
+
+
+def _speeds(config: MultirotorConfig, speed: Array, lift_n: Array, scale: Array) -> Array:
+    """Return rotor speeds whose thrust is that of `speed` times `scale`, plus `lift_n`."""
+    thrust = scale[:, None] * config.thrust_coefficient_n_s2 * speed**2 + lift_n
+    wanted = np.sqrt(np.maximum(thrust, 0.0) / config.thrust_coefficient_n_s2)
+    return np.clip(wanted, config.rotor_speed_min_rad_s, config.rotor_speed_max_rad_s)
