@@ -300,13 +300,11 @@ class _Files:
         """
         if self._rerun is not None:
             self._check_disk()
-        recording, self._recording = self._recording, None
         logger, self._rerun = self._rerun, None
         if logger is not None:
             logger.close()
-        if recording is not None:
-            self._recording = recording
-            recording.close()
+        if self._recording is not None:
+            self._recording.close()
 
     def __enter__(self) -> _Files:
         return self
@@ -327,7 +325,8 @@ class _Files:
         if shutil.disk_usage(self._folder).free < _ROOM_BYTES:
             why = f"less than {_ROOM_BYTES / 1e6:g} MB are left on the disk"
         if why and self._recording is not None:
-            self._rerun.abandon()
+            with contextlib.suppress(OSError):
+                self._rerun.close()
             self._rerun = None
             (self._folder / "flight.rrd").unlink(missing_ok=True)
             self._console.print(

@@ -102,7 +102,7 @@ class RecordingWriter:
         self.kept_ns = 0
         """The file holds the packets up to this stamp, whatever happens [ns]."""
         self._pending_bytes = 0
-        self._flushed_bytes = _FIRST_FLUSH_BYTES
+        self._flushed_bytes = 4 * _FIRST_FLUSH_BYTES
         self._flushed_s = time.monotonic()
         try:
             self._disk = Disk(self._path)
@@ -141,7 +141,7 @@ class RecordingWriter:
         self._order += 1
         self._newest_ns = max(self._newest_ns, packet.stamp_ns)
         due = time.monotonic() - self._flushed_s >= self._flush_interval_s
-        if due or self._pending_bytes >= min(self._buffer_bytes, self._flushed_bytes):
+        if due or self._pending_bytes >= min(self._buffer_bytes, self._flushed_bytes // 4):
             self.flush()
 
     def flush(self) -> None:

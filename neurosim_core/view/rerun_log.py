@@ -24,7 +24,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,7 +41,7 @@ from neurosim_core.view.rerun_layout import (
     picture_panel,
     sensor_panels,
 )
-from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
+from neurosim_core.view.rerun_sdk import TIMELINE, RerunStream, import_rerun
 from neurosim_core.view.rerun_shapes import (
     SceneShapes,
     body_entity,
@@ -49,9 +49,6 @@ from neurosim_core.view.rerun_shapes import (
     encode_picture,
     event_colors,
 )
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 _BATCH_NS = 50_000_000
 _BATCH_ROWS = 1024
@@ -89,7 +86,7 @@ class RerunLogger:
 
     def __init__(
         self,
-        recording: rr.RecordingStream,
+        stream: RerunStream,
         *,
         vehicles: Mapping[str, tuple[SensorDescription, ...]],
         scene: SceneShapes | None = None,
@@ -103,7 +100,7 @@ class RerunLogger:
         """Log what does not change, and the layout of the viewer.
 
         Args:
-            recording: Where to log: `open_rerun`.
+            stream: Where to log: `open_rerun`.
             vehicles: Descriptions of the sensors of each vehicle; packets of other sensors are shown without
                 frustum.
             scene: The scene to show.
@@ -123,7 +120,8 @@ class RerunLogger:
         if not vehicles:
             raise ValueError("there must be at least one vehicle to log")
         self._rr = import_rerun()
-        self._recording: Any = recording
+        self._stream = stream
+        recording = self._recording = stream.recording
         self._vehicles = dict(vehicles)
         self._first = next(iter(vehicles))
         self._colors = {
@@ -269,10 +267,7 @@ class RerunLogger:
             OSError: The file cannot be written, such as on a full disk.
         """
         self.send()
-        try:
-            self._recording.flush()
-        except RuntimeError as error:
-            raise OSError(f"Rerun cannot write its recording: {error}") from None
+        self._stream.flush()
 
     def close(self) -> None:
         """Flush and disconnect from the file or viewer.
@@ -280,14 +275,8 @@ class RerunLogger:
         Raises:
             OSError: As `flush`.
         """
-        try:
-            self.flush()
-        finally:
-            self.abandon()
-
-    def abandon(self) -> None:
-        """Disconnect without sending what waits."""
-        self._recording.disconnect()
+        self.send()
+        self._stream.close()
 
     def __enter__(self) -> RerunLogger:
         return self

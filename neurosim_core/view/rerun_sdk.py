@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import Any
 
 from neurosim_core.install import install_hint
 
-if TYPE_CHECKING:
-    import rerun as rr
-
 TIMELINE = "sim_time"
 """The only timeline: simulated time."""
-_QUIET = "warn,re_log_encoding=off,re_sdk::recording_stream=off"
-"""What Rerun says: nothing of files that it cannot write, which `RerunLogger.flush` raises, or that have no
-footer, which are meant."""
+_QUIET = "warn,re_log_encoding::rrd::file_sink=error"
+"""What Rerun says: no warning of files without a footer, which are meant."""
+_PIPE_BYTES = 1 << 20
 
 
 def import_rerun() -> ModuleType:
@@ -40,7 +38,68 @@ def import_rerun() -> ModuleType:
     return rerun
 
 
-def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool = True) -> rr.RecordingStream:
+class RerunStream:
+    """A recording of Rerun's, and the file that it goes to if it goes to one.
+
+    Attributes:
+        recording: Where to log.
+    """
+
+    def __init__(self, recording: Any, file: _FileWriter | None = None) -> None:
+        self.recording = recording
+        self._file = file
+
+    def flush(self) -> None:
+        """Wait until what was logged has left.
+
+        Raises:
+            OSError: The file cannot be written, such as on a full disk.
+        """
+        self.recording.flush()
+        if self._file is not None:
+            self._file.check()
+
+    def close(self) -> None:
+        """Disconnect from the file or viewer.
+
+        Raises:
+            OSError: As `flush`.
+        """
+        self.recording.disconnect()
+        if self._file is not None:
+            self._file.join()
+            self._file.check()
+
+
+class _FileWriter:
+    """Writes to a file what Rerun writes into a pipe: on a full disk Rerun's own writing hangs."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._error: OSError | None = None
+        self._file = open(path, "wb", buffering=0)  # noqa: SIM115 (closed by the thread)
+        self._read_end, self.write_end = os.pipe()
+        self._thread = threading.Thread(target=self._run, name="Rerun file", daemon=True)
+        self._thread.start()
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise OSError(self._error.errno, f"cannot write {self._path}: {self._error.strerror}")
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def _run(self) -> None:
+        with self._file, open(self._read_end, "rb", buffering=0) as pipe:
+            while data := pipe.read(_PIPE_BYTES):
+                while data and self._error is None:  # after an error, what comes is let go
+                    try:
+                        data = data[self._file.write(data) :]
+                    except OSError as error:
+                        self._error = error
+
+
+def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool = True) -> RerunStream:
     """Open a recording of its own, independent of others in this process.
 
     Args:
@@ -57,12 +116,16 @@ def open_rerun(path: str | Path | None = None, *, name: str = "", footer: bool =
     recording = rr.RecordingStream("neurosim")
     recording.set_log_time_enabled(False)  # wall-clock time has no place in a simulation's recording
     recording.set_log_tick_enabled(False)
+    file = None
     if path is not None:
         try:
-            Path(path).touch()
-            recording.save(path, write_footer=footer)
+            file = _FileWriter(Path(path))
+            recording.save(f"/dev/fd/{file.write_end}", write_footer=footer)
         except (OSError, RuntimeError) as error:
             raise OSError(f"cannot write {path}: {error}") from error
+        finally:
+            if file is not None:
+                os.close(file.write_end)  # Rerun has its own; the pipe ends when that is closed
     if name:
         recording.send_recording_name(name)
-    return recording  # type: ignore[no-any-return]
+    return RerunStream(recording, file)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from neurosim_core.view.rerun_log import RerunLogger
-from neurosim_core.view.rerun_sdk import open_rerun
+from neurosim_core.view.rerun_sdk import RerunStream, open_rerun
 from neurosim_core.view.rerun_viewer import RerunViewer
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 CLOSE_S = 0.3
 
@@ -45,7 +43,7 @@ class RerunTarget(Protocol):
 
     compress: bool
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str) -> RerunStream:
         """Open a recording of this name."""
 
     def check(self) -> bool:
@@ -63,7 +61,7 @@ class ViewerTarget:
     def __init__(self, viewer: RerunViewer) -> None:
         self._viewer = viewer
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str) -> RerunStream:
         """Open a recording; the viewer shows it."""
         return self._viewer.open(name)
 
@@ -74,7 +72,12 @@ class ViewerTarget:
 
     def close_recording(self, logger: RerunLogger) -> None:
         """Close a recording. A viewer that does not take it is not waited for."""
-        closing = threading.Thread(target=logger.close, name="close recording", daemon=True)
+
+        def close() -> None:
+            with contextlib.suppress(OSError):
+                logger.close()
+
+        closing = threading.Thread(target=close, name="close recording", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
 
@@ -100,7 +103,7 @@ class FileTarget:
         self._next = (other for other in itertools.chain([path], numbered) if not other.exists())
         self._path = path
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str) -> RerunStream:
         """Open the next file."""
         self._path = next(self._next)
         return open_rerun(self._path, name=name, footer=False)

@@ -21,14 +21,10 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from neurosim_core.install import install_hint
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.view.rerun_sdk import import_rerun, open_rerun
-
-if TYPE_CHECKING:
-    import rerun as rr
+from neurosim_core.view.rerun_sdk import RerunStream, import_rerun, open_rerun
 
 HOST = "127.0.0.1"
 _START_S = 20.0
@@ -104,15 +100,15 @@ class RerunViewer:
             self.close()
             raise
 
-    def open(self, name: str) -> rr.RecordingStream:
+    def open(self, name: str) -> RerunStream:
         """Open a recording in the viewer, which shows it at once.
 
         Args:
             name: What the viewer calls it.
         """
-        recording = open_rerun(name=name)
-        recording.connect_grpc(self.data_url)
-        return recording
+        stream = open_rerun(name=name)
+        stream.recording.connect_grpc(self.data_url)
+        return stream
 
     @property
     def ended(self) -> bool:

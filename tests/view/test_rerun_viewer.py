@@ -36,7 +36,7 @@ def listening(pid: int) -> set[tuple[str, int]]:
 
 def test_it_listens_on_this_machine_only():
     with RerunViewer(web=True) as viewer:
-        recording = viewer.open("flight 1")
+        recording = viewer.open("flight 1").recording
         recording.log("text", rr.TextDocument("hello"))
         recording.flush(timeout_sec=SOON_S)
         ports = {int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)", viewer.page_url)}
