@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurosim_core.overrides import add_set_option, read_settings
 
@@ -18,20 +18,47 @@ if TYPE_CHECKING:
 
 _HALVED_LOSS_MAX = 0.15
 _BURST_SHARE_MAX = 0.5
+
+
+class _Option(NamedTuple):
+    setting: str
+    """The setting that the option is."""
+    help: str
+    metavar: str | None = None
+    type: Callable[[str], Any] = str
+    choices: tuple[str, ...] | None = None
+
+
 _OPTIONS = {
-    "preset": "pixel.preset",
-    "size": "size",
-    "crop": "crop",
-    "fit": "fit",
-    "fps": "fps",
-    "timestamps": "timestamps",
-    "time_unit": "time_unit",
-    "slow_motion": "slow_motion",
-    "transfer": "transfer",
-    "dark_floor": "dark_floor",
-    "seed": "seed",
+    "preset": _Option("pixel.preset", "pixels of a sensor: davis346, imx636, v2e_noisy, ...", "NAME"),
+    "size": _Option(
+        "size", "resolution of the sensor; `preset`: that of the preset (default: as it is)", "WxH"
+    ),
+    "crop": _Option("crop", "take this part of the picture", "WxH+X+Y"),
+    "fit": _Option(
+        "fit", "where --size has another shape (default: crop the middle)", choices=("crop", "stretch")
+    ),
+    "fps": _Option("fps", "frames a second; needed for folders, else as the video says", "HZ", float),
+    "timestamps": _Option("timestamps", "time of each frame, one a line, instead of --fps", "FILE"),
+    "time-unit": _Option("time_unit", "of --timestamps (default: seconds)", choices=("s", "ms", "us", "ns")),
+    "slow-motion": _Option(
+        "slow_motion",
+        "how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
+        "FACTOR",
+        float,
+    ),
+    "transfer": _Option(
+        "transfer", "how numbers become light: srgb, bt709, linear, pq, ... (default: auto)", "NAME"
+    ),
+    "dark-floor": _Option(
+        "dark_floor",
+        "added before the logarithm; white is 1 (default: 0.001, or what it takes for a step of the stored "
+        "numbers to be half a threshold at most)",
+        "L",
+        float,
+    ),
+    "seed": _Option("seed", "seed of the noise of the pixels", None, int),
 }
-"""Options, and the settings that they are."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,52 +66,20 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "convert",
         help="turn a video or a folder of pictures into events",
-        description="Let a simulated event camera look at a video (needs PyAV) or at the pictures "
-        "of a folder, and write its events as `neurosim run` does. Log radiance is taken as linear between "
-        "frames.",
+        description="Let a simulated event camera look at a video (needs PyAV) or at the pictures of a "
+        "folder, and write its events as `neurosim run` does. Log radiance is linear between frames.",
     )
     parser.add_argument("source", type=Path, help="video file, or folder of pictures")
     parser.add_argument("out", type=Path, help="HDF5 file to write")
-    parser.add_argument(
-        "--preset", metavar="NAME", help="pixels of a sensor: davis346, imx636, v2e_noisy, ..."
-    )
-    parser.add_argument(
-        "--size",
-        metavar="WxH",
-        help="resolution of the sensor; `preset`: that of the preset (default: as it is)",
-    )
-    parser.add_argument("--crop", metavar="WxH+X+Y", help="take this part of the picture")
-    parser.add_argument(
-        "--fit", choices=["crop", "stretch"], help="where --size has another shape (default: crop the middle)"
-    )
-    parser.add_argument(
-        "--fps", type=float, metavar="HZ", help="frames a second; needed for folders, else as the video says"
-    )
-    parser.add_argument(
-        "--timestamps", metavar="FILE", help="time of each frame, one a line, instead of --fps"
-    )
-    parser.add_argument(
-        "--time-unit", choices=["s", "ms", "us", "ns"], help="of --timestamps (default: seconds)"
-    )
-    parser.add_argument(
-        "--slow-motion",
-        type=float,
-        metavar="FACTOR",
-        help="how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
-    )
-    parser.add_argument(
-        "--transfer",
-        metavar="NAME",
-        help="how numbers become light: srgb, bt709, linear, pq, ... (default: auto)",
-    )
-    parser.add_argument(
-        "--dark-floor",
-        type=float,
-        metavar="L",
-        help="added before the logarithm; white is 1 (default: 0.001, or what it takes for a step of the "
-        "stored numbers to be half a threshold at most)",
-    )
-    parser.add_argument("--seed", type=int, help="seed of the noise of the pixels")
+    for name, option in _OPTIONS.items():
+        parser.add_argument(
+            f"--{name}",
+            help=option.help,
+            metavar=option.metavar,
+            type=option.type,
+            choices=option.choices,
+            dest=option.setting,
+        )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
     parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
     add_set_option(parser, "any setting by its dotted key, such as pixel.threshold_on=0.15; may be repeated")
@@ -150,12 +145,12 @@ def read_config(arguments: argparse.Namespace) -> ConversionConfig:
     from neurosim_core.convert.convert import ConversionConfig
     from neurosim_core.mistakes import explain
 
-    given = {key: getattr(arguments, option) for option, key in _OPTIONS.items()}
+    given = {option.setting: getattr(arguments, option.setting) for option in _OPTIONS.values()}
     settings = {key: value for key, value in given.items() if value is not None}
     more = read_settings(arguments.settings)
-    for option, key in _OPTIONS.items():
-        if key in settings and key in more:
-            raise ValueError(f"{key} is given twice: --{option.replace('_', '-')} and --set {key}=...")
+    for name, option in _OPTIONS.items():
+        if option.setting in settings and option.setting in more:
+            raise ValueError(f"{option.setting} is given twice: --{name} and --set {option.setting}=...")
     settings |= more
     if "time_unit" in settings and "timestamps" not in settings:
         raise ValueError("--time-unit is that of --timestamps, which are not given")
@@ -199,9 +194,9 @@ def print_conversion(conversion: Conversion, out: Path, console: Console) -> Non
 def _facts(c: Conversion) -> list[tuple[str, str]]:
     from neurosim_core.sensors.event_config import describe_pixel
 
-    source, duration_s = c.source, 1e-9 * c.duration_ns
-    whole = (c.crop.width, c.crop.height) == (source.width, source.height)
-    part = "" if whole else f", of which {c.crop}"
+    source, plan, duration_s = c.source, c.plan, 1e-9 * c.duration_ns
+    whole = (plan.crop.width, plan.crop.height) == (source.width, source.height)
+    part = "" if whole else f", of which {plan.crop}"
     rate_hz = (c.frame_count - 1) / duration_s
     longest_ms, shortest_ms = 1e-6 * c.interval_max_ns, 1e-6 * c.interval_min_ns
     even = c.interval_max_ns - c.interval_min_ns <= 1_000_000
@@ -211,7 +206,7 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
     return [
         ("source", f"{source.name}: {source.width}x{source.height}{part}; {source.light}"),
         ("frames", f"{c.frame_count:,} in {duration_s:.3f} s, {intervals}"),
-        ("sensor", f"{c.width}x{c.height}, {describe_pixel(c.pixel)}, dark floor {c.dark_floor:g}"),
+        ("sensor", f"{plan.width}x{plan.height}, {describe_pixel(c.pixel)}, dark floor {plan.dark_floor:g}"),
         (
             "events",
             f"{c.event_count:,} ({event_rate:.2f} M/s, {on_share:.0%} brighter), {c.dropped_count:,} dropped",
@@ -234,6 +229,12 @@ def _sampling(c: Conversion) -> str:
 
 def _warnings(c: Conversion) -> list[str]:
     notes = []
+    plan, crop = c.plan, c.plan.crop
+    if plan.width > crop.width or plan.height > crop.height:
+        notes.append(
+            f"the pictures are enlarged from {crop.width}x{crop.height} to {plan.width}x{plan.height}: "
+            "details as fine as the pixels of the sensor are not there"
+        )
     if c.halved_loss > _HALVED_LOSS_MAX:
         notes.append(
             f"the motion is fast for this frame rate: without every second frame {c.halved_loss:.0%} of the "
@@ -245,11 +246,11 @@ def _warnings(c: Conversion) -> list[str]:
             f"{c.burst_share:.0%} of the pixels that fire do so four times or more within one interval: edges"
             " pass them in less than that, and times within an interval are those of a cross-fade."
         )
-    if c.code_step > c.threshold:
+    if plan.code_step > plan.threshold:
         notes.append(
-            f"one step of the stored numbers changes log radiance by up to {c.code_step:.2g} in the dark, "
-            f"more than the threshold {c.threshold:g}: noise of one step makes events there. A larger "
-            f"--dark-floor helps, now {c.dark_floor:g}."
+            f"one step of the stored numbers changes log radiance by up to {plan.code_step:.2g} in the dark, "
+            f"more than the threshold {plan.threshold:g}: noise of one step makes events there. A larger "
+            f"--dark-floor helps, now {plan.dark_floor:g}."
         )
     if c.dropped_count:
         notes.append("dropped events were more than the readout or event_count_max lets through")

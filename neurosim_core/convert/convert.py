@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -30,7 +31,7 @@ from pydantic import Field, field_validator
 from neurosim_core import __version__
 from neurosim_core.clock import NS_PER_S, NS_PER_US
 from neurosim_core.convert.frames import Description, Frame, Source, open_source, read_stamps
-from neurosim_core.convert.geometry import Crop, Reducer, largest_crop, read_crop, read_size, require_inside
+from neurosim_core.convert.geometry import Crop, Resizer, largest_crop, read_crop, read_size
 from neurosim_core.convert.light import TRANSFERS
 from neurosim_core.packets import Events
 from neurosim_core.record import RecordingHeader, RecordingWriter, SensorDescription
@@ -47,6 +48,7 @@ BURST_COUNT = 4
 
 _STAMP_MAX_NS = 1 << 62
 _OTHER_UNIT = "are the times in another unit? --time-unit says which"
+_ENLARGE_MAX = 16
 _STACK_BYTES = 64_000_000
 _STACK_FRAMES_MAX = 32
 _CODE_STEP_MAX = 0.5
@@ -59,8 +61,9 @@ class ConversionConfig(Settings):
     pixel: EventCameraConfig = EventCameraConfig()
     """The law of the pixels."""
     size: str | None = None
-    """Width and height of the sensor, such as 346x260: pictures are averaged to it, in linear light.
-    "preset": those of the sensor that `pixel.preset` names. null: those of the video."""
+    """Width and height of the sensor, such as 346x260: pictures are averaged to it, in linear light, or
+    interpolated where they are smaller. "preset": those of the sensor that `pixel.preset` names. null: those
+    of the video."""
     crop: str | None = None
     """Part of the picture that is taken, WIDTHxHEIGHT+X+Y in pixels; null: all of it."""
     fit: Literal["crop", "stretch"] = "crop"
@@ -91,54 +94,6 @@ class ConversionConfig(Settings):
         return name
 
 
-@dataclass(frozen=True, kw_only=True)
-class Conversion:
-    """What came of a video."""
-
-    source: Description
-    width: int
-    """Of the sensor [px]."""
-    height: int
-    """Of the sensor [px]."""
-    crop: Crop
-    """What was taken of the pictures."""
-    dark_floor: float
-    code_step: float
-    """Largest change of log radiance by one step of the stored numbers."""
-    threshold: float
-    """The smaller of the two thresholds, in log radiance."""
-    pixel: EventCameraConfig
-    """The law of the pixels."""
-    frame_count: int
-    duration_ns: int
-    """From the first frame to the last."""
-    interval_min_ns: int
-    """Shortest time between two frames."""
-    interval_max_ns: int
-    """Longest time between two frames."""
-    event_count: int
-    on_count: int
-    """Events of polarity 1."""
-    dropped_count: int
-    halved_loss: float
-    """Share of the events that would be missing if every second frame were; nan if there are none. As many or
-    more are missing now for want of the frames between these. On a flight through the default apartment, seen
-    with 173x130 px, this was 6, 11, 20, 29, 31 % at 500, 250, 100, 50, 29 Hz; the events of the simulator at
-    1 kHz show that 6, 12, 25, 40, 53 % were missing."""
-    burst_share: float
-    """Share of the pixels that fire between two frames which do so `BURST_COUNT` times or more; nan if none
-    fires. What they saw took less than an interval, so their times are those of a cross-fade."""
-    wall_s: float
-    """Time that it took [s]."""
-    complete: bool
-    """Whether it came to the end of the video."""
-
-    @property
-    def real_time_factor(self) -> float:
-        """Time of the video over time that it took."""
-        return self.duration_ns / NS_PER_S / self.wall_s
-
-
 class _Stack(NamedTuple):
     log_radiance: NDArray[np.float32]
     """Shape [K, H, W]."""
@@ -147,17 +102,89 @@ class _Stack(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Plan:
+class ConversionPlan:
     """What is decided before the first frame."""
 
     crop: Crop
+    """What is taken of the pictures."""
     width: int
+    """Of the sensor [px]."""
     height: int
+    """Of the sensor [px]."""
     dark_floor: float
+    """Luminance that is added before the logarithm, white is 1."""
     code_step: float
+    """Largest change of log radiance by one step of the stored numbers."""
     threshold: float
+    """The smaller of the two thresholds, in log radiance."""
     slow_motion: Fraction
+    """How much slower than the world the video runs."""
     stack_length: int
+    """Frames that are in memory at a time."""
+
+
+@dataclass(kw_only=True)
+class Conversion:
+    """What came of a video."""
+
+    source: Description
+    plan: ConversionPlan
+    pixel: EventCameraConfig
+    """The law of the pixels."""
+    frame_count: int = 0
+    duration_ns: int = 0
+    """From the first frame to the last."""
+    interval_min_ns: int = 1 << 62
+    """Shortest time between two frames."""
+    interval_max_ns: int = 0
+    """Longest time between two frames."""
+    event_count: int = 0
+    on_count: int = 0
+    """Events of polarity 1."""
+    dropped_count: int = 0
+    active_count: int = 0
+    """Pixels that fired between two frames, summed over the intervals."""
+    burst_count: int = 0
+    """Those of them that fired `BURST_COUNT` times or more."""
+    halved_loss: float = math.nan
+    """Share of the events that would be missing if every second frame were; nan if there are none. As many or
+    more are missing now for want of the frames between these. On a flight through the default apartment, seen
+    with 173x130 px, this was 6, 11, 20, 29, 31 % at 500, 250, 100, 50, 29 Hz; the events of the simulator at
+    1 kHz show that 6, 12, 25, 40, 53 % were missing."""
+    wall_s: float = 0.0
+    """Time that it took [s]."""
+    complete: bool = False
+    """Whether it came to the end of the video."""
+
+    @property
+    def burst_share(self) -> float:
+        """Share of the pixels that fire between two frames which do so `BURST_COUNT` times or more.
+
+        What they saw took less than an interval, so their times are those of a cross-fade. nan if none fires.
+        """
+        return self.burst_count / self.active_count if self.active_count else math.nan
+
+    @property
+    def real_time_factor(self) -> float:
+        """Time of the video over time that it took."""
+        return self.duration_ns / NS_PER_S / self.wall_s
+
+    def add(self, stack: _Stack, packets: list[Events]) -> None:
+        """Count the frames of a stack and their events."""
+        stamps = stack.stamps_ns if self.frame_count == 0 else np.append(self.duration_ns, stack.stamps_ns)
+        intervals = np.diff(stamps)
+        self.interval_min_ns = min(self.interval_min_ns, int(intervals.min()))
+        self.interval_max_ns = max(self.interval_max_ns, int(intervals.max()))
+        self.frame_count += len(stack.stamps_ns)
+        self.duration_ns = int(stamps[-1])
+        for events in packets:
+            self.event_count += len(events)
+            self.dropped_count += events.dropped_count
+            arrays = events.numpy()
+            self.on_count += int(np.count_nonzero(arrays.polarity))
+            of_pixel = np.bincount(arrays.y.astype(np.int64) * events.width + arrays.x)
+            self.active_count += int(np.count_nonzero(of_pixel))
+            self.burst_count += int(np.count_nonzero(of_pixel >= BURST_COUNT))
 
 
 def convert_video(
@@ -214,41 +241,36 @@ def convert_video(
     every_second = _EverySecond(_make_camera(at_once, plan, seed=config.seed, device=device))
     stacks = _ahead(_stacks(source, plan))
     first = next(stacks)
-    tally = _Tally()
-    _require_near(camera, source.description, tally, first)
+    done = Conversion(source=source.description, plan=plan, pixel=config.pixel)
+    _require_near(camera, done, first)
     writer = RecordingWriter(out, _header(source.description, config, plan, first))
-    complete = closed = False
+    closed = False
     try:
         for stack in itertools.chain([first], stacks):
-            _require_near(camera, source.description, tally, stack)
+            _require_near(camera, done, stack)
             packets = _see(camera, stack)
             for events in packets:
                 writer.write(events)
-            tally.add(stack, packets)
+            done.add(stack, packets)
             every_second.add(stack, packets)
             if on_stack is not None:
-                on_stack(tally.frame_count, tally.event_count, tally.end_ns)
+                on_stack(done.frame_count, done.event_count, done.duration_ns)
             if stopped is not None and stopped():
                 break
         else:
-            complete = True
+            done.complete = True
         closed = True
     finally:
         stacks.close()
         writer.close(complete=closed)
-        if tally.frame_count == 0:
+        if done.frame_count == 0:
             out.unlink()
-    return tally.conversion(
-        source.description,
-        plan,
-        config.pixel,
-        halved_loss=every_second.loss,
-        wall_s=time.perf_counter() - begin,
-        complete=complete,
-    )
+    done.halved_loss = every_second.loss
+    done.wall_s = time.perf_counter() - begin
+    return done
 
 
-def _make_camera(pixel: EventCameraConfig, plan: _Plan, *, seed: int, device: str) -> EventCamera:
+def _make_camera(pixel: EventCameraConfig, plan: ConversionPlan, *, seed: int, device: str) -> EventCamera:
     if device == "auto":
         device = "cuda:0" if wp.get_cuda_device_count() else "cpu"
     return EventCamera(
@@ -269,11 +291,10 @@ def _open(path: Path, config: ConversionConfig) -> Source:
     return open_source(path, fps=config.fps, stamps_ns=stamps_ns, transfer=config.transfer)
 
 
-def _make_plan(source: Source, config: ConversionConfig, stack_length: int | None) -> _Plan:
+def _make_plan(source: Source, config: ConversionConfig, stack_length: int | None) -> ConversionPlan:
     known = source.description
     crop = Crop(known.width, known.height) if config.crop is None else read_crop(config.crop)
     size = _wanted_size(config, crop)
-    require_inside((known.width, known.height), crop, size)
     if config.fit == "crop":
         crop = largest_crop(crop, size)
     threshold = _threshold(config.pixel)
@@ -281,7 +302,7 @@ def _make_plan(source: Source, config: ConversionConfig, stack_length: int | Non
     if floor is None:
         floor = find_floor(known.codes, _CODE_STEP_MAX * threshold, least=RenderConfig().dark_floor)
     length = max(1, min(_STACK_FRAMES_MAX, _STACK_BYTES // (4 * size[0] * size[1])))
-    return _Plan(
+    return ConversionPlan(
         crop=crop,
         width=size[0],
         height=size[1],
@@ -297,11 +318,18 @@ def _wanted_size(config: ConversionConfig, crop: Crop) -> tuple[int, int]:
     if config.size is None:
         return crop.width, crop.height
     if config.size != "preset":
-        return read_size(config.size)
-    if config.pixel.preset is None:
+        size = read_size(config.size)
+    elif config.pixel.preset is None:
         raise ValueError("size preset needs a preset: --preset davis346, or another")
-    sensor = PRESETS[config.pixel.preset]
-    return sensor.width, sensor.height
+    else:
+        sensor = PRESETS[config.pixel.preset]
+        size = sensor.width, sensor.height
+    if size[0] > _ENLARGE_MAX * crop.width or size[1] > _ENLARGE_MAX * crop.height:
+        raise ValueError(
+            f"size must be at most {_ENLARGE_MAX} times the {crop.width}x{crop.height} pixels there are, "
+            f"got {size[0]}x{size[1]}"
+        )
+    return size
 
 
 def _threshold(pixel: EventCameraConfig) -> float:
@@ -345,10 +373,10 @@ def _ahead(stacks: Iterator[_Stack]) -> Generator[_Stack, None, None]:
             yield stack
 
 
-def _stacks(source: Source, plan: _Plan) -> Iterator[_Stack]:
+def _stacks(source: Source, plan: ConversionPlan) -> Iterator[_Stack]:
     """Yield the frames of a source as stacks of log radiance; the first has two frames at least."""
     known = source.description
-    reducer = Reducer((known.width, known.height), plan.crop, (plan.width, plan.height))
+    resizer = Resizer((known.width, known.height), plan.crop, (plan.width, plan.height))
     frames = _in_order(source, plan.slow_motion)
     length = max(plan.stack_length, 2)
     while rows := list(itertools.islice(frames, length)):
@@ -356,7 +384,7 @@ def _stacks(source: Source, plan: _Plan) -> Iterator[_Stack]:
             raise ValueError(f"{known.name} has one frame only; events need two or more")
         log = np.empty((len(rows), plan.height, plan.width), dtype=np.float32)
         for row, frame in zip(log, rows, strict=True):
-            np.log(reducer.reduce(frame.luminance) + np.float32(plan.dark_floor), out=row)
+            np.log(resizer.resize(frame.luminance) + np.float32(plan.dark_floor), out=row)
         yield _Stack(log, np.array([frame.stamp_ns for frame in rows], dtype=np.int64))
         length = plan.stack_length
 
@@ -397,16 +425,16 @@ def _see(camera: EventCamera, stack: _Stack) -> list[Events]:
     return camera.collect_windows(ends)
 
 
-def _require_near(camera: EventCamera, source: Description, tally: _Tally, stack: _Stack) -> None:
+def _require_near(camera: EventCamera, done: Conversion, stack: _Stack) -> None:
     """Raise ValueError if a stack reaches further than the camera can tell times apart."""
-    spans_ns = stack.stamps_ns - tally.end_ns
+    spans_ns = stack.stamps_ns - done.duration_ns
     if spans_ns[-1] < camera.span_max_ns:
         return
     row = int(np.argmax(spans_ns >= camera.span_max_ns))
     limit_s = camera.span_max_ns / NS_PER_S
     raise ValueError(
-        f"frame {tally.frame_count + row} of {source.name} is {spans_ns[row] / NS_PER_S:.6g} s after frame"
-        f" {max(tally.frame_count - 1, 0)}, at most {limit_s:.4g} s are allowed: {_OTHER_UNIT}"
+        f"frame {done.frame_count + row} of {done.source.name} is {spans_ns[row] / NS_PER_S:.6g} s after "
+        f"frame {max(done.frame_count - 1, 0)}, at most {limit_s:.4g} s are allowed: {_OTHER_UNIT}"
     )
 
 
@@ -423,7 +451,7 @@ class _EverySecond:
     @property
     def loss(self) -> float:
         """Share of the events that every second frame does not have."""
-        return 1.0 - self._half_count / self._full_count if self._full_count else float("nan")
+        return 1.0 - self._half_count / self._full_count if self._full_count else math.nan
 
     def add(self, stack: _Stack, packets: list[Events]) -> None:
         """Take a stack, and the packets of the camera that sees all of it."""
@@ -441,69 +469,9 @@ class _EverySecond:
         self._half_count += sum(len(events) + events.dropped_count for events in _see(self._camera, taken))
 
 
-class _Tally:
-    """Counts what goes by."""
-
-    def __init__(self) -> None:
-        self._intervals_ns = (1 << 62, 0)
-        self.frame_count = 0
-        self.end_ns = 0
-        self.event_count = 0
-        self.on_count = 0
-        self.dropped_count = 0
-        self._active_count = 0
-        self._burst_count = 0
-
-    def add(self, stack: _Stack, packets: list[Events]) -> None:
-        stamps = stack.stamps_ns if self.frame_count == 0 else np.append(self.end_ns, stack.stamps_ns)
-        intervals = np.diff(stamps)
-        low, high = self._intervals_ns
-        self._intervals_ns = min(low, int(intervals.min())), max(high, int(intervals.max()))
-        self.frame_count += len(stack.stamps_ns)
-        self.end_ns = int(stamps[-1])
-        for events in packets:
-            self.event_count += len(events)
-            self.dropped_count += events.dropped_count
-            arrays = events.numpy()
-            self.on_count += int(np.count_nonzero(arrays.polarity))
-            of_pixel = np.bincount(arrays.y.astype(np.int64) * events.width + arrays.x)
-            self._active_count += int(np.count_nonzero(of_pixel))
-            self._burst_count += int(np.count_nonzero(of_pixel >= BURST_COUNT))
-
-    def conversion(
-        self,
-        source: Description,
-        plan: _Plan,
-        pixel: EventCameraConfig,
-        *,
-        halved_loss: float,
-        wall_s: float,
-        complete: bool,
-    ) -> Conversion:
-        return Conversion(
-            source=source,
-            width=plan.width,
-            height=plan.height,
-            crop=plan.crop,
-            dark_floor=plan.dark_floor,
-            code_step=plan.code_step,
-            threshold=plan.threshold,
-            pixel=pixel,
-            frame_count=self.frame_count,
-            duration_ns=self.end_ns,
-            interval_min_ns=self._intervals_ns[0],
-            interval_max_ns=self._intervals_ns[1],
-            event_count=self.event_count,
-            on_count=self.on_count,
-            dropped_count=self.dropped_count,
-            halved_loss=halved_loss,
-            burst_share=self._burst_count / self._active_count if self._active_count else float("nan"),
-            wall_s=wall_s,
-            complete=complete,
-        )
-
-
-def _header(source: Description, config: ConversionConfig, plan: _Plan, first: _Stack) -> RecordingHeader:
+def _header(
+    source: Description, config: ConversionConfig, plan: ConversionPlan, first: _Stack
+) -> RecordingHeader:
     """Return what goes with the events: what was converted, and how."""
     seen = {
         "source": source.name,

@@ -1,4 +1,4 @@
-"""Which part of a picture is taken, and how it is made smaller: averages of light over areas."""
+"""Which part of a picture is taken, and how it gets another size."""
 
 from __future__ import annotations
 
@@ -57,13 +57,17 @@ def read_crop(text: str) -> Crop:
 
 def largest_crop(crop: Crop, size: tuple[int, int]) -> Crop:
     """Return the largest rectangle in the middle of `crop` that has the shape of `size`, to the pixel."""
-    width = min(crop.width, max(size[0], round(crop.height * size[0] / size[1])))
-    height = min(crop.height, max(size[1], round(crop.width * size[1] / size[0])))
+    width = max(1, min(crop.width, round(crop.height * size[0] / size[1])))
+    height = max(1, min(crop.height, round(crop.width * size[1] / size[0])))
     return Crop(width, height, crop.x + (crop.width - width) // 2, crop.y + (crop.height - height) // 2)
 
 
-def require_inside(source: tuple[int, int], crop: Crop, size: tuple[int, int]) -> None:
-    """Refuse a rectangle that is not inside the picture, and a result that would be larger than it.
+class Resizer:
+    """Takes a rectangle of a picture and gives it another size.
+
+    An axis that becomes shorter is averaged over the areas of the larger pixels, exactly: a source pixel that
+    lies in two pixels counts in each by the share of its area, so the mean is kept. An axis that becomes
+    longer is interpolated linearly between the centres of the source pixels.
 
     Args:
         source: Width and height of the pictures [px].
@@ -71,39 +75,18 @@ def require_inside(source: tuple[int, int], crop: Crop, size: tuple[int, int]) -
         size: Width and height of the result [px].
 
     Raises:
-        ValueError: Its message says what is there.
-    """
-    if crop.x + crop.width > source[0] or crop.y + crop.height > source[1]:
-        raise ValueError(f"crop must lie inside the {source[0]}x{source[1]} pixels there are, got {crop}")
-    if size[0] > crop.width or size[1] > crop.height:
-        raise ValueError(
-            f"size must be at most the {crop.width}x{crop.height} pixels there are (pictures are made"
-            f" smaller, never larger), got {size[0]}x{size[1]}"
-        )
-
-
-class Reducer:
-    """Takes a rectangle of a picture and averages it over the areas of larger pixels, exactly.
-
-    A source pixel that lies in two pixels counts in each by the share of its area, so the mean is kept.
-
-    Args:
-        source: Width and height of the pictures [px].
-        crop: What of them is taken.
-        size: Width and height of the result [px].
-
-    Raises:
-        ValueError: The rectangle is not inside the picture, or the result would be larger than it.
+        ValueError: The rectangle is not inside the picture.
     """
 
     def __init__(self, source: tuple[int, int], crop: Crop, size: tuple[int, int]) -> None:
-        require_inside(source, crop, size)
+        if crop.x + crop.width > source[0] or crop.y + crop.height > source[1]:
+            raise ValueError(f"crop must lie inside the {source[0]}x{source[1]} pixels there are, got {crop}")
         self._span = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
-        self._rows = _averages(crop.height, size[1])
-        self._columns = _averages(crop.width, size[0])
+        self._rows = _weights(crop.height, size[1])
+        self._columns = _weights(crop.width, size[0])
 
-    def reduce(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the averages, shape [height, width], of a picture of light."""
+    def resize(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return a picture of light in the new size, shape [height, width]."""
         part = picture[self._span]
         if self._rows is not None:
             part = self._rows @ part
@@ -112,13 +95,17 @@ class Reducer:
         return np.ascontiguousarray(part)
 
 
-def _averages(count: int, wanted: int) -> sparse.csr_array | None:
-    """Return the matrix that averages `count` numbers to `wanted`; None: they are as many already."""
+def _weights(count: int, wanted: int) -> sparse.csr_array | None:
+    """Return the matrix that makes `wanted` numbers of `count`; None: they are as many already."""
     if wanted == count:
         return None
-    edges = np.arange(wanted + 1) * (count / wanted)
-    cells = np.arange(count + 1)
-    low = np.maximum(edges[:-1, None], cells[None, :-1])
-    high = np.minimum(edges[1:, None], cells[None, 1:])
-    share = np.maximum(high - low, 0.0)
+    if wanted > count:
+        place = ((np.arange(wanted) + 0.5) * (count / wanted) - 0.5).clip(0.0, count - 1.0)
+        share = np.maximum(1.0 - np.abs(place[:, None] - np.arange(count)), 0.0)
+    else:
+        edges = np.arange(wanted + 1) * (count / wanted)
+        cells = np.arange(count + 1)
+        low = np.maximum(edges[:-1, None], cells[None, :-1])
+        high = np.minimum(edges[1:, None], cells[None, 1:])
+        share = np.maximum(high - low, 0.0)
     return sparse.csr_array((share / share.sum(axis=1, keepdims=True)).astype(np.float32))

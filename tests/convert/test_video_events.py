@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import re
+import subprocess
+import sys
 
 import h5py
 import numpy as np
@@ -166,11 +169,11 @@ def test_fewer_pixels_see_the_average_of_the_light(tmp_path):
     small, blurred = convert(folder, tmp_path / "b.h5", fps=10.0, size="4x2")
     assert len(sharp.t) > 0
     assert len(blurred.t) == 0
-    assert (small.width, small.height) == (4, 2)
+    assert (small.plan.width, small.plan.height) == (4, 2)
     stretched, _ = convert(folder, tmp_path / "c.h5", fps=10.0, size="4x4", fit="stretch")
     cropped, _ = convert(folder, tmp_path / "d.h5", fps=10.0, size="4x4")
-    assert str(stretched.crop) == "16x8+0+0"
-    assert str(cropped.crop) == "8x8+4+0"
+    assert str(stretched.plan.crop) == "16x8+0+0"
+    assert str(cropped.plan.crop) == "8x8+4+0"
 
 
 def test_what_flickers_is_said_to_need_more_frames(tmp_path):
@@ -188,6 +191,20 @@ def test_what_flickers_is_said_to_need_more_frames(tmp_path):
     assert mixed.burst_share == pytest.approx(4 / 7)
 
 
+def test_the_size_of_a_preset_may_be_larger_than_the_video(tmp_path):
+    """The pictures are enlarged, cropped to the shape of the sensor, and the command says so."""
+    folder = write_folder(tmp_path / "f", moving_pictures(3))
+    out = tmp_path / "e.h5"
+    line = [sys.executable, "-m", "neurosim_core", "convert", str(folder), str(out), "--fps", "10"]
+    line += ["--preset", "davis346", "--size", "preset", "--set", "pixel.readout=null"]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert re.search(r"note: the pictures are enlarged from \d+x\d+ to 346x260", done.stdout)
+    with Recording(out) as recording:
+        events = next(recording.packets())
+    assert (events.width, events.height) == (346, 260)
+    assert len(events) > 0
+
+
 def test_the_floor_keeps_one_step_of_the_numbers_below_half_a_threshold(tmp_path):
     codes = SRGB(np.arange(256) / 255.0)
     floor = find_floor(codes, 0.1, least=1e-3)
@@ -196,7 +213,7 @@ def test_the_floor_keeps_one_step_of_the_numbers_below_half_a_threshold(tmp_path
     assert code_step(codes, floor) <= 0.1 < code_step(codes, 0.95 * floor)
     assert find_floor(SRGB(np.linspace(0.0, 1.0, 65536)), 0.1, least=1e-3) == 1e-3
     shown, _ = convert(write_folder(tmp_path / "f", moving_pictures(3)), tmp_path / "e.h5", fps=10.0)
-    assert shown.dark_floor == floor
+    assert shown.plan.dark_floor == floor
 
 
 def test_lost_events_are_counted(tmp_path):
@@ -258,8 +275,8 @@ def test_the_file_has_what_was_decided(tmp_path):
     found, events = convert(folder, tmp_path / "a.h5", fps=10.0, size="16x16")
     with Recording(tmp_path / "a.h5") as flight:
         settings = yaml.safe_load(flight.header.config_yaml)["conversion"]
-    assert settings["dark_floor"] == found.dark_floor > 0.0
-    assert settings["crop"] == str(found.crop) == "30x30+5+0"
+    assert settings["dark_floor"] == found.plan.dark_floor > 0.0
+    assert settings["crop"] == str(found.plan.crop) == "30x30+5+0"
     again = ConversionConfig(**{key: settings[key] for key in ConversionConfig.model_fields})
     convert_video(folder, tmp_path / "b.h5", again, device="cpu")
     assert same_events(events_of(tmp_path / "b.h5"), events)
@@ -350,7 +367,7 @@ def test_the_command_replaces_nothing_unless_told_to(tmp_path, capsys):
         ),
         (["--slow-motion", "0"], "slow_motion: Input should be greater than 0, got 0.0"),
         (["--set", "seed.x=1", "--seed", "3"], "seed.x: seed is 3, and has no keys"),
-        (["--size", "9x9000"], "size must be at most the 24x10 pixels there are (pictures are made smaller"),
+        (["--size", "9x9000"], "size must be at most 16 times the 24x10 pixels there are, got 9x9000"),
     ],
 )
 def test_the_command_says_what_is_wrong_in_one_line(tmp_path, capsys, given, said):

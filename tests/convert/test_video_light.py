@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neurosim_core.convert.geometry import Crop, Reducer, largest_crop, read_crop, read_size
+from neurosim_core.convert.geometry import Crop, Resizer, largest_crop, read_crop, read_size
 from neurosim_core.convert.light import TRANSFERS, luminance_weights, transfer_of
 from neurosim_core.convert.luminance import LightTables, LumaDecoder, matrix_of
 
@@ -121,17 +121,17 @@ def test_a_file_that_names_no_matrix_is_taken_by_its_height():
 def test_areas_are_averaged_exactly():
     """Against a picture of which every pixel was cut into as many as it takes for whole numbers."""
     light = np.random.default_rng(2).random((6, 10)).astype(np.float32)
-    reducer = Reducer((10, 6), Crop(10, 6), (4, 4))
+    resizer = Resizer((10, 6), Crop(10, 6), (4, 4))
     fine = np.repeat(np.repeat(light.astype(np.float64), 2, axis=0), 2, axis=1)  # 12 x 20
     expected = fine.reshape(4, 3, 4, 5).mean(axis=(1, 3))
-    np.testing.assert_allclose(reducer.reduce(light), expected, rtol=1e-6)  # float32 sums
+    np.testing.assert_allclose(resizer.resize(light), expected, rtol=1e-6)  # float32 sums
 
 
 def test_a_picture_of_the_wanted_size_is_left_as_it_is():
     light = np.random.default_rng(3).random((6, 10)).astype(np.float32)
-    np.testing.assert_array_equal(Reducer((10, 6), Crop(10, 6), (10, 6)).reduce(light), light)
+    np.testing.assert_array_equal(Resizer((10, 6), Crop(10, 6), (10, 6)).resize(light), light)
     np.testing.assert_array_equal(
-        Reducer((10, 6), read_crop("4x3+5+2"), (4, 3)).reduce(light), light[2:5, 5:9]
+        Resizer((10, 6), read_crop("4x3+5+2"), (4, 3)).resize(light), light[2:5, 5:9]
     )
 
 
@@ -146,7 +146,21 @@ def test_sizes_that_make_no_sense_are_refused():
         read_size("346")
     with pytest.raises(ValueError, match=r"crop must be WIDTHxHEIGHT\+X\+Y.*got '10x0\+1\+1'"):
         read_crop("10x0+1+1")
-    with pytest.raises(ValueError, match=r"size must be at most the 10x6 pixels there are.*got 11x6"):
-        Reducer((10, 6), Crop(10, 6), (11, 6))
     with pytest.raises(ValueError, match=r"inside the 10x6 pixels there are, got 10x6\+1\+0"):
-        Reducer((10, 6), Crop(10, 6, 1, 0), (10, 6))
+        Resizer((10, 6), Crop(10, 6, 1, 0), (10, 6))
+
+
+def test_a_picture_is_enlarged_between_its_centres():
+    """A ramp stays a ramp, but for the half pixel at the borders; a square keeps its shape."""
+    ramp = np.arange(8, dtype=np.float32)[None, :].repeat(3, axis=0)
+    larger = Resizer((8, 3), Crop(8, 3), (24, 9)).resize(ramp)
+    expected = ((np.arange(24) + 0.5) / 3 - 0.5).clip(0.0, 7.0)
+    np.testing.assert_allclose(larger, expected[None, :].repeat(9, axis=0), atol=1e-6)  # float32 weights
+
+
+def test_one_axis_may_grow_while_the_other_shrinks():
+    light = np.random.default_rng(4).random((6, 10)).astype(np.float32)
+    found = Resizer((10, 6), Crop(10, 6), (20, 3)).resize(light)
+    assert found.shape == (3, 20)
+    shrunk = Resizer((10, 6), Crop(10, 6), (10, 3)).resize(light)
+    np.testing.assert_allclose(found, Resizer((10, 3), Crop(10, 3), (20, 3)).resize(shrunk), rtol=1e-6)
