@@ -38,6 +38,9 @@ class Panel(NamedTuple):
     """Entities that it shows, if not those."""
     rank: int = 0
     """Pictures are laid out by rising rank."""
+    legend: bool = False
+    """A plot has a legend, which hides a part of it: only if neither its title nor the colours of x, y, z
+    (red, green, blue) name the lines."""
 
 
 def body(vehicle: str) -> str:
@@ -72,12 +75,12 @@ def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *,
     if kind == "text":
         return [Panel("text", sensor, at)]
     if kind == "delay":
-        return [Panel("plot", "link delay [ms]", f"plots/{vehicle}/links")]
+        return [Panel("plot", "link delay [ms]", f"plots/{vehicle}/links", legend=True)]
     if kind == "pose":
         motion = (f"/{at}/speed", f"/{at}/height") + (() if live else (f"/plots/{vehicle}/clearance",))
         name = "speed [m/s], height" + (" [m]" if live else ", clearance [m]")
         return [
-            Panel("plot", name, at, motion),
+            Panel("plot", name, at, motion, legend=True),
             Panel("plot", "rotor speed [rad/s]", f"{at}/rotor_speed"),
         ]
     return []
@@ -107,7 +110,7 @@ def make_blueprint(
     """
     rrb = import_rerun().blueprint
     many = len(panels) > 1
-    timing = Panel("plot", "loop timing [ms]", "simulator/timing")
+    timing = Panel("plot", "loop timing [ms]", "simulator/timing", legend=True)
     pictures: list[Any] = []
     plots: list[Any] = []
     shares: list[int] = []
@@ -116,7 +119,7 @@ def make_blueprint(
         cameras[name] = sorted((p for p in shown if p.kind == "picture"), key=lambda p: p.rank)
         others = [panel for panel in shown if panel.kind != "picture"]
         if live:
-            others += [Panel("plot", "command", f"plots/{name}/command"), timing]
+            others += [Panel("plot", "command", f"plots/{name}/command", legend=True), timing]
         views = [_view(panel, rolling=rolling) for panel in cameras[name]]
         if views:
             pictures += [rrb.Vertical(*views, name=name)] if many else views
@@ -128,7 +131,7 @@ def make_blueprint(
     right = [rrb.Tabs(*pictures)] if many and pictures else pictures
     if live:
         factor = Panel("plot", "real-time factor", "simulator/real_time_factor")
-        losses = Panel("plot", "lost messages", "simulator/losses")
+        losses = Panel("plot", "lost messages", "simulator/losses", legend=True)
         views = [_view(panel, rolling=rolling) for panel in (timing, factor, losses)]
         plots.append(rrb.Horizontal(*views, name="simulator"))
         right = [*right, rrb.TextDocumentView(origin="status", name="status")]
@@ -162,7 +165,7 @@ def _view(panel: Panel, *, rolling: bool) -> Any:
     return rrb.TimeSeriesView(
         **options,
         time_ranges=_last_seconds(ROLLING_PLOT_S) if rolling else None,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=panel.legend),
     )
 
 
