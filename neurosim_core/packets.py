@@ -174,11 +174,12 @@ def schema_of(cls: type[Packet]) -> PacketSchema:
     Raises:
         TypeError: A field has an annotation that no recording can hold; the message names it.
     """
-    return cls._schema if issubclass(cls, GenericPacket) else _derived_schema(cls)
+    schema: PacketSchema = cls._schema if issubclass(cls, GenericPacket) else _derived_schema(cls)
+    return schema
 
 
 @functools.cache
-def _derived_schema(cls: type[Packet]) -> PacketSchema:
+def _derived_schema(cls: Any) -> PacketSchema:
     header = {field.name for field in dataclasses.fields(Packet)}
     hints = get_type_hints(cls, include_extras=True)
     docs = _field_docs(cls)

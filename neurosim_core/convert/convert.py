@@ -32,7 +32,7 @@ from neurosim_core import __version__
 from neurosim_core.clock import NS_PER_S, NS_PER_US
 from neurosim_core.convert.frames import Description, Frame, Source, open_source, read_stamps
 from neurosim_core.convert.geometry import Crop, Resizer, largest_crop, read_crop, read_size
-from neurosim_core.convert.light import TRANSFERS
+from neurosim_core.convert.light import TRANSFERS, code_step, find_floor
 from neurosim_core.packets import Events
 from neurosim_core.record import RecordingHeader, RecordingWriter, SensorDescription
 from neurosim_core.render.config import RenderConfig
@@ -337,31 +337,6 @@ def _threshold(pixel: EventCameraConfig) -> float:
     if pixel.stochastic is not None:
         return 1.0 / pixel.stochastic.k1
     return min(pixel.threshold_on, pixel.threshold_off)
-
-
-def code_step(codes: NDArray[np.float64], floor: float) -> float:
-    """Return the largest change of log(luminance + floor) by one step of the stored numbers.
-
-    Args:
-        codes: Luminance of all numbers in their order, none if light is stored itself.
-        floor: Dark floor.
-    """
-    return float(np.diff(np.log(codes + floor)).max()) if len(codes) > 1 else 0.0
-
-
-def find_floor(codes: NDArray[np.float64], step_max: float, *, least: float) -> float:
-    """Return the smallest dark floor, at least `least`, with which `code_step` is at most `step_max`.
-
-    It is rounded up to two digits; 1 if that is not enough.
-    """
-    low, high = least, 1.0
-    if code_step(codes, low) <= step_max:
-        return low
-    while high / low > 1.001:
-        middle = (low * high) ** 0.5
-        low, high = (low, middle) if code_step(codes, middle) <= step_max else (middle, high)
-    digit = 10.0 ** np.floor(np.log10(high) - 1.0)
-    return float(min(1.0, round(np.ceil(high / digit) * digit, 12)))
 
 
 def _ahead(stacks: Iterator[_Stack]) -> Generator[_Stack, None, None]:

@@ -124,3 +124,28 @@ def luminance_weights(primaries: int) -> tuple[float, float, float]:
     Those of BT.2020 for BT.2020, and those of BT.709 for all others, from which they differ little.
     """
     return _WEIGHTS_2020 if primaries == BT2020_PRIMARIES else _WEIGHTS_709
+
+
+def code_step(codes: NDArray[np.float64], floor: float) -> float:
+    """Return the largest change of log(luminance + floor) by one step of the stored numbers.
+
+    Args:
+        codes: Luminance of all numbers in their order, none if light is stored itself.
+        floor: Dark floor.
+    """
+    return float(np.diff(np.log(codes + floor)).max()) if len(codes) > 1 else 0.0
+
+
+def find_floor(codes: NDArray[np.float64], step_max: float, *, least: float) -> float:
+    """Return the smallest dark floor, at least `least`, with which `code_step` is at most `step_max`.
+
+    It is rounded up to two digits; 1 if that is not enough.
+    """
+    low, high = least, 1.0
+    if code_step(codes, low) <= step_max:
+        return low
+    while high / low > 1.001:
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if code_step(codes, middle) <= step_max else (middle, high)
+    digit = 10.0 ** np.floor(np.log10(high) - 1.0)
+    return float(min(1.0, round(np.ceil(high / digit) * digit, 12)))

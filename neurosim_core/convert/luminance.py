@@ -10,8 +10,6 @@ and G' follows from Y' = k_r R' + (1 - k_r - k_b) G' + k_b B'.
 Reference: ITU-T H.273 (2021), 8.3, equations 38 to 43; ITU-R BT.601, BT.709, BT.2020.
 """
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
@@ -70,28 +68,6 @@ def _luminance(
             luminance_out[row, col] = wp.dot(weights, light)
 
 
-@wp.kernel
-def _look_up(
-    # Model:
-    red: wp.array[wp.float64],
-    green: wp.array[wp.float64],
-    blue: wp.array[wp.float64],
-    # In:
-    picture: wp.array3d[Any],
-    # Out:
-    luminance_out: wp.array2d[wp.float32],
-) -> None:
-    row = wp.tid()
-    for col in range(picture.shape[1]):
-        # summed in float64, so that a grey is the same whether it is stored as one number or as three
-        light = red[wp.int32(picture[row, col, 0])] + green[wp.int32(picture[row, col, 1])]
-        luminance_out[row, col] = wp.float32(light + blue[wp.int32(picture[row, col, 2])])
-
-
-for _code in (wp.uint8, wp.uint16):
-    wp.overload(_look_up, {"picture": wp.array3d[_code]})
-
-
 class LightTables:
     """Looks up the luminance of numbers of which 0 is black and the largest is white.
 
@@ -107,10 +83,8 @@ class LightTables:
     def __init__(self, transfer: str, *, bits: int, primaries: int = 1) -> None:
         self.codes = TRANSFERS[transfer](np.linspace(0.0, 1.0, 1 << bits))
         self._gray = self.codes.astype(np.float32)
-        self._bands = [
-            wp.array(weight * self.codes, dtype=wp.float64, device="cpu")
-            for weight in luminance_weights(primaries)
-        ]
+        # summed in float64, so that a grey is the same whether it is stored as one number or as three
+        self._bands = [weight * self.codes for weight in luminance_weights(primaries)]
 
     def luminance(self, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the luminance of a picture, shape [H, W], white is 1.
@@ -120,17 +94,8 @@ class LightTables:
         """
         if picture.ndim == 2:
             return self._gray[picture]
-        return _launch(_look_up, self._bands, picture)
-
-
-def _launch(kernel: Any, parameters: list[Any], picture: NDArray[Any]) -> NDArray[np.float32]:
-    """Launch a kernel that takes rows of a picture, and return the luminance that it writes."""
-    out = np.empty(picture.shape[:2], dtype=np.float32)
-    inputs, outputs = (
-        wp.array(np.ascontiguousarray(values), device="cpu", copy=False) for values in (picture, out)
-    )
-    wp.launch(kernel, dim=picture.shape[0], inputs=[*parameters, inputs], outputs=[outputs], device="cpu")
-    return out
+        red, green, blue = (band.take(picture[..., k]) for k, band in enumerate(self._bands))
+        return (red + green + blue).astype(np.float32)
 
 
 def matrix_of(number: int, height: int) -> tuple[float, float]:
@@ -184,4 +149,12 @@ class LumaDecoder:
         Args:
             picture: Y', C_b, C_r, their highest bit at bit 15, shape [H, W, 3].
         """
-        return _launch(_luminance, [*self._scales, self._matrix, self._weights, self._table], picture)
+        out = np.empty(picture.shape[:2], dtype=np.float32)
+        inputs, outputs = (
+            wp.array(np.ascontiguousarray(values), device="cpu", copy=False) for values in (picture, out)
+        )
+        parameters = [*self._scales, self._matrix, self._weights, self._table]
+        wp.launch(
+            _luminance, dim=picture.shape[0], inputs=[*parameters, inputs], outputs=[outputs], device="cpu"
+        )
+        return out

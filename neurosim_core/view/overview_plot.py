@@ -67,7 +67,12 @@ def save_overview(
         import matplotlib.figure
     except ImportError as error:
         raise ImportError(f"the overview picture needs matplotlib: {install_hint('view')}") from error
-    style = {"font.size": 11, "text.color": _INK, "axes.edgecolor": _FAINT, "axes.labelcolor": _INK}
+    style: dict[Any, Any] = {
+        "font.size": 11,
+        "text.color": _INK,
+        "axes.edgecolor": _FAINT,
+        "axes.labelcolor": _INK,
+    }
     style |= {"xtick.color": _FAINT, "ytick.color": _FAINT, "axes.linewidth": 0.8}
     style |= {"font.family": "DejaVu Sans"}
     snapshot = summary.snapshot()

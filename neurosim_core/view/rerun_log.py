@@ -22,17 +22,20 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, schema_of
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
 from neurosim_core.view.pictures import EventWindow, picture_of
+from neurosim_core.view.rerun_batches import RateLimit, Table
 from neurosim_core.view.rerun_layout import (
     PICTURES,
     Panel,
@@ -51,7 +54,6 @@ from neurosim_core.view.rerun_shapes import (
 )
 
 _BATCH_NS = 50_000_000
-_BATCH_ROWS = 1024
 _EVENT_PERIOD_NS = 20_000_000
 _EVENT_BURST_NS = 500_000_000
 _XYZ_COLORS = ((224, 49, 49), (47, 158, 68), (28, 126, 214))
@@ -128,14 +130,14 @@ class RerunLogger:
             name: _VEHICLE_COLORS[k % len(_VEHICLE_COLORS)] for k, name in enumerate(self._vehicles)
         }
         self._event_window_ns = event_window_ns
-        self._image_limit = _RateLimit(0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz))
-        self._event_limit = _RateLimit(max(event_window_ns, _EVENT_PERIOD_NS), burst_ns=_EVENT_BURST_NS)
+        self._image_limit = RateLimit(0 if image_rate_max_hz is None else round(1e9 / image_rate_max_hz))
+        self._event_limit = RateLimit(max(event_window_ns, _EVENT_PERIOD_NS), burst_ns=_EVENT_BURST_NS)
         self._compress = compress
         self._live = live
         self._keep_layout = keep_layout
         self._clock_ns = clock_ns
         self._windows: dict[str, EventWindow] = {}
-        self._tables: dict[str, _Table] = {}
+        self._tables: dict[str, Table] = {}
         self._trail_end: dict[str, NDArray[np.float64]] = {}
         self._pose_of: dict[str, str] = {}
         self._bodies: Mapping[str, BodyConfig] = {}
@@ -333,16 +335,23 @@ class RerunLogger:
     def _set_time(self, stamp_ns: int) -> None:
         self._recording.set_time(TIMELINE, duration=np.timedelta64(stamp_ns, "ns"))
 
-    def _table(self, entity: str, widths: dict[str, int], send: Callable[..., None]) -> _Table:
+    def _table(self, entity: str, send: Callable[..., None]) -> Table:
         if entity not in self._tables:
-            self._tables[entity] = _Table(entity, widths, send, span_ns=None if self._live else _BATCH_NS)
+            self._tables[entity] = Table(entity, send, span_ns=None if self._live else _BATCH_NS)
         return self._tables[entity]
 
+    def _times(self, stamp_ns: NDArray[np.int64]) -> Any:
+        return self._rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
+
+    def _send_poses_of(
+        self, entity: str, stamp_ns: NDArray[np.int64], translation: Any, quaternion: Any
+    ) -> None:
+        columns = self._rr.Transform3D.columns(translation=translation, quaternion=quaternion)
+        self._recording.send_columns(entity, indexes=[self._times(stamp_ns)], columns=columns)
+
     def _send_scalars(self, entity: str, stamp_ns: NDArray[np.int64], scalars: NDArray[np.float64]) -> None:
-        times = self._rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
-        self._recording.send_columns(
-            entity, indexes=[times], columns=self._rr.Scalars.columns(scalars=scalars)
-        )
+        columns = self._rr.Scalars.columns(scalars=scalars)
+        self._recording.send_columns(entity, indexes=[self._times(stamp_ns)], columns=columns)
 
     def _plot(self, entity: str, stamp_ns: int, value: Any, names: Sequence[str]) -> None:
         if entity not in self._tables:
@@ -350,7 +359,7 @@ class RerunLogger:
             if len(names) > 1:
                 colors = [_SERIES_COLORS[k % len(_SERIES_COLORS)] for k in range(len(names))]
             self._recording.log(entity, self._rr.SeriesLines(names=names, colors=colors), static=True)
-        self._table(entity, {"scalars": len(names)}, self._send_scalars).append(stamp_ns, scalars=value)
+        self._table(entity, self._send_scalars).append(stamp_ns, scalars=value)
 
     def _log_numbers(self, vehicle: str, packet: Packet, schema: PacketSchema) -> None:
         for field in schema.fields:
@@ -384,7 +393,7 @@ class RerunLogger:
 
     def _log_pose(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         if self._pose_of.setdefault(vehicle, packet.sensor) == packet.sensor:
-            self._table(body(vehicle), {"translation": 3, "quaternion": 4}, self._send_poses).append(
+            self._table(body(vehicle), self._send_poses).append(
                 packet.stamp_ns, translation=packet.position, quaternion=packet.orientation
             )
         plot = f"plots/{vehicle}/{packet.sensor}"
@@ -402,27 +411,17 @@ class RerunLogger:
     ) -> None:
         rr = self._rr
         vehicle = entity.removeprefix(body(""))
-        times = rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
-        columns = rr.Transform3D.columns(translation=translation, quaternion=quaternion)
-        self._recording.send_columns(entity, indexes=[times], columns=columns)
-        if vehicle == self._first:
-            self._send_bodies(stamp_ns)
+        self._send_poses_of(entity, stamp_ns, translation, quaternion)
+        if vehicle == self._first and self._bodies:
+            position, orientation = body_poses(self._bodies, stamp_ns)
+            for index, name in enumerate(self._bodies):
+                self._send_poses_of(body_entity(name), stamp_ns, position[:, index], orientation[:, index])
         stroke = np.concatenate([self._trail_end.get(vehicle, translation[:1]), translation])
         self._trail_end[vehicle] = translation[-1:]
         self._set_time(int(stamp_ns[-1]))
-        line = rr.LineStrips3D([stroke], colors=[self._color(vehicle)], radii=rr.Radius.ui_points(3.0))
+        color = self._colors.get(vehicle, _VEHICLE_COLORS[0])
+        line = rr.LineStrips3D([stroke], colors=[color], radii=rr.Radius.ui_points(3.0))
         self._recording.log(f"world/trails/{vehicle}", line)
-
-    def _send_bodies(self, stamp_ns: NDArray[np.int64]) -> None:
-        rr = self._rr
-        times = rr.TimeColumn(TIMELINE, duration=stamp_ns.astype("timedelta64[ns]"))
-        position, orientation = body_poses(self._bodies, stamp_ns)
-        for index, name in enumerate(self._bodies):
-            columns = rr.Transform3D.columns(translation=position[:, index], quaternion=orientation[:, index])
-            self._recording.send_columns(body_entity(name), indexes=[times], columns=columns)
-
-    def _color(self, vehicle: str) -> tuple[int, int, int]:
-        return self._colors.get(vehicle, _VEHICLE_COLORS[0])
 
     def _log_picture(self, vehicle: str, packet: Packet, _schema: PacketSchema) -> None:
         entity = f"{body(vehicle)}/{packet.sensor}/image"
@@ -477,69 +476,11 @@ def _rotors(count: int) -> tuple[str, ...]:
     return tuple(f"rotor {k}" for k in range(count))
 
 
-def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
+def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles of q = yaw about z, then pitch about y, then roll about x [rad]; nan for no rotation at all."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        x, y, z, w = quaternion / np.linalg.norm(quaternion)
-        roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-        pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return float(roll), float(pitch), float(yaw)
-
-
-class _RateLimit:
-    """Lets so many pass that their mean rate is as wanted, whatever rate they come at."""
-
-    def __init__(self, period_ns: int, *, burst_ns: int = 0) -> None:
-        """Let the first one pass.
-
-        Args:
-            period_ns: Mean time between those that pass, at least [ns].
-            burst_ns: How far ahead of the mean rate they may be, when they come at once [ns].
-        """
-        self._period_ns = period_ns
-        self._burst_ns = burst_ns
-        self._due_ns: dict[str, int] = {}
-
-    def passes(self, key: str, now_ns: int) -> bool:
-        """Return whether one of a kind may pass now."""
-        earliest_ns = now_ns - self._burst_ns
-        due_ns = self._due_ns.get(key, earliest_ns)
-        if now_ns < due_ns - self._period_ns:  # time has begun again
-            due_ns = now_ns
-        if now_ns < due_ns:
-            return False
-        self._due_ns[key] = max(due_ns + self._period_ns, earliest_ns)
-        return True
-
-
-class _Table:
-    """Rows of one entity that are sent together."""
-
-    def __init__(
-        self, entity: str, widths: dict[str, int], send: Callable[..., None], *, span_ns: int | None
-    ) -> None:
-        self._entity = entity
-        self._send = send
-        self._span_ns = span_ns
-        self._stamp_ns: list[int] = []
-        self._columns: dict[str, list[NDArray[np.float64]]] = {name: [] for name in widths}
-        self._widths = widths
-
-    def append(self, stamp_ns: int, **values: Any) -> None:
-        if self._stamp_ns and stamp_ns < self._stamp_ns[-1]:  # after a reset
-            self.send()
-        self._stamp_ns.append(stamp_ns)
-        for name, value in values.items():
-            self._columns[name].append(np.array(value, dtype=np.float64).reshape(self._widths[name]))
-        if len(self._stamp_ns) >= _BATCH_ROWS or (
-            self._span_ns is not None and stamp_ns - self._stamp_ns[0] >= self._span_ns
-        ):
-            self.send()
-
-    def send(self) -> None:
-        if self._stamp_ns:
-            columns = {name: np.stack(rows) for name, rows in self._columns.items()}
-            self._send(self._entity, np.array(self._stamp_ns, dtype=np.int64), **columns)
-            self._stamp_ns = []
-            self._columns = {name: [] for name in self._columns}
+    if not np.linalg.norm(quaternion) > 0.0:
+        return np.full(3, np.nan)
+    with warnings.catch_warnings():  # at a pitch of 90 degrees yaw is taken as 0
+        warnings.simplefilter("ignore", UserWarning)
+        angles: NDArray[np.float64] = Rotation.from_quat(quaternion).as_euler("ZYX")
+    return angles[::-1]

@@ -14,13 +14,8 @@ import yaml
 from frame_files import write_folder, write_video
 
 from neurosim_core import cli
-from neurosim_core.convert.convert import (
-    ConversionConfig,
-    code_step,
-    convert_video,
-    find_floor,
-)
-from neurosim_core.convert.light import TRANSFERS
+from neurosim_core.convert.convert import ConversionConfig, convert_video
+from neurosim_core.convert.light import TRANSFERS, code_step, find_floor
 from neurosim_core.flight import rerun_file
 from neurosim_core.record import Recording
 
