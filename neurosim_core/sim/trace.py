@@ -270,7 +270,7 @@ class Trace:
             setattr(self._rows_on_host, name, copy.mapped())
 
     def fetch(self, first: int, count: int) -> None:
-        """Launch the copy of some slots to the host, after `bring_to_host`: by one kernel, not four copies."""
+        """Launch the copy of some slots to the host, after `bring_to_host`; one kernel copies all."""
         if self._is_cuda and self._copies:
             wp.launch(
                 _copy_rows,
