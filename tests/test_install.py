@@ -48,7 +48,7 @@ def test_a_foreign_cortex_is_refused_in_words(tmp_path):
     foreign.mkdir()
     (foreign / "__init__.py").write_text("raise SystemExit('the foreign package ran')\n")
     code = (
-        f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; import neurosim_core.nodes.simulator"
+        f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; import neurosim_core.live.simulator"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1

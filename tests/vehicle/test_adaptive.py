@@ -10,7 +10,7 @@ import warp as wp
 from multirotor_oracle import NO_AERO, angle, solve
 from pydantic import ValidationError
 
-from neurosim_core import load_config, simulation
+from neurosim_core import load_config, sim
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 MS = 1_000_000
@@ -195,11 +195,11 @@ def test_a_run_counts_redone_intervals(caplog, device):
     }
     for stiff in (False, True):
         config = load_config(settings if stiff else {**settings, "vehicle": {}})
-        model = simulation.make_model(config)
-        state = simulation.make_state(model)
+        model = sim.make_model(config)
+        state = sim.make_state(model)
         with caplog.at_level(logging.INFO, logger="neurosim_core"):
             for _ in range(3):
-                simulation.step(model, state, [500.0, 520.0, 480.0, 510.0])
+                sim.step(model, state, [500.0, 520.0, 480.0, 510.0])
         assert (state.counts["redone intervals"] > 0) == stiff
         assert state.counts["redone intervals"] == state.vehicle.effort.redone_count.sum()
     assert [record.getMessage() for record in caplog.records if "redone" in record.getMessage()] == [

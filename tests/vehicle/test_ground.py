@@ -8,7 +8,7 @@ from multirotor_oracle import NO_AERO, angle, rotation_matrix, solve
 from pydantic import ValidationError
 from scipy.optimize import brentq
 
-from neurosim_core import load_config, simulation
+from neurosim_core import load_config, sim
 from neurosim_core.packets import Collision, Odometry
 from neurosim_core.vehicle import GroundConfig, Multirotor, MultirotorConfig, MultirotorState, preset
 
@@ -211,7 +211,7 @@ def test_one_that_stands_does_not_touch_one_that_flies(device):
 # In a run, with all other settings at their defaults
 
 
-def start_run(**start) -> tuple[simulation.Model, simulation.State]:
+def start_run(**start) -> tuple[sim.Model, sim.State]:
     settings = {
         "device": "cpu",
         "duration_s": 6.0,
@@ -220,14 +220,14 @@ def start_run(**start) -> tuple[simulation.Model, simulation.State]:
         "path": {"kind": "hover"},
         "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
     }
-    model = simulation.make_model(load_config(settings))
-    return model, simulation.make_state(model, start=simulation.StartState(**start))
+    model = sim.make_model(load_config(settings))
+    return model, sim.make_state(model, start=sim.StartState(**start))
 
 
 def fly_run(model, state, speed_rad_s: float, until_s: float) -> list:
     packets = []
     while state.stamp_ns < until_s * 1e9 and not state.ended:
-        packets += simulation.step(model, state, np.full(4, speed_rad_s), mode="motor_speeds")
+        packets += sim.step(model, state, np.full(4, speed_rad_s), mode="motor_speeds")
     return packets
 
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from scipy import stats
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from neurosim_core import load_config, simulation
+from neurosim_core import load_config, sim
 from neurosim_core.vehicle import (
     GroundConfig,
     GustConfig,
@@ -357,10 +357,10 @@ def test_a_further_sensor_does_not_change_the_wind():
     own = {"odometry": {"kind": "odometry", "rate_hz": 25}}
     ends = []
     for sensors in (own, {**own, "imu": {"kind": "imu", "rate_hz": 200}}):
-        model = simulation.make_model(load_config({**settings, "sensors": sensors}))
-        state = simulation.make_state(model)
+        model = sim.make_model(load_config({**settings, "sensors": sensors}))
+        state = sim.make_state(model)
         while state.stamp_ns < 1_000 * MS:
-            simulation.step(model, state, np.full(4, 1.01 * HUMMINGBIRD.hover_rotor_speed_rad_s))
+            sim.step(model, state, np.full(4, 1.01 * HUMMINGBIRD.hover_rotor_speed_rad_s))
         ends.append(np.concatenate(state.vehicle.state, axis=1)[0])
         assert state.stamp_ns == 1_000 * MS
     assert ends[1] == pytest.approx(ends[0], rel=1e-12, abs=1e-12)
@@ -425,12 +425,12 @@ def test_a_run_has_the_wind_of_its_seed():
         "sensors": {"odometry": {"kind": "odometry", "rate_hz": 100}},
         "path": {"kind": "hover"},
     }
-    model = simulation.make_model(load_config({**settings, "seed": 3}))
+    model = sim.make_model(load_config({**settings, "seed": 3}))
     ends = []
     for seed in (None, 3, 4):
-        state = simulation.make_state(model, seed=seed)
+        state = sim.make_state(model, seed=seed)
         for _ in range(4):
-            simulation.step(model, state, np.full(4, HUMMINGBIRD.hover_rotor_speed_rad_s))
+            sim.step(model, state, np.full(4, HUMMINGBIRD.hover_rotor_speed_rad_s))
         ends.append(np.concatenate(state.vehicle.state, axis=1))
     assert np.array_equal(ends[0], ends[1])
     assert not np.isclose(ends[0][0, :3], ends[2][0, :3], rtol=1e-9, atol=0.0).any()
