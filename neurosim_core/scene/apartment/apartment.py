@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
-from neurosim_core.scene.apartment.assembly import Assembly
 from neurosim_core.scene.apartment.floorplan import make_floor_plan
-from neurosim_core.scene.apartment.looks import Palette
+from neurosim_core.scene.apartment.looks import Palette, Surface
+from neurosim_core.scene.apartment.pieces import Piece
 from neurosim_core.scene.apartment.rooms import furnish
-from neurosim_core.scene.apartment.shell import add_shell
-from neurosim_core.scene.scene import Ambient, Scene
+from neurosim_core.scene.apartment.shell import make_shell
+from neurosim_core.scene.scene import Ambient, Material, Scene, Texture
+from neurosim_core.scene.solids import merge
 from neurosim_core.settings import Settings
 
 _FLIGHT_HEIGHT_M = 1.4
@@ -49,28 +54,66 @@ def make_apartment(config: ApartmentConfig) -> Scene:
         door_height_m=config.door_height_m,
         ceiling_m=config.ceiling_m,
     )
-
     palette = Palette(config.seed)
-    assembly = Assembly(palette.paint)
-    finishes = {
-        room.name: palette.finish(room.name, room.role, index) for index, room in enumerate(plan.rooms)
-    }
-    add_shell(assembly, plan, finishes, palette.common, ceiling_m=config.ceiling_m)
-    spaces = [
-        furnish(
+    finishes = [palette.finish(room.name, room.role, index) for index, room in enumerate(plan.rooms)]
+    pieces = make_shell(plan, finishes, palette.common, ceiling_m=config.ceiling_m)
+    points = []
+    for index, room in enumerate(plan.rooms):
+        space = furnish(
             room,
             index,
-            assembly,
             palette,
-            finishes[room.name],
+            finishes[index],
             seed=config.seed,
             density=config.furniture,
             ceiling_m=config.ceiling_m,
         )
-        for index, room in enumerate(plan.rooms)
-    ]
-    return assembly.finish(
-        f"apartment with {config.rooms} room{'s' * (config.rooms > 1)}, seed {config.seed}",
+        pieces.extend(space.pieces)
+        points.append(space.roomiest(_FLIGHT_HEIGHT_M))
+    name = f"apartment with {config.rooms} room{'s' * (config.rooms > 1)}, seed {config.seed}"
+    return _assemble(name, pieces, palette, inside_m=max(points)[1])
+
+
+def _assemble(
+    name: str, pieces: Sequence[Piece], palette: Palette, *, inside_m: tuple[float, float, float]
+) -> Scene:
+    """Return a scene in which every piece is an object; objects are named `kind_1`, `kind_2` and so on."""
+    counts: dict[str, int] = {}
+    instances: list[str] = []
+    surfaces: dict[Surface, int] = {}
+    parts, face_material, face_instance = [], [], []
+    for piece in pieces:
+        counts[piece.kind] = counts.get(piece.kind, 0) + 1
+        for part, surface in piece.parts:
+            # Shifts of textures differ from part to part (additive recurrence of the plastic number).
+            shift = np.array([0.7548776662, 0.5698402910]) * len(parts) % 1.0
+            parts.append(replace(part, uv=part.uv / surface.tile_m + (0.0 if surface.exact else shift)))
+            material = surfaces.setdefault(surface, len(surfaces))
+            face_material.append(np.full(len(part.faces), material, np.int32))
+            face_instance.append(np.full(len(part.faces), len(instances), np.int32))
+        instances.append(f"{piece.kind}_{counts[piece.kind]}")
+    keys = {surface.texture for surface in surfaces if surface.texture is not None}
+    textures = {key: Texture(name=key, srgb=partial(palette.paint, key)) for key in keys}
+    whole = merge(parts)
+    return Scene(
+        name=name,
+        vertices=whole.vertices.astype(np.float32),
+        faces=whole.faces.astype(np.int32),
+        normals=whole.normals.astype(np.float32),
+        uv=whole.uv.astype(np.float32),
+        face_material=np.concatenate(face_material),
+        face_instance=np.concatenate(face_instance),
+        instance_names=tuple(instances),
+        materials=tuple(
+            Material(
+                name=surface.name,
+                base_color=surface.color,
+                texture=textures.get(surface.texture or ""),
+                emission=surface.emission,
+            )
+            for surface in surfaces
+        ),
+        lights=tuple(light for piece in pieces for light in piece.lights),
         ambient=Ambient(up=(0.3, 0.3, 0.31), down=(0.23, 0.22, 0.21)),
-        inside_m=max(space.roomiest(_FLIGHT_HEIGHT_M) for space in spaces)[1],
+        inside_m=inside_m,
     )

@@ -216,10 +216,11 @@ def _subdivide(
     """Cut a rectangle into one for each room of `order`."""
     if len(order) == 1:
         return [(order[0], rect)]
-    shares = np.cumsum([areas[k] for k in order])[:-1] / sum(areas[k] for k in order)
-    weight = np.exp(-6.0 * np.abs(shares - 0.5))
+    total = sum(areas[k] for k in order)
+    shares = [area / total for area in itertools.accumulate(areas[k] for k in order[:-1])]
+    weight = np.array([math.exp(-6.0 * abs(share - 0.5)) for share in shares])
     cut = 1 + int(rng.choice(len(shares), p=weight / weight.sum()))
-    share = float(shares[cut - 1])
+    share = shares[cut - 1]
     if (rect.width > rect.depth) == (rng.uniform() < 0.9):
         at = round(rect.x0 + share * rect.width, 2)
         first, second = Rect(rect.x0, rect.y0, at, rect.y1), Rect(at, rect.y0, rect.x1, rect.y1)

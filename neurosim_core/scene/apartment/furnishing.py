@@ -7,11 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.scene.apartment.assembly import Assembly
 from neurosim_core.scene.apartment.draws import Draws
 from neurosim_core.scene.apartment.floorplan import Room, Wall
-from neurosim_core.scene.apartment.geometry import Array
 from neurosim_core.scene.apartment.pieces import Piece
+from neurosim_core.scene.solids import Array
 
 WALL_GAP_M = 0.024
 """Between the wall and the back of what stands at it: room for the baseboard [m]."""
@@ -26,16 +25,16 @@ Place = Literal["anywhere", "corner", "middle"]
 
 
 class RoomSpace:
-    """What is still free in one room; pieces that fit are handed to the assembly.
+    """What is still free in one room; pieces that fit are kept where they stand.
 
     Boxes are lowest and highest corners in the world [m], shape [N, 2, 3].
     """
 
-    def __init__(self, room: Room, assembly: Assembly, ceiling_m: float) -> None:
+    def __init__(self, room: Room, ceiling_m: float) -> None:
         """Start with an empty room, whose doors and windows stay free."""
         self.room = room
         self.ceiling_m = ceiling_m
-        self._assembly = assembly
+        self.pieces: list[Piece] = []
         self._bodies: list[Array] = []
         self._doors: list[Array] = []
         self._windows: list[Array] = []
@@ -77,7 +76,7 @@ class RoomSpace:
         moved = piece.moved(np.add(offset, (0.0, 0.0, _LIFT_M)), yaw_rad)
         if not self._free(moved.bounds[None], group=group, window=window)[0]:
             return False
-        self._assembly.place(moved)
+        self.pieces.append(moved)
         self._bodies.append(moved.bounds[None])
         return True
 

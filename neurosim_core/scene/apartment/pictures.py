@@ -10,11 +10,14 @@ from neurosim_core.scene.apartment.textures import Field, Picture, blend, noise,
 
 SPINE_COLUMNS, SPINE_ROWS = 16, 2
 """Cells of the picture that `spines` paints; the last one is paper."""
+_SPINE_COLORS = (
+    "#7b2d26 #23395b #c9a227 #3d5a45 #e8dcc4 #2b2b2b #a3603a #5b7a8c #8c3b52 #d8cfc0 #44355b #b5482e"
+)
 
 
-def _cover(picture: Picture, inside: Field, color: str, *, px: float = 384.0) -> Picture:
+def _cover(picture: Picture, inside: Field, color: str) -> Picture:
     """Paint where a signed distance (in picture widths, negative inside) says so, with a soft edge."""
-    return blend(picture, rgb(color), 0.5 - inside * px)
+    return blend(picture, color, 0.5 - inside * 384.0)
 
 
 def _framed(picture: Picture, rng: np.random.Generator, *, margin: float = 0.07) -> Picture:
@@ -22,15 +25,15 @@ def _framed(picture: Picture, rng: np.random.Generator, *, margin: float = 0.07)
     height, width = picture.shape[:2]
     x, y = texel_grid(width, height)
     inset = np.minimum(np.minimum(x, 1.0 - x), np.minimum(y, height / width - y))
-    picture = blend(rgb("#f3efe6"), picture, (inset - margin) * width)
+    picture = blend("#f3efe6", picture, (inset - margin) * width)
     tooth = noise(rng, 0.6)[:height, :width]
     return np.asarray(picture * (1.0 + 0.025 * tooth[..., None]), np.float32)
 
 
-def poster_hills(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
+def _hills(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """A sun over ranges of hills, paler with distance."""
     x, y = texel_grid(384, 512)
-    picture = blend(rgb(colors[0]), rgb("#f6e8cf"), y * 1.1)
+    picture = blend(colors[0], "#f6e8cf", y * 1.1)
     center = rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.5)
     picture = _cover(picture, np.hypot(x - center[0], y - center[1]) - 0.15, colors[1])
     for layer in range(5):
@@ -38,13 +41,13 @@ def poster_hills(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
         for octave in range(1, 7):
             height = 0.10 / octave**1.2 * rng.uniform(0.4, 1.0)
             crest = crest + height * np.sin(2.0 * np.pi * (octave * 0.8 * x + rng.uniform()))
-        shade = blend(rgb(colors[2]), rgb("#f6e8cf"), np.full_like(x, 0.75 - 0.18 * layer))
+        shade = blend(colors[2], "#f6e8cf", np.full_like(x, 0.75 - 0.18 * layer))
         strata = 1.0 - 0.08 * (np.sin(2.0 * np.pi * (y - crest) * 26.0) > 0.75)
         picture = blend(picture, shade * strata[..., None], 0.5 + (y - crest) * 384.0)
-    return _framed(picture, rng)
+    return picture
 
 
-def poster_shapes(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
+def _shapes(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """Quarter discs, rings and bars on a grid."""
     x, y = texel_grid(384, 512)
     picture = np.broadcast_to(rgb("#efe6d6"), (512, 384, 3)).astype(np.float32)
@@ -66,12 +69,12 @@ def poster_shapes(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
                 share = 0.5 + 8.0 * np.sin(2.0 * np.pi * 6.0 * (u if corner[0] else v))
             else:
                 share = np.clip((u - v) * 128.0, 0.0, 1.0)
-            tile = blend(rgb(colors[ground]), rgb(colors[motif]), np.asarray(share, np.float32))
+            tile = blend(colors[ground], colors[motif], np.asarray(share, np.float32))
             picture = np.where(inside[..., None], tile, picture).astype(np.float32)
-    return _framed(picture, rng)
+    return picture
 
 
-def poster_blocks(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
+def _blocks(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """Rectangles of colour between black lines."""
     picture = np.broadcast_to(rgb("#f1ede2"), (512, 384, 3)).astype(np.float32)
     todo = [(0, 0, 384, 512)]
@@ -90,10 +93,10 @@ def poster_blocks(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
         if rng.uniform() < 0.55:
             picture[y0:y1, x0:x1] = rgb(colors[int(rng.integers(len(colors)))])
         picture[y0 : y0 + 6, x0:x1] = picture[y0:y1, x0 : x0 + 6] = 0.07
-    return _framed(picture, rng)
+    return picture
 
 
-def poster_contours(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
+def _contours(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """Level lines of a landscape, filled between some of them."""
     height = noise(rng, 2.6)[:, :384]
     level = height * 4.5
@@ -101,13 +104,13 @@ def poster_contours(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     picture = np.stack([rgb(color) for color in colors])[index]
     slope = np.hypot(*np.gradient(level)) + 1e-4
     line = np.minimum(level % 1.0, 1.0 - level % 1.0) / slope
-    return _framed(blend(rgb("#26282b"), picture, line - 0.6), rng)
+    return blend("#26282b", picture, line - 0.6)
 
 
-def poster_stems(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
+def _stems(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
     """A pressed plant: stems with pairs of leaves on paper."""
     x, y = texel_grid(384, 512)
-    picture = blend(rgb("#efe4cc"), rgb("#e2d3b4"), 0.5 + 0.3 * noise(rng, 1.8)[:, :384])
+    picture = blend("#efe4cc", "#e2d3b4", 0.5 + 0.3 * noise(rng, 1.8)[:, :384])
     for stem in range(3):
         root, lean = 0.5 + 0.05 * (stem - 1), 0.3 * (stem - 1) + rng.uniform(-0.06, 0.06)
         top = rng.uniform(0.16, 0.3)
@@ -132,10 +135,15 @@ def poster_stems(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
         share = np.clip((1.25 - y) / (1.25 - top), 0.0, 1.0)
         line = np.abs(x - root - lean * share * share) - 0.004
         picture = _cover(picture, np.maximum(line, np.maximum(top - y, y - 1.25)), color)
-    return _framed(picture, rng)
+    return picture
 
 
-POSTERS = (poster_hills, poster_shapes, poster_blocks, poster_contours, poster_stems)
+def poster(rng: np.random.Generator, colors: Sequence[str], kind: int) -> Picture:
+    """A framed print: hills, shapes, blocks, contours or a plant."""
+    return _framed(_POSTERS[kind % len(_POSTERS)](rng, colors), rng)
+
+
+_POSTERS = (_hills, _shapes, _blocks, _contours, _stems)
 
 
 def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
@@ -171,20 +179,7 @@ def rug(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
 def spines(rng: np.random.Generator) -> Picture:
     """Backs of books in a grid of cells, each with bands, title bars and worn edges."""
     width, height = 512 // SPINE_COLUMNS, 512 // SPINE_ROWS
-    colors = [
-        "#7b2d26",
-        "#23395b",
-        "#c9a227",
-        "#3d5a45",
-        "#e8dcc4",
-        "#2b2b2b",
-        "#a3603a",
-        "#5b7a8c",
-        "#8c3b52",
-        "#d8cfc0",
-        "#44355b",
-        "#b5482e",
-    ]
+    colors = _SPINE_COLORS.split()
     picture = np.empty((512, 512, 3), np.float32)
     across = np.abs(np.linspace(-1.0, 1.0, width, dtype=np.float32))
     for row in range(SPINE_ROWS):
@@ -227,9 +222,9 @@ def screen(rng: np.random.Generator) -> Picture:
 def view(rng: np.random.Generator) -> Picture:
     """What is outside: sky with clouds, a hazy town, trees; row 0 is the top."""
     x, y = texel_grid(512, 512)
-    picture = blend(rgb("#8db9e8"), rgb("#e9f1f7"), y * 1.5)
+    picture = blend("#8db9e8", "#e9f1f7", y * 1.5)
     cloud = noise(rng, 1.75, stretch=2.2)
-    picture = blend(picture, rgb("#ffffff"), (cloud - 0.2) * 0.9 * (1.0 - y))
+    picture = blend(picture, "#ffffff", (cloud - 0.2) * 0.9 * (1.0 - y))
     for depth in range(3):
         haze = 0.62 - 0.2 * depth
         left = 0
@@ -247,5 +242,9 @@ def view(rng: np.random.Generator) -> Picture:
             picture[top:, left : left + visible] = block[:, :visible]
             left += wide
     tree = 0.80 + 0.05 * np.sin(2.0 * np.pi * 2.0 * x + 1.0) + 0.035 * noise(rng, 1.1)[:1]
-    foliage = blend(rgb("#34502c"), rgb("#9dbb68"), 0.45 + 0.3 * noise(rng, 0.9, coarsest=8.0))
+    foliage = blend("#34502c", "#9dbb68", 0.45 + 0.3 * noise(rng, 0.9, coarsest=8.0))
     return blend(picture, foliage, (y - tree) * 120.0)
+
+
+PAINTERS = (poster, rug, spines, screen, view)
+"""What an expression of a texture can use; each takes a source of randomness first."""

@@ -1,6 +1,6 @@
 """Pieces of furniture, built from the table in `furniture.yaml`.
 
-An entry of the table is a solid (`box`, `cushion`, `lathe`, ...; `geometry.py` has their options) or another
+An entry of the table is a solid (`box`, `cushion`, `lathe`, ...; `solids.py` has their options) or another
 piece with the variables it is given. Strings are expressions of NumPy functions, variables, the surfaces of
 the room and random numbers (`uniform(low, high)`, `jitter(reach)`, `chance(probability)`, `pick(...)`).
 The other keys of an entry are:
@@ -28,12 +28,12 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.scene.apartment import geometry
+from neurosim_core.scene import solids
 from neurosim_core.scene.apartment.draws import Draws
-from neurosim_core.scene.apartment.geometry import Array, Part, turned
 from neurosim_core.scene.apartment.looks import Surface
 from neurosim_core.scene.apartment.pictures import SPINE_COLUMNS, SPINE_ROWS
 from neurosim_core.scene.scene import Light
+from neurosim_core.scene.solids import Array, Part, turned
 
 _WARM = np.array([1.5, 1.35, 1.14])
 """Intensity of a lamp of strength 1: walls and floors of furnished rooms get a radiance of 0.2 to 0.6."""
@@ -80,26 +80,25 @@ def make_piece(kind: str, surfaces: Mapping[str, Surface], draws: Draws, **given
     Raises:
         NameError: It asks for a variable that is not given.
     """
-    return replace(_build(_table()[kind], {**_SCOPE, **surfaces, **given}, draws, given), kind=kind)
+    return replace(_build(_table()[kind], {**FUNCTIONS, **surfaces, **given}, draws, given), kind=kind)
 
 
 def _build(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws, given: Mapping[str, Any]) -> Piece:
     """Build an entry; variables in `given` keep their value."""
-    if "if" in node and not _value(node["if"], scope, draws, "if"):
+    if "if" in node and not evaluate(node["if"], scope, draws, "if"):
         return _build({"parts": node.get("else", [])}, scope, draws.under("else"), {})
     whole = Piece("")
     for inner, own in _copies(list(node.get("for", {}).items()), scope, draws):
         for name, data in node.get("let", {}).items():
             if name not in given:
-                inner[name] = _value(data, inner, own, name)
+                inner[name] = evaluate(data, inner, own, name)
         if "of" in node:
-            inner["of"] = _value(node["of"], inner, own, "of")
+            inner["of"] = evaluate(node["of"], inner, own, "of")
         piece = _solid(node, inner, own)
         for index, entry in enumerate(node.get("parts", ())):
             piece.include(_build(entry, dict(inner), own.under(index), {}))
-        whole.include(
-            _placed(piece, {key: _value(node[key], inner, own, key) for key in _PLACING if key in node})
-        )
+        placing = {key: evaluate(node[key], inner, own, key) for key in _PLACING if key in node}
+        whole.include(_placed(piece, placing) if placing else piece)
     return whole
 
 
@@ -111,7 +110,7 @@ def _copies(
         yield dict(scope), draws
         return
     (name, data), *rest = loops
-    for index, value in enumerate(_value(data, scope, draws, name)):
+    for index, value in enumerate(evaluate(data, scope, draws, name)):
         yield from _copies(rest, {**scope, name: value}, draws.under(name, index))
 
 
@@ -121,42 +120,47 @@ def _solid(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws) -> Piec
     if kind is None:
         return Piece("")
     if kind in _table():
-        given = {name: _value(data, scope, draws, name) for name, data in node[kind].items()}
+        given = {name: evaluate(data, scope, draws, name) for name, data in node[kind].items()}
         surfaces = {name: value for name, value in scope.items() if isinstance(value, Surface)}
         return make_piece(kind, surfaces, draws.under(kind), **given)
     if kind == "light":
-        r, g, b = (float(value) for value in _value(node[kind], scope, draws, kind) * _WARM)
+        r, g, b = (float(value) for value in evaluate(node[kind], scope, draws, kind) * _WARM)
         return Piece("", lights=[Light(position_m=(0.0, 0.0, 0.0), intensity=(r, g, b))])
     if kind == "sheet":
         columns, rows = (
-            np.linspace(0.0, 1.0, count + 1) for count in _value(node["steps"], scope, draws, "steps")
+            np.linspace(0.0, 1.0, count + 1) for count in evaluate(node["steps"], scope, draws, "steps")
         )
         scope["u"], scope["v"] = np.meshgrid(columns, rows)
-    options = {key: _value(data, scope, draws, key) for key, data in node.items() if key not in _KEYS}
+    options = {key: evaluate(data, scope, draws, key) for key, data in node.items() if key not in _KEYS}
     return Piece("", parts=[(_SOLIDS[kind](options.pop(kind), **options), scope["of"])])
 
 
 def _placed(piece: Piece, where: Mapping[str, Any]) -> Piece:
     """Scale, turn and shift what an entry made."""
-    factor, offset = where.get("scale", 1.0), np.asarray(where.get("at", (0.0, 0.0, 0.0)), float)
+    offset = np.asarray(where.get("at", (0.0, 0.0, 0.0)), float)
     parts = []
     for part, surface in piece.parts:
-        part = replace(part, vertices=part.vertices * factor, uv=part.uv + where.get("shift_uv", (0.0, 0.0)))
+        if "scale" in where or "shift_uv" in where:
+            uv = part.uv + where.get("shift_uv", (0.0, 0.0))
+            part = replace(part, vertices=part.vertices * where.get("scale", 1.0), uv=uv)
         for axis, angle in where.get("turn", {}).items():
             part = part.turned(angle, axis="xyz".index(axis))
         parts.append((part.moved(offset), surface))
-    return Piece("", parts, piece.moved(offset).lights)
+    return Piece("", parts, Piece("", [], piece.lights).moved(offset).lights)
 
 
-def _value(data: Any, scope: dict[str, Any], draws: Draws, name: str) -> Any:
-    """Evaluate what the table has for a variable or an option called `name`."""
+def evaluate(data: Any, scope: dict[str, Any], draws: Draws, name: str) -> Any:
+    """Return the value of what a table has for a variable or an option called `name`."""
     if isinstance(data, str):
         code, draws_numbers = _compiled(data)
         return eval(code, scope | draws.functions(name) if draws_numbers else scope)
     if isinstance(data, list):
-        return [_value(item, scope, draws, f"{name}.{index}") for index, item in enumerate(data)]
+        return [
+            evaluate(item, scope, draws, f"{name}.{index}") if isinstance(item, str | list) else item
+            for index, item in enumerate(data)
+        ]
     if isinstance(data, dict):
-        return {key: _value(item, scope, draws, f"{name}.{key}") for key, item in data.items()}
+        return {key: evaluate(item, scope, draws, f"{name}.{key}") for key, item in data.items()}
     return data
 
 
@@ -175,7 +179,7 @@ def _table() -> dict[str, Any]:
 
 def _book(size: Sequence[float], *, cell: int) -> Part:
     """A standing book (thickness, depth, height), its spine at y = 0; `cell` of the picture of spines."""
-    part = geometry.box(size).moved((0.0, 0.5 * size[1], 0.5 * size[2]))
+    part = solids.box(size).moved((0.0, 0.5 * size[1], 0.5 * size[2]))
     low = np.array([cell % SPINE_COLUMNS, SPINE_ROWS - 1 - cell // SPINE_COLUMNS])
     paper = np.array([SPINE_COLUMNS - 1, 0])
     corners = np.array([[0.06, 0.02], [0.94, 0.02], [0.06, 0.98], [0.94, 0.98]])
@@ -193,24 +197,24 @@ def _sheet(points: Sequence[ArrayLike], *, steps: Sequence[int], uv: Sequence[Ar
             [np.broadcast_to(np.asarray(value, float), (rows, columns)) for value in values], axis=-1
         )
 
-    return geometry.grid_surface(stacked(points), stacked(uv))
+    return solids.grid_surface(stacked(points), stacked(uv))
 
 
 _PLACING = ("scale", "turn", "at", "shift_uv")
 _KEYS = {"of", "let", "for", "if", "else", "parts", *_PLACING}
 _SOLIDS: dict[str, Any] = {
-    "box": geometry.box,
-    "cushion": geometry.cushion,
-    "lathe": geometry.lathe,
-    "cylinder": geometry.cylinder,
-    "tube": geometry.tube,
-    "frame": geometry.frame,
-    "quad": lambda edges: geometry.quad(*edges),
-    "canvas": lambda edges: geometry.picture_quad(*edges),
+    "box": solids.box,
+    "cushion": solids.cushion,
+    "lathe": solids.lathe,
+    "cylinder": solids.cylinder,
+    "tube": solids.tube,
+    "frame": solids.frame,
+    "quad": lambda edges: solids.quad(*edges),
+    "canvas": lambda edges: solids.picture_quad(*edges),
     "sheet": _sheet,
     "book": _book,
 }
-_SCOPE: dict[str, Any] = {
+FUNCTIONS: dict[str, Any] = {
     "__builtins__": {},
     **{name: getattr(np, name) for name in ("sin", "cos", "pi", "clip", "abs", "linspace", "cumsum")},
     **{function.__name__: function for function in (min, max, sum, len, int, range, round)},

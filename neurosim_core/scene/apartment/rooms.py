@@ -11,14 +11,13 @@ from typing import Any
 
 import yaml
 
-from neurosim_core.scene.apartment.assembly import Assembly
 from neurosim_core.scene.apartment.draws import Draws
 from neurosim_core.scene.apartment.floorplan import Room, Wall
 from neurosim_core.scene.apartment.furnishing import WALL_GAP_M, RoomSpace
 from neurosim_core.scene.apartment.looks import Finish, Palette
-from neurosim_core.scene.apartment.pieces import Piece, make_piece
+from neurosim_core.scene.apartment.pieces import FUNCTIONS, Piece, evaluate, make_piece
 
-_ON_RUG_M = 0.014
+_PLACE = ("front", "sides", "window")
 
 
 @functools.cache
@@ -30,7 +29,6 @@ def _steps() -> dict[str, list[dict[str, dict[str, Any]]]]:
 def furnish(
     room: Room,
     index: int,
-    assembly: Assembly,
     palette: Palette,
     finish: Finish,
     *,
@@ -43,7 +41,6 @@ def furnish(
     Args:
         room: The room.
         index: Its number in the plan.
-        assembly: Receives the furniture and the lamps.
         palette: Surfaces of the flat.
         finish: What the room is lined with.
         seed: Chooses the furniture.
@@ -51,9 +48,9 @@ def furnish(
         ceiling_m: Height of the room [m].
 
     Returns:
-        What space is left.
+        The furniture and the lamps, and what space is left.
     """
-    space = RoomSpace(room, assembly, ceiling_m)
+    space = RoomSpace(room, ceiling_m)
     furnisher = Furnisher(space, Draws(seed, room.name), palette, finish, index, density)
     for number, step in enumerate(_steps()[room.role]):
         ((method, options),) = step.items()
@@ -91,117 +88,97 @@ class Furnisher:
         return self._draws.chance(name, chance * self._density)
 
     def _make(self, kind: str, *name: object, **given: Any) -> Piece:
-        """Make a piece that stands with its back at y = 0."""
-        piece = make_piece(kind, self._surfaces, self._draws.under(kind, *name), **given)
-        return piece.moved((0.0, -piece.bounds[1, 1] - 0.02, 0.0)) if kind == "plant" else piece
+        if kind == "rug":
+            given["pattern"] = self._palette.rug(self._index, given["w"], given["d"])
+        elif kind == "picture":
+            number = 2 * self._index + self._prints % 2
+            given["print"] = self._palette.poster(number, given["w"], given["h"])
+            self._prints += 1
+        return make_piece(kind, self._surfaces, self._draws.under(kind, *name), **given)
 
     def along_wall(
         self,
         kind: str,
         *,
-        sizes: Sequence[dict[str, Any]] = ({},),
+        tries: Sequence[dict[str, Any]] = ({},),
         count: int = 1,
-        above: str | None = None,
+        beside: float | None = None,
+        pictures: float = 0.0,
+        around: Sequence[dict[str, Any]] = (),
         **options: Any,
     ) -> None:
-        """Place pieces along the walls, each in the first of its sizes that fits, with something above."""
-        for k in range(count):
-            for given in sizes:
-                spot = self._space.along_wall(
-                    self._make(kind, k, **given), self._draws.under("at", k), **options
+        """Place pieces along the walls, each in the first way that fits, with what belongs to them.
+
+        Args:
+            kind: Of the piece.
+            tries: Variables of the piece and requirements of its place, the best first.
+            count: How many there are.
+            beside: Each one stands at this distance from the one before, if it fits there [m].
+            pictures: Chance of pictures above it.
+            around: What stands around it, see `rooms.yaml`.
+            **options: What all ways have in common; `with` are variables of the piece.
+        """
+        common = evaluate(options.pop("with", {}), dict(FUNCTIONS), self._draws, "with")
+        spot: tuple[Wall, float] | None = None
+        piece, made = Piece(kind), (-1, common)
+        for k, (number, way) in itertools.product(range(count), enumerate(tries)):
+            place = options | {key: value for key, value in way.items() if key in _PLACE}
+            given = common | {key: value for key, value in way.items() if key not in _PLACE}
+            if (k, given) != made:
+                piece, made = self._make(kind, k, **given), (k, given)
+            near = [(spot[0], spot[1] + side * beside) for side in (-1.0, 1.0)] if spot and beside else []
+            spot = next((at for at in near if self._space.put_at_wall(piece, *at)), None)
+            spot = spot or self._space.along_wall(piece, self._draws.under("at", k, number), **place)
+            if spot:
+                if pictures and self._wants("pictures", pictures):
+                    self._pictures_above(*spot)
+                self._put_around(piece, *spot, WALL_GAP_M, given, around)
+                if count == 1:
+                    return
+
+    def _put_around(
+        self,
+        piece: Piece,
+        wall: Wall,
+        at: float,
+        out: float,
+        variables: dict[str, Any],
+        around: Sequence[dict[str, Any]],
+    ) -> None:
+        (_, front, _), (half, _, top) = (corner.tolist() for corner in piece.bounds)
+        scope = FUNCTIONS | variables | {"half": half, "deep": -front, "top": top, "edge": out - front}
+        for number, data in enumerate(around):
+            draws = self._draws.under("around", data["kind"], number)
+            given = evaluate(data.get("with", {}), scope, draws, "with")
+            other = self._make(data["kind"], number, at, **given)
+            scope["own"] = -float(other.bounds[0, 1])
+            side, middle = wall, at
+            if data.get("across", False):
+                side = self._room.walls[(self._room.walls.index(wall) + 2) % 4]
+                middle = side.length_m - at
+            scope["placed"], placed = False, scope.get("placed", False)
+            for x in evaluate(data.get("x", [0.0]), scope, draws, "x"):
+                inner = scope | {"x": x, "placed": placed}
+                distance, lift, yaw = (
+                    evaluate(data.get(key, default), inner, draws, key)
+                    for key, default in (("out", WALL_GAP_M), ("lift", 0.0), ("yaw", 0.0))
                 )
-                if spot:
-                    if above:
-                        self._space.hang(self._make(above), *spot)
-                    break
+                if self._space.put_at_wall(
+                    other, side, middle + x, out=distance, yaw_rad=yaw, lift=lift, group=True
+                ):
+                    scope["placed"] = True
+                    nested = given | {"x": x}
+                    self._put_around(other, side, middle + x, distance, nested, data.get("around", ()))
+                    if not data.get("every", False):
+                        break
+            if "elsewhere" in data and not scope["placed"]:
+                self._space.along_wall(other, draws, prefer=data["elsewhere"])
 
     def hang(self, kind: str) -> None:
         """Hang a piece on the first stretch of wall that is free."""
+        piece = self._make(kind)
         for wall, share in itertools.product(self._room.walls, (0.5, 0.35, 0.65, 0.2, 0.8)):
-            if self._space.hang(self._make(kind), wall, share * wall.length_m):
-                return
-
-    def sofa_group(self) -> None:
-        """A sofa, a rug and a low table in front, an armchair beside it and a television across the room."""
-        space = self._space
-        for width, front, window in (
-            (2.3, 1.7, False),
-            (2.3, 1.3, False),
-            (1.8, 1.3, False),
-            (2.3, 1.3, True),
-            (1.8, 0.8, True),
-        ):
-            sofa = self._make("sofa", w=width)
-            place = self._draws.under("at", width, front)
-            spot = space.along_wall(sofa, place, front=front, sides=0.1, prefer="middle", window=window)
-            if spot:
-                break
-        else:
-            return
-        wall, x = spot
-        self._pictures_above(wall, x)
-        edge, rug_width = WALL_GAP_M - float(sofa.bounds[0, 1]), width + 0.1
-        on_rug = space.put_at_wall(self._rug(rug_width, 1.55), wall, x, out=edge + 0.04, group=True)
-        table = self._make("coffee_table")
-        space.put_at_wall(table, wall, x, out=edge + 0.42, lift=_ON_RUG_M if on_rug else 0.0, group=True)
-        chair = self._make("armchair")
-        for side in (-1.0, 1.0) if self._draws.chance("left", 0.5) else (1.0, -1.0):
-            # Its front towards the table: turned by a quarter, its depth runs along the wall.
-            at = x + side * (0.5 * rug_width + 0.06 - float(chair.bounds[0, 1]))
-            if space.put_at_wall(chair, wall, at, out=edge + 0.75, yaw_rad=-side * 0.5 * math.pi, group=True):
-                break
-        across = self._room.walls[(self._room.walls.index(wall) + 2) % 4]
-        board = self._make("sideboard", tv=True)
-        board.kind = "television_board"
-        shifts = (0.0, 0.4, -0.4, 0.8, -0.8, 1.2, -1.2)
-        if not any(space.put_at_wall(board, across, across.length_m - x + shift) for shift in shifts):
-            space.along_wall(board, self._draws.under("board"), prefer="middle")
-        lamp = self._make("floor_lamp", strength=0.5)
-        ends = (x - 0.5 * width - 0.32, x + 0.5 * width + 0.32)
-        any(space.put_at_wall(lamp, wall, at, group=True) for at in ends)
-
-    def bed_group(self, widths: Sequence[float]) -> None:
-        """A bed with nightstands and lamps on both sides, and rugs beside it."""
-        space = self._space
-        bed = self._make("bed", w=self._draws.pick("width", widths))
-        for sides, front, window in (
-            (0.5, 0.55, False),
-            (0.5, 0.3, True),
-            (0.1, 0.55, False),
-            (0.1, 0.3, True),
-        ):
-            place = self._draws.under("at", sides, front)
-            spot = space.along_wall(bed, place, front=front, sides=sides, prefer="middle", window=window)
-            if spot:
-                break
-        else:
-            return
-        wall, x = spot
-        if self._wants("pictures", 0.7):
-            self._pictures_above(wall, x)
-        half = float(bed.bounds[1, 0])
-        for side in (-1.0, 1.0):
-            stand = self._make("nightstand", side)
-            (_, front, _), (_, _, top) = stand.bounds
-            at, out = x + side * (half + 0.28), WALL_GAP_M - 0.5 * float(front)
-            if space.put_at_wall(stand, wall, at, group=True):
-                lamp = self._make("table_lamp")
-                space.put_at_wall(lamp, wall, at, out=out, lift=float(top) + 0.002, group=True)
-                out = WALL_GAP_M - float(front) + 0.1
-                space.put_at_wall(self._rug(0.75, 1.5), wall, x + side * (half + 0.46), out=out, group=True)
-
-    def kitchen_line(self, widths: Sequence[float]) -> None:
-        """The longest counter that fits, and a fridge near it."""
-        space = self._space
-        for width in widths:
-            counter = self._make("kitchen_counter", w=width)
-            spot = space.along_wall(counter, self._draws.under("at", width), front=0.8, prefer="corner")
-            if spot:
-                wall, x = spot
-                fridge = self._make("refrigerator")
-                ends = (x - 0.5 * width - 0.37, x + 0.5 * width + 0.37)
-                if not any(space.put_at_wall(fridge, wall, at, group=True) for at in ends):
-                    space.along_wall(fridge, self._draws.under("fridge"), prefer="corner")
+            if self._space.hang(piece, wall, share * wall.length_m):
                 return
 
     def dining_group(self, seats: Sequence[int]) -> None:
@@ -214,7 +191,6 @@ class Furnisher:
                 table = self._make("round_table", r=0.5 if count == 2 else 0.58)
             else:
                 table = self._make("table", w=0.4 + 0.33 * count)
-            table.kind = "table"
             table = table.moved((0.0, -0.5 * table.bounds[:, 1].sum(), 0.0))
             group = [(table, 0.0, 0.0, 0.0)]
             chair = self._make("chair")
@@ -242,37 +218,14 @@ class Furnisher:
                 space.put(lamp, (*spot, -0.002))
                 return
 
-    def desk_group(self) -> None:
-        """A desk, at a window too, and a chair in front of it."""
-        space, desk, chair = self._space, self._make("desk"), self._make("office_chair")
-        spot = space.along_wall(desk, self._draws.under("at"), front=0.9, prefer="middle", window=True)
-        if spot:
-            out = WALL_GAP_M - float(desk.bounds[0, 1]) + 0.1 - float(chair.bounds[0, 1])
-            yaw = math.pi + self._draws.uniform("turn", -0.2, 0.2)
-            space.put_at_wall(chair, spot[0], spot[1] - 0.1, out=out, yaw_rad=yaw, group=True)
-
-    def shelves(self, count: int) -> None:
-        """Bookshelves of one height, next to each other where there is room."""
-        height = self._draws.pick("height", (1.75, 2.0, 2.15))
-        spot: tuple[Wall, float] | None = None
-        for k in range(count):
-            shelf = self._make("bookshelf", k, h=height)
-            beside = [(spot[0], spot[1] + side * 0.935) for side in (-1.0, 1.0)] if spot else []
-            spot = next((at for at in beside if self._space.put_at_wall(shelf, *at)), None)
-            spot = spot or self._space.along_wall(shelf, self._draws.under("at", k), prefer="corner")
-
     def rug(self, w: float, d: float) -> None:
         """A rug in the open."""
-        rug, rect = self._rug(w, d), self._room.rect
+        rug, rect = self._make("rug", w=w, d=d), self._room.rect
         turn = 0.0 if rect.width >= rect.depth else 0.5 * math.pi
         bounds = rug.moved((0.0, 0.0, 0.0), turn).bounds
         spot = self._space.open_spot(bounds, self._draws.under("at"), around=0.0, group=True)
         if spot:
             self._space.put(rug, (*spot, 0.0), turn, group=True)
-
-    def _rug(self, width: float, depth: float) -> Piece:
-        pattern = self._palette.rug(self._index, width, depth)
-        return self._make("rug", w=width, d=depth, pattern=pattern)
 
     def main_lamps(self, strength: float) -> None:
         """One lamp in the middle of the ceiling, two in a long room."""
@@ -318,16 +271,12 @@ class Furnisher:
                     if put(self._make("curtain", x, side, w=panel_width, low=low, top=top, **look), wall, at):
                         break
 
-    def _picture(self, width: float, height: float) -> Piece:
-        poster = self._palette.poster(2 * self._index + self._prints % 2, width, height)
-        self._prints += 1
-        return self._make("picture", w=width, h=height, print=poster)
-
     def _pictures_above(self, wall: Wall, x: float) -> None:
         """Two or three prints in a row above a piece of furniture."""
         count = self._draws.pick("prints", (2, 3))
         for k in range(count):
-            picture = self._picture(*((0.6, 0.8) if count == 2 else (0.45, 0.6)))
+            w, h = (0.6, 0.8) if count == 2 else (0.45, 0.6)
+            picture = self._make("picture", w=w, h=h)
             self._space.hang(picture, wall, x + 0.74 * (k - 0.5 * (count - 1)))
 
     def hang_pictures(self) -> None:
@@ -339,5 +288,6 @@ class Furnisher:
             for share in (0.5, 0.32, 0.68, 0.16, 0.84):
                 name = f"{index} {share}"
                 if hung < 2 and self._wants(f"wanted {name}", 0.7):
-                    picture = self._picture(*self._draws.pick(f"format {name}", formats))
+                    w, h = self._draws.pick(f"format {name}", formats)
+                    picture = self._make("picture", w=w, h=h)
                     hung += self._space.hang(picture, wall, share * wall.length_m)

@@ -46,9 +46,10 @@ def noise(
     return np.asarray(field / field.std(), np.float32)
 
 
-def blend(low: NDArray[np.float32], high: NDArray[np.float32], share: NDArray[np.floating[Any]]) -> Picture:
+def blend(low: str | Picture, high: str | Picture, share: NDArray[np.floating[Any]]) -> Picture:
     """Return the way from colour (or picture) `low` to `high` by a share that is clipped to [0, 1]."""
-    return np.asarray(low + (high - low) * np.clip(share, 0.0, 1.0)[..., None], np.float32)
+    first, last = (rgb(color) if isinstance(color, str) else color for color in (low, high))
+    return np.asarray(first + (last - first) * np.clip(share, 0.0, 1.0)[..., None], np.float32)
 
 
 def quantize(picture: Picture) -> NDArray[np.uint8]:
@@ -79,7 +80,7 @@ def wood(rng: np.random.Generator, dark: str = "#000000", light: str = "#ffffff"
     rings = np.sin(2.0 * np.pi * (9.0 * v + 26.0 * warp)).astype(np.float32)
     fibre = noise(rng, 0.9, stretch=26.0, coarsest=10.0)
     pores = np.clip(noise(rng, 0.35, stretch=18.0, coarsest=60.0) - 1.4, 0.0, 1.0)
-    return blend(rgb(dark), rgb(light), 0.55 + 0.17 * rings + 0.17 * fibre - 0.5 * pores + 2.0 * warp)
+    return blend(dark, light, 0.55 + 0.17 * rings + 0.17 * fibre - 0.5 * pores + 2.0 * warp)
 
 
 def planks(rng: np.random.Generator, dark: str, light: str) -> Picture:
@@ -94,7 +95,7 @@ def planks(rng: np.random.Generator, dark: str, light: str) -> Picture:
     grain = wood(rng)[(_texels(v) + shift) % SIZE_PX, (_texels(u) + 3 * shift) % SIZE_PX, 0]
     to_end = np.minimum(along % 1.0, 1.0 - along % 1.0) / 2.0
     joint = np.clip(np.minimum(_edge(v, rows), to_end) * SIZE_PX / 1.4, 0.0, 1.0)
-    picture = blend(rgb(dark), rgb(light), 0.12 + 0.66 * grain + 0.19 * tone)
+    picture = blend(dark, light, 0.12 + 0.66 * grain + 0.19 * tone)
     return np.asarray(picture * (0.3 + 0.7 * joint[..., None]), np.float32)
 
 
@@ -109,7 +110,7 @@ def chevron(rng: np.random.Generator, dark: str, light: str) -> Picture:
     shift = rng.uniform(size=(columns, boards)).astype(np.float32)[column, board]
     grain = wood(rng)[_texels(across + shift), _texels(inside * 0.33 + shift * 1.7), 0]
     joint = np.clip(np.minimum(_edge(across, boards), _edge(u, columns)) * SIZE_PX / 1.3, 0.0, 1.0)
-    picture = blend(rgb(dark), rgb(light), 0.15 + 0.62 * grain + 0.2 * tone)
+    picture = blend(dark, light, 0.15 + 0.62 * grain + 0.2 * tone)
     return np.asarray(picture * (0.35 + 0.65 * joint[..., None]), np.float32)
 
 
@@ -145,7 +146,7 @@ def tiles(
 
 def terrazzo(rng: np.random.Generator, ground: str, chips: Sequence[str]) -> Picture:
     """Return ground stone chips of several sizes in cement."""
-    picture = blend(rgb(ground) * 0.93, rgb(ground), 0.5 + 0.3 * noise(rng, 0.5))
+    picture = blend(rgb(ground) * 0.93, ground, 0.5 + 0.3 * noise(rng, 0.5))
     for index, chip in enumerate(chips):
         grain = noise(rng, 3.0, coarsest=26.0 - 5.0 * index)
         picture = blend(picture, rgb(chip) * (1.0 + 0.04 * grain[..., None]), (grain - 1.05) * 9.0)
@@ -158,14 +159,14 @@ def marble(rng: np.random.Generator, ground: str, vein: str) -> Picture:
     veins = np.exp(-12.0 * np.abs(noise(rng, 1.75, stretch=0.6) + 0.25 * cloud))
     fine = np.exp(-16.0 * np.abs(noise(rng, 1.5, coarsest=3.0)))
     share = 0.12 + 0.1 * cloud + 0.62 * veins + 0.25 * fine + 0.05 * noise(rng, 0.2)
-    return blend(rgb(ground), rgb(vein), share)
+    return blend(ground, vein, share)
 
 
 def wallpaper(rng: np.random.Generator, ground: str, motif: str, kind: str) -> Picture:
     """Return printed paper: `stripes`, `scales` (overlapping arcs), `lattice` (diamonds) or `leaves`."""
     ink = _MOTIFS[kind](rng) * (0.93 + 0.05 * noise(rng, 0.5))
     paper = 1.0 + 0.022 * noise(rng, 0.5) + 0.018 * noise(rng, 1.5)
-    return np.asarray(blend(rgb(ground), rgb(motif), ink) * paper[..., None], np.float32)
+    return np.asarray(blend(ground, motif, ink) * paper[..., None], np.float32)
 
 
 def _stripes(rng: np.random.Generator) -> Field:
@@ -210,3 +211,5 @@ def _leaves(rng: np.random.Generator) -> Field:
 
 
 _MOTIFS = {"stripes": _stripes, "scales": _scales, "lattice": _lattice, "leaves": _leaves}
+PAINTERS = (noise, wood, planks, chevron, tiles, terrazzo, marble, wallpaper)
+"""What an expression of a texture can use; each takes a source of randomness first."""
