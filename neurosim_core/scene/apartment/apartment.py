@@ -13,10 +13,10 @@ from pydantic import Field
 from neurosim_core.scene.apartment.floorplan import make_floor_plan
 from neurosim_core.scene.apartment.looks import Palette, Surface
 from neurosim_core.scene.apartment.pieces import Piece
-from neurosim_core.scene.apartment.rooms import furnish
+from neurosim_core.scene.apartment.rooms import Furnisher
 from neurosim_core.scene.apartment.shell import make_shell
 from neurosim_core.scene.scene import Ambient, Material, Scene, Texture
-from neurosim_core.scene.solids import merge
+from neurosim_core.scene.solids import Part, merge
 from neurosim_core.settings import Settings
 
 _FLIGHT_HEIGHT_M = 1.4
@@ -59,7 +59,7 @@ def make_apartment(config: ApartmentConfig) -> Scene:
     pieces = make_shell(plan, finishes, palette.common, ceiling_m=config.ceiling_m)
     points = []
     for index, room in enumerate(plan.rooms):
-        space = furnish(
+        furnisher = Furnisher(
             room,
             index,
             palette,
@@ -68,6 +68,7 @@ def make_apartment(config: ApartmentConfig) -> Scene:
             density=config.furniture,
             ceiling_m=config.ceiling_m,
         )
+        space = furnisher.furnish()
         pieces.extend(space.pieces)
         points.append(space.roomiest(_FLIGHT_HEIGHT_M))
     name = f"apartment with {config.rooms} room{'s' * (config.rooms > 1)}, seed {config.seed}"
@@ -81,7 +82,8 @@ def _assemble(
     counts: dict[str, int] = {}
     instances: list[str] = []
     surfaces: dict[Surface, int] = {}
-    parts, face_material, face_instance = [], [], []
+    parts: list[Part] = []
+    face_material, face_instance = [], []
     for piece in pieces:
         counts[piece.kind] = counts.get(piece.kind, 0) + 1
         for part, surface in piece.parts:

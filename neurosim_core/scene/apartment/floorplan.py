@@ -20,16 +20,7 @@ OUTER_WALL_M = 0.30
 """Thickness of the walls to the outside [m]."""
 _CORNER_M = 0.30
 """Least distance of an opening from the corner of a room [m]."""
-_MANY: tuple[Role, ...] = (
-    "living",
-    "kitchen",
-    "bedroom",
-    "study",
-    "bathroom",
-    "bedroom",
-    "dining",
-    "study",
-)
+_MANY: tuple[Role, ...] = ("living", "kitchen", "bedroom", "study", "bathroom", "bedroom", "dining", "study")
 _OPEN_PLAN = ({"living", "kitchen"}, {"living", "dining"}, {"kitchen", "dining"})
 """Rooms with a wider doorway between them."""
 

@@ -207,7 +207,7 @@ def _touches(boxes: Array, others: list[Array]) -> NDArray[np.bool_]:
         return np.zeros(len(boxes), bool)
     there = np.concatenate(others)
     apart = (boxes[:, None, 0] >= there[None, :, 1]) | (there[None, :, 0] >= boxes[:, None, 1])
-    return np.asarray(~np.any(apart, axis=2)).any(axis=1)
+    return np.asarray(np.any(~np.any(apart, axis=2), axis=1))
 
 
 def _liking(prefer: Place, wall: Wall, x: float) -> float:

@@ -74,7 +74,9 @@ class Palette:
         self._scheme: dict[str, list[str]] = schemes[int(stream(seed, "scheme").integers(len(schemes)))]
         self.common = {name: _surface(name, **data) for name, data in _table()["surfaces"].items()}
         """Surfaces that do not differ between rooms, by name."""
-        self._formulas = {key: (formula, {}) for key, formula in _table()["textures"].items()}
+        self._formulas: dict[str, tuple[str, dict[str, Any]]] = {
+            key: (formula, {}) for key, formula in _table()["textures"].items()
+        }
 
     def paint(self, key: str) -> NDArray[np.uint8]:
         """Return the texture of a surface's key."""

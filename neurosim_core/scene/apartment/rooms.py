@@ -26,59 +26,57 @@ def _steps() -> dict[str, list[dict[str, dict[str, Any]]]]:
     return table
 
 
-def furnish(
-    room: Room,
-    index: int,
-    palette: Palette,
-    finish: Finish,
-    *,
-    seed: int,
-    density: float,
-    ceiling_m: float,
-) -> RoomSpace:
-    """Furnish one room; its furniture depends on its name and the seed, not on the other rooms.
-
-    Args:
-        room: The room.
-        index: Its number in the plan.
-        palette: Surfaces of the flat.
-        finish: What the room is lined with.
-        seed: Chooses the furniture.
-        density: Share of the optional things that are there, 0 to 1.
-        ceiling_m: Height of the room [m].
-
-    Returns:
-        The furniture and the lamps, and what space is left.
-    """
-    space = RoomSpace(room, ceiling_m)
-    furnisher = Furnisher(space, Draws(seed, room.name), palette, finish, index, density)
-    for number, step in enumerate(_steps()[room.role]):
-        ((method, options),) = step.items()
-        furnisher.step(f"{method} {number}", method, **options)
-    furnisher.dress_windows()
-    furnisher.hang_pictures()
-    for k in range(2):
-        furnisher.step(f"plant {k}", "along_wall", kind="plant", chance=0.75, front=0.05, prefer="corner")
-    return space
-
-
 class Furnisher:
-    """Arranges the furniture of one room. Each step has random numbers of its own."""
+    """Arranges the furniture of one room. Each step has random numbers of its own.
+
+    The furniture depends on the name of the room and the seed, not on the other rooms.
+    """
 
     def __init__(
-        self, space: RoomSpace, draws: Draws, palette: Palette, finish: Finish, index: int, density: float
+        self,
+        room: Room,
+        index: int,
+        palette: Palette,
+        finish: Finish,
+        *,
+        seed: int,
+        density: float,
+        ceiling_m: float,
     ) -> None:
-        """Take the empty room, see `furnish`."""
-        self._space = space
-        self._room = space.room
-        self._all_draws = self._draws = draws
+        """Take an empty room.
+
+        Args:
+            room: The room.
+            index: Its number in the plan.
+            palette: Surfaces of the flat.
+            finish: What the room is lined with.
+            seed: Chooses the furniture.
+            density: Share of the optional things that are there, 0 to 1.
+            ceiling_m: Height of the room [m].
+        """
+        self._room = room
+        self._space = RoomSpace(room, ceiling_m)
+        self._all_draws = self._draws = Draws(seed, room.name)
         self._palette = palette
-        self._surfaces = palette.look(space.room.name) | {"splash": finish.splash}
+        self._surfaces = palette.look(room.name) | {"splash": finish.splash}
         self._index = index
         self._density = density
         self._prints = 0
 
-    def step(self, name: str, method: str, *, chance: float | None = None, **options: Any) -> None:
+    def furnish(self) -> RoomSpace:
+        """Do all steps, and return the furniture, the lamps and what space is left."""
+        for number, step in enumerate(_steps()[self._room.role]):
+            ((method, options),) = step.items()
+            self._do(f"{method} {number}", method, **options)
+        self._draws = self._all_draws.under("windows")
+        self._dress_windows()
+        self._draws = self._all_draws.under("pictures")
+        self._hang_pictures()
+        for k in range(2):
+            self._do(f"plant {k}", "along_wall", kind="plant", chance=0.75, front=0.05, prefer="corner")
+        return self._space
+
+    def _do(self, name: str, method: str, *, chance: float | None = None, **options: Any) -> None:
         """Do one step of that name, or not if it is optional."""
         self._draws = self._all_draws.under(name)
         if chance is None or self._wants("wanted", chance):
@@ -120,21 +118,21 @@ class Furnisher:
         """
         common = evaluate(options.pop("with", {}), dict(FUNCTIONS), self._draws, "with")
         spot: tuple[Wall, float] | None = None
-        piece, made = Piece(kind), (-1, common)
-        for k, (number, way) in itertools.product(range(count), enumerate(tries)):
-            place = options | {key: value for key, value in way.items() if key in _PLACE}
-            given = common | {key: value for key, value in way.items() if key not in _PLACE}
-            if (k, given) != made:
-                piece, made = self._make(kind, k, **given), (k, given)
-            near = [(spot[0], spot[1] + side * beside) for side in (-1.0, 1.0)] if spot and beside else []
-            spot = next((at for at in near if self._space.put_at_wall(piece, *at)), None)
-            spot = spot or self._space.along_wall(piece, self._draws.under("at", k, number), **place)
-            if spot:
-                if pictures and self._wants("pictures", pictures):
-                    self._pictures_above(*spot)
-                self._put_around(piece, *spot, WALL_GAP_M, given, around)
-                if count == 1:
-                    return
+        for k in range(count):
+            piece, made = Piece(kind), None
+            for number, way in enumerate(tries):
+                place = options | {key: value for key, value in way.items() if key in _PLACE}
+                given = common | {key: value for key, value in way.items() if key not in _PLACE}
+                if given != made:
+                    piece, made = self._make(kind, k, **given), given
+                near = [(spot[0], spot[1] + side * beside) for side in (-1.0, 1.0)] if spot and beside else []
+                spot = next((at for at in near if self._space.put_at_wall(piece, *at)), None)
+                spot = spot or self._space.along_wall(piece, self._draws.under("at", k, number), **place)
+                if spot:
+                    if pictures and self._wants("pictures", pictures):
+                        self._pictures_above(*spot)
+                    self._put_around(piece, *spot, WALL_GAP_M, given, around)
+                    break
 
     def _put_around(
         self,
@@ -245,9 +243,8 @@ class Furnisher:
                 if self._space.put(lamp, (x + dx, y + dy, -0.002), group=True):
                     break
 
-    def dress_windows(self) -> None:
+    def _dress_windows(self) -> None:
         """Curtains at windows outside of wet rooms, radiators below windows."""
-        self._draws = self._all_draws.under("windows")
         fabric = self._surfaces["linen" if self._draws.chance("linen", 0.5) else "accent"]
         for index, wall in enumerate(self._room.walls):
             for k, o in enumerate(o for o in wall.openings if o.kind == "window"):
@@ -279,9 +276,8 @@ class Furnisher:
             picture = self._make("picture", w=w, h=h)
             self._space.hang(picture, wall, x + 0.74 * (k - 0.5 * (count - 1)))
 
-    def hang_pictures(self) -> None:
+    def _hang_pictures(self) -> None:
         """Prints on free stretches of wall, above whatever stands there."""
-        self._draws = self._all_draws.under("pictures")
         formats = ((0.6, 0.8), (0.45, 0.6), (0.75, 1.0), (0.36, 0.48))
         for index, wall in enumerate(self._room.walls):
             hung = 0
