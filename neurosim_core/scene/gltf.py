@@ -8,22 +8,20 @@ KHR_materials_emissive_strength, KHR_materials_pbrSpecularGlossiness, KHR_mesh_q
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
 import math
 import struct
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from neurosim_core.scene.gltf_file import UNREADABLE, GltfFile
 from neurosim_core.scene.materials import srgb_to_linear
 from neurosim_core.scene.scene import Material
 from neurosim_core.scene.source import (
@@ -37,20 +35,6 @@ from neurosim_core.scene.source import (
     unique_name,
 )
 
-_COMPONENT = {
-    5120: np.int8,
-    5121: np.uint8,
-    5122: np.int16,
-    5123: np.uint16,
-    5125: np.uint32,
-    5126: np.float32,
-}
-_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_UNREADABLE = {
-    "KHR_draco_mesh_compression": "compressed geometry",
-    "EXT_meshopt_compression": "compressed geometry",
-    "KHR_texture_basisu": "compressed textures",
-}
 _MAX_DEPTH = 256
 
 
@@ -91,144 +75,28 @@ def _picture_of(path: Path, index: int) -> NDArray[np.uint8]:
 class _Reader:
     def __init__(self, path: Path, *, textures_required: bool, pictures: bool) -> None:
         self.path = path
+        self.file = GltfFile(path)
         self.textures_required = textures_required
         self.pictures = pictures
         self.source = Source(unit_reason="glTF is in metres by specification", up_default="y")
-        self.tree, self.binary = self._split(path.read_bytes())
-        version = str(self.tree.get("asset", {}).get("version", "2.0"))
-        if not version.startswith("2"):
-            raise SceneError(f"{path}: glTF version {version}, only 2.x is read")
-        for name in self.tree.get("extensionsRequired", []):
-            if name in _UNREADABLE:
-                raise SceneError(
-                    f"{path}: needs {name} ({_UNREADABLE[name]}), which is not read; "
-                    "export it again without compression"
-                )
-
-    def _split(self, data: bytes) -> tuple[dict[str, Any], bytes]:
-        if data[:4] != b"glTF":
-            if self.path.suffix.lower() == ".glb":
-                raise SceneError(f"{self.path}: not a GLB file, it does not start with 'glTF'")
-            return self._parse(data), b""
-        if len(data) < 20:
-            raise SceneError(f"{self.path}: truncated, only {len(data)} bytes")
-        length = struct.unpack_from("<I", data, 8)[0]
-        if len(data) < length:
-            raise SceneError(f"{self.path}: truncated, {len(data)} of {length} bytes are there")
-        chunks: dict[int, bytes] = {}
-        at = 12
-        while at + 8 <= length:
-            size, kind = struct.unpack_from("<II", data, at)
-            if at + 8 + size > length:
-                raise SceneError(f"{self.path}: truncated, a chunk of {size} bytes ends after the file")
-            chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-            at += 8 + size
-        if 0x4E4F534A not in chunks:
-            raise SceneError(f"{self.path}: no JSON chunk, not a glTF 2.0 binary")
-        return self._parse(chunks[0x4E4F534A]), chunks.get(0x004E4942, b"")
-
-    def _parse(self, text: bytes) -> dict[str, Any]:
-        try:
-            tree = json.loads(text.decode("utf-8-sig"))
-        except (UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise SceneError(f"{self.path}: not glTF, or truncated: {error}") from error
-        if not isinstance(tree, dict) or "asset" not in tree:
-            raise SceneError(f"{self.path}: not glTF, there is no 'asset' in its JSON")
-        return tree
-
-    def _entry(self, kind: str, index: int) -> dict[str, Any]:
-        """Return entry `index` of the top-level list `kind`."""
-        entries = self.tree.get(kind, [])
-        if not isinstance(entries, list) or not isinstance(index, int) or not 0 <= index < len(entries):
-            raise SceneError(
-                f"{self.path}: malformed glTF, it refers to number {index!r} of its {kind}, "
-                f"of which there are {len(entries)}"
-            )
-        entry = entries[index]
-        if not isinstance(entry, dict):
-            raise SceneError(f"{self.path}: malformed glTF, number {index} of its {kind} is no JSON object")
-        return entry
-
-    def _uri(self, uri: str) -> bytes | None:
-        """Return the bytes behind a URI, None if there is no such file."""
-        if uri.startswith("data:"):
-            try:
-                return base64.b64decode(uri.partition(",")[2], validate=False)
-            except binascii.Error as error:
-                raise SceneError(f"{self.path}: broken base64 in a data URI: {error}") from error
-        file = self.path.parent / unquote(uri)
-        return file.read_bytes() if file.is_file() else None
-
-    @cached_property
-    def _buffers(self) -> list[bytes]:
-        buffers = []
-        for index, buffer in enumerate(self.tree.get("buffers", [])):
-            data = self._uri(buffer["uri"]) if "uri" in buffer else self.binary
-            if data is None:
-                raise SceneError(f"{self.path}: buffer file {buffer['uri']!r} is missing beside it")
-            if len(data) < buffer["byteLength"]:
-                raise SceneError(
-                    f"{self.path}: truncated, buffer {index} has {len(data)} of {buffer['byteLength']} bytes"
-                )
-            buffers.append(data)
-        return buffers
-
-    def _view(self, index: int) -> tuple[memoryview, int | None]:
-        view = self._entry("bufferViews", index)
-        start = view.get("byteOffset", 0)
-        self._entry("buffers", view["buffer"])
-        data = memoryview(self._buffers[view["buffer"]])[start : start + view["byteLength"]]
-        if len(data) < view["byteLength"]:
-            raise SceneError(f"{self.path}: truncated, buffer view {index} ends after its buffer")
-        return data, view.get("byteStride")
-
-    def _elements(self, view: int, offset: int, component: int, width: int, count: int) -> NDArray[Any]:
-        data, stride = self._view(view)
-        dtype = np.dtype(_COMPONENT[component]).newbyteorder("<")
-        row = dtype.itemsize * width
-        stride = stride or row
-        if count and offset + (count - 1) * stride + row > len(data):
-            raise SceneError(f"{self.path}: truncated, an accessor ends after buffer view {view}")
-        values: NDArray[Any] = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
-        return values
-
-    def _accessor(self, index: int) -> NDArray[Any]:
-        """Return accessor `index`, shape [count, width]; normalised integers as floats."""
-        accessor = self._entry("accessors", index)
-        component, width, count = accessor["componentType"], _WIDTH[accessor["type"]], accessor["count"]
-        if "bufferView" in accessor:
-            values = self._elements(
-                accessor["bufferView"], accessor.get("byteOffset", 0), component, width, count
-            )
-        else:
-            values = np.zeros((count, width), _COMPONENT[component])
-        if "sparse" in accessor:
-            sparse = accessor["sparse"]
-            where, what = sparse["indices"], sparse["values"]
-            values = values.copy()
-            rows = self._elements(
-                where["bufferView"], where.get("byteOffset", 0), where["componentType"], 1, sparse["count"]
-            )
-            values[rows[:, 0]] = self._elements(
-                what["bufferView"], what.get("byteOffset", 0), component, width, sparse["count"]
-            )
-        if accessor.get("normalized", False) and np.issubdtype(values.dtype, np.integer):
-            return np.asarray(np.maximum(values / np.float64(np.iinfo(values.dtype).max), -1.0))
-        return values
 
     def _image_index(self, texture: dict[str, Any]) -> int:
         """Return the index of the picture behind a texture reference, -1 if there is none."""
-        entry = self._entry("textures", texture["index"])
+        entry = self.file.entry("textures", texture["index"])
         webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
         return int(entry.get("source", webp.get("source", -1)))
 
     def _image(self, index: int) -> tuple[str, bytes | None]:
         """Return name and bytes of a picture; no bytes: its file is not there, and need not be."""
-        image = self._entry("images", index)
+        image = self.file.entry("images", index)
         name = image.get("name") or (
             image["uri"] if "uri" in image and not image["uri"].startswith("data:") else f"image {index}"
         )
-        data = bytes(self._view(image["bufferView"])[0]) if "bufferView" in image else self._uri(image["uri"])
+        data = (
+            bytes(self.file.view(image["bufferView"])[0])
+            if "bufferView" in image
+            else self.file.uri_bytes(image["uri"])
+        )
         if data is None and self.textures_required:
             raise SceneError(
                 f"{self.path}: texture file {image['uri']!r} is missing beside it; put it there, or "
@@ -257,7 +125,10 @@ class _Reader:
 
     def _materials(self) -> list[dict[str, Any]]:
         """Fill the materials; return for each how its texture coordinates are found."""
-        entries = [*self.tree.get("materials", []), {}]  # the last one: the specification's default material
+        entries = [
+            *self.file.tree.get("materials", []),
+            {},
+        ]  # the last one: the specification's default material
         bases, emissives = [], []
         for entry in entries:
             glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
@@ -273,7 +144,7 @@ class _Reader:
         }
         pictures = self._pictures({index for index in index_of.values() if index >= 0})
         store = TextureStore()
-        names = {index: self.tree["images"][index].get("name") or f"image {index}" for index in pictures}
+        names = {index: self.file.tree["images"][index].get("name") or f"image {index}" for index in pictures}
         taken: set[str] = set()
         coordinates = []
         see_through = metallic = glowing = transformed = clamped = 0
@@ -304,8 +175,12 @@ class _Reader:
             metallic += bool(entry) and self._is_metal(entry)
             transform = (info or {}).get("extensions", {}).get("KHR_texture_transform", {})
             transformed += bool(transform)
-            if info and "samplers" in self.tree and "sampler" in self.tree["textures"][info["index"]]:
-                sampler = self._entry("samplers", self.tree["textures"][info["index"]]["sampler"])
+            if (
+                info
+                and "samplers" in self.file.tree
+                and "sampler" in self.file.tree["textures"][info["index"]]
+            ):
+                sampler = self.file.entry("samplers", self.file.tree["textures"][info["index"]]["sampler"])
                 clamped += sampler.get("wrapS", 10497) != 10497 or sampler.get("wrapT", 10497) != 10497
             coordinates.append(
                 {"set": transform.get("texCoord", (info or {}).get("texCoord", 0)), "transform": transform}
@@ -342,9 +217,9 @@ class _Reader:
 
     def _world(self) -> dict[int, NDArray[np.float64]]:
         """Return the matrix of each node of the default scene, parents before children."""
-        nodes = self.tree.get("nodes", [])
-        if "scenes" in self.tree:
-            roots = self._entry("scenes", self.tree.get("scene", 0)).get("nodes", [])
+        nodes = self.file.tree.get("nodes", [])
+        if "scenes" in self.file.tree:
+            roots = self.file.entry("scenes", self.file.tree.get("scene", 0)).get("nodes", [])
         else:
             children = {child for node in nodes for child in node.get("children", [])}
             roots = [index for index in range(len(nodes)) if index not in children]
@@ -354,7 +229,7 @@ class _Reader:
             index, parent, depth = stack.pop()
             if depth > _MAX_DEPTH or index in world:
                 raise SceneError(f"{self.path}: node {index} has two parents or is its own ancestor")
-            node = self._entry("nodes", index)
+            node = self.file.entry("nodes", index)
             world[index] = parent @ self._local(node)
             stack.extend((child, world[index], depth + 1) for child in reversed(node.get("children", [])))
         return world
@@ -366,12 +241,12 @@ class _Reader:
         primitives: dict[int, list[dict[str, Any]]] = {}
         taken: set[str] = set()
         for index, matrix in world.items():
-            node = self.tree["nodes"][index]
+            node = self.file.tree["nodes"][index]
             if "light" in node.get("extensions", {}).get("KHR_lights_punctual", {}):
                 self._lamp(node["extensions"]["KHR_lights_punctual"]["light"], matrix)
             if "mesh" not in node:
                 continue
-            mesh = self._entry("meshes", node["mesh"])
+            mesh = self.file.entry("meshes", node["mesh"])
             if node["mesh"] not in primitives:
                 primitives[node["mesh"]] = self._primitives(mesh, coordinates)
             name = unique_name(node.get("name") or mesh.get("name") or f"node {index}", taken)
@@ -379,7 +254,7 @@ class _Reader:
                 arrays, place = dict(primitive), matrix
                 skin = arrays.pop("skin")
                 if "skin" in node and skin is not None:
-                    arrays = self._posed(arrays, skin, self._entry("skins", node["skin"]), world)
+                    arrays = self._posed(arrays, skin, self.file.entry("skins", node["skin"]), world)
                     place = np.eye(4)
                 source.parts.append(
                     Part(name=name, matrix=place, instance=len(source.instance_names), **arrays)
@@ -397,13 +272,13 @@ class _Reader:
                 self.source.notes.append(f"Points and lines of {mesh.get('name', 'a mesh')!r} are left out.")
                 continue
             for name in primitive.get("extensions", {}):
-                if name in _UNREADABLE:
+                if name in UNREADABLE:
                     raise SceneError(
                         f"{self.path}: uses {name}, which is not read; export it again without it"
                     )
-            positions = self._accessor(attributes["POSITION"]).astype(np.float64)
+            positions = self.file.accessor(attributes["POSITION"]).astype(np.float64)
             if "indices" in primitive:
-                order = self._accessor(primitive["indices"])[:, 0].astype(np.int64)
+                order = self.file.accessor(primitive["indices"])[:, 0].astype(np.int64)
             else:
                 order = np.arange(len(positions), dtype=np.int64)
             faces = _triangles(order, mode)
@@ -414,29 +289,29 @@ class _Reader:
                 )
             material = primitive.get("material", len(coordinates) - 1)
             if "material" in primitive:
-                self._entry("materials", material)
+                self.file.entry("materials", material)
             where = coordinates[material]
             uv = None
             if f"TEXCOORD_{where['set']}" in attributes:
-                uv = self._accessor(attributes[f"TEXCOORD_{where['set']}"]).astype(np.float64)
+                uv = self.file.accessor(attributes[f"TEXCOORD_{where['set']}"]).astype(np.float64)
                 uv = _transformed(uv, where["transform"])
                 uv[:, 1] = 1.0 - uv[:, 1]  # glTF counts v from the top row down
             colors = None
             if "COLOR_0" in attributes:
-                colors = self._accessor(attributes["COLOR_0"])[:, :3].astype(np.float64)[faces]
+                colors = self.file.accessor(attributes["COLOR_0"])[:, :3].astype(np.float64)[faces]
             skin = None
             if "JOINTS_0" in attributes and "WEIGHTS_0" in attributes:
                 skin = (
-                    self._accessor(attributes["JOINTS_0"]).astype(np.int64),
-                    self._accessor(attributes["WEIGHTS_0"]).astype(np.float64),
+                    self.file.accessor(attributes["JOINTS_0"]).astype(np.int64),
+                    self.file.accessor(attributes["WEIGHTS_0"]).astype(np.float64),
                 )
             normals = None
             if "NORMAL" in attributes:
-                normals = self._accessor(attributes["NORMAL"]).astype(np.float64)
+                normals = self.file.accessor(attributes["NORMAL"]).astype(np.float64)
             if "targets" in primitive and any(mesh.get("weights", [])):
                 for weight, target in zip(mesh["weights"], primitive["targets"], strict=False):
                     if "POSITION" in target:
-                        positions = positions + weight * self._accessor(target["POSITION"])
+                        positions = positions + weight * self.file.accessor(target["POSITION"])
                 normals = None
             parts.append(
                 {
@@ -458,7 +333,7 @@ class _Reader:
         joints, weights = skin
         bind = np.tile(np.eye(4), (len(entry["joints"]), 1, 1))
         if "inverseBindMatrices" in entry:
-            bind = self._accessor(entry["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+            bind = self.file.accessor(entry["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
         pose = np.stack([world.get(joint, np.eye(4)) for joint in entry["joints"]]) @ bind
         total = weights.sum(axis=1, keepdims=True)
         blend = np.einsum("vk,vkij->vij", weights / np.where(total > 0.0, total, 1.0), pose[joints])
@@ -469,7 +344,7 @@ class _Reader:
         return {**arrays, "positions": positions, "normals": None}
 
     def _lamp(self, index: int, matrix: NDArray[np.float64]) -> None:
-        light = self.tree["extensions"]["KHR_lights_punctual"]["lights"][index]
+        light = self.file.tree["extensions"]["KHR_lights_punctual"]["lights"][index]
         intensity = np.asarray(light.get("color", [1, 1, 1]), dtype=np.float64) * light.get("intensity", 1.0)
         if not intensity.any():
             return
@@ -487,8 +362,8 @@ class _Reader:
     def _orientation(self) -> None:
         """Find what the file says about up: extras, then a Habitat settings file, then its generator."""
         source = self.source
-        scenes = self.tree.get("scenes") or [{}]
-        for holder in (self.tree.get("asset", {}), scenes[self.tree.get("scene", 0)]):
+        scenes = self.file.tree.get("scenes") or [{}]
+        for holder in (self.file.tree.get("asset", {}), scenes[self.file.tree.get("scene", 0)]):
             extras = holder.get("extras")
             for key in ("up_axis", "upAxis", "up"):
                 value = extras.get(key) if isinstance(extras, dict) else None
@@ -511,7 +386,7 @@ class _Reader:
                 source.up_axis = axis  # type: ignore[assignment]
                 source.up_reason = f"{beside.name} beside it says up = {up}"
                 return
-        generator = str(self.tree.get("asset", {}).get("generator", ""))
+        generator = str(self.file.tree.get("asset", {}).get("generator", ""))
         if "trimesh" in generator.lower():
             source.up_reason = (
                 "glTF is y up by specification, though its writer, trimesh, stores any axes as they are"
