@@ -14,8 +14,8 @@ from scipy import ndimage
 
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.apartment.floorplan import make_floor_plan
-from neurosim_core.scene.solids import Part, box, cushion, cylinder, lathe, tube
 from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.solids import Part, box, cushion, cylinder, lathe, tube
 
 FLATS = [(0, 1), (1, 2), (2, 3), (7, 4), (3, 5), (4, 6), (5, 8)]
 SHELL = re.compile(
