@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from neurosim_core.scene.apartment import pictures, textures
 from neurosim_core.scene.apartment.draws import stream
 from neurosim_core.scene.apartment.floorplan import Role
+from neurosim_core.scene.apartment.tables import read_table
 from neurosim_core.scene.scene import LinearRgb
 
 
@@ -47,12 +46,6 @@ class Finish(NamedTuple):
     """Behind the counter of a kitchen."""
 
 
-@functools.cache
-def _table() -> dict[str, Any]:
-    table: dict[str, Any] = yaml.load(Path(__file__).with_name("looks.yaml").read_bytes(), yaml.CSafeLoader)
-    return table
-
-
 def _surface(
     name: str, *, color: str = "#ffffff", texture: str | None = None, tile: float = 1.0, **more: Any
 ) -> Surface:
@@ -70,12 +63,13 @@ class Palette:
     def __init__(self, seed: int) -> None:
         """Choose a scheme of colours."""
         self._seed = seed
-        schemes = list(_table()["schemes"].values())
+        self._table = read_table("looks")
+        schemes = list(self._table["schemes"].values())
         self._scheme: dict[str, list[str]] = schemes[int(stream(seed, "scheme").integers(len(schemes)))]
-        self.common = {name: _surface(name, **data) for name, data in _table()["surfaces"].items()}
+        self.common = {name: _surface(name, **data) for name, data in self._table["surfaces"].items()}
         """Surfaces that do not differ between rooms, by name."""
         self._formulas: dict[str, tuple[str, dict[str, Any]]] = {
-            key: (formula, {}) for key, formula in _table()["textures"].items()
+            key: (formula, {}) for key, formula in self._table["textures"].items()
         }
 
     def paint(self, key: str) -> NDArray[np.uint8]:
@@ -112,16 +106,16 @@ class Palette:
         if role in ("living", "studio", "dining") and stream(self._seed, "chevron").uniform() < 0.4:
             floor = _surface("parquet", texture="chevron", tile=1.4, exact=True)
         if role in ("bedroom", "dining", "living") and rng.uniform() < 0.75:
-            kind = str(rng.choice(list(_table()["wallpapers"])))
+            kind = str(rng.choice(list(self._table["wallpapers"])))
             colors = {
                 "ground": rng.choice(self._scheme["walls"]),
                 "motif": rng.choice(self._scheme["accents"]),
             }
-            tile = (_table()["wallpapers"][kind],) * 2
+            tile = (self._table["wallpapers"][kind],) * 2
             formula = "wallpaper(ground, motif, kind)"
             accent = self._painted(f"wallpaper {kind} {number}", formula, tile, kind=kind, **colors)
         if role == "bedroom" and rng.uniform() < 0.4:
-            color["carpet"] = str(rng.choice(_table()["carpets"]))
+            color["carpet"] = str(rng.choice(self._table["carpets"]))
             floor = _surface(f"carpet {number}", color=color["carpet"], texture="pile", tile=1.2)
         if role in ("kitchen", "bathroom"):
             floor, accent = self._tiled(role, rng, number)
@@ -132,7 +126,8 @@ class Palette:
     def _tiled(self, role: Role, rng: np.random.Generator, number: int) -> tuple[Surface, Surface]:
         """Return floor and wall of a wet room."""
         color, pale = str(rng.choice(self._scheme["accents"])), str(rng.choice(self._scheme["walls"]))
-        kind, data = list(_table()["wet_floors"].items())[int(rng.integers(len(_table()["wet_floors"])))]
+        floors = self._table["wet_floors"]
+        kind, data = list(floors.items())[int(rng.integers(len(floors)))]
         size = (data["tile"], data["tile"])
         floor = self._painted(f"{kind} floor {number}", data["texture"], size, color=color, pale=pale)
         colors = (color,) if role == "kitchen" else ("#e8e6df", "#dfdfd9", pale)
@@ -143,7 +138,7 @@ class Palette:
         """Return what the furniture of a room is made of, by name."""
         rng = stream(self._seed, "look", name)
         fabric, accent, knit = (str(color) for color in rng.permutation(self._scheme["fabrics"])[:3])
-        pot = str(rng.choice(_table()["pots"]))
+        pot = str(rng.choice(self._table["pots"]))
         front = str(rng.choice([*self._scheme["accents"], "#e9e6df", "#e9e6df"]))
         return self.common | {
             "front": _surface(f"front {name}", color=front, texture="plaster", tile=1.5),

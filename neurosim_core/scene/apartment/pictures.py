@@ -58,18 +58,14 @@ def _shapes(rng: np.random.Generator, colors: Sequence[str]) -> Picture:
             ground, motif = rng.choice(len(colors), 2, replace=False)
             corner = rng.integers(0, 2, 2)
             radius = np.hypot(u - corner[0], v - corner[1])
-            kind = int(rng.integers(0, 5))
-            if kind == 0:
-                share = np.clip((0.98 - radius) * 128.0, 0.0, 1.0)
-            elif kind == 1:
-                share = 0.5 + 4.0 * np.sin(2.0 * np.pi * 5.0 * radius)
-            elif kind == 2:
-                share = np.clip((0.42 - np.hypot(u - 0.5, v - 0.5)) * 128.0, 0.0, 1.0)
-            elif kind == 3:
-                share = 0.5 + 8.0 * np.sin(2.0 * np.pi * 6.0 * (u if corner[0] else v))
-            else:
-                share = np.clip((u - v) * 128.0, 0.0, 1.0)
-            tile = blend(colors[ground], colors[motif], np.asarray(share, np.float32))
+            share = (
+                (0.98 - radius) * 128.0,
+                0.5 + 4.0 * np.sin(2.0 * np.pi * 5.0 * radius),
+                (0.42 - np.hypot(u - 0.5, v - 0.5)) * 128.0,
+                0.5 + 8.0 * np.sin(2.0 * np.pi * 6.0 * (u if corner[0] else v)),
+                (u - v) * 128.0,
+            )[int(rng.integers(0, 5))]
+            tile = blend(colors[ground], colors[motif], share)
             picture = np.where(inside[..., None], tile, picture).astype(np.float32)
     return picture
 

@@ -20,18 +20,17 @@ import functools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import CodeType
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from neurosim_core.scene import solids
 from neurosim_core.scene.apartment.draws import Draws
 from neurosim_core.scene.apartment.looks import Surface
 from neurosim_core.scene.apartment.pictures import SPINE_COLUMNS, SPINE_ROWS
+from neurosim_core.scene.apartment.tables import read_table
 from neurosim_core.scene.scene import Light
 from neurosim_core.scene.solids import Array, Part, turned
 
@@ -80,7 +79,8 @@ def make_piece(kind: str, surfaces: Mapping[str, Surface], draws: Draws, **given
     Raises:
         NameError: It asks for a variable that is not given.
     """
-    return replace(_build(_table()[kind], {**FUNCTIONS, **surfaces, **given}, draws, given), kind=kind)
+    scope = {**FUNCTIONS, **surfaces, **given}
+    return replace(_build(read_table("furniture")[kind], scope, draws, given), kind=kind)
 
 
 def _build(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws, given: Mapping[str, Any]) -> Piece:
@@ -119,7 +119,7 @@ def _solid(node: Mapping[str, Any], scope: dict[str, Any], draws: Draws) -> Piec
     kind = next((key for key in node if key not in _KEYS), None)
     if kind is None:
         return Piece("")
-    if kind in _table():
+    if kind in read_table("furniture"):
         given = {name: evaluate(data, scope, draws, name) for name, data in node[kind].items()}
         surfaces = {name: value for name, value in scope.items() if isinstance(value, Surface)}
         return make_piece(kind, surfaces, draws.under(kind), **given)
@@ -167,14 +167,6 @@ def evaluate(data: Any, scope: dict[str, Any], draws: Draws, name: str) -> Any:
 @functools.cache
 def _compiled(text: str) -> tuple[CodeType, bool]:
     return compile(text, text, "eval"), re.search(r"\b(uniform|jitter|chance|pick)\(", text) is not None
-
-
-@functools.cache
-def _table() -> dict[str, Any]:
-    table: dict[str, Any] = yaml.load(
-        Path(__file__).with_name("furniture.yaml").read_bytes(), yaml.CSafeLoader
-    )
-    return table
 
 
 def _book(size: Sequence[float], *, cell: int) -> Part:
