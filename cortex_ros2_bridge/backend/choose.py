@@ -11,7 +11,7 @@ from cortex_ros2_bridge.backend.base import Backend, BackendError
 
 _log = logging.getLogger(__name__)
 
-INSTALL = "pip install 'neurosim[ros2]'"
+INSTALL = "pip install -e '.[ros2]'"
 
 
 def open_backend(

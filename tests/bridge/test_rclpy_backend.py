@@ -319,7 +319,7 @@ def test_choice_without_ros(dds_domain: int, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "cyclonedds" else real(name, *rest)
     )
-    with pytest.raises(BackendError, match=r"pip install 'neurosim\[ros2\]'"):
+    with pytest.raises(BackendError, match=r"pip install -e '.\[ros2\]'"):
         open_backend("auto")
 
 
