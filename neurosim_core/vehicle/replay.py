@@ -118,7 +118,7 @@ def replay(log: FlightLog, config: MultirotorConfig, *, window_s: float = 0.3) -
     corners = [[1, 1], [1, -1], [-1, -1], [-1, 1]]
     if np.sign(position[:, :2]).tolist() != corners or config.rotor_drag_kg == 0.0:
         raise ValueError(
-            "the vehicle must have rotor drag, and rotors front left, front right, rear right, rear left, got "
+            "the vehicle must have rotor drag and rotors front left, front right, rear right, rear left; got "
             f"rotor_drag_kg = {config.rotor_drag_kg:g} and rotor_position_m = {config.rotor_position_m}"
         )
     size = round(window_s / _STEP_S)
