@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from cortex.schema import TypeMismatch
     from cortex.service import ServiceFailed, ServiceTimeout, ServiceUnavailable
     from cortex.subscriber import Info, Subscriber
+    from cortex.synchronise import synchronised
 
 _HOME = {
     "Array": "message",
@@ -64,6 +65,7 @@ _HOME = {
     "keep_last": "policy",
     "latest": "policy",
     "reliable": "policy",
+    "synchronised": "synchronise",
 }
 
 __all__ = [
@@ -95,6 +97,7 @@ __all__ = [
     "latest",
     "message",
     "reliable",
+    "synchronised",
 ]
 
 
