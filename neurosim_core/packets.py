@@ -174,7 +174,8 @@ def schema_of(cls: type[Packet]) -> PacketSchema:
     Raises:
         TypeError: A field has an annotation that no recording can hold; the message names it.
     """
-    schema: PacketSchema = cls._schema if issubclass(cls, GenericPacket) else _derived_schema(cls)
+    known: Any = cls  # mypy does not take classes for hashable
+    schema: PacketSchema = cls._schema if issubclass(cls, GenericPacket) else _derived_schema(known)
     return schema
 
 
