@@ -49,13 +49,19 @@ class FieldSpec:
     packet of a sensor fixes. A lower-case name, such as "n", is a length that differs from packet to packet;
     only the first axis may have one. "..." stands for any axes that the first packet fixes."""
     unit: str = ""
+    """SI symbol; empty for counts."""
     dtype: str = ""
     """Type of the items; empty: that of the annotation."""
     constant: bool = False
     """Every packet of a sensor has the same value."""
+    frame: str = ""
+    """Frame in which the components are expressed, such as "world"; empty where there is none."""
 
-    def __init__(self, *shape: int | str, unit: str = "", dtype: str = "", constant: bool = False) -> None:
-        for name, value in (("shape", shape), ("unit", unit), ("dtype", dtype), ("constant", constant)):
+    def __init__(
+        self, *shape: int | str, unit: str = "", dtype: str = "", constant: bool = False, frame: str = ""
+    ) -> None:
+        values = {"shape": shape, "unit": unit, "dtype": dtype, "constant": constant, "frame": frame}
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
 
@@ -70,6 +76,7 @@ class FieldSchema(NamedTuple):
     unit: str = ""
     constant: bool = False
     doc: str = ""
+    frame: str = ""
 
     @property
     def varying(self) -> str:
@@ -108,23 +115,6 @@ class PacketSchema(NamedTuple):
         values = json.loads(text)
         fields = (FieldSchema(**{**field, "shape": tuple(field["shape"])}) for field in values["fields"])
         return cls(values["name"], values["display"], tuple(fields), values["doc"])
-
-
-class Axes:
-    """The axes of an array field, for packets whose message types are derived from their fields.
-
-    `ranges: Annotated[NDArray[np.float32], Axes("beams", unit="m")]` is an array of shape [beams] in metres.
-
-    Attributes:
-        sizes: For each axis its size, or a name; axes of one name have the same size within a packet.
-        unit: SI symbol; empty for counts.
-        frame: Frame that the components are expressed in, such as "world"; empty where there is none.
-    """
-
-    def __init__(self, *sizes: int | str, unit: str = "", frame: str = "") -> None:
-        self.sizes = sizes
-        self.unit = unit
-        self.frame = frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -174,7 +164,8 @@ def schema_of(cls: type[Packet]) -> PacketSchema:
     Raises:
         TypeError: A field has an annotation that no recording can hold; the message names it.
     """
-    schema: PacketSchema = cls._schema if issubclass(cls, GenericPacket) else _derived_schema(cls)
+    known: Any = cls  # mypy does not take classes for hashable
+    schema: PacketSchema = cls._schema if issubclass(cls, GenericPacket) else _derived_schema(known)
     return schema
 
 
@@ -234,7 +225,7 @@ def _field_schema(cls: type, name: str, hint: Any, doc: str) -> FieldSchema:
     unit = spec.unit
     if not unit and (ending := re.search(r"_(rad_s|m_s2|m_s|[a-z]+)$", name)) and ending[1] in _UNITS:
         unit = {"hz": "Hz", "n": "N"}.get(ending[1], ending[1].replace("_s2", "/s^2").replace("_s", "/s"))
-    return FieldSchema(name, dtype, spec.shape, unit, spec.constant, doc)
+    return FieldSchema(name, dtype, spec.shape, unit, spec.constant, doc, spec.frame)
 
 
 def _display(fields: tuple[FieldSchema, ...]) -> str:

@@ -9,7 +9,7 @@ from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,23 +57,6 @@ class Description:
     """Luminance of all numbers that a grey may have, in their order; none if light itself is stored."""
     notes: tuple[str, ...] = ()
     """What was assumed or left out, one sentence each."""
-
-
-class Source(Protocol):
-    """Frames in the order of time."""
-
-    @property
-    def description(self) -> Description:
-        """What is known about it."""
-        ...
-
-    def frames(self) -> Iterator[Frame]:
-        """Yield all frames, from the first.
-
-        Raises:
-            ValueError: A frame cannot be read, has another size than the first, or no time.
-        """
-        ...
 
 
 def open_source(
@@ -208,7 +191,11 @@ class FolderSource:
         )
 
     def frames(self) -> Iterator[Frame]:
-        """Yield all frames; see `Source.frames`."""
+        """Yield all frames, from the first.
+
+        Raises:
+            ValueError: A frame cannot be read, or has another size than the first.
+        """
         for number, file in enumerate(self._files):
             picture = _read_picture(file)
             _require_size(file, "the picture", (picture.shape[1], picture.shape[0]), self._size)
@@ -305,7 +292,11 @@ class VideoSource:
         )
 
     def frames(self) -> Iterator[Frame]:
-        """Yield all frames; see `Source.frames`."""
+        """Yield all frames, from the first.
+
+        Raises:
+            ValueError: A frame cannot be read, has another size or format than the first, or no time.
+        """
         with self._open() as container:
             for number, frame in enumerate(self._decoded(container)):
                 _require_size(self._path, f"frame {number}", (frame.width, frame.height), self._size)
@@ -419,3 +410,7 @@ def _planes(frame: Any) -> NDArray[np.uint16]:
         format="yuv444p16le", src_color_range=_FULL_RANGE, dst_color_range=_FULL_RANGE
     )
     return picture
+
+
+Source: TypeAlias = FolderSource | VideoSource
+"""Frames in the order of time."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import typing
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
@@ -37,25 +36,21 @@ _TYPES: dict[type[pkt.Packet], type[Any]] = {
 """The message type of each packet type; `message_type` adds those that it derives."""
 _TIMES = ("stamp_ns", "start_ns")
 """Fields that the clock of a sensor applies to."""
-_SCALARS = (bool, int, float, str, bytes)
+_SCALARS = {"bool": bool, "str": str}
 
 
 def message_type(packet: type[pkt.Packet]) -> type[Any]:
     """Return the message type that carries a packet type; derive it at the first call.
 
     The derived type is called `neurosim/NAME`. Its fields are `stamp_ns`, the packet's own in their order,
-    `sequence` and `frame_id`. Fields may be bool, int, float, str, bytes, or arrays whose annotation says
-    their axes: `Annotated[NDArray[np.float32], Axes("beams", unit="m")]`.
+    `sequence` and `frame_id`. The schema of the packet gives their types, axes, units and frames.
 
     Raises:
-        TypeError: A field has another type, or an array has no axes.
+        TypeError: A field has a type, or an array axes, that no message can have.
     """
     if packet not in _TYPES:
-        hints = typing.get_type_hints(packet, include_extras=True)
-        header = {field.name for field in dataclasses.fields(pkt.Packet)}
-        own = {name: hint for name, hint in hints.items() if name not in header}
         annotations: dict[str, Any] = {"stamp_ns": Annotated[int, cortex.Unit("ns")]}
-        annotations |= {name: _field_type(packet, name, hint) for name, hint in own.items()}
+        annotations |= {field.name: _field_type(packet, field) for field in pkt.schema_of(packet).fields}
         annotations |= {"sequence": cortex.UInt64, "frame_id": str}
         namespace = {"__annotations__": annotations, "__doc__": packet.__doc__, "__module__": __name__}
         derived = type(packet.__name__, (), namespace)
@@ -63,20 +58,19 @@ def message_type(packet: type[pkt.Packet]) -> type[Any]:
     return _TYPES[packet]
 
 
-def _field_type(packet: type[pkt.Packet], name: str, hint: Any) -> Any:
-    """Return the annotation of a message field for that of a packet field."""
-    if hint in _SCALARS:
-        return Annotated[int, cortex.Unit("ns")] if name.endswith("_ns") else hint
-    base, *extras = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
-    axes = next((extra for extra in extras if isinstance(extra, pkt.Axes)), None)
-    if typing.get_origin(base) is np.ndarray and axes is not None:
-        dtype = typing.get_args(typing.get_args(base)[1])[0]
-        parameters = ("any" if dtype is Any else np.dtype(dtype).name, *axes.sizes)
-        return Annotated[cortex.Array[parameters], cortex.Unit(axes.unit, axes.frame)]
-    raise TypeError(
-        f"{packet.__name__}.{name}: a packet field must be bool, int, float, str, bytes or an array with "
-        f"axes, Annotated[NDArray[np.float32], Axes('n')], got {hint}"
-    )
+def _field_type(packet: type[pkt.Packet], field: pkt.FieldSchema) -> Any:
+    """Return the annotation of a message field for a packet field."""
+    if "..." in field.shape:
+        raise TypeError(
+            f"{packet.__name__}.{field.name}: the array needs axes, such as "
+            "Annotated[NDArray[np.float32], FieldSpec('n', 3)]"
+        )
+    if field.shape:
+        base: Any = cortex.Array[(field.dtype, *field.shape)]
+    else:
+        base = _SCALARS.get(field.dtype, float if field.dtype.startswith("float") else int)
+    has_unit = bool(field.unit or field.frame)
+    return Annotated[base, cortex.Unit(field.unit, field.frame)] if has_unit else base
 
 
 def to_message(packet: pkt.Packet, *, frame_id: str = "", clock_ns: ClockNs | None = None) -> Any:

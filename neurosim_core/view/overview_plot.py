@@ -264,8 +264,9 @@ def _draw_strips(
         for column, color in zip(values.T, (_INK,) if one else 3 * _XYZ, strict=False):
             axes.plot(time_s, column, color=color, linewidth=1.6 if one else 1.0, solid_capstyle="round")
         axes.margins(x=0.0, y=0.12)
-        if np.isfinite(values).any() and np.nanmin(values) >= 0.0:
-            axes.set_ylim(0.0, 1.12 * max(float(np.nanmax(values)), 1e-9))
+        finite = values[np.isfinite(values)]
+        if finite.size and finite.min() >= 0.0:
+            axes.set_ylim(0.0, 1.12 * max(float(finite.max()), 1e-9))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e7ea", linewidth=0.8)
         axes.set_axisbelow(True)

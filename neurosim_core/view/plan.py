@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from trimesh.intersections import mesh_plane
 
 from neurosim_core.scene.materials import mip_chain, srgb_to_linear
 from neurosim_core.scene.scene import Scene
@@ -40,7 +43,8 @@ def cut_plan(scene: Scene, *, height_m: float) -> Plan:
     """
     corners = scene.vertices[scene.faces].astype(np.float64)
     floor_m = float(corners[:, :, 2].min())
-    outlines = slice_triangles(corners, height_m=height_m)
+    mesh = trimesh.Trimesh(scene.vertices, scene.faces, process=False)
+    outlines = _slice(mesh, height_m)
     normal_z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
     below = (corners[:, :, 2].max(axis=1) < height_m) & (np.abs(normal_z) > 1e-9)
     faces = np.flatnonzero(below)
@@ -52,37 +56,18 @@ def cut_plan(scene: Scene, *, height_m: float) -> Plan:
     return Plan(
         height_m=height_m,
         outlines=outlines,
-        low_outlines=slice_triangles(corners, height_m=floor_m + 0.3 * (height_m - floor_m)),
+        low_outlines=_slice(mesh, floor_m + 0.3 * (height_m - floor_m)),
         triangles=triangles,
         colors=face_colors(scene, faces),
         bounds=np.stack([shown.min(axis=0), shown.max(axis=0)]),
     )
 
 
-def slice_triangles(corners: NDArray[np.float64], *, height_m: float) -> NDArray[np.float64]:
-    """Intersect triangles with the plane z = height_m.
-
-    Args:
-        corners: Triangles [m], shape [F, 3, 3].
-        height_m: Height of the plane [m]; a corner exactly on it counts as above.
-
-    Returns:
-        One segment for each triangle that has corners on both sides, shape [n, 2, 2].
-    """
-    z = corners[:, :, 2] - height_m
-    above = z >= 0.0
-    cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
-    corners, z, above = corners[cut], z[cut], above[cut]
-    # The corner that is alone on its side is an end of both edges that are cut.
-    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    row = np.arange(len(cut))
-    tip, tip_z = corners[row, alone, :2], z[row, alone]
-    ends = []
-    for step in (1, 2):
-        other = (alone + step) % 3
-        share = tip_z / (tip_z - z[row, other])
-        ends.append(tip + share[:, None] * (corners[row, other, :2] - tip))
-    return np.stack(ends, axis=1)
+def _slice(mesh: trimesh.Trimesh, height_m: float) -> NDArray[np.float64]:
+    """Return where the plane z = height_m cuts a mesh: segments of two points (x, y), shape [n, 2, 2]."""
+    slice_mesh: Any = mesh_plane  # trimesh has no annotations
+    segments: NDArray[np.float64] = slice_mesh(mesh, (0.0, 0.0, 1.0), (0.0, 0.0, height_m))
+    return segments.reshape(-1, 2, 3)[..., :2]
 
 
 def face_colors(scene: Scene, faces: NDArray[np.int64]) -> NDArray[np.float64]:

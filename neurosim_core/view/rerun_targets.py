@@ -7,7 +7,7 @@ import itertools
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import RerunStream, open_rerun
@@ -32,25 +32,6 @@ def check_new_file(path: Path) -> None:
         raise OSError(f"cannot write {path}: there is no folder {path.parent}")
     if path.exists():
         raise FileExistsError(f"{path} is there already: name another file")
-
-
-class RerunTarget(Protocol):
-    """Where Rerun recordings are opened.
-
-    Attributes:
-        compress: Whether pictures should be small, rather than there at once.
-    """
-
-    compress: bool
-
-    def open(self, name: str) -> RerunStream:
-        """Open a recording of this name."""
-
-    def check(self) -> bool:
-        """Return whether there is still somebody who looks; raise if it failed."""
-
-    def close_recording(self, logger: RerunLogger) -> None:
-        """Send what is left, and close a recording."""
 
 
 class ViewerTarget:
@@ -116,3 +97,7 @@ class FileTarget:
         """Close a file, and say so."""
         logger.close()
         self._say(f"wrote {self._path}")
+
+
+RerunTarget: TypeAlias = ViewerTarget | FileTarget
+"""Where Rerun recordings are opened; `compress` says whether pictures should be small, or there at once."""
