@@ -123,6 +123,7 @@ class VehicleEngine:
     Attributes:
         model: What does not change during a run.
         camera_names: Its cameras.
+        is_cuda: It runs on a CUDA device.
         period_count_max: Control periods that the cameras may lag behind the flight before they are late.
         writes_in_place: The device writes pictures into memory of `acquire`, and may still do so after
             `end_step`: `settle` waits for it.
@@ -138,7 +139,8 @@ class VehicleEngine:
         """
         self.model = model
         self.camera_names = frozenset(name for cast in model.casts for name in cast.names)
-        self.writes_in_place = lockstep and bool(wp.get_device(model.device).is_cuda)
+        self.is_cuda = bool(wp.get_device(model.device).is_cuda)
+        self.writes_in_place = lockstep and self.is_cuda
         self._lockstep = lockstep
         self._acquire = acquire
         period_ns = model.schedule.control.stamp_ns(1)
