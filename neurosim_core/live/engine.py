@@ -14,6 +14,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.pinned import PinError, PinnedMapping
 from neurosim_core.schedule import batch_end_ns
+from neurosim_core.sensors.rig import EventSensorConfig
 from neurosim_core.simulation import (
     COLLISION,
     Batch,
@@ -50,6 +51,7 @@ __all__ = [
     "StartState",
     "State",
     "VehicleEngine",
+    "expected_bytes",
     "load_scene",
     "make_fleet",
     "packet_type",
@@ -67,6 +69,9 @@ _PACKETS: Mapping[str, type[Packet]] = {
     "imu": pkt.ImuSample,
     "odometry": pkt.Odometry,
 }
+_PIXEL_EVENTS_HZ = 100.0
+_EVENT_BYTES = 13
+_RESERVED_MAX_BYTES = 8 << 20
 _PENDING_PERIODS = (2, 100)
 """Bounds of how far the cameras may lag behind the flight, in control periods."""
 _SPARE_PERIODS = 32
@@ -80,6 +85,19 @@ def packet_type(kind: str) -> type[Packet]:
         KeyError: There is no such kind.
     """
     return _PACKETS[kind]
+
+
+def expected_bytes(sensor: object) -> int:
+    """Return a size that messages of an event camera hardly exceed [bytes]; 0 for other sensors.
+
+    Memory that is made before the flight delays no message in it: pixels fire at most about 100 times a
+    second on average, also in fast flight.
+    """
+    if not isinstance(sensor, EventSensorConfig):
+        return 0
+    window_s = sensor.packets.stamp_ns(1) * 1e-9
+    count = _PIXEL_EVENTS_HZ * window_s * sensor.lens.width * sensor.lens.height
+    return min(round(count) * _EVENT_BYTES, _RESERVED_MAX_BYTES)
 
 
 class FlownBatch(NamedTuple):
