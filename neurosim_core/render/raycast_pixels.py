@@ -268,7 +268,7 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                                     out,
                                 )
                 if layer == layer_count - 1:
-                    _mark_unresolved(
+                    mark_pixel(
                         unresolved,
                         (block + member) * 64 + in_tile,
                         candidates.unresolved,
@@ -292,9 +292,9 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
     return render_pixel_of_group
 
 
-@wp.func_native(read_native(__file__, "mark_unresolved"))
-def _mark_unresolved(is_unresolved: wp.bool, index: int, unresolved: wp.array[int], count: wp.array[int]):
-    """Append the pixel of a thread if it is unresolved; count it also where the array is full.
+@wp.func_native(read_native(__file__, "mark_pixel"))
+def mark_pixel(marked: wp.bool, index: int, pixels: wp.array[int], count: wp.array[int]):
+    """Append the pixel of a thread to an array if it is marked; count it also where the array is full.
 
     All threads of a block call it together.
     """

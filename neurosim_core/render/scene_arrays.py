@@ -152,7 +152,7 @@ def _terms_of(
         textured=textured,
         emissive=any(max(m.emission) > 0.0 for m in materials),
         baked=config.lighting.mode == "baked",
-        supersampled=config.samples_per_pixel > 1,
+        supersampled=config.samples_per_pixel not in (1, "adaptive"),
         embree=_embree_width(config, device),
         finest_level=textured and config.texture_filter != "trilinear",
         nearest_texel=textured and config.texture_filter == "nearest",

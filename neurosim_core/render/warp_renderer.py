@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.render.antialias import AdaptiveSampling, first_rays, ray_layers, sample_rays
 from neurosim_core.render.body_arrays import (
     make_body_data,
     place_camera,
@@ -21,10 +22,7 @@ from neurosim_core.render.candidate_lists import CandidateLists, choose_candidat
 from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.lighting import (
-    spread_order,
-)
-from neurosim_core.render.outputs import OUTPUTS, make_render_outputs
+from neurosim_core.render.outputs import OUTPUTS, make_render_outputs, requested_outputs
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists
 from neurosim_core.render.scene_arrays import SceneArrays
@@ -33,23 +31,6 @@ from neurosim_core.scene.bodies import BodyPoses
 
 _THREAD_COUNT_MAX = 2**31 - 1
 """Kernels count in 32 bits."""
-
-
-def ray_layers(lens: Lens, sample_count: int) -> NDArray[np.float32]:
-    """Return rays through the centres of pixels and, for several samples, through points spread over them.
-
-    The points are a lattice: along rows and along columns each n-th of a pixel has one of the n.
-
-    Returns:
-        Direction in C and spread [rad], shape [1 or 1 + n, H * W, 4].
-    """
-    spread = lens.ray_spread()[..., None] / np.float32(np.sqrt(sample_count))
-    offsets = [(0.5, 0.5)]
-    if sample_count > 1:
-        columns, rows = np.arange(sample_count), spread_order(sample_count)
-        offsets += list(zip((columns + 0.5) / sample_count, (rows + 0.5) / sample_count, strict=True))
-    layers = [np.concatenate([lens.ray_table(offset), spread], axis=-1).reshape(-1, 4) for offset in offsets]
-    return np.stack(layers)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,10 +109,13 @@ class WarpRenderer:
         self._stride = instant_count
         device = arrays.device
         lenses = worlds.lenses or (lens,)
-        rays = np.concatenate([ray_layers(each, arrays.config.samples_per_pixel) for each in lenses], axis=1)
+        adaptive = arrays.config.samples_per_pixel == "adaptive" and requested_outputs(outputs).radiance
+        has_geometry = requested_outputs(outputs).geometry
+        rays = np.concatenate([self._layers(each, adaptive, has_geometry) for each in lenses], axis=1)
         shared = self._choose_terms(rays, several=worlds.count > 1)
-        self._kernel = raycast_kernel(outputs, self.terms)
-        self._fallback = fallback_kernel(outputs, self.terms)
+        rendered = {*outputs, "log_radiance"} if adaptive else set(outputs)
+        self._kernel = raycast_kernel(rendered, self.terms)
+        self._fallback = fallback_kernel(rendered, self.terms)
         self._group = instants_per_thread(self.terms)
         rays_together = TILE * TILE if self.terms.by_tile else PACKET if self.terms.embree else 1
         self._instant_threads = self._tile_count * TILE * TILE // rays_together
@@ -142,16 +126,29 @@ class WarpRenderer:
         self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
         self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
         images = (image_count, lens.height, lens.width)
+        self._sampling = None
+        if adaptive:
+            fill_factor = arrays.config.fill_factor
+            self._sampling = AdaptiveSampling(
+                np.concatenate([sample_rays(each, fill_factor) for each in lenses]),
+                outputs=outputs,
+                terms=self.terms,
+                pixel_count=worlds.count * instant_count * self._tile_count * TILE * TILE,
+                device=device,
+                thread_count=thread_count,
+            )
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
-            return wp.zeros(shape, dtype=dtype, device=device) if name in outputs else None
+            return wp.zeros(shape, dtype=dtype, device=device) if name in rendered else None
 
-        self.log_radiance = allocate("log_radiance", (worlds.count * instant_count, *images[1:]), float)
+        log_radiance = allocate("log_radiance", (worlds.count * instant_count, *images[1:]), float)
+        self.log_radiance = log_radiance if "log_radiance" in outputs else None
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
-        self._render_outputs = make_render_outputs(**{name: getattr(self, name) for name in OUTPUTS})
+        arrays_of = {name: getattr(self, name) for name in OUTPUTS} | {"log_radiance": log_radiance}
+        self._render_outputs = make_render_outputs(**arrays_of)
 
     def render(
         self,
@@ -210,11 +207,32 @@ class WarpRenderer:
                 outputs=outputs,
                 device=device,
             )
+        if self._sampling is not None:
+            self._sampling.launch(
+                *inputs[:4],
+                self._render_outputs,
+                pixel_count=count * instant_count * self._tile_count * TILE * TILE,
+            )
+
+    def _layers(self, lens: Lens, adaptive: bool, has_geometry: bool) -> NDArray[np.float32]:
+        """Return the rays of the first pass: of one layer, or that of the centres first."""
+        config = self._arrays.config
+        if config.samples_per_pixel != "adaptive":
+            return ray_layers(lens, config.samples_per_pixel, config.fill_factor)
+        centres = ray_layers(lens, 1)
+        if not adaptive:
+            return centres
+        first = first_rays(lens, config.fill_factor)[None]
+        return np.concatenate([centres, first]) if has_geometry else first
 
     def _choose_terms(self, rays: NDArray[np.float32], *, several: bool) -> CandidateListConfig | None:
         """Set `terms`, and return how tiles share candidate lists, if they do."""
         arrays, worlds = self._arrays, self._worlds
-        terms = (worlds.terms or arrays.terms)._replace(worlds=several, world_lenses=len(worlds.lenses) > 1)
+        terms = (worlds.terms or arrays.terms)._replace(
+            worlds=several,
+            world_lenses=len(worlds.lenses) > 1,
+            supersampled=len(rays) > 1,
+        )
         shared = None
         if not (terms.world_scenes or terms.world_lenses):  # lists change nothing but the speed
             shared = choose_candidate_lists(
