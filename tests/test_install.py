@@ -47,9 +47,7 @@ def test_a_foreign_cortex_is_refused_in_words(tmp_path):
     foreign = tmp_path / "cortex"
     foreign.mkdir()
     (foreign / "__init__.py").write_text("raise SystemExit('the foreign package ran')\n")
-    code = (
-        f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; import neurosim_core.live.simulator"
-    )
+    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]; import neurosim_core.live.topics"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1
     assert f"ImportError: `import cortex` finds {foreign}" in done.stderr

@@ -96,6 +96,7 @@ class EmbreeTree:
     Attributes:
         scene: Address of the tree, for kernels.
         intersect: Address of the function that casts a packet, for kernels.
+        intersect_one: Address of the function that casts a ray, for `embree_distance`.
     """
 
     def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
@@ -112,6 +113,7 @@ class EmbreeTree:
         call = library.call
         self.scene = call("rtcNewScene", library.device)
         self.intersect = library.address(f"rtcIntersect{library.width}")
+        self.intersect_one = library.address("rtcIntersect1")
         weakref.finalize(self, call, "rtcReleaseScene", self.scene)
         call("rtcSetSceneFlags", self.scene, _ROBUST)
         geometry = call("rtcNewGeometry", library.device, _TRIANGLES)
@@ -127,6 +129,14 @@ class EmbreeTree:
         call("rtcReleaseGeometry", geometry)
         call("rtcCommitScene", self.scene)
         library.check()
+
+
+@wp.func_native(read_native(__file__, "embree_ray"))
+def embree_distance(
+    intersect: wp.uint64, scene: wp.uint64, origin: wp.vec3, ray: wp.vec3, far_m: float
+) -> float:
+    """Return the distance to the nearest triangle along a unit ray [m], or `far_m`; on a CPU only."""
+    ...
 
 
 @cache

@@ -1,4 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,no-any-return,operator,no-untyped-def"
+# mypy: disable-error-code="return-value"
 # ruff: noqa: UP018, RUF046  (typed literals are variables in kernels)
 """Light: the one equation of how a surface looks, and its shadows, computed once per scene.
 
@@ -23,6 +24,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.config import LightingConfig
+from neurosim_core.render.embree import EmbreeTree, embree_distance
 from neurosim_core.render.launch import launch_split
 from neurosim_core.scene.scene import Scene
 
@@ -179,6 +181,7 @@ def _bake(
     first: int,
     # Model:
     occluders: wp.uint64,
+    intersect: wp.uint64,
     ambient_up: wp.vec3,
     ambient_down: wp.vec3,
     light_position: wp.array[wp.vec3],
@@ -223,8 +226,7 @@ def _bake(
         below = wp.dot(direction, face_normal)
         if below < 0.0:
             direction = direction - 2.0 * below * face_normal
-        query = wp.mesh_query_ray(occluders, origin, direction, ambient_radius_m)
-        near = wp.where(query.result, query.t / ambient_radius_m, 1.0)
+        near = _free_distance(occluders, intersect, origin, direction, ambient_radius_m) / ambient_radius_m
         openness += near * (2.0 - near)
         ray += 1
         if 4 * ray >= ray_count and (openness == float(ray) or openness < 0.25 * float(ray)):
@@ -247,13 +249,37 @@ def _bake(
                 )
                 to_light = light_position[lamp] + light_radius_m * sphere[shadow_ray] - origin
                 distance = wp.length(to_light)
-                if not wp.mesh_query_ray_anyhit(occluders, origin, to_light / distance, distance):
+                if not _is_blocked(occluders, intersect, origin, to_light / distance, distance):
                     clear += 1
                 shadow_ray += 1
                 if 2 * shadow_ray >= shadow_ray_count and (clear == 0 or clear == shadow_ray):
                     shadow_ray_count = shadow_ray  # half of them agree: full light or full shadow
             light = light + (float(clear) / float(shadow_ray_count)) * unshaded
     light_out[index] = light
+
+
+@wp.func
+def _free_distance(
+    occluders: wp.uint64, intersect: wp.uint64, origin: wp.vec3, ray: wp.vec3, far_m: float
+) -> float:
+    # Embree's tree where there is a function for it, else Warp's
+    distance = far_m
+    if intersect != wp.uint64(0):
+        distance = embree_distance(intersect, occluders, origin, ray, far_m)
+    else:
+        query = wp.mesh_query_ray(occluders, origin, ray, far_m)
+        if query.result:
+            distance = query.t
+    return distance
+
+
+@wp.func
+def _is_blocked(
+    occluders: wp.uint64, intersect: wp.uint64, origin: wp.vec3, ray: wp.vec3, far_m: float
+) -> bool:
+    if intersect != wp.uint64(0):
+        return embree_distance(intersect, occluders, origin, ray, far_m) < far_m
+    return wp.mesh_query_ray_anyhit(occluders, origin, ray, far_m)
 
 
 @wp.func
@@ -358,18 +384,21 @@ def _unbury(light: NDArray[np.float32], openness: NDArray[np.float32], faces: ND
 
 def shading_mesh(scene: Scene, device: str) -> wp.Mesh:
     """Return the triangles of a scene that cast shadows: all that do not emit light."""
-    dark = np.array([max(m.emission) <= 0.0 for m in scene.materials])[scene.face_material]
-    shading = scene.faces[dark] if dark.any() else np.zeros((1, 3), dtype=np.int32)  # a point hides nothing
     return wp.Mesh(
         wp.array(scene.vertices, dtype=wp.vec3, device=device),
-        wp.array(shading.reshape(-1), dtype=int, device=device),
+        wp.array(_shading_faces(scene).reshape(-1), dtype=int, device=device),
         bvh_constructor="sah",
         bvh_leaf_size=1 if wp.get_device(device).is_cuda else 4,
     )
 
 
+def _shading_faces(scene: Scene) -> NDArray[np.int32]:
+    dark = np.array([max(m.emission) <= 0.0 for m in scene.materials])[scene.face_material]
+    return scene.faces[dark] if dark.any() else np.zeros((1, 3), dtype=np.int32)  # a point hides nothing
+
+
 def bake_light(
-    scene: Scene, mesh: RefinedMesh, config: LightingConfig, *, device: str
+    scene: Scene, mesh: RefinedMesh, config: LightingConfig, *, device: str, embree: bool = False
 ) -> NDArray[np.float32]:
     """Compute the light that a white surface reflects at each corner of each face, on both sides.
 
@@ -385,6 +414,7 @@ def bake_light(
         mesh: Where light is wanted: the scene, refined.
         config: Numbers of rays, radii.
         device: Where to compute.
+        embree: Cast the rays with Embree, on a CPU.
 
     Returns:
         Linear light, shape [2, F, 3, 3]: front and back, face, corner, RGB.
@@ -393,7 +423,8 @@ def bake_light(
     group, example = _group_corners(mesh, normals)
     order = np.argsort(group, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(np.bincount(group))]).astype(np.int32)
-    occluders = shading_mesh(scene, device)
+    tree = EmbreeTree(scene.vertices, _shading_faces(scene)) if embree else None
+    occluders = shading_mesh(scene, device) if tree is None else None
     light = wp.empty(2 * len(example), dtype=wp.vec3, device=device)
     openness = wp.empty(2 * len(example), dtype=float, device=device)
     lamps = np.array([lamp.position_m for lamp in scene.lights], dtype=np.float32).reshape(-1, 3)
@@ -402,7 +433,8 @@ def bake_light(
         _bake,
         dim=2 * len(example),
         inputs=[
-            occluders.id,
+            wp.uint64(tree.scene if tree is not None else occluders.id if occluders is not None else 0),
+            wp.uint64(0 if tree is None else tree.intersect_one),
             wp.vec3(*scene.ambient.up),
             wp.vec3(*scene.ambient.down),
             wp.array(lamps, dtype=wp.vec3, device=device),

@@ -87,7 +87,7 @@ def upload_scene(
     start = time.perf_counter()
     light: NDArray[np.float32] | None = None
     if baked or config.exposure == "auto":
-        light = bake_light(scene, mesh, config.lighting, device=device)
+        light = bake_light(scene, mesh, config.lighting, device=device, embree=bool(terms.embree))
     light_s = time.perf_counter() - start
     exposure = config.exposure
     if exposure == "auto":

@@ -84,6 +84,21 @@ def test_refinement_of_a_huge_scene_is_bounded_and_says_so(caplog):
     assert not caplog.text
 
 
+def test_embree_bakes_the_same_light():
+    """A lamp in a room with a box that shades: to rounding but where a ray grazes an edge."""
+    pytest.importorskip("embreex")
+    room = trimesh.util.concatenate(
+        [box((4.0, 3.0, 2.5), (0.0, 0.0, 0.0)), box((0.7, 0.6, 0.9), (0.4, 0.3, -0.7))]
+    )
+    scene = dataclasses.replace(scene_of(room), lights=(point_light((0.3, -0.2, 1.0), 3.0),), ambient=AMBIENT)
+    mesh = refine(scene, 0.4)
+    by_warp = bake_light(scene, mesh, LightingConfig(), device="cpu")
+    by_embree = bake_light(scene, mesh, LightingConfig(), device="cpu", embree=True)
+    assert by_warp.max() > 4.0 * by_warp.mean()
+    agrees = np.isclose(by_embree, by_warp, rtol=1e-4, atol=1e-6)
+    assert agrees.mean() > 0.995
+
+
 @pytest.mark.parametrize("flipped", [False, True])
 def test_open_surface_gets_the_ambient_of_its_normal(device, flipped):
     """No occluders: up * (1 + n_z) / 2 + down * (1 - n_z) / 2 on each side, whichever way faces are wound."""
