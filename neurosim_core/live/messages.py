@@ -65,7 +65,8 @@ def _field_type(packet: type[pkt.Packet], field: pkt.FieldSchema) -> Any:
             "Annotated[NDArray[np.float32], FieldSpec('n', 3)]"
         )
     if field.shape:
-        base: Any = cortex.Array[(field.dtype, *field.shape)]
+        parameters = (field.dtype, *field.shape)
+        base: Any = cortex.Array[parameters]
     else:
         base = _SCALARS.get(field.dtype, float if field.dtype.startswith("float") else int)
     has_unit = bool(field.unit or field.frame)
