@@ -22,7 +22,7 @@ Bytes = NDArray[np.uint8]
 Code = NDArray[np.uint8]
 Words = NDArray[np.uint16]
 Allocate = Callable[[int], Bytes]
-"""Returns so many bytes to write to, at an address that is a multiple of 4."""
+"""Returns so many bytes to write to, or a few more, at an address that is a multiple of 4."""
 
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x8
 _KNOWN = {_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, 0x7, 0xA, 0xE, 0xF}
@@ -30,6 +30,8 @@ _KNOWN = {_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, 0
 _EPOCH_BITS = 24
 _EPOCHS_MAX = 256
 """Time that goes further ahead than this many wraps of 16.8 s has been set anew."""
+_WRAP = np.array([_TIME_HIGH << 12 | 0xFFF, _TIME_HIGH << 12], np.uint16)
+"""The last and the first value of the high half of a time."""
 _JITTER = 10
 """A high half that is smaller by no more than this came late, it did not wrap; as other decoders have it."""
 _EVT3_SIZE_MAX = 2048
@@ -57,16 +59,16 @@ class EventColumns(NamedTuple):
 class Evt3Encoder:
     """Encodes the packets of one camera as evt3, one after the other.
 
-    Each event takes 4 bytes (row and column), and each new time another 4; if there are many new times, each
-    event has one. Sensors write a row only when it changes, and neighbours as one vector: that saves little
-    where a microsecond has few events, and costs several times the time here. Where time wraps, the last and
-    the first value of its high half are written, so that a decoder notices it even after a silence of any
-    length up to an hour.
+    A packet begins with a time and a row, so that it can be read without the one before. From there on each
+    half of a time and a row is written where it changes, 2 bytes each, and 2 bytes for each event. Events of
+    one time, row and polarity that lie close together become vectors of 12 columns where that is shorter.
+    Where time wraps, the last and the first value of its high half are written, so that a decoder notices it
+    even after a silence of any length up to an hour.
     """
 
     def __init__(self) -> None:
         self._epoch: int | None = None
-        self._scratch = np.empty(0, np.uint32)
+        self._kept: dict[str, NDArray[Any]] = {}
 
     def encode(
         self,
@@ -92,58 +94,112 @@ class Evt3Encoder:
         """
         if width > _EVT3_SIZE_MAX or height > _EVT3_SIZE_MAX:
             raise EventCodecError(f"evt3 holds at most 2048 x 2048 pixels, not {width} x {height}; use mono")
-        t_us, x, y, polarity = events
-        count = len(t_us)
         _check(events, width, height)
-        first_of_group = np.empty(count, bool)
-        if count:
-            first_of_group[0] = True
-            np.not_equal(t_us[1:], t_us[:-1], out=first_of_group[1:])
-            before = np.flatnonzero(first_of_group)
-            times = t_us[before]
-        else:
-            before, times = np.zeros(1, np.intp), np.array([end_us], np.int64)
         allocate = _new_bytes if allocate is None else allocate
-        if 3 * len(before) > count > 0 and not self._wraps(times):
-            # A time for each event, new or not: then all words have their places beforehand.
-            out = allocate(8 * count).view("<u4").reshape(count, 2)
-            out[:, 0] = _time_words(t_us)
-            _write_events(out[:, 1:], x, y, polarity)
-            return out.view(np.uint8).reshape(-1)
-
-        before, words = self._with_wraps(before, _time_words(times), times)
-        out = allocate(4 * (count + len(words))).view("<u4")
-        where = before + np.arange(len(before))
-        is_event = np.ones(len(out), bool)
-        is_event[where] = False
-        out[where] = words
-        if len(self._scratch) < count:
-            self._scratch = np.empty(count * 5 // 4, np.uint32)
-        places = self._scratch[:count]
-        _write_events(places[:, None], x, y, polarity)
-        out[is_event] = places
+        times = events.t if len(events.t) else np.array([end_us], np.int64)
+        first, last = int(times[0]) >> _EPOCH_BITS, int(times[-1]) >> _EPOCH_BITS
+        since = _wraps(first - (first if self._epoch is None else self._epoch))
+        self._epoch = last
+        if len(events.t):
+            places = self._places(events)
+            count = int(places.x[-1]) + 1
+        else:
+            count = 1
+        wraps = np.zeros(0, np.intp)
+        if first != last:  # events before which time wraps, as often as it does
+            epochs = np.diff(times >> _EPOCH_BITS, prepend=first)
+            which = np.flatnonzero(epochs)
+            wraps = np.repeat(which, [_wraps(int(each)) for each in epochs[which]])
+        size = 2 * (count + 1 + 2 * (since + len(wraps)))
+        out = allocate(size)[:size].view("<u2")
+        out[: 2 * since] = np.tile(_WRAP, since)
+        out[2 * since] = _TIME_HIGH << 12 | int(times[0]) >> 12 & 0xFFF
+        rest = out[2 * since + 1 :]
+        if not len(events.t):
+            rest[0] = _TIME_LOW << 12 | end_us & 0xFFF
+        elif len(wraps):
+            words = np.empty(count, np.uint16)
+            places.write(words)
+            rest[:] = np.insert(words, np.repeat(places.begin(wraps), 2), np.tile(_WRAP, len(wraps)))
+        else:
+            places.write(rest)
         return out.view(np.uint8)
 
-    def _wraps(self, times: NDArray[np.int64]) -> bool:
-        """Return whether time wraps, in a packet or since the one before."""
-        return not self._epoch == int(times[0]) >> _EPOCH_BITS == int(times[-1]) >> _EPOCH_BITS
+    def _places(self, events: EventColumns) -> _Places:
+        """Find out which words each event needs, and where they are written.
 
-    def _with_wraps(
-        self, before: NDArray[np.intp], words: NDArray[np.uint32], times: NDArray[np.int64]
-    ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
-        """Put words in wherever time has wrapped since the word before."""
-        begin, end = int(times[0]) >> _EPOCH_BITS, int(times[-1]) >> _EPOCH_BITS
-        last = begin if self._epoch is None or not 0 <= begin - self._epoch <= _EPOCHS_MAX else self._epoch
-        self._epoch = end
-        if last == end:
-            return before, words
-        wraps = np.diff(times >> _EPOCH_BITS, prepend=last)
-        repeats = np.where(wraps > _EPOCHS_MAX, 0, wraps) + 1
-        owner = np.repeat(np.arange(len(words)), repeats)
-        is_time = np.zeros(len(owner), bool)
-        is_time[np.cumsum(repeats) - 1] = True
-        wrap = np.uint32((_TIME_HIGH << 12) << 16 | _TIME_HIGH << 12 | 0xFFF)
-        return before[owner], np.where(is_time, words[owner], wrap)
+        Large arrays are kept from packet to packet: to get new memory takes longer than what is done here.
+        """
+        t_us, x, y, polarity = events
+        n = len(t_us)
+        low, column = self._room("low", n, np.uint16), self._room("column", n, np.uint16)
+        np.copyto(low, t_us, casting="unsafe")
+        new_low = _changes(low, self._room("new_low", n, np.bool_))
+        new_row = _changes(y, self._room("new_row", n, np.bool_))
+        np.copyto(column, polarity)
+        column <<= 11
+        column |= x
+        new_high = np.zeros(0, np.intp)
+        if int(t_us[0]) >> 12 != int(t_us[-1]) >> 12:
+            new_high = np.flatnonzero(np.diff(t_us >> 12)) + 1
+            new_low[new_high] = True  # some decoders take the low half for 0 after a new high one
+        count = self._room("count", n, np.uint8)
+        np.add(new_low.view(np.uint8), new_row.view(np.uint8), out=count)
+        vectors = self._vectors(column, count)
+        count += np.uint8(1)
+        count[new_high] += np.uint8(1)
+        if vectors is not None:
+            count[vectors.members] -= np.uint8(1)
+            count[vectors.windows] += np.uint8(1)
+            count[vectors.groups] += np.uint8(1)
+        at_x = np.cumsum(count, dtype=np.intp, out=self._room("at_x", n, np.intp))
+        at_x -= 1
+        at_y = np.subtract(at_x, new_row, out=self._room("at_y", n, np.intp))
+        if vectors is not None:
+            at_y[vectors.groups] -= 1
+        low &= np.uint16(0xFFF)
+        low |= np.uint16(_TIME_LOW << 12)
+        high = (t_us[new_high] >> 12 & 0xFFF | _TIME_HIGH << 12).astype(np.uint16)
+        return _Places(at_x, at_y, column, y, low, np.flatnonzero(new_low), high, new_high, vectors)
+
+    def _vectors(self, column: Words, apart: NDArray[np.uint8]) -> _Vectors | None:
+        """Find groups of events that are shorter as vectors: neighbours at most 11 columns apart.
+
+        Args:
+            column: Column and polarity of each event.
+            apart: 0 where an event has time and row of the one before.
+        """
+        n = len(column)
+        gap = np.subtract(column[1:], column[:-1], out=self._room("gap", n - 1, np.uint16))
+        gap -= np.uint16(1)
+        near = self._room("near", n + 2, np.bool_)  # to the event before; none is at the ends
+        near[0] = near[n:] = False
+        np.less(gap, 11, out=near[1:n])
+        near[:n] &= np.equal(apart, 0, out=self._room("same", n, np.bool_))
+        both = np.logical_and(near[1:-1], near[2:], out=self._room("both", n, np.bool_))
+        begins = np.flatnonzero(both[:-1] & ~near[:-3]) if n > 1 else np.zeros(0, np.intp)
+        if not len(begins):  # no group of three and more
+            return None
+        ends = np.flatnonzero(both[:-1] & ~near[3:]) + 2
+        keep = (column[ends] - column[begins]) // np.uint16(12) + 2 < ends - begins + 1
+        begins, sizes = begins[keep], (ends - begins + 1)[keep]  # a base and vectors against one word each
+        if not len(begins):
+            return None
+        first = np.cumsum(sizes) - sizes
+        members = np.repeat(begins - first, sizes) + np.arange(int(sizes.sum()))
+        step = column[members] - np.repeat(column[begins], sizes)
+        is_window = _changes(step // np.uint16(12), np.empty(len(step), bool))
+        is_window[first] = True
+        starts = np.flatnonzero(is_window)
+        bits = np.bitwise_or.reduceat(np.uint16(1) << step % np.uint16(12), starts)
+        return _Vectors(begins, members, members[starts], bits | np.uint16(_VECT_12 << 12))
+
+    def _room(self, name: str, count: int, dtype: Any) -> NDArray[Any]:
+        """Return an array that is kept under a name; its content is of the packet before."""
+        kept = self._kept.get(name)
+        if kept is None or len(kept) < count:
+            kept = self._kept[name] = np.empty(count * 5 // 4 + 64, dtype)
+        return kept[:count]
 
 
 class Evt3Decoder:
@@ -415,29 +471,64 @@ def _after(t_us: NDArray[np.int64], begin_us: int) -> NDArray[np.uint32]:
     return after
 
 
-def _time_words(t_us: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the high and the low half of each time, as they are written one after the other."""
-    time = t_us.astype(np.uint32)
-    words: NDArray[np.uint32] = time << np.uint32(16)
-    words &= 0xFFF0000
-    time >>= 12
-    time &= 0xFFF
-    words |= time
-    words |= _TIME_LOW << 28 | _TIME_HIGH << 12
-    return words
+class _Vectors(NamedTuple):
+    """Events that become vectors, by their numbers."""
+
+    groups: NDArray[np.intp]
+    """First events of groups: their columns are the bases."""
+    members: NDArray[np.intp]
+    """All events of groups."""
+    windows: NDArray[np.intp]
+    """First events of vectors."""
+    bits: Words
+    """The words of these vectors."""
 
 
-def _write_events(
-    out: NDArray[np.uint32], x: NDArray[np.uint16], y: NDArray[np.uint16], polarity: NDArray[np.uint8]
-) -> None:
-    """Write a row and a column for each event; shape of `out` [n, 1]."""
-    column = polarity.astype(np.uint16)
-    column <<= 11
-    column |= x
-    column |= _ADDR_X << 12
-    halves = out.view("<u2")
-    halves[:, 0] = y
-    halves[:, 1] = column
+class _Places(NamedTuple):
+    """The words of a packet, after its first one, and where they are."""
+
+    x: NDArray[np.intp]
+    """Of columns, and of vectors; of an event without a word, of the one before."""
+    y: NDArray[np.intp]
+    """Of rows; where none is written, of a word that comes after it."""
+    column: Words
+    """Column and polarity of each event."""
+    row: Words
+    low: Words
+    """Words of the low half of each time."""
+    new_low: NDArray[np.intp]
+    """Events before which one is written."""
+    high: Words
+    """Words of high halves."""
+    new_high: NDArray[np.intp]
+    vectors: _Vectors | None
+
+    def begin(self, events: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the place of the first word of some events that have a high half."""
+        return self.y[events] - 2
+
+    def write(self, out: Words) -> None:
+        """Write all words; what is not to be there is written over."""
+        out[self.y] = self.row
+        out[self.y[self.new_low] - 1] = self.low[self.new_low]
+        out[self.y[self.new_high] - 2] = self.high
+        out[self.x] = self.column | np.uint16(_ADDR_X << 12)
+        if self.vectors is not None:
+            groups = self.vectors.groups
+            out[self.x[groups] - 1] = self.column[groups] & 0xFFF | _BASE_X << 12
+            out[self.x[self.vectors.windows]] = self.vectors.bits
+
+
+def _wraps(epochs: int) -> int:
+    """Return how often time has wrapped, which a decoder is told; 0 if it was set anew."""
+    return epochs if 0 <= epochs <= _EPOCHS_MAX else 0
+
+
+def _changes(values: NDArray[Any], out: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find out which elements differ from the one before; the first does."""
+    out[0] = True
+    np.not_equal(values[1:], values[:-1], out=out[1:])
+    return out
 
 
 def _new_bytes(size: int) -> Bytes:

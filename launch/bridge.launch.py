@@ -2,8 +2,9 @@
 
     ros2 launch neurosim bridge.launch.py namespace:=/neurosim config:=bridge.yaml
 
-`ros2 launch neurosim bridge.launch.py --show-args` explains the arguments. It is a ROS node: `PushRosNamespace`,
-`SetRemap` and `SetParameter` around an include of this file hold for it. Nothing here imports rclpy itself.
+`ros2 launch neurosim bridge.launch.py --show-args` explains the arguments. It is a ROS node, so that
+`PushRosNamespace`, `SetRemap` and `SetParameter` around an include of this file hold for it. Nothing here
+imports rclpy itself.
 """
 
 from __future__ import annotations

@@ -163,6 +163,7 @@ class _Room:
         self._buffer = np.empty(begin + (size + 3 & -4), np.uint8)
         self._buffer[:begin] = self._prefix
         self._buffer[begin - 4 : begin].view("<u4")[0] = size if count is None else count
+        self._buffer[begin + size :] = 0
         return self._buffer[begin:]
 
     def message(self) -> memoryview:
