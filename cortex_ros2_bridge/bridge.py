@@ -24,13 +24,15 @@ from cortex_ros2_bridge.incoming import Caller, Incoming, Target
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Whereabouts
 from cortex_ros2_bridge.routes import (
-    CORTEX_TYPES,
     INFO,
     Route,
     Seen,
+    in_of,
+    kind_of,
     look,
     make_routes,
     odometry_of,
+    out_of,
     shared_topics,
     unfit,
     vehicle_of,
@@ -310,11 +312,10 @@ class Bridge:
             source = route.cortex_topic
             self._tap(feed, lambda message: self._take_transform(source, message, tally), lambda: True, stack)
             return tally, lambda: publisher.subscriber_count
-        kind = CORTEX_TYPES[route.cortex_type]
         output = Outgoing(
             route,
             publisher,
-            convert.OUT[kind, route.ros_type],
+            out_of(route),
             self._context(route),
             latched=any(t.topic == route.cortex_topic and t.latched for t in seen.topics),
         )
@@ -328,13 +329,14 @@ class Bridge:
     def _open_in(
         self, route: Route, seen: Seen, stack: contextlib.ExitStack
     ) -> tuple[Tally, Callable[[], int]]:
-        kind = CORTEX_TYPES[route.cortex_type]
+        kind = kind_of(route.cortex_type)
+        assert kind is not None  # only types with a class come in
         publisher = self._cortex_publishers.take(
             stack,
             (route.cortex_topic, route.cortex_type),
             lambda: self._node.publisher(route.cortex_topic, kind),
         )
-        target = Target(route, publisher, convert.IN[route.ros_type, kind], self._context(route))
+        target = Target(route, publisher, in_of(route), self._context(route))
         whereabouts = self._whereabouts_of(vehicle_of(route.cortex_topic))
 
         def subscribe() -> Incoming:
@@ -352,8 +354,7 @@ class Bridge:
     def _open_call(
         self, route: Route, seen: Seen, stack: contextlib.ExitStack
     ) -> tuple[Tally, Callable[[], int]]:
-        function = convert.IN[route.ros_type, CORTEX_TYPES[route.cortex_type]]
-        caller = Caller(route, self._node, function, self._context(route))
+        caller = Caller(route, self._node, in_of(route), self._context(route))
         stack.callback(caller.close)
         subscription = self._backend.subscription(route.ros_topic, route.ros_type, route.qos, caller.take)
         stack.callback(subscription.close)
@@ -377,7 +378,7 @@ class Bridge:
         return self._feeds.take(
             stack,
             (topic, type_name),
-            lambda: Feed(self._node, topic, CORTEX_TYPES[type_name], latched=latched),
+            lambda: Feed(self._node, topic, kind_of(type_name), latched=latched),
         )
 
     def _tap(

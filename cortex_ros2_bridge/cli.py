@@ -106,6 +106,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--print-config", action="store_true", help="print all settings as YAML, and exit")
     parser.add_argument("--verbose", "-v", action="store_true", help="say when topics are subscribed to, too")
     parser.add_argument(
+        "--converter",
+        action="append",
+        metavar="MODULE|FILE.py",
+        help="import conversions for types of your own; may be repeated",
+    )
+    parser.add_argument(
         "--beside", action="store_true", help="run although another bridge publishes the same topics"
     )
     return parser
@@ -142,6 +148,7 @@ def _config(options: argparse.Namespace, ros: RosArguments, parameters: Mapping[
         for name, check in checks.items()
         if (value := getattr(options, name)) is not None
     }
+    changes["converters"] = (*config.converters, *(options.converter or ()))
     config = dataclasses.replace(config, **changes)
     node, namespace = ros.names(config.node, config.namespace)
     return dataclasses.replace(config, node=node, namespace=namespace, ros=ros)
@@ -165,6 +172,7 @@ def _bridge(
         beside: Run although another bridge publishes the same topics.
     """
     config = make(given)
+    _load_converters(config)
     stop = _stop_at_signals(forced=not config.backend.endswith(".mcap"))
     from cortex_ros2_bridge.backend.choose import open_backend
     from cortex_ros2_bridge.bridge import Bridge
@@ -195,6 +203,13 @@ def _bridge(
     return 0
 
 
+def _load_converters(config: BridgeConfig) -> None:
+    from cortex_ros2_bridge.convert.registry import load_converters
+
+    for problem in load_converters(config.converters):
+        logger.error("%s", problem)
+
+
 def _identity(config: BridgeConfig) -> str:
     """Return what a bridge is called in Cortex: two of one name publish the same topics."""
     if config.backend.endswith(".mcap"):
@@ -223,6 +238,7 @@ def _refuse_second(node: Node) -> None:
 
 def _show(config: BridgeConfig, *, as_yaml: bool) -> int:
     """Print what would go where; return 1 if anything is wrong with that, and it is not to be edited."""
+    _load_converters(config)
     with Node(f"{config.node} list", domain=config.cortex_domain) as node:
         node.wait_for_registry(LIST_S)
         seen = _what_there_is(node)
@@ -273,7 +289,7 @@ def _row(route: Route) -> tuple[str, str, str, str]:
 def to_yaml(config: BridgeConfig, routes: Sequence[Route]) -> str:
     """Return settings as YAML that `load` reads back, with the routes that there are now as entries."""
     settings: dict[str, Any] = {name: getattr(config, name) for name in SETTINGS}
-    settings |= {"include": list(config.include), "exclude": list(config.exclude)}
+    settings |= {name: list(getattr(config, name)) for name in ("include", "exclude", "converters")}
     settings |= {"rename": dict(config.rename), "frames": dataclasses.asdict(config.frames)}
     settings["routes"] = [
         {

@@ -86,6 +86,8 @@ class BridgeConfig:
     """Beginnings of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
     routes: tuple[RouteChange, ...] = ()
     """Changes, in order; later ones win."""
+    converters: tuple[str, ...] = ()
+    """Modules, or .py files, that register conversions."""
     ros: RosArguments = field(default_factory=RosArguments)
     """What followed `--ros-args`; no setting of the file."""
 
@@ -371,6 +373,7 @@ SETTINGS: Mapping[str, Callable[[str, object], Any]] = {
     "include": _patterns,
     "exclude": _patterns,
     "rename": _renames,
+    "converters": lambda key, value: tuple(_text(f"{key}[{n}]", item) for n, item in _items(key, value)),
     "routes": lambda key, value: tuple(_route_change(f"{key}[{n}]", item) for n, item in _items(key, value)),
 }
 """What makes the value of each setting of what YAML says."""

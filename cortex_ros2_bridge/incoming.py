@@ -55,7 +55,8 @@ class Target:
         self.context = context
         self.publisher = publisher
         self.convert = convert
-        stale_s = context.option("stale_s")
+        is_command = route.cortex_type.startswith("cortex/")
+        stale_s = context.option("stale_s") if is_command else context.options.get("stale_s")
         self.stale_ns = None if stale_s is None else round(stale_s * 1e9)
         self.restamp = context.option("stamp") == "now"
 
@@ -154,7 +155,7 @@ class Incoming:
             target.tally.clamp(context.excess)
         if target.restamp:
             command = dataclasses.replace(command, stamp_ns=context.now_ns)
-        reason = _staleness(command.stamp_ns, self.whereabouts.now_ns, target.stale_ns)
+        reason = _staleness(getattr(command, "stamp_ns", 0), self.whereabouts.now_ns, target.stale_ns)
         if reason:
             target.tally.refuse(reason)
             return

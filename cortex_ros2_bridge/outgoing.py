@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 Convert = Callable[[Any, Context], "Buffer | None"]
 
-QUEUES: dict[type[Any], int] = {Image: 72, PointCloud: 72, Events: 128}
+QUEUES: dict[type[Any] | None, int] = {Image: 72, PointCloud: 72, Events: 128}
 """Messages that wait for their conversion; the option `queue` changes it.
 
 More than by default, so that Cortex makes room in shared memory for those that wait while others are busy."""
@@ -213,7 +213,7 @@ class Feed:
         newest: When the newest message came [s], and its stamp [ns], if it has one.
     """
 
-    def __init__(self, node: Node, topic: str, kind: type[Any], *, latched: bool) -> None:
+    def __init__(self, node: Node, topic: str, kind: type[Any] | None, *, latched: bool) -> None:
         """Prepare; nothing is subscribed to yet.
 
         Args:

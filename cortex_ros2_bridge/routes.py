@@ -11,7 +11,7 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import cortex.messages
 from cortex import Node
@@ -20,9 +20,10 @@ from cortex.service import service_number
 from cortex_ros2_bridge import convert
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.config import QOS, BridgeConfig, RouteChange, is_ros_name
-
-Direction = Literal["out", "in", "call"]
-"""out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+from cortex_ros2_bridge.convert.context import In, Out
+from cortex_ros2_bridge.convert.registry import ADDED, PACKETS, Direction, Rule, adopt
+from cortex_ros2_bridge.convert.registry import IN as ADDED_IN
+from cortex_ros2_bridge.convert.registry import OUT as ADDED_OUT
 
 CORTEX_TYPES: Mapping[str, type[Any]] = {
     schema_of(kind).name: kind
@@ -64,22 +65,8 @@ class Route:
         return f"{self.cortex_topic} {arrow} {self.ros_topic}"
 
 
-class Rule(NamedTuple):
-    """What happens by default to a topic of a type; `{topic}`, `{parent}` and `{base}` as in `_name`."""
-
-    cortex_type: str
-    ros_type: str
-    direction: Direction
-    name: str
-    qos: Qos = Qos()
-    default: bool = True
-    """False: only where the settings ask for it."""
-
-
 STREAM = Qos(depth=1000)
 """Many small messages: at 1 kHz a subscriber may sleep for a second."""
-PACKETS = Qos(depth=100)
-"""Many messages that may be large."""
 FRAMES = Qos(depth=10)
 """Few large messages."""
 NEWEST = Qos(depth=1)
@@ -128,6 +115,31 @@ RULES: tuple[Rule, ...] = (
 )
 """The table. A row for a service has the type of its request."""
 
+
+def rules() -> tuple[Rule, ...]:
+    """Return all rules: those of the table, and those of types that were added."""
+    return (*RULES, *(rule for added in ADDED.values() for rule in added.rules))
+
+
+def kind_of(type_name: str) -> type[Any] | None:
+    """Return the class of a type of Cortex; None if it is known by its schema only."""
+    return CORTEX_TYPES[type_name] if type_name in CORTEX_TYPES else ADDED[type_name].kind
+
+
+def out_of(route: Route) -> Out:
+    """Return the conversion of a route to ROS."""
+    key = route.cortex_type, route.ros_type
+    return (
+        ADDED_OUT[key] if key in ADDED_OUT else convert.OUT[CORTEX_TYPES[route.cortex_type], route.ros_type]
+    )
+
+
+def in_of(route: Route) -> In:
+    """Return the conversion of a route from ROS."""
+    key = route.ros_type, route.cortex_type
+    return ADDED_IN[key] if key in ADDED_IN else convert.IN[route.ros_type, CORTEX_TYPES[route.cortex_type]]
+
+
 _TF_SOURCES = ("odometry", "odom")
 """Odometry on topics of these names moves the vehicle in tf; another one of the same vehicle does not."""
 
@@ -141,6 +153,8 @@ class SeenTopic(NamedTuple):
     published: bool
     latched: bool = False
     """Whether a publisher gives its last message to whoever comes later."""
+    schema: str = ""
+    """Of a published topic, as Cortex writes it."""
 
 
 class Seen(NamedTuple):
@@ -163,7 +177,7 @@ def look(node: Node) -> Seen:
             before = topics.get(key)
             latched = publisher.latch or (before is not None and before.latched)
             topics[key] = SeenTopic(
-                publisher.topic, publisher.type_name, publisher.fingerprint, True, latched
+                publisher.topic, publisher.type_name, publisher.fingerprint, True, latched, publisher.schema
             )
         for subscriber in record.subscribers:
             if subscriber.fingerprint:  # else it takes any type: a recorder
@@ -191,7 +205,7 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
     Returns:
         Routes in the order of their topics, and a sentence for each topic or setting that has none.
     """
-    problems = _unknown_types(seen, config)
+    problems = _adopt(seen, config) + _unknown_types(seen, config)
     routes: list[Route] = []
     images: dict[str, str] = {}
     unused = {(n, name): set[str]() for n, change in enumerate(config.routes) for name in change.options}
@@ -215,10 +229,9 @@ def shared_topics(config: BridgeConfig) -> frozenset[str]:
 
 def known_options(route: Route) -> frozenset[str]:
     """Return the names of the options that a route has."""
-    kind = CORTEX_TYPES[route.cortex_type]
     if route.direction == "out":
-        return convert.OPTIONS.get(convert.OUT[kind, route.ros_type], frozenset()) | {"queue"}
-    known = convert.OPTIONS.get(convert.IN[route.ros_type, kind], frozenset())
+        return convert.OPTIONS.get(out_of(route), frozenset()) | {"queue"}
+    known = convert.OPTIONS.get(in_of(route), frozenset())
     return known | {"stale_s", "stamp"} if route.direction == "in" else known
 
 
@@ -264,7 +277,7 @@ def _candidates(seen: Seen) -> list[tuple[Route, Rule]]:
     for topic in seen.topics:
         if not _is_known(topic):
             continue
-        for rule in RULES:
+        for rule in rules():
             if rule.cortex_type != topic.type_name or rule.direction == "call":
                 continue
             if (rule.direction == "out") != topic.published:
@@ -305,7 +318,10 @@ def _name(pattern: str, topic: str) -> str:
 
 def _is_known(topic: SeenTopic) -> bool:
     kind = CORTEX_TYPES.get(topic.type_name)
-    return kind is not None and schema_of(kind).fingerprint == topic.fingerprint
+    if kind is None:
+        added = ADDED.get(topic.type_name)
+        return added is not None and added.fingerprint == topic.fingerprint
+    return bool(schema_of(kind).fingerprint == topic.fingerprint)
 
 
 def _wanted(topic: str, config: BridgeConfig) -> bool:
@@ -378,7 +394,7 @@ def _changed(
 
 def _is_main(route: Route) -> bool:
     """Whether it is the first of the routes that a topic has."""
-    return next(rule for rule in RULES if rule.cortex_type == route.cortex_type).ros_type == route.ros_type
+    return next(rule for rule in rules() if rule.cortex_type == route.cortex_type).ros_type == route.ros_type
 
 
 def _without_conflicts(routes: Iterable[Route], problems: list[str], shared: frozenset[str]) -> list[Route]:
@@ -411,13 +427,27 @@ def _without_conflicts(routes: Iterable[Route], problems: list[str], shared: fro
     return list(found.values())
 
 
+def _adopt(seen: Seen, config: BridgeConfig) -> list[str]:
+    """Let published types cross that nothing is registered for; say which cannot."""
+    problems = []
+    for topic in seen.topics:
+        known = topic.type_name in CORTEX_TYPES or topic.type_name in ADDED
+        if topic.schema and not known and _wanted(topic.topic, config):
+            reason = adopt(topic.schema, topic.fingerprint)
+            if reason:
+                problems.append(f"no route for {topic.topic} of type {topic.type_name}: {reason}")
+    return problems
+
+
 def _unknown_types(seen: Seen, config: BridgeConfig) -> list[str]:
     """Say which published topics cannot be converted."""
     problems = []
     for topic in seen.topics:
         if not topic.published or _is_known(topic) or not _wanted(topic.topic, config):
             continue
-        if topic.type_name in CORTEX_TYPES:
+        if topic.schema and topic.type_name not in (*CORTEX_TYPES, *ADDED):
+            continue  # `_adopt` says why
+        if topic.type_name in (*CORTEX_TYPES, *ADDED):
             what = f"its {topic.type_name} is of another version ({topic.fingerprint:016x}) than ours"
         else:
             what = f"nothing converts its type {topic.type_name}"
@@ -431,16 +461,16 @@ def _useless(seen: Seen, config: BridgeConfig) -> list[str]:
     for change in config.routes:
         if change.type is None:
             continue
-        types = sorted({rule.ros_type for rule in RULES})
+        types = sorted({rule.ros_type for rule in rules()})
         if change.type not in types:
             problems.append(f"routes: nothing converts to or from {change.type}, known: {', '.join(types)}")
             continue
         there = [
             topic for topic in seen.topics if _is_known(topic) and fnmatchcase(topic.topic, change.cortex)
         ]
-        fitting = {rule.cortex_type for rule in RULES if rule.ros_type == change.type}
+        fitting = {rule.cortex_type for rule in rules() if rule.ros_type == change.type}
         if there and not any(topic.type_name in fitting for topic in there) and "*" not in change.cortex:
-            known = sorted({r.ros_type for r in RULES if r.cortex_type == there[0].type_name})
+            known = sorted({r.ros_type for r in rules() if r.cortex_type == there[0].type_name})
             problems.append(
                 f"routes: {change.cortex} is a {there[0].type_name}, which does not become a {change.type}, "
                 f"but: {', '.join(known)}"

@@ -50,14 +50,43 @@ def typestore(distro: str = DEFAULT_DISTRO) -> Typestore:
     if distro not in DISTROS:
         raise ValueError(f"unknown ROS distribution {distro!r}, known: {', '.join(DISTROS)}")
     store = get_typestore(DISTROS[distro].store)
-    for name, text in definitions().items():
-        message = name.replace("/srv/", "/msg/")  # as which rosbags reads the halves of a service
-        try:
-            (definition,) = get_types_from_msg(text, message).values()
-            store.register({name: definition})
-        except TypesysError as error:
-            raise RuntimeError(f"definition of {name}: {error}") from error
+    for name, text in {**definitions(), **_added}.items():
+        _register(store, name, text)
+    _stores.append(store)
     return store
+
+
+def define(type_name: str, text: str) -> None:
+    """Make a message type known that no distribution has.
+
+    Args:
+        type_name: Such as "my_robot/msg/Battery".
+        text: As in a .msg file.
+
+    Raises:
+        ValueError: The text is no definition, or the type is known with another one.
+    """
+    if _added.get(type_name, text) != text or (
+        type_name in typestore().fielddefs and type_name not in _added
+    ):
+        raise ValueError(f"{type_name} is defined already, otherwise")
+    _added[type_name] = text
+    for store in _stores:
+        if type_name not in store.fielddefs:
+            _register(store, type_name, text)
+
+
+def _register(store: Typestore, name: str, text: str) -> None:
+    message = name.replace("/srv/", "/msg/")  # as which rosbags reads the halves of a service
+    try:
+        (definition,) = get_types_from_msg(text, message).values()
+        store.register({name: definition})
+    except TypesysError as error:
+        raise ValueError(f"definition of {name}: {error}") from error
+
+
+_added: dict[str, str] = {}
+_stores: list[Typestore] = []
 
 
 @functools.cache

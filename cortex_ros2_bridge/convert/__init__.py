@@ -32,6 +32,7 @@ from cortex_ros2_bridge.convert.commands import (
 )
 from cortex_ros2_bridge.convert.context import Context, ConvertError, In, Out
 from cortex_ros2_bridge.convert.events import event_array, event_image, event_packet, events_camera_info
+from cortex_ros2_bridge.convert.registry import from_ros, share, to_ros
 from cortex_ros2_bridge.convert.simulator import (
     collision,
     simulation,
@@ -69,6 +70,7 @@ __all__ = [
     "event_image",
     "event_packet",
     "events_camera_info",
+    "from_ros",
     "image",
     "image_camera_info",
     "imu",
@@ -82,12 +84,14 @@ __all__ = [
     "reset",
     "reset_empty",
     "rotor_speeds",
+    "share",
     "simulation",
     "simulator_diagnostics",
     "simulator_status",
     "static_transforms",
     "steps",
     "text",
+    "to_ros",
     "trajectory",
     "transform",
     "trigger",

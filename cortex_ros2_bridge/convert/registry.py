@@ -1,0 +1,340 @@
+"""Conversions that users add, both directions of a type in one file; and those that follow from a schema.
+
+    @to_ros(Battery, "sensor_msgs/msg/BatteryState")
+    def battery(message, context): return BatteryState(...)     # a message of ROS, or CDR
+
+    @from_ros("sensor_msgs/msg/BatteryState", Battery)
+    def command(message, context): return Battery(...)
+
+    share(Gripper)    # both directions, field by field, as my_robot/msg/Gripper
+
+The bridge imports the modules that the settings name (`converters`), and those of installed packages with an
+entry point in the group `cortex_ros2_bridge.converters`. A type that nothing is registered for, and whose
+fields all have a counterpart in ROS, goes out field by field without any registration.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
+
+from cortex.schema import schema_of
+from cortex_ros2_bridge import cdr
+from cortex_ros2_bridge.backend.base import Buffer, Qos
+from cortex_ros2_bridge.convert.context import Context, ConvertError, In, Out
+from cortex_ros2_bridge.convert.records import header, record
+from cortex_ros2_bridge.typestore import define, typestore
+
+GROUP = "cortex_ros2_bridge.converters"
+PACKETS = Qos(depth=100)
+Direction = Literal["out", "in", "call"]
+"""out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Rule(NamedTuple):
+    """What happens by default to a topic of a type; `{topic}`, `{parent}` and `{base}` as in `routes`."""
+
+    cortex_type: str
+    ros_type: str
+    direction: Direction
+    name: str
+    qos: Qos = Qos()
+    default: bool = True
+    """False: only where the settings ask for it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Added:
+    """What was registered, or follows from a schema."""
+
+    kind: type[Any] | None
+    """Class in Cortex; None: it is known by its schema only."""
+    fingerprint: int
+    rules: tuple[Rule, ...]
+
+
+ADDED: dict[str, Added] = {}
+"""By the name of the type in Cortex."""
+OUT: dict[tuple[str, str], Out] = {}
+"""Conversions to ROS, by the types in Cortex and in ROS."""
+IN: dict[tuple[str, str], In] = {}
+"""Conversions from ROS, likewise."""
+
+
+def to_ros(kind: type[Any], ros_type: str, *, name: str = "{topic}", qos: Qos = PACKETS) -> Callable[[F], F]:
+    """Register a function that makes a message of ROS of one of Cortex.
+
+    The function takes the message and the `Context`, and returns a message of ROS, its CDR, or None for
+    nothing now. It raises `ConvertError` for a message that cannot be used.
+
+    Args:
+        kind: Class of the message in Cortex.
+        ros_type: Such as "sensor_msgs/msg/BatteryState".
+        name: Topic in ROS; {topic} stands for the one in Cortex.
+        qos: Quality of service in ROS.
+    """
+
+    def register(function: F) -> F:
+        def convert(message: Any, context: Context) -> Buffer | None:
+            made = function(message, context)
+            return made if made is None or isinstance(made, Buffer) else cdr.encode(made)
+
+        type_name = _add(kind, Rule(schema_of(kind).name, ros_type, "out", name, qos))
+        OUT[type_name, ros_type] = convert
+        return function
+
+    return register
+
+
+def from_ros(
+    ros_type: str, kind: type[Any], *, name: str = "{topic}", qos: Qos = PACKETS
+) -> Callable[[F], F]:
+    """Register a function that makes a message of Cortex of one of ROS.
+
+    The function takes the message, as an object of `msgs`, and the `Context`; arguments are as for `to_ros`.
+    """
+
+    def register(function: F) -> F:
+        def convert(data: Buffer, context: Context) -> Any:
+            return function(cdr.decode(data, ros_type), context)
+
+        type_name = _add(kind, Rule(schema_of(kind).name, ros_type, "in", name, qos))
+        IN[ros_type, type_name] = convert
+        return function
+
+    return register
+
+
+def share(kind: type[Any], ros_type: str | None = None) -> None:
+    """Let a type cross in both directions, field by field.
+
+    Args:
+        kind: Class of the message in Cortex.
+        ros_type: Type in ROS with the same fields; None: named as in Cortex, and defined if ROS
+            does not know it.
+
+    Raises:
+        ValueError: A field has no counterpart.
+    """
+    plain = json.loads(schema_of(kind).to_json())
+    ros_type = _define(plain, ros_type)
+    to_ros(kind, ros_type)(_writer(plain, ros_type))
+    from_ros(ros_type, kind)(_reader(kind, plain))
+
+
+def adopt(schema: str, fingerprint: int) -> str:
+    """Let messages go out whose type is known by its schema only; returns why not, empty if they do."""
+    plain = json.loads(schema)
+    name = plain["name"]
+    if name in ADDED:
+        return "" if ADDED[name].fingerprint == fingerprint else f"another {name} is known already"
+    try:
+        ros_type = _define(plain, None)
+    except ValueError as error:
+        return str(error)
+    OUT[name, ros_type] = _writer(plain, ros_type)
+    ADDED[name] = Added(
+        kind=None, fingerprint=fingerprint, rules=(Rule(name, ros_type, "out", "{topic}", PACKETS),)
+    )
+    return ""
+
+
+def load_converters(modules: Iterable[str]) -> list[str]:
+    """Import modules with conversions: those of entry points, and others; returns what went wrong.
+
+    Args:
+        modules: Names of modules, or files that end in .py.
+    """
+    problems = []
+    entries = [(each.name, each.load) for each in importlib.metadata.entry_points(group=GROUP)]
+    for name, load in [*entries, *((each, lambda each=each: _import(each)) for each in modules)]:
+        try:
+            load()
+        except Exception as error:  # code of others: the rest of the bridge works without it
+            problems.append(f"the converters of {name} cannot be loaded: {type(error).__name__}: {error}")
+    return problems
+
+
+def _import(module: str) -> None:
+    if not module.endswith(".py"):
+        importlib.import_module(module)
+        return
+    path = Path(module).resolve()
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FileNotFoundError(f"there is no {path}")
+    sys.modules[path.stem] = loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+
+
+def _add(kind: type[Any], rule: Rule) -> str:
+    schema = schema_of(kind)
+    before = ADDED.get(schema.name)
+    rules = before.rules if before is not None and before.kind is not None else ()
+    ADDED[schema.name] = Added(
+        kind=kind, fingerprint=schema.fingerprint, rules=(*(r for r in rules if r[:3] != rule[:3]), rule)
+    )
+    return schema.name
+
+
+# Field by field
+
+_SCALARS = {"bool", "float32", "float64", *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64))}
+
+
+def ros_type_of(name: str) -> str:
+    """Return what a type of Cortex is called in ROS: my_robot/msg/Battery for my_robot/Battery.
+
+    The package of the messages of Cortex itself is cortex_msgs.
+    """
+    package, _, base = name.replace(".", "/").rpartition("/")
+    package = re.sub("[^a-z0-9_]", "_", package.lower()).strip("_") or "cortex"
+    base = "".join(part[:1].upper() + part[1:] for part in re.split("[^A-Za-z0-9]+", base))
+    return f"{'cortex_msgs' if package == 'cortex' else package}/msg/{base}"
+
+
+def _define(plain: Any, ros_type: str | None) -> str:
+    """Return the ROS type with the fields of a schema; defined, if ROS does not know it."""
+    name = ros_type or ros_type_of(plain["name"])
+    lines = _lines(plain)
+    if name not in typestore().fielddefs:
+        define(name, "".join(f"{line}\n" for line in lines))
+    known = [field for field, _ in typestore().fielddefs[name][1]]
+    wanted = [line.split()[1] for line in lines]
+    if known != wanted:
+        raise ValueError(f"{name} has the fields {', '.join(known)}, {plain['name']} {', '.join(wanted)}")
+    return name
+
+
+def _lines(plain: Any) -> list[str]:
+    """Return the definition in ROS of a schema, a line for each field."""
+    names = [field["name"] for field in plain["fields"]]
+    lines = ["std_msgs/Header header"] if "stamp_ns" in names else []
+    for field in plain["fields"]:
+        name, kind = field["name"], field["type"]
+        if name == "stamp_ns" or (name == "frame_id" and lines):
+            continue
+        if not re.fullmatch("[a-z](_?[a-z0-9]+)*", name):
+            raise ValueError(f"ROS allows no field {name!r}")
+        lines.append(f"{_ros_field(kind, name)} {name}")
+        if isinstance(kind, dict) and len(kind.get("shape", ())) > 1:
+            lines.append(f"uint32[] {name}_shape")
+    return lines
+
+
+def _ros_field(kind: Any, name: str) -> str:
+    if isinstance(kind, str):
+        base = {"str": "string", "bytes": "uint8[]"}.get(kind, kind)
+        if kind in _SCALARS or base != kind:
+            return base
+    elif "array" in kind and kind["array"] in _SCALARS:
+        sizes = kind["shape"]
+        return (
+            f"{kind['array']}[{sizes[0]}]"
+            if len(sizes) == 1 and isinstance(sizes[0], int)
+            else (f"{kind['array']}[]")
+        )
+    elif "enum" in kind:
+        return "int32"
+    elif "message" in kind:
+        return _define(kind["message"], None).replace("/msg/", "/")
+    elif "list" in kind and not _ros_field(kind["list"], name).endswith("]"):
+        return f"{_ros_field(kind['list'], name)}[]"
+    raise ValueError(f"its field {name} has no counterpart in ROS: {kind}")
+
+
+def _writer(plain: Any, ros_type: str) -> Out:
+    """Return the conversion to ROS of messages of a schema."""
+    convert = _to_record(plain, ros_type)
+    return lambda message, context: cdr.encode(convert(message, context))
+
+
+def _to_record(plain: Any, ros_type: str) -> Callable[[Any, Context], Any]:
+    fields = [(field["name"], _to_value(field["type"])) for field in plain["fields"]]
+    names = [name for name, _ in fields]
+    make = record(ros_type)
+
+    def convert(message: Any, context: Context) -> Any:
+        values: list[Any] = []
+        if "stamp_ns" in names:
+            frame = getattr(message, "frame_id", "") or context.frame_id
+            values.append(header(message.stamp_ns, frame, context))
+        for name, to_value in fields:
+            if name != "stamp_ns" and not (name == "frame_id" and "stamp_ns" in names):
+                values += to_value(getattr(message, name), context)
+        return make(*values)
+
+    return convert
+
+
+def _to_value(kind: Any) -> Callable[[Any, Context], list[Any]]:
+    """Return what makes the values in ROS of a field: one, or for arrays of more dimensions two."""
+    if kind == "bytes":
+        return lambda value, _: [np.frombuffer(bytes(value), np.uint8)]
+    if isinstance(kind, str):
+        return lambda value, _: [value]
+    if "array" in kind:
+        dtype, many = np.dtype(kind["array"]), len(kind["shape"]) > 1
+
+        def flat(value: Any, _: Context) -> list[Any]:
+            array = np.ascontiguousarray(value, dtype)
+            shape = [np.array(array.shape, np.uint32)] if many else []
+            return [array.reshape(-1), *shape]
+
+        return flat
+    if "enum" in kind:
+        return lambda value, _: [int(getattr(value, "value", value))]
+    if "message" in kind:
+        inner = _to_record(kind["message"], ros_type_of(kind["message"]["name"]))
+        return lambda value, context: [inner(value, context)]
+    item = _to_value(kind["list"])
+    plain_item = isinstance(kind["list"], str) and kind["list"] != "str"
+
+    def each(values: Any, context: Context) -> list[Any]:
+        items = [item(value, context)[0] for value in values]
+        return [np.array(items, kind["list"]) if plain_item else items]
+
+    return each
+
+
+def _reader(kind: type[Any], plain: Any) -> Callable[[Any, Context], Any]:
+    """Return what makes a message of a class of one of ROS with the same fields."""
+    fields = [(field["name"], field["type"]) for field in plain["fields"]]
+    nested = [name for name, each in fields if isinstance(each, dict) and ({"message", "list"} & each.keys())]
+    if nested:
+        raise ValueError(
+            f"{plain['name']}: nested fields ({', '.join(nested)}) need a converter of their own"
+        )
+    names = [name for name, _ in fields]
+
+    def convert(message: Any, context: Context) -> Any:
+        values: dict[str, Any] = {}
+        for name, each in fields:
+            if name == "stamp_ns":
+                stamp = message.header.stamp
+                values[name] = stamp.sec * 1_000_000_000 + stamp.nanosec
+            elif name == "frame_id" and "stamp_ns" in names:
+                values[name] = message.header.frame_id
+            elif isinstance(each, dict) and "array" in each:
+                array = np.array(getattr(message, name), each["array"])
+                shape = getattr(message, f"{name}_shape", array.shape)
+                if int(np.prod(shape)) != array.size:
+                    raise ConvertError(f"{name}: {array.size} numbers for the shape {list(shape)}")
+                values[name] = array.reshape(tuple(shape))
+            else:
+                value = getattr(message, name)
+                values[name] = bytes(value) if each == "bytes" else value
+        return kind(**values)
+
+    return convert
