@@ -112,7 +112,8 @@ class Evt3Encoder:
             wraps = np.repeat(which, [_wraps(int(each)) for each in epochs[which]])
         size = 2 * (count + 1 + 2 * (since + len(wraps)))
         out = allocate(size)[:size].view("<u2")
-        out[: 2 * since] = np.tile(_WRAP, since)
+        if since:
+            out[: 2 * since] = np.tile(_WRAP, since)
         out[2 * since] = _TIME_HIGH << 12 | int(times[0]) >> 12 & 0xFFF
         rest = out[2 * since + 1 :]
         if not len(events.t):

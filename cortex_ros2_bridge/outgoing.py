@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from cortex import Node, Subscriber, keep_last
+from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last
 from cortex.messages import (
     CameraInfo,
     Clock,
@@ -44,6 +44,10 @@ DDS calls a subscriber matched when it knows it, not when the subscriber knows u
 once may not be heard yet. In lockstep both would wait for ever."""
 
 
+RECEIVE_S = 0.5
+"""How long the thread of a large topic waits before it looks whether it is still wanted [s]."""
+CLOSE_S = 2.0
+"""Longest wait for a conversion that is under way [s]."""
 STREAM_S = 0.05
 """What has sent something within this time needs no reminder [s]."""
 
@@ -206,6 +210,9 @@ class StaticTransforms:
 class Feed:
     """One Cortex topic: it is subscribed to only while a route or the bridge itself wants its messages.
 
+    Small messages are converted on the node's callback thread. Large ones (`QUEUES`) have a thread for each
+    topic, so that a picture does not hold up an Imu.
+
     Of a latched topic it keeps the last message, for those who come to want it while it is subscribed to.
 
     Attributes:
@@ -232,6 +239,7 @@ class Feed:
         self._lock = threading.Lock()
         self._queue = QUEUES.get(kind, QUEUE)
         self._subscriber: Subscriber[Any] | None = None
+        self._thread: threading.Thread | None = None
         self._told = (0, 0)
         self.newest = (0.0, 0)
 
@@ -292,9 +300,7 @@ class Feed:
         if any(wanted):
             if self._subscriber is None:
                 self._told = (0, 0)
-                self._subscriber = self._node.subscriber(
-                    self.topic, self._kind, self._take, policy=keep_last(self._queue)
-                )
+                self._subscribe()
                 logger.debug("%s: subscribed", self.topic)
         elif self._subscriber is not None:
             self.close()
@@ -307,9 +313,37 @@ class Feed:
         """Unsubscribe."""
         self._count()
         subscriber, self._subscriber = self._subscriber, None
+        thread, self._thread = self._thread, None
         if subscriber is not None:
             subscriber.close()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(CLOSE_S)
         self._last = None
+
+    def _subscribe(self) -> None:
+        is_large = self._kind in QUEUES
+        subscriber: Subscriber[Any] = self._node.subscriber(
+            self.topic, self._kind, None if is_large else self._take, policy=keep_last(self._queue)
+        )
+        self._subscriber = subscriber
+        if is_large:
+            self._thread = threading.Thread(
+                target=self._receive, args=(subscriber,), name=f"feed {self.topic}", daemon=True
+            )
+            self._thread.start()
+
+    def _receive(self, subscriber: Subscriber[Any]) -> None:
+        """Take messages until the subscription is closed."""
+        while self._subscriber is subscriber:
+            try:
+                message = subscriber.recv(RECEIVE_S)
+            except TimeoutError:
+                continue
+            except TypeMismatch:  # counted by Cortex
+                continue
+            except Closed:
+                return
+            self._take(message)
 
     def _take(self, message: Any) -> None:
         stamp_ns = getattr(message, "stamp_ns", 0)
