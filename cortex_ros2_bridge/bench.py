@@ -1,7 +1,7 @@
-"""`cortex-ros2-bridge bench`: is the bridge right, and what does it cost here; one `name value unit` a line.
+"""`cortex-ros2-bridge bench`: what does the bridge cost here; one `name value unit` a line.
 
-Bytes are compared with those of rosbags and, where it imports, rclpy. For latencies there are three
-processes: a Cortex publisher, the bridge, and a DDS subscriber. Messages are stamped when they are published,
+For latencies there are three processes: a Cortex publisher, the bridge, and a DDS subscriber. Messages are
+stamped when they are published,
 so that a latency is everything from `publish` in Cortex to the callback in DDS: both transports, the
 conversion, and the bridge. At the end flights of a controller on DDS, and all bars: met or missed.
 """
@@ -97,9 +97,6 @@ def main(arguments: Sequence[str]) -> int:
     print(f"# {platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, "
           f"NumPy {np.__version__}, events as {options.encoding}")  # fmt: skip
     bars = Bars()
-    for name, (right, count) in bytes_check().items():
-        print(f"bytes.{name} {right} of {count} messages", flush=True)
-        bars.add(f"bytes.{name}: all the same", right == count)
     for name, milliseconds in conversions().items():
         print(f"{name} {milliseconds:.3f} ms", flush=True)
         if name in CONVERSION_MAX_MS:
@@ -141,62 +138,6 @@ class Bars:
         for text, met in self._lines:
             print(f"# {'met   ' if met else 'MISSED'} {text}")
         return 0 if all(met for _, met in self._lines) else 1
-
-
-def bytes_check() -> dict[str, tuple[int, int]]:
-    """Return, by check, how many messages were as they must be, of how many.
-
-    rosbags: what `cdr.encode` makes of each routed type are the bytes of rosbags. rclpy: messages that one
-    encodes and the other decodes are the same; only types that are installed. evt3, mono: packets over three
-    wraps of time are decoded to the same events.
-    """
-    from cortex_ros2_bridge import cdr, convert
-    from cortex_ros2_bridge.msgs import Message, message_class
-    from cortex_ros2_bridge.typestore import typestore
-
-    found: dict[str, list[bool]] = {"rosbags": [], "evt3": [], "mono": []}
-    try:
-        from rclpy.serialization import deserialize_message, serialize_message
-
-        found["rclpy"] = []
-    except ImportError:
-        pass
-    for ros_type in sorted({name for _, name in convert.OUT} | {name for name, _ in convert.IN}):
-        message = message_class(ros_type)()
-        ours = bytes(cdr.encode(message))
-        record = cdr.decode_record(ours, ros_type)
-        theirs = bytes(typestore().serialize_cdr(record, ros_type))
-        found["rosbags"].append(ours == theirs + bytes(-len(theirs) % 4))
-        if "rclpy" in found and not isinstance(message, Message):
-            back = cdr.decode(serialize_message(message), ros_type)
-            found["rclpy"].append(deserialize_message(ours, type(message)) == message == back)
-    for encoding in ("evt3", "mono"):
-        found[encoding] = list(_round_trips(encoding))
-    return {name: (sum(right), len(right)) for name, right in found.items()}
-
-
-def _round_trips(encoding: str) -> Iterator[bool]:
-    """Encode and decode packets of 0.25 s over 60 s of random events, and say which came back the same."""
-    from cortex_ros2_bridge import cdr, convert
-    from cortex_ros2_bridge.event_codec import Evt3Decoder, decode_mono
-    from cortex_ros2_bridge.frames import FrameNames
-
-    rng = np.random.default_rng(2)
-    context = convert.Context(frames=FrameNames(), vehicle="bench", options={"encoding": encoding})
-    decoder = Evt3Decoder()
-    for number in range(240):
-        events = make_events(rng, 1 + number % 7 * 300, stamp_ns=(number + 1) * 250 * TICK_NS)
-        data = convert.event_packet(events, context)
-        packet = cdr.decode_record(data, "event_camera_msgs/msg/EventPacket")
-        if encoding == "evt3":
-            columns = decoder.decode(packet.events, width=WIDTH, height=HEIGHT)
-            t_us = columns.t
-        else:
-            columns = decode_mono(packet.events, base_ns=packet.time_base)
-            t_us = columns.t // 1000
-        pairs = ((t_us, events.t), (columns.x, events.x), (columns.y, events.y))
-        same = all(np.array_equal(one, other) for one, other in pairs)
-        yield same and np.array_equal(columns.polarity, events.polarity)
 
 
 def closed_loops() -> Iterator[dict[str, Any]]:

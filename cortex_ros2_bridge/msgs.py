@@ -221,7 +221,7 @@ def _field(name: str, desc: Any) -> Field:
         check = _nested(name, default)
     elif kind == Nodetype.BASE:
         base, limit = what
-        check, default = _CHECKS[_check_of(base)](name, base, limit), _DEFAULT_OF[_check_of(base)]
+        check, default = _scalar(name, base, limit), _DEFAULT_OF[_check_of(base)]
     else:
         element, size = what
         base = element[1][0] if element[0] == Nodetype.BASE else ""
@@ -258,58 +258,37 @@ def _nested(name: str, kind: Any) -> Callable[[Any], Any]:
     return check
 
 
-def _string(name: str, _base: str, limit: int) -> Callable[[Any], Any]:
+_PYTHON: dict[str, type[Any]] = {
+    "string": str,
+    "bool": bool,
+    "byte": bytes,
+    "float32": float,
+    "float64": float,
+}
+"""What Python has for a base type; int for all others."""
+
+
+def _scalar(name: str, base: str, limit: int) -> Callable[[Any], Any]:
+    kind: type[Any] = _PYTHON.get(base, int)
+    low, high = _bounds(base) if kind is int else (-_FLOAT32_MAX, _FLOAT32_MAX)
+    number = "float" if kind is float else "integer" if low else "unsigned integer"
+
     def check(value: Any) -> Any:
-        assert isinstance(value, str), f"The '{name}' field must be of type 'str'"
-        assert not limit or len(value) <= limit, f"The '{name}' field must be at most {limit} long"
+        if kind is bytes and isinstance(value, bytearray | memoryview):
+            value = bytes(value)
+        assert isinstance(value, kind), f"The '{name}' field must be of type '{kind.__name__}'"
+        if kind is str:
+            assert not limit or len(value) <= limit, f"The '{name}' field must be at most {limit} long"
+        elif kind is bytes:
+            assert len(value) == 1, f"The '{name}' field must have a length of 1"
+        elif kind is int or (base == "float32" and math.isfinite(value)):
+            article = "an" if kind is int else "a"
+            assert low <= value <= high, f"The '{name}' field must be {article} {number} in [{low}, {high}]"
         return value
 
     return check
 
 
-def _bool(name: str, _base: str, _limit: int) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        assert isinstance(value, bool), f"The '{name}' field must be of type 'bool'"
-        return value
-
-    return check
-
-
-def _byte(name: str, _base: str, _limit: int) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        assert isinstance(value, bytes | bytearray | memoryview), (
-            f"The '{name}' field must be of type 'bytes' or 'ByteString'"
-        )
-        assert len(value) == 1, f"The '{name}' field must have a length of 1"
-        return bytes(value)
-
-    return check
-
-
-def _int(name: str, base: str, _limit: int) -> Callable[[Any], Any]:
-    low, high = _bounds(base)
-    kind = "integer" if low else "unsigned integer"
-
-    def check(value: Any) -> Any:
-        assert isinstance(value, int), f"The '{name}' field must be of type 'int'"
-        assert low <= value <= high, f"The '{name}' field must be an {kind} in [{low}, {high}]"
-        return value
-
-    return check
-
-
-def _float(name: str, base: str, _limit: int) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        assert isinstance(value, float), f"The '{name}' field must be of type 'float'"
-        assert base == "float64" or abs(value) <= _FLOAT32_MAX or not math.isfinite(value), (
-            f"The '{name}' field must be a float in [{-_FLOAT32_MAX}, {_FLOAT32_MAX}]"
-        )
-        return value
-
-    return check
-
-
-_CHECKS = {"string": _string, "bool": _bool, "byte": _byte, "int": _int, "float": _float}
 _DEFAULT_OF: dict[str, Callable[[], Any]] = {
     "string": str,
     "bool": bool,
@@ -391,7 +370,7 @@ def _to_array(base: str, value: Any) -> array.array[Any]:
 
 
 def _check_numbers(name: str, base: str, values: Any) -> None:
-    check = _CHECKS[_check_of(base)](name, base, 0)
+    check = _scalar(name, base, 0)
     for value in values:
         check(value)
 
