@@ -30,18 +30,22 @@ class _Job:
 class CameraThread:
     """Renders batches in order, and collects their packets until `take`.
 
+    On a CUDA device the thread that flies renders inline, since only one thread can record CUDA graphs.
+
     Attributes:
         dropped: Frames that were not rendered since the last `reset`, by vehicle and sensor: pictures, or
             instants of an event camera.
     """
 
-    def __init__(self, *, on_packets: Callable[[], object]) -> None:
+    def __init__(self, *, inline: bool, on_packets: Callable[[], object]) -> None:
         """Start the thread.
 
         Args:
+            inline: Render in the calling thread instead.
             on_packets: Called from the thread when there is something to `take`.
         """
         self.dropped: Counter[tuple[str, str]] = Counter()
+        self._inline = inline
         self._on_packets = on_packets
         self._jobs: deque[_Job] = deque()
         self._done: deque[tuple[str, list[Packet]]] = deque()
@@ -50,15 +54,23 @@ class CameraThread:
         self._failure: Exception | None = None
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
-        self._thread.start()
+        if not inline:
+            self._thread.start()
 
-    def render(self, vehicle: str, engine: VehicleEngine, batches: Sequence[FlownBatch]) -> None:
+    def render(
+        self, vehicle: str, engine: VehicleEngine, batches: Sequence[FlownBatch], *, is_late: bool
+    ) -> None:
         """Queue batches of a vehicle; a batch without frames is done at once if nothing waits before it.
+
+        Args:
+            vehicle: Name of the vehicle.
+            engine: Its simulation.
+            batches: What it has flown.
+            is_late: Drop them where rendering is inline, so that no batch waits.
 
         Raises:
             RuntimeError: The rendering of an earlier batch failed.
         """
-        self.check()
         for flown in batches:
             with self._changed:
                 if not (self._jobs or self._work or flown.frame_counts):
@@ -66,6 +78,11 @@ class CameraThread:
                     continue
                 self._jobs.append(_Job(vehicle=vehicle, engine=engine, flown=flown))
                 self._changed.notify_all()
+            if self._inline:
+                job = self._jobs.popleft()
+                job.dropped = is_late
+                self._do(job)
+        self.check()
 
     def drop_until(self, vehicle: str, stamp_ns: int) -> None:
         """Drop the batches of a vehicle that wait and end at a simulated time [ns] or before."""
@@ -149,28 +166,31 @@ class CameraThread:
             self._closed = True
             self._jobs.clear()
             self._changed.notify_all()
-        self._thread.join(GIVE_UP_S)
+        if not self._inline:
+            self._thread.join(GIVE_UP_S)
 
     def _run(self) -> None:
-        while (job := self._next()) is not None:
-            try:
-                if job.dropped:
-                    job.engine.skip(job.flown)
-                    packets = []
-                else:
-                    packets = job.engine.render(job.flown)
-            except Exception as error:  # raised again in the thread that flies
-                self._failure = error
+        while self._failure is None and (job := self._next()) is not None:
+            self._do(job)
+
+    def _do(self, job: _Job) -> None:
+        """Render or skip a batch."""
+        packets: list[Packet] = []
+        try:
+            if job.dropped:
+                job.engine.skip(job.flown)
+            else:
+                packets = job.engine.render(job.flown)
+        except Exception as error:  # raised again in the thread that flies
+            self._failure = error
+        with self._changed:
+            if job.discarded:
                 return
-            with self._changed:
-                if job.discarded:
-                    continue
-                if job.dropped:
-                    self._count(job)
-                if packets:
-                    self._done.append((job.vehicle, packets))
+            if job.dropped:
+                self._count(job)
             if packets:
-                self._on_packets()
+                self._done.append((job.vehicle, packets))
+        self._on_packets()
 
     def _next(self) -> _Job | None:
         """Wait for the next job; None to end."""

@@ -119,6 +119,7 @@ class VehicleEngine:
     Attributes:
         model: What does not change during a run.
         camera_names: Its cameras.
+        is_cuda: It runs on a CUDA device.
         period_count_max: Control periods that the cameras may lag behind the flight before they are late.
         writes_in_place: The device writes pictures into memory of `acquire`, and may still do so after
             `end_step`: `settle` waits for it.
@@ -134,7 +135,8 @@ class VehicleEngine:
         """
         self.model = model
         self.camera_names = frozenset(name for group in model.groups for name in group.names)
-        self.writes_in_place = lockstep and bool(wp.get_device(model.device).is_cuda)
+        self.is_cuda = bool(wp.get_device(model.device).is_cuda)
+        self.writes_in_place = lockstep and self.is_cuda
         self._lockstep = lockstep
         self._acquire = acquire
         period_ns = model.schedule.control.stamp_ns(1)

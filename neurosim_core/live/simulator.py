@@ -110,7 +110,8 @@ class Simulator:
             for vehicle in self.vehicles:
                 stack.callback(vehicle.close_loans)
             if config.live.mode == "streaming":
-                self._cameras = CameraThread(on_packets=self._wakeup.set)
+                inline = self.vehicles[0].engine.is_cuda
+                self._cameras = CameraThread(inline=inline, on_packets=self._wakeup.set)
                 stack.callback(self._cameras.close)
                 self._streaming = StreamingLoop(
                     self.vehicles, self._cameras, self._pacer, self._stats, wakeup=self._wakeup

@@ -76,7 +76,8 @@ class StreamingLoop:
                 self._cameras.drop_until(vehicle.name, stamp_ns - engine.period_count_max * period_ns)
             if not self._cameras.wait_for(lambda e=engine: e.can_fly(drop=drop), stop):  # type: ignore[misc]
                 return False
-            self._cameras.render(vehicle.name, engine, vehicle.fly(stamp_ns))
+            is_late = drop and self._pacer.lateness_ns(stamp_ns) > BEHIND_MAX_NS / 2
+            self._cameras.render(vehicle.name, engine, vehicle.fly(stamp_ns), is_late=is_late)
         return True
 
     def catch_up(self, stamp_ns: int, stop: Callable[[], bool]) -> None:
