@@ -14,6 +14,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.registry import find
 from neurosim_core.runtime.pinned import PinError, PinnedMapping
+from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sim import (
     COLLISION,
     Batch,
@@ -52,6 +53,7 @@ __all__ = [
     "StartState",
     "State",
     "VehicleEngine",
+    "expected_bytes",
     "load_scene",
     "make_fleet",
     "packet_type",
@@ -62,6 +64,9 @@ __all__ = [
 AcquireBuffer = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Gives memory for a picture: called with camera, stamp [ns] and an array of its shape and dtype."""
 
+_PIXEL_EVENTS_HZ = 100.0
+_EVENT_BYTES = 13
+_RESERVED_MAX_BYTES = 8 << 20
 _PENDING_PERIODS = (2, 100)
 """Bounds of how far the cameras may lag behind the flight, in control periods."""
 _SPARE_PERIODS = 32
@@ -76,6 +81,19 @@ def packet_type(kind: str) -> type[Packet]:
     """
     found: type[Packet] = find("sensor", kind).packet_type  # type: ignore[attr-defined]
     return found
+
+
+def expected_bytes(sensor: object) -> int:
+    """Return a size that messages of an event camera hardly exceed [bytes]; 0 for other sensors.
+
+    Memory that is made before the flight delays no message in it: pixels fire at most about 100 times a
+    second on average, also in fast flight.
+    """
+    if not isinstance(sensor, EventSensorConfig):
+        return 0
+    window_s = sensor.packets.stamp_ns(1) * 1e-9
+    count = _PIXEL_EVENTS_HZ * window_s * sensor.lens.width * sensor.lens.height
+    return min(round(count) * _EVENT_BYTES, _RESERVED_MAX_BYTES)
 
 
 class FlownBatch(NamedTuple):

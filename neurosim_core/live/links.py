@@ -59,6 +59,7 @@ class Link:
     def configure(self, config: LinkConfig) -> None:
         """Change the settings for messages sent from now on; those in flight keep their arrival time."""
         self.config = config
+        self._is_direct = config.delivers_at_once
         self._latency_ns = to_ns(config.latency_s)
         self._jitter_ns = to_ns(config.jitter_s)
         self._queue_ns = to_ns(config.queue_s)
@@ -116,7 +117,7 @@ class Link:
 
     def is_free(self, stamp_ns: int) -> bool:
         """Return whether a message sent at a time [ns] arrives at once."""
-        return self.config.delivers_at_once and self._last_delivered_ns <= stamp_ns
+        return self._is_direct and self._last_delivered_ns <= stamp_ns
 
     def due(self, stamp_ns: int) -> list[tuple[int, Any]]:
         """Take the messages that have arrived by a time [ns]: pairs of arrival [ns] and message, in order."""

@@ -14,7 +14,7 @@ from cortex import Node, Publisher
 from cortex import messages as msg
 from neurosim_core.live import messages, topics
 from neurosim_core.live.config import NO_LINK
-from neurosim_core.live.engine import COLLISION, Model, packet_type
+from neurosim_core.live.engine import COLLISION, Model, expected_bytes, packet_type
 from neurosim_core.live.links import Link, payload_bytes
 from neurosim_core.live.loans import PictureLoan
 from neurosim_core.live.pacing import Timings
@@ -32,7 +32,7 @@ class Topic:
 
     def __init__(self, publisher: Publisher[Any]) -> None:
         self.publisher = publisher
-        self.reset()
+        self.undelivered_count = self._told_count = 0
 
     def publish(self, message: Any, send: Callable[[Any], bool] | None = None) -> None:
         """Publish a message with `send`, by default as usual; count it if a reliable reader loses it."""
@@ -41,8 +41,8 @@ class Topic:
 
     def take_lost(self) -> bool:
         """Return whether readers have lost messages since the last call."""
-        lost, self._told_count = self.undelivered_count > self._told_count, self.undelivered_count
-        return lost
+        before, self._told_count = self._told_count, self.undelivered_count
+        return self.undelivered_count > before
 
     def reset(self) -> None:
         """Count from 0."""
@@ -171,7 +171,9 @@ class PacketPublisher:
             name: str, message: type[Any], convert: Callable[..., Any], *, latch: bool, **options: str
         ) -> None:
             link = NO_LINK if name == COLLISION else config.links.get(name, NO_LINK)
-            publisher = node.publisher(topics.stream_topic(vehicle, name), message, latch=latch)
+            size_bytes = expected_bytes(config.sensors.get(name))
+            topic = topics.stream_topic(vehicle, name)
+            publisher = node.publisher(topic, message, latch=latch, expected_bytes=size_bytes)
             queue = Link(link, seed=config.seed, name=name)
             self.topics[name] = PacketTopic(name, publisher, queue, convert, **options)
             if not link.delivers_at_once:

@@ -287,7 +287,7 @@ class LiveSession:
             "dropped by the simulator": sum(sensor.dropped_count for sensor in status.sensors) - by_links,
             "lost by links": by_links,
             "lost by reliable readers": sum(
-                entry.undelivered_count for entry in (*status.sensors, *status.vehicles)
+                [s.undelivered_count for s in status.sensors] + [v.undelivered_count for v in status.vehicles]
             ),
             "commands lost or refused": sum(v.lost_count + v.refused_count for v in status.vehicles),
             "lost on the way here": sum(lost.values()),

@@ -216,13 +216,10 @@ class Simulator:
 
     def _step(self) -> None:
         """Fly a control period; on a CUDA device, all vehicles at the same time."""
-        ends: list[Callable[[], None]] = []
-        with contextlib.ExitStack() as stack:
+        with contextlib.ExitStack() as stack:  # ends each step that has begun, whatever another one raises
             for vehicle in self.vehicles:
-                ends.append(vehicle.begin_step(self.stamp_ns))
+                stack.callback(vehicle.begin_step(self.stamp_ns))
             self._housekeep()  # while the device works
-            for end in reversed(ends):  # each of them, whatever another one raises
-                stack.callback(end)
 
     def _fly_streaming(self, streaming: StreamingLoop) -> None:
         """Fly a control period, and publish its packets when they are due."""
@@ -247,6 +244,7 @@ class Simulator:
         self._is_flown = False
         self._take_commands(end_ns)  # before this stamp is published: its answers count from the next tick on
         self._publish_end(end_ns)
+        streaming.yield_to_readers(end_ns, period_ns)
         self._end_period(end_ns)
 
     def _receive_commands(self, *, every: int) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 
 from neurosim_core.live.cameras import CameraThread
@@ -17,6 +18,12 @@ ANSWER_NS = 50_000_000
 """A request waits for the end of a control period that is this near [ns]."""
 BEHIND_MAX_NS = 500_000_000
 """How far the machine may be late where camera frames are dropped [ns]."""
+READERS_SHARE = 0.04
+"""Share of a control period that is left to readers before the next one is flown."""
+READERS_S = (50e-6, 250e-6)
+"""The least that is worth a sleep, and the most that readers need to take a picture and answer it [s]."""
+BEHIND_SHARE = 0.25
+"""Share of a period that the machine may be late and still leave time to readers."""
 
 
 class StreamingLoop:
@@ -138,6 +145,21 @@ class StreamingLoop:
             for vehicle in self._vehicles.values():
                 vehicle.publisher.publish_due(due_ns)
         return False
+
+    def yield_to_readers(self, end_ns: int, period_ns: int) -> None:
+        """Sleep for a moment, if there is time, after the packets of the end of a period [ns] were published.
+
+        A scheduler may wake a reader on the core of its publisher even if another core is idle; without the
+        sleep it waits there until the next period has been flown.
+        """
+        factor = self._pacer.factor
+        if not factor:
+            return
+        wall_ns = period_ns / factor
+        least_s, most_s = READERS_S
+        sleep_s = min(READERS_SHARE * wall_ns * 1e-9, most_s)
+        if sleep_s >= least_s and self._pacer.lateness_ns(end_ns) < BEHIND_SHARE * wall_ns:
+            time.sleep(sleep_s)
 
     def offer_rendered(self) -> None:
         """Send what the cameras have rendered."""
