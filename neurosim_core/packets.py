@@ -110,23 +110,6 @@ class PacketSchema(NamedTuple):
         return cls(values["name"], values["display"], tuple(fields), values["doc"])
 
 
-class Axes:
-    """The axes of an array field, for packets whose message types are derived from their fields.
-
-    `ranges: Annotated[NDArray[np.float32], Axes("beams", unit="m")]` is an array of shape [beams] in metres.
-
-    Attributes:
-        sizes: For each axis its size, or a name; axes of one name have the same size within a packet.
-        unit: SI symbol; empty for counts.
-        frame: Frame that the components are expressed in, such as "world"; empty where there is none.
-    """
-
-    def __init__(self, *sizes: int | str, unit: str = "", frame: str = "") -> None:
-        self.sizes = sizes
-        self.unit = unit
-        self.frame = frame
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Packet:
     """The header that every packet carries. Defining a subclass makes it known by its name."""

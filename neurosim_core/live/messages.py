@@ -8,7 +8,6 @@ the same name; `sensor` is left out, as the topic says it, and `frame_id` names 
 from __future__ import annotations
 
 import dataclasses
-import typing
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
@@ -36,46 +35,38 @@ _TYPES: dict[type[pkt.Packet], type[Any]] = {
 """The message type of each packet type; `message_type` adds those that it derives."""
 _TIMES = ("stamp_ns", "start_ns")
 """Fields that the clock of a sensor applies to."""
-_SCALARS = (bool, int, float, str, bytes)
+_SCALARS = {"int64": int, "float64": float, "bool": bool, "str": str}
+_UNITS = {"m_s": "m/s", "m_s2": "m/s^2", "rad_s": "rad/s", "hz": "Hz", "n": "N"}
+"""SI symbols of units whose name in a packet differs."""
 
 
 def message_type(packet: type[pkt.Packet]) -> type[Any]:
     """Return the message type that carries a packet type; derive it at the first call.
 
-    The derived type is called `neurosim/NAME`. Its fields are `stamp_ns`, the packet's own in their order,
-    `sequence` and `frame_id`. Fields may be bool, int, float, str, bytes, or arrays whose annotation says
-    their axes: `Annotated[NDArray[np.float32], Axes("beams", unit="m")]`.
+    The derived type is called `neurosim/NAME`. Its fields are `stamp_ns`, those of the packet's schema in
+    their order, `sequence` and `frame_id`.
 
     Raises:
-        TypeError: A field has another type, or an array has no axes.
+        TypeError: A field has no schema, or an array any number of axes.
     """
     if packet not in _TYPES:
-        hints = typing.get_type_hints(packet, include_extras=True)
-        header = {field.name for field in dataclasses.fields(pkt.Packet)}
-        own = {name: hint for name, hint in hints.items() if name not in header}
         annotations: dict[str, Any] = {"stamp_ns": Annotated[int, cortex.Unit("ns")]}
-        annotations |= {name: _field_type(packet, name, hint) for name, hint in own.items()}
+        for field in pkt.schema_of(packet).fields:
+            kind: Any = _SCALARS.get(field.dtype, int)
+            if "..." in field.shape:
+                raise TypeError(
+                    f"{packet.__name__}.{field.name}: a message needs each axis of an array, got ..."
+                )
+            if field.shape:
+                parameters = (field.dtype, *field.shape)
+                kind = cortex.Array[parameters]
+            unit = _UNITS.get(field.unit, field.unit)
+            annotations[field.name] = Annotated[kind, cortex.Unit(unit)] if unit else kind
         annotations |= {"sequence": cortex.UInt64, "frame_id": str}
         namespace = {"__annotations__": annotations, "__doc__": packet.__doc__, "__module__": __name__}
         derived = type(packet.__name__, (), namespace)
         _TYPES[packet] = cortex.message(derived, name=f"neurosim/{packet.__name__}")
     return _TYPES[packet]
-
-
-def _field_type(packet: type[pkt.Packet], name: str, hint: Any) -> Any:
-    """Return the annotation of a message field for that of a packet field."""
-    if hint in _SCALARS:
-        return Annotated[int, cortex.Unit("ns")] if name.endswith("_ns") else hint
-    base, *extras = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
-    axes = next((extra for extra in extras if isinstance(extra, pkt.Axes)), None)
-    if typing.get_origin(base) is np.ndarray and axes is not None:
-        dtype = typing.get_args(typing.get_args(base)[1])[0]
-        parameters = ("any" if dtype is Any else np.dtype(dtype).name, *axes.sizes)
-        return Annotated[cortex.Array[parameters], cortex.Unit(axes.unit, axes.frame)]
-    raise TypeError(
-        f"{packet.__name__}.{name}: a packet field must be bool, int, float, str, bytes or an array with "
-        f"axes, Annotated[NDArray[np.float32], Axes('n')], got {hint}"
-    )
 
 
 def to_message(packet: pkt.Packet, *, frame_id: str = "", clock_ns: ClockNs | None = None) -> Any:
