@@ -27,7 +27,7 @@ from rerun_file import Rows, read, scalars
 from cortex import Node
 from cortex import messages as msg
 from neurosim_core.live import viewer as viewer_module
-from neurosim_core.live.session import SceneLoader, ViewOptions
+from neurosim_core.live.session import ViewOptions
 from neurosim_core.live.viewer import view, watch
 from neurosim_core.packets import EventArrays
 from neurosim_core.view import FileTarget, event_picture
@@ -56,12 +56,10 @@ class Watcher:
 
     def _run(self, path: Path, options: dict[str, Any]) -> int:
         to_the_end = options.pop("to_the_end", False)
-        scene, shown = SceneLoader(self.said.append), ViewOptions(**options)
+        shown = ViewOptions(**options)
         with Node("viewer") as node:
             outlet = FileTarget(path, self.said.append)
-            return watch(
-                node, outlet, scene, shown, stop=self._stop, say=self.said.append, to_the_end=to_the_end
-            )
+            return watch(node, outlet, shown, stop=self._stop, say=self.said.append, to_the_end=to_the_end)
 
     def wait_for(self, text: str) -> None:
         """Wait until it has said something."""
@@ -369,18 +367,6 @@ def test_signals_end_it_and_close_the_file(tmp_path, box, number):
         assert (process.returncode, errors) == (130, "")
         assert out.endswith(f"wrote {file}\n")
     assert len(scalars(read(file), "/plots/drone/odometry/speed")) == 100
-
-
-def test_loading_a_scene_is_interrupted(tmp_path):
-    """The thread that loads is not torn down in the middle of foreign code, which would abort the process."""
-    rooms = {"scene": {"kind": "apartment", "rooms": 8}}
-    with viewer_process(tmp_path / "live.rrd") as process, FakeSimulator(overrides=rooms) as simulator:
-        simulator.announce()
-        assert process.stdout is not None
-        assert "showing" in process.stdout.readline()
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=SOON_S)
-        assert (process.returncode, errors) == (130, "")
 
 
 def test_waiting_is_interrupted(tmp_path):
