@@ -95,7 +95,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 if TYPE_CHECKING:
     AnySensor = SensorConfig
 else:
-    AnySensor = Annotated[tuple(kinds("sensor").values()), Field(discriminator="kind")]
+    AnySensor = Annotated[Union[tuple(kinds("sensor").values())], Field(discriminator="kind")]  # noqa: UP007
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
 Sensors = dict[Name, AnySensor]
