@@ -23,7 +23,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from neurosim_core.bench.bridge_laws import DURATION_S, MAX_THRUST_N, Errors, flight_config, make_law
-from neurosim_core.simulation import plan_paths
+from neurosim_core.sim.model import plan_paths
 
 
 def struct(name: str, **fields: Any) -> Any:

@@ -30,7 +30,9 @@ from neurosim_core.bench.bridge_laws import (
     make_law,
     settings_of,
 )
-from neurosim_core.simulation import Model, make_fleet, make_state, observe, step
+from neurosim_core.sim.model import Model, make_fleet
+from neurosim_core.sim.rollout import observe, step
+from neurosim_core.sim.state import make_state
 
 MODES: tuple[Literal["attitude", "motor_speeds"], ...] = ("attitude", "motor_speeds")
 LIVE_MODES = ("lockstep", "streaming")

@@ -1,82 +1,96 @@
+# mypy: disable-error-code="attr-defined,no-untyped-call,method-assign"
 """What a scene does not need is left out: kernels, memory, libraries and time of runs, small and large.
 
-Each case flies in a process of its own, where launches, allocations and imports are counted
-(`leave_out_probe`). Kernels that leave terms out are compared with ones that have them with coefficients of
-zero.
+Each case flies in a process of its own (`python -m neurosim_core.bench.leave_out`), where Warp's launches
+and allocators are wrapped before anything else is imported: what is counted is what happened. Kernels that
+leave terms out are compared with ones that have them with coefficients of zero.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import resource
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from pathlib import Path
+import time
+from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import warp as wp
 
-from neurosim_core.bench.leave_out_cases import make_cases, plain_room, textured_room
-from neurosim_core.bench.leave_out_chapter import leave_out_chapter
-from neurosim_core.bench.leave_out_probe import Probe
-from neurosim_core.bench.leave_out_result import EQUAL_BAR, Difference, LeaveOutResult
+from neurosim_core.bench.options import Options, Progress, silent
+from neurosim_core.bench.report import Chapter, Claim, Panel, Plot, Row, Series, Table, cell
 
-__all__ = ["leave_out_chapter", "measure_leave_out"]
-
+_SCENE_LIBRARIES = ("trimesh", "PIL", "networkx", "embreex", "pyrender", "OpenGL")
+LIBRARIES = (*_SCENE_LIBRARIES, "h5py", "mcap", "matplotlib", "rerun", "zmq", "cortex", "scipy", "torch")
+"""Libraries that a run may or may not need; the first ones are for scenes."""
+_HEIGHT_PX, _WIDTH_PX = 47, 61
+"""Prime, and of no other array: what has them is a picture."""
 _TIMEOUT_S = 600.0
 
 
-def measure_leave_out(
-    *, quick: bool = False, progress: Callable[[str], None] | None = None
-) -> LeaveOutResult:
-    """Fly the cases, one after the other, on the CPU.
-
-    What is counted does not depend on the device.
-
-    Args:
-        quick: Few cases, short flights, one room.
-        progress: Told what is measured next.
-
-    Raises:
-        RuntimeError: A run failed; the message has what it said.
-    """
-    tell = progress or (lambda _: None)
-    with tempfile.TemporaryDirectory(prefix="neurosim-") as folder:
-        rooms = Path(folder) / "plain.gltf", Path(folder) / "textured.gltf"
-        rooms[0].write_text(plain_room(), encoding="utf-8")
-        rooms[1].write_text(textured_room(), encoding="utf-8")
-        cases = make_cases(*rooms, quick)
-        probes = {}
-        for case in cases:
-            tell(case.title)
-            seconds, repetitions = (0.05, 3) if quick else (0.5, 7)
-            probes[case.name] = run_probe(case.config, seconds=seconds, repetitions=repetitions)
-    tell("reduced against full kernels")
-    return LeaveOutResult(
-        quick=quick,
-        cases=cases,
-        probes=probes,
-        differences=(*dynamics_differences(), imu_difference(), radiance_difference(), pixel_difference()),
-    )
+def measure(options: Options, progress: Progress = silent) -> Chapter:
+    """Fly the cases one after the other, on the CPU: what is counted does not depend on the device."""
+    rows, quick = [], options.quick
+    for title, config in cases(quick).items():
+        progress(title)
+        rows.append({"run": title, **run_case(config, seconds=0.2 if quick else 1.0)})
+    progress("reduced against full kernels")
+    differences = [*_vehicle_rows(quick), _imu_row(), _pixel_row()]
+    return _chapter(rows, differences)
 
 
-def run_probe(config: Mapping[str, Any], *, seconds: float, repetitions: int = 1) -> Probe:
+def cases(quick: bool) -> dict[str, dict[str, Any]]:
+    """Return the settings of the runs, from an IMU alone to everything."""
+    lens = {"width": _WIDTH_PX, "height": _HEIGHT_PX, "horizontal_fov_rad": 1.5}
+    events = {"kind": "event_camera", "lens": lens}
+    pictures = {kind: {"kind": kind, "lens": lens} for kind in ("rgb", "depth")}
+    inertial = {"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}}
+    everything = {
+        "events": {**events, "pixel": {"preset": "davis346"}},
+        **pictures,
+        "imu": {"kind": "imu", "accelerometer_noise_density": 1e-3, "accelerometer_random_walk": 1e-4},
+        "odometry": {"kind": "odometry"},
+    }
+    terms = {
+        "motor_time_constant_scale": [1.0, 1.1, 1.2, 1.3],
+        "flapping_kg_m": 1e-6,
+        "wind_m_s": [0.3, 0.1, 0.0],
+        "gusts": [{"velocity_m_s": [0.2, 0.0, 0.1], "start_s": 0.0, "rise_s": 0.1}],
+        "turbulence": {"wind_20ft_m_s": 1.0},
+        "ground": {"rotor_radius_m": 0.1},
+    }
+    ball = {"ball": {"shape": {"kind": "sphere"}, "motion": {"position_m": [0.0, 0.0, 0.3]}}}
+    chosen: dict[str, dict[str, Any]] = {
+        "IMU only": {"sensors": {"imu": {"kind": "imu"}}},
+        "events only": {"sensors": {"events": events}},
+        "RGB and depth": {"sensors": pictures},
+        "all sensors": {"sensors": {"events": events, **pictures, **inertial}},
+        "all sensors and terms": {"sensors": everything, "vehicle": {"parameters": terms}, "bodies": ball},
+    }
+    for config in chosen.values():
+        config |= {"device": "cpu", "path": {"kind": "circle", "radius_m": 0.3}}
+        config["scene"] = {"kind": "apartment", **({"rooms": 1} if quick else {})}
+        config["vehicle"] = {**config.get("vehicle", {}), "on_collision": "report"}
+    return chosen
+
+
+def run_case(config: dict[str, Any], *, seconds: float) -> Row:
     """Fly in a fresh process and return what was counted there.
 
     Args:
         config: Settings.
-        seconds: Simulated time that is measured [s].
-        repetitions: How often the flight is timed.
+        seconds: Simulated time that is measured, after as much that is not [s].
 
     Raises:
         RuntimeError: The run failed.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "neurosim_core.bench.leave_out_probe"],
-        input=json.dumps({"config": config, "seconds": seconds, "repetitions": repetitions}),
+        [sys.executable, "-m", "neurosim_core.bench.leave_out"],
+        input=json.dumps({"config": config, "seconds": seconds}),
         capture_output=True,
         text=True,
         check=False,
@@ -84,131 +98,213 @@ def run_probe(config: Mapping[str, Any], *, seconds: float, repetitions: int = 1
     )
     if done.returncode != 0:
         raise RuntimeError(f"a run ended with status {done.returncode}: {done.stderr.strip()[-2000:]}")
-    return Probe(**json.loads(done.stdout.splitlines()[-1]))
+    row: Row = json.loads(done.stdout.splitlines()[-1])
+    return row
 
 
-def dynamics_differences() -> tuple[Difference, ...]:
-    """Return how far vehicles without optional terms are from ones that have them all, with zeros.
+# In the process of a run
 
-    Both fly 1 s under the same random commands, which toss them about.
-    """
-    from neurosim_core.vehicle import Multirotor, preset
-    from neurosim_core.vehicle.multirotor import TERMS
 
-    zeros = {
-        "rotor_drag_kg": 0.0,
-        "rotor_inflow_kg": 0.0,
-        "translational_lift_kg_m": 0.0,
-        "parasitic_drag_kg_m": (0.0, 0.0, 0.0),
-        "motor_time_constant_s": 0.0,
+class _Counts:
+    """Counts launches, allocations and pictures of this process from now on."""
+
+    def __init__(self) -> None:
+        from warp._src import context
+
+        self.launches: Counter[str] = Counter()
+        self.allocations = self.bytes = self.pictures = 0
+        launch, replay, make = wp.launch, wp.Launch.launch, wp.array.__init__
+
+        def counted_launch(kernel: Any, *args: Any, **options: Any) -> Any:
+            self.launches[kernel.key] += not options.get("record_cmd")
+            return launch(kernel, *args, **options)
+
+        def counted_replay(command: Any, *args: Any, **options: Any) -> Any:
+            self.launches[command.kernel.key] += 1
+            return replay(command, *args, **options)
+
+        def counted_array(array: Any, *args: Any, **options: Any) -> None:
+            before = self.allocations
+            make(array, *args, **options)
+            made = self.allocations > before
+            self.pictures += made and (_HEIGHT_PX, _WIDTH_PX) in zip(
+                array.shape, array.shape[1:], strict=False
+            )
+
+        for owner, name, counted in (
+            (wp, "launch", counted_launch),
+            (wp.Launch, "launch", counted_replay),
+            (wp.array, "__init__", counted_array),
+        ):
+            setattr(owner, name, counted)
+        for name in ("CpuDefaultAllocator", "CpuPinnedAllocator"):
+            allocator = getattr(context, name)
+            allocator.allocate = self._counted(allocator.allocate)
+
+    def _counted(self, allocate: Callable[[Any, int], int]) -> Callable[[Any, int], int]:
+        def wrapped(allocator: Any, size_in_bytes: int) -> int:
+            self.allocations += 1
+            self.bytes += size_in_bytes
+            return allocate(allocator, size_in_bytes)
+
+        return wrapped
+
+
+def _fly(config: dict[str, Any], seconds: float) -> Row:
+    """Fly, and return what was counted; for a process that does nothing else."""
+    counts = _Counts()
+    begin_s = time.process_time()  # what else runs on the machine does not count
+
+    from neurosim_core.config import load_config
+    from neurosim_core.sim.model import make_model
+    from neurosim_core.sim.rollout import run_model
+    from neurosim_core.sim.state import make_state
+
+    model = make_model(load_config({**config, "duration_s": 2.0 * seconds}))
+    state = make_state(model)
+    setup_s = time.process_time() - begin_s
+    arrays, held = counts.allocations, counts.bytes
+    launched: Counter[str] = Counter()
+    allocated, flown_ns, flight_s, halfway = 0, 0, 0.0, False
+    for packet in run_model(model, state):
+        if not halfway and packet.stamp_ns >= 1e9 * seconds:
+            halfway, launched, allocated = True, counts.launches.copy(), counts.allocations
+            flown_ns, flight_s = packet.stamp_ns, time.process_time()
+        last_ns = packet.stamp_ns
+    simulated_s = 1e-9 * (last_ns - flown_ns)
+    in_flight = counts.launches - launched
+    return {
+        "kernels in flight": len(in_flight),
+        "launches per simulated s": sum(in_flight.values()) / simulated_s,
+        "allocations per simulated s": (counts.allocations - allocated) / simulated_s,
+        "arrays of the set-up": arrays,
+        "their size [MiB]": held / 2**20,
+        "pictures": counts.pictures,
+        "most memory [MiB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "set-up [s of CPU]": setup_s,
+        "CPU per simulated s [ms]": 1e3 * (time.process_time() - flight_s) / simulated_s,
+        "libraries": ", ".join(name for name in LIBRARIES if name in sys.modules) or "none",
     }
-    found = []
-    for name, config in (
-        ("bare", preset("hummingbird", **zeros)),
-        ("hummingbird", preset("hummingbird")),
-    ):
-        reduced, full = (Multirotor(config, terms=terms) for terms in (None, TERMS))
-        largest = 0.0
-        rng = np.random.default_rng(9)
-        for vehicle in (reduced, full):
-            vehicle.reset(position=[0.0, 0.0, 1.4])
+
+
+# Reduced and full kernels
+
+
+def _vehicle_rows(quick: bool) -> list[Row]:
+    """Compare vehicles without optional terms with ones that have them all, with zeros: states and speed."""
+    from neurosim_core.bench.dynamics_long import best_rate
+    from neurosim_core.bench.engine import TERMS, Multirotor, preset
+
+    rows = []
+    for name in ("hummingbird", "crazyflie", "racer"):
+        config = preset(name)
+        vehicles = [Multirotor(config), Multirotor(config, terms=TERMS)]
+        rng, largest = np.random.default_rng(9), 0.0
         for _ in range(100):
             command = config.hover_rotor_speed_rad_s * rng.uniform(0.9, 1.1, (1, config.rotor_count))
-            for vehicle in (reduced, full):
+            for vehicle in vehicles:
                 vehicle.step(command, 10_000_000)
-            pairs = zip(reduced.state, full.state, strict=True)
+            pairs = zip(vehicles[0].state, vehicles[1].state, strict=True)
             largest = max(largest, *(float(np.abs(a - b).max()) for a, b in pairs))
-        found.append(
-            Difference(
-                kernel=f"dynamics, {name}",
-                reduced=", ".join(reduced.terms) or "none",
-                full="all",
-                largest=largest,
-                precision="float64",
-                bar=EQUAL_BAR,
-            )
-        )
-    return tuple(found)
+        reduced, full = (best_rate(v, 100, repetitions=3, cpu_s=0.05 if quick else 0.3) for v in vehicles)
+        row: Row = {"kernel": f"vehicle, {name}", "terms": ", ".join(vehicles[0].terms) or "none"}
+        rows.append({**row, "largest difference": largest, "allowed": 1e-12, "times as fast": reduced / full})
+    return rows
 
 
-def imu_difference() -> Difference:
-    """Return how far an IMU without errors is from one that computes them all, with zeros.
-
-    Both are carried about for 1 s under random commands; noise of density 0 and without limits.
-    """
-    from neurosim_core.frames import Mount
-    from neurosim_core.sensors.imu import TERMS, Imu, ImuConfig
-    from neurosim_core.vehicle import Multirotor, preset
+def _imu_row() -> Row:
+    """Compare an IMU without errors with one that computes them all, with zeros."""
+    from neurosim_core.bench.engine import IMU_TERMS, Imu, ImuSensorConfig, Mount, Multirotor, preset
 
     airframe = preset("hummingbird")
     vehicle = Multirotor(airframe)
-    config = ImuConfig(mount=Mount(position_m=(0.1, -0.05, 0.02), rpy_rad=(0.1, 0.2, 0.3)))
-    reduced, full = (Imu(config, vehicle, terms=terms) for terms in (None, TERMS))
-    vehicle.reset(position=[0.0, 0.0, 1.4])
-    rng = np.random.default_rng(9)
-    largest = 0.0
+    config = ImuSensorConfig(mount=Mount(position_m=(0.1, -0.05, 0.02), rpy_rad=(0.1, 0.2, 0.3)))
+    reduced, full = (Imu(config, vehicle, terms=terms) for terms in (None, IMU_TERMS))
+    rng, largest = np.random.default_rng(9), 0.0
     for _ in range(400):
         speeds = airframe.hover_rotor_speed_rad_s * rng.uniform(0.9, 1.1, (1, airframe.rotor_count))
         vehicle.step(speeds, 2_500_000)
         pairs = zip(reduced.sample(), full.sample(), strict=True)
         largest = max(largest, *(float(np.abs(a - b).max()) for a, b in pairs))
-    return Difference(
-        kernel="IMU",
-        reduced=", ".join(reduced.terms) or "none",
-        full="all",
-        largest=largest,
-        precision="float64",
-        bar=EQUAL_BAR,
-    )
+    terms = ", ".join(reduced.terms) or "none"
+    return {"kernel": "IMU", "terms": terms, "largest difference": largest, "allowed": 1e-12}
 
 
-def pixel_difference() -> Difference:
-    """Return how far ideal pixels are from ones that compute every departure from the ideal, with zeros.
+def _pixel_row() -> Row:
+    """Compare ideal pixels with ones that compute every departure from the ideal, with zeros: stamps [us].
 
-    They see pictures whose log radiance wanders at random, by 0.3 a picture. The difference is that of the
-    stamps, and infinite where an event is missing or of another pixel or polarity.
+    Log radiance wanders at random. The difference is infinite where an event is missing or of another pixel.
     """
-    from neurosim_core.sensors.event_config import EventCameraConfig
-    from neurosim_core.sensors.event_noise_model import TERMS
-    from neurosim_core.sensors.events import EventCamera
+    from neurosim_core.bench.engine import PIXEL_TERMS, EventCamera, EventCameraConfig
 
-    height, width = 48, 64
-    steps = np.random.default_rng(9).normal(scale=0.3, size=(20, height, width))
-    frames = steps.cumsum(axis=0).astype(np.float32)
-    zeros = tuple(term for term in TERMS if term != "stochastic")  # which is a law of its own, without zeros
+    frames = np.random.default_rng(9).normal(scale=0.3, size=(20, 48, 64)).cumsum(axis=0).astype(np.float32)
+    zeros = tuple(term for term in PIXEL_TERMS if term != "stochastic")  # a law of its own, without zeros
     found = []
     for terms in (None, zeros):
-        camera = EventCamera(EventCameraConfig(), width=width, height=height, terms=terms)
+        camera = EventCamera(EventCameraConfig(), width=64, height=48, terms=terms)
         camera.reset(frames[0])
         found.append(camera.feed(frames[1:], np.arange(1, len(frames)) * 1_700_123).numpy())
     reduced, full = found
     same = all(np.array_equal(getattr(reduced, key), getattr(full, key)) for key in ("x", "y", "polarity"))
-    return Difference(
-        kernel=f"pixels, {len(reduced.t):,} events",
-        reduced="none",
-        full=", ".join(zeros),
-        largest=float(np.abs(reduced.t - full.t).max()) if same else math.inf,
-        precision="stamps of 1 us",
-        bar=0.0,
+    largest = float(np.abs(reduced.t - full.t).max()) if same else math.inf
+    return {
+        "kernel": f"pixels, {len(reduced.t):,} events",
+        "terms": "none",
+        "largest difference": largest,
+        "allowed": 0.0,
+    }
+
+
+def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
+    least, most = rows[0], rows[-1]
+    imported = [name for name in _SCENE_LIBRARIES if name in least["libraries"].split(", ")]
+    cpu, setup = "CPU per simulated s [ms]", "set-up [s of CPU]"
+    places = list(range(len(rows)))
+    panels = []
+    for heading in (cpu, "launches per simulated s", "their size [MiB]"):
+        values = [row[heading] for row in rows]
+        series = Series(label="runs", x=values, y=places, style="points", names=list(map(cell, values)))
+        ticks = {row["run"]: place for place, row in enumerate(rows)}
+        panels.append(Panel(x_label=heading, series=[series], x_scale="log", y_ticks=ticks))
+    return Chapter(
+        name="leave-out",
+        title="What a scene does not need is left out",
+        summary=f"A flight with an IMU alone takes {least[cpu]:,.0f} ms of CPU time for a simulated "
+        "second, one with "
+        f"every sensor and term {most[cpu]:,.0f} ms; set-up takes {least[setup]:.1f} and {most[setup]:.1f} "
+        "s.",
+        claims=[
+            Claim(
+                "a run with an IMU only allocates no picture",
+                "Warp's allocators, counted in the process of the run",
+                f"{least['pictures']} of {least['arrays of the set-up']} arrays; {most['pictures']} with "
+                "all sensors",
+                least["pictures"] == 0 < most["pictures"],
+            ),
+            Claim(
+                "a run with an IMU only imports no library for scenes",
+                "modules of the process of the run",
+                ", ".join(imported) or f"none of {', '.join(_SCENE_LIBRARIES)}",
+                not imported,
+            ),
+            Claim(
+                "reduced kernels equal the full ones with coefficients of zero: to 1e-12, and to the stamp",
+                "the equations: a term with coefficient 0 adds 0",
+                "; ".join(f"{row['kernel']} {cell(row['largest difference'])}" for row in differences),
+                all(row["largest difference"] <= row["allowed"] for row in differences),
+            ),
+        ],
+        tables=[
+            Table(
+                "leave-out", "Launches, memory, libraries and time", rows, "On the CPU, each in a process."
+            ),
+            Table("leave-out-differences", "Reduced kernels against full ones with zeros", differences),
+        ],
+        plots=[Plot("leave-out", "What runs take, few parts to many", panels)],
     )
 
 
-def radiance_difference() -> Difference:
-    """Return how far radiance without texture and emission is from that with both compiled in, and unused."""
-    from neurosim_core.bench.render import checkerboard_floor, first_pictures
-    from neurosim_core.scene.scene import Material
-
-    textured = checkerboard_floor(0.1)
-    grey = Material(name="grey", base_color=(0.5, 0.4, 0.3))
-    glowing = Material(name="glowing", emission=(1.0, 1.0, 1.0))
-    plain = replace(textured, materials=(grey,))
-    unused = replace(textured, materials=(grey, glowing, textured.materials[0]))  # all faces are of the first
-    reduced, full = first_pictures(plain), first_pictures(unused)
-    return Difference(
-        kernel="radiance",
-        reduced="none",
-        full="textured, emissive",
-        largest=float(np.abs(reduced - full).max()),
-        precision="float32",
-        bar=0.0,
-    )
+if __name__ == "__main__":
+    wp.config.log_level = wp.LOG_WARNING
+    request = json.load(sys.stdin)
+    print(json.dumps(_fly(request["config"], request["seconds"])))

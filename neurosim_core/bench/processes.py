@@ -1,4 +1,4 @@
-"""The processes of the live stack, started to be measured, among themselves and ended again."""
+"""The processes of the live stack, started to be measured, among themselves, and ended again."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
+
+from neurosim_core.bench.engine import SimulationConfig, to_yaml
 
 _RUNTIME = "CORTEX_RUNTIME_DIR"
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""
 _STOP_S = 5.0
-_TAIL_LINES = 5
 
 
 class ProcessEnded(RuntimeError):
@@ -46,24 +46,25 @@ def own_runtime() -> Iterator[Path]:
 
 
 class NeurosimProcess:
-    """A command of `neurosim` as a process of its own; leaving the `with` block ends it."""
+    """A command of `neurosim` as a process of its own; leaving the `with` block ends it.
 
-    def __init__(
-        self, command: str, *arguments: str, log: Path, python: Sequence[str] = (sys.executable,)
-    ) -> None:
-        """Start it.
+    Args:
+        command: What follows `neurosim` on the command line.
+        config: Settings that it is given as a file; None: none.
+        arguments: What follows.
+        log: File for what it says.
+    """
 
-        Args:
-            command: What follows `neurosim` on the command line.
-            arguments: What follows that.
-            log: File for what it says.
-            python: How to start the interpreter, such as under a profiler.
-        """
+    def __init__(self, command: str, config: SimulationConfig | None, *arguments: str, log: Path) -> None:
         self._command = command
         self._log = log
+        if config is not None:
+            settings = log.with_suffix(".yaml")
+            settings.write_text(to_yaml(config), encoding="utf-8")
+            arguments = (str(settings), *arguments)
         with log.open("wb") as out:
             self._process = subprocess.Popen(
-                [*python, "-m", "neurosim_core", command, *arguments],
+                [sys.executable, "-m", "neurosim_core", command, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
@@ -81,24 +82,23 @@ class NeurosimProcess:
 
     def last_words(self) -> str:
         """Return the last lines that it said, for an error message."""
-        lines = self._log.read_text(errors="replace").strip().splitlines()[-_TAIL_LINES:]
+        lines = self._log.read_text(errors="replace").strip().splitlines()[-5:]
         return "it said:\n" + ("\n".join(f"  {line}" for line in lines) or "  (nothing)")
 
-    def wait(self, timeout_s: float) -> int:
-        """Wait until it ends by itself, and return its exit status.
-
-        Args:
-            timeout_s: Longest wait [s].
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it ends by itself.
 
         Raises:
+            ProcessEnded: It ended with another status than 0.
             TimeoutError: It goes on.
         """
         try:
-            return self._process.wait(timeout_s)
+            status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            raise TimeoutError(
-                f"`neurosim {self._command}` did not end within {timeout_s:g} s; {self.last_words()}"
-            ) from None
+            late = f"`neurosim {self._command}` did not end within {timeout_s:g} s"
+            raise TimeoutError(f"{late}; {self.last_words()}") from None
+        if status != 0:
+            self.check()
 
     def resident_bytes(self) -> int:
         """Return the memory that it holds, shared pages included; -1 where the system does not say."""
@@ -108,7 +108,10 @@ class NeurosimProcess:
             return -1
         return pages * os.sysconf("SC_PAGE_SIZE")
 
-    def stop(self) -> None:
+    def __enter__(self) -> NeurosimProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """End it as Ctrl-C does, and kill it if that takes long."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
@@ -117,11 +120,3 @@ class NeurosimProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
         self._process.wait()
-
-    def __enter__(self) -> NeurosimProcess:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()

@@ -1,147 +1,246 @@
-"""Reports of benchmarks: tables as CSV, plots as PNG, and one page to read, as Markdown and as HTML."""
+"""What a benchmark returns, as plain data: chapters of claims, tables and plots, and their files.
+
+Nothing here draws: `render_report` turns chapters into a terminal's tables, pictures and a page.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Literal, TypeAlias
 
-from neurosim_core.bench.chapter import (
-    Bar,
-    Chapter,
-    Plot,
-    Table,
-    cells,
-    numeric_columns,
-    print_chapter,
-    save_table,
-)
-from neurosim_core.bench.figures import can_draw, draw_plot, save_plot
-from neurosim_core.bench.machine import accelerators, command_line, hardware, now, versions
-from neurosim_core.bench.page import html_page
-from neurosim_core.install import install_hint
+import numpy as np
+from pydantic import TypeAdapter
 
-if TYPE_CHECKING:
-    from rich.console import Console
+Row: TypeAlias = dict[str, Any]
+"""Values of a table by heading, which says the unit."""
+Numbers: TypeAlias = Sequence[float | None]
+"""None stands for a value that is unknown or not finite."""
+Scale = Literal["linear", "log"]
+Style = Literal["line", "dashed", "points", "law", "step", "bar"]
 
-_SPECIAL = re.compile(r"(?=\||<[A-Za-z/!?])")
-"""Places in a cell that need a backslash: a bar, and what begins a tag."""
-
-__all__ = ["Bar", "Chapter", "Plot", "Table", "print_chapter", "save_files", "write_report"]
+_NAME = re.compile(r"[a-z0-9]([a-z0-9_-]*[a-z0-9])?")
 
 
-def write_report(chapters: Sequence[Chapter], folder: Path, *, title: str = "Neurosim: the numbers") -> Path:
-    """Leave a report: `<table>.csv`, `<plot>.png`, `report.md` and `report.html`, which needs no other file.
+@dataclass(frozen=True)
+class Table:
+    """Rows under headings; becomes `<name>.csv`."""
 
-    Plots are left out where matplotlib is not installed; the report says so.
+    name: str
+    """Of the file: lower-case letters, digits, - and _."""
+    title: str
+    rows: Sequence[Mapping[str, Any]]
+    """Values by heading, which says the unit; a value that is missing, None or nan reads as unknown."""
+    note: str = ""
+    """What a reader must know."""
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+    @property
+    def headings(self) -> list[str]:
+        """Return the headings of all rows, in order of appearance."""
+        return list(dict.fromkeys(heading for row in self.rows for heading in row))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """One line of a panel; series of one label share colour and marker in all panels of a plot."""
+
+    label: str
+    x: Numbers
+    y: Numbers
+    style: Style = "line"
+    """`law`: a thin line without marks, which the legend does not name."""
+    colour_of: str = ""
+    """Label of the series whose colour this one shares; empty: its own."""
+    names: Sequence[str] = ()
+    """Text beside each point; empty: none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """Axes with series on them."""
+
+    title: str = ""
+    x_label: str = ""
+    y_label: str = ""
+    series: Sequence[Series] = ()
+    x_scale: Scale = "linear"
+    y_scale: Scale = "linear"
+    x_ticks: Mapping[str, float] | None = None
+    """Text -> place, where numbers would say little; None: as the library chooses."""
+    y_ticks: Mapping[str, float] | None = None
+    x_lines: Mapping[str, float] = field(default_factory=dict)
+    """Vertical lines: label -> x."""
+    y_lines: Mapping[str, float] = field(default_factory=dict)
+    """Horizontal lines: label -> y."""
+    y_min: float | None = None
+    y_max: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A grey picture, such as what a camera sees or where errors are."""
+
+    title: str
+    values: Sequence[Sequence[float]]
+    """Rows from the top, shape [H, W]."""
+    value_label: str = ""
+    """What the scale beside the picture shows; empty: no scale."""
+    value_scale: Scale = "linear"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Panels beside each other; becomes `<name>.png`."""
+
+    name: str
+    """Of the file: lower-case letters, digits, - and _."""
+    title: str
+    panels: Sequence[Panel | Picture]
+    columns: int = 3
+    """The most panels in a row."""
+    shared_axes: bool = False
+    """All panels have the same limits."""
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A statement with a limit, where the limit comes from, and what was measured."""
+
+    text: str
+    """What is claimed, with its limit."""
+    reference: str
+    """The law, closed form, publication or independent program that the limit rests on."""
+    measured: str
+    """What was measured, with unit; or why it was not."""
+    met: bool | None
+    """None: not measured here."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chapter:
+    """The answer to one question; becomes `<name>.json`."""
+
+    name: str
+    """Unique in a report: lower-case letters, digits, - and _."""
+    title: str
+    summary: str
+    """The answer in words; paragraphs are separated by an empty line."""
+    claims: Sequence[Claim] = ()
+    tables: Sequence[Table] = ()
+    plots: Sequence[Plot] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """Term -> text: when, by which command, on which machine, with which versions."""
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"name must be of lower-case letters, digits, - and _, got {name!r}")
+
+
+def chapter_to_json(chapter: Chapter) -> str:
+    """Return a chapter as JSON; numbers that are not finite become null."""
+    return json.dumps(_plain(asdict(chapter)), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """Return nested values as JSON has them."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table_to_csv(table: Table) -> str:
+    """Return a table as CSV: the keys, then all digits of the values."""
+    out = io.StringIO(newline="")
+    writer = csv.DictWriter(out, table.headings)
+    writer.writeheader()
+    writer.writerows(
+        {k: v.item() if isinstance(v, np.generic) else v for k, v in r.items()} for r in table.rows
+    )
+    return out.getvalue()
+
+
+def lines(
+    rows: Sequence[Mapping[str, Any]], x: str, y: str, *, by: str, style: Style = "line", y_floor: float = 0.0
+) -> list[Series]:
+    """Return a line through the rows of each value of a column.
 
     Args:
-        chapters: What it says.
-        folder: Where to leave it; made if need be, files of these names are replaced.
-        title: Of the whole.
+        rows: Of a table.
+        x: Heading of what stands on the horizontal axis.
+        y: Heading of what stands on the vertical axis; what is no number leaves a gap.
+        by: Heading of the column whose values name the lines.
+        style: Of all lines.
+        y_floor: Smaller values are drawn there, as a logarithmic axis has no zero.
+    """
+    found = []
+    for name in dict.fromkeys(row[by] for row in rows):
+        mine = [row for row in rows if row[by] == name and isinstance(row.get(x), float | int)]
+        ys = [max(v, y_floor) if isinstance(v := row.get(y), float | int) else None for row in mine]
+        found.append(Series(label=str(name), x=[row[x] for row in mine], y=ys, style=style))
+    return found
 
-    Returns:
-        The path of `report.html`.
+
+def cell(value: object) -> str:
+    """Return a value as people read it: 3 or 4 significant digits, thousands apart, unknown as a dash."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if not isinstance(value, float):
+        return str(value)
+    if math.isinf(value):
+        return "∞" if value > 0.0 else "-∞"
+    if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
+        return f"{value:.2e}".replace("e-0", "e-").replace("e+0", "e").replace("e+", "e")
+    return f"{value:,.0f}" if abs(value) >= 1e3 else f"{value:.4g}"
+
+
+def is_numeric(table: Table, heading: str) -> bool:
+    """Return whether all known values of a column are numbers, of which there are some."""
+    known = [value for row in table.rows if (value := row.get(heading)) is not None]
+    return bool(known) and all(
+        isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in known
+    )
+
+
+def write_chapter(chapter: Chapter, folder: Path) -> None:
+    """Write `<chapter>.json` and `<table>.csv`; the folder is made if need be, and files are replaced."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for table in chapter.tables:
+        (folder / f"{table.name}.csv").write_text(table_to_csv(table), encoding="utf-8", newline="")
+    (folder / f"{chapter.name}.json").write_text(chapter_to_json(chapter), encoding="utf-8")
+
+
+def read_chapter(folder: str | Path, name: str) -> Chapter | None:
+    """Return the chapter that `write_chapter` left in a folder, or None.
 
     Raises:
-        ValueError: Two chapters, two tables or two plots have one name.
+        ValueError: The file is no such chapter.
     """
-    _check_unique("chapters", [chapter.name for chapter in chapters])
-    _check_unique("tables", [table.name for chapter in chapters for table in chapter.tables])
-    _check_unique("plots", [plot.name for chapter in chapters for plot in chapter.plots])
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures: dict[str, bytes] = {}
-    for chapter in chapters:
-        for table in chapter.tables:
-            save_table(table, folder)
-        for plot in chapter.plots if can_draw() else ():
-            pictures[plot.name] = draw_plot(plot)
-            (folder / f"{plot.name}.png").write_bytes(pictures[plot.name])
-    facts = _facts()
-    (folder / "report.md").write_text(
-        _markdown(chapters, pictures, title=title, facts=facts), encoding="utf-8"
-    )
-    page = folder / "report.html"
-    page.write_text(html_page(chapters, pictures, title=title, facts=facts), encoding="utf-8")
-    return page
-
-
-def save_files(
-    folder: Path,
-    console: Console,
-    *,
-    tables: Sequence[Table],
-    plots: Sequence[Plot] = (),
-    notes: Sequence[str] = (),
-) -> None:
-    """Leave tables and plots without a report around them, and say so.
-
-    Args:
-        folder: Where to; made if need be, files of these names are replaced.
-        console: Where to say it.
-        tables: What becomes `<name>.csv`.
-        plots: What becomes `<name>.png`, where matplotlib is installed.
-        notes: Lines on machine and versions, below each plot.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    made = [save_table(table, folder) for table in tables]
-    for plot in plots:
-        if can_draw():
-            made.append(save_plot(plot, folder, notes=notes))
-        else:
-            missing = f"{plot.name}.png is left out: {install_hint('view')}"
-            console.print(missing, style="yellow", markup=False)
-    console.print(f"left in {', '.join(map(str, made))}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _check_unique(kind: str, names: Sequence[str]) -> None:
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise ValueError(f"two {kind} have the name {twice[0]!r}")
-
-
-def _facts() -> dict[str, str]:
-    facts = {"date": now(), "machine": hardware()}
-    if devices := accelerators():
-        facts["GPU"] = ", ".join(devices)
-    facts["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
-    return {**facts, "command": f"`{command_line()}`"}
-
-
-def _markdown(
-    chapters: Sequence[Chapter], pictures: Mapping[str, bytes], *, title: str, facts: Mapping[str, str]
-) -> str:
-    blocks = [f"# {title}", "\n".join(f"- {term}: {text}" for term, text in facts.items())]
-    promised = [[chapter.title, b.verdict, b.text, b.measured] for chapter in chapters for b in chapter.bars]
-    if promised:
-        blocks.append(_grid(["chapter", "verdict", "promised", "measured"], promised))
-    for chapter in chapters:
-        blocks += [f"## {chapter.title}", f"`{chapter.command}`", chapter.summary]
-        for plot in chapter.plots:
-            drawn = plot.name in pictures
-            blocks.append(f"![{plot.title}]({plot.name}.png)" if drawn else f"({plot.title}: not drawn)")
-        for table in chapter.tables:
-            numeric = numeric_columns(table)
-            numbers = [key in numeric for key in table.columns]
-            blocks += [
-                f"### {table.title}",
-                _grid(list(table.columns.values()), cells(table), numbers=numbers),
-                f"[{table.name}.csv]({table.name}.csv)",
-            ]
-            if table.note:
-                blocks.append(table.note)
-    return "\n\n".join(blocks) + "\n"
-
-
-def _grid(
-    headings: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Sequence[bool] | None = None
-) -> str:
-    """Return a Markdown table."""
-    rule = ["---:" if right else "---" for right in numbers or [False] * len(headings)]
-    return "\n".join(_line(row) for row in (headings, rule, *rows))
-
-
-def _line(texts: Sequence[str]) -> str:
-    escaped = (" ".join(_SPECIAL.sub(r"\\", text).split()) for text in texts)
-    return f"| {' | '.join(escaped)} |"
+    file = Path(folder) / f"{name}.json"
+    return TypeAdapter(Chapter).validate_json(file.read_text(encoding="utf-8")) if file.exists() else None

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cortex import Node, Publisher, Subscriber, keep_last, latest
 from cortex.messages import Events, Image, Imu, MotorCommand, RotorSpeeds, SimulatorStatus
-from neurosim_core.bench.loop_trace import LoopTrace, command_speed
 from neurosim_core.live.topics import STATUS, command_topic, stream_topic
 
 Check = Callable[[], None]
@@ -33,111 +32,104 @@ class ProbeError(RuntimeError):
     """Messages did not arrive; the text names the topic."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopTrace:
+    """What a controller saw that answers every image; times are of CLOCK_MONOTONIC."""
+
+    sent_ns: NDArray[np.int64]
+    """When each command was handed to Cortex [ns], shape [commands]."""
+    answered_ns: NDArray[np.int64]
+    """Stamp of the state that each command answers [ns], shape [commands]."""
+    image_stamp_ns: NDArray[np.int64]
+    """Stamp of each image that was received after the warm-up [ns], shape [images]."""
+    published_ns: NDArray[np.int64]
+    """When the simulator published each image [ns], shape [images]."""
+    received_ns: NDArray[np.int64]
+    """When each image was in the controller's hands [ns], shape [images]."""
+    image_bytes: int
+    """Size of an image."""
+    lost_count: int
+    """Images after the warm-up that never arrived."""
+    overtaken_count: int
+    """Images after the warm-up that gave way to newer ones before the controller looked."""
+
+
 def answer_images(
     *,
     vehicle: str,
     camera: str,
-    hover_rad_s: float,
-    rotor_count: int,
+    speed_rad_s: NDArray[np.float64],
     seconds: float,
     warm_up_s: float,
-    watch_rotors: bool,
     check: Check,
     spin_s: float = 0.0,
 ) -> LoopTrace:
-    """Answer each image with a numbered command, and note the times.
+    """Be a controller that answers each image with a command, and note when that happens.
 
     Args:
-        vehicle: Name of the vehicle.
+        vehicle: Whose images.
         camera: Name of its camera.
-        hover_rad_s: Rotor speed at hover [rad/s].
-        rotor_count: Number of rotors.
-        seconds: Duration of the measurement [wall-clock s].
-        warm_up_s: Duration of the flight before it [wall-clock s].
-        watch_rotors: Subscribe to rotor speeds during the measurement, too.
-        check: See `Check`.
-        spin_s: How long to poll for an image before sleeping (`Subscriber.look_out`) [s].
+        speed_rad_s: Rotor speeds that are commanded [rad/s], shape [R].
+        seconds: How long to measure [wall-clock s].
+        warm_up_s: How long to fly before that [wall-clock s].
+        check: Is called about five times a second while nothing comes.
+        spin_s: How long to look for an image before sleeping (`Subscriber.look_out`) [s].
 
     Raises:
         ProbeError: No message arrived for a long time.
     """
-    sent: list[int] = []
-    answered: list[int] = []
+    commands_sent: list[tuple[int, int]] = []
     images: list[tuple[int, int, int]] = []
-    reports: list[tuple[int, int, float]] = []
     with Node("loop probe") as node:
         pictures = node.subscriber(stream_topic(vehicle, camera), Image, policy=latest())
-        rotors = _subscribe_rotors(node, vehicle)
+        rotors = node.subscriber(
+            stream_topic(vehicle, "rotor_speeds"), RotorSpeeds, policy=keep_last(_SMALL_DEPTH)
+        )
         commands = node.publisher(command_topic(vehicle, "motor_speeds"), MotorCommand)
 
         def command(stamp_ns: int) -> None:
-            number = len(sent)
-            speed = np.full(rotor_count, command_speed(number, hover_rad_s))
-            message = MotorCommand(stamp_ns=stamp_ns, speed=speed, sequence=number)
-            answered.append(stamp_ns)
-            sent.append(time.monotonic_ns())
+            message = MotorCommand(stamp_ns=stamp_ns, speed=speed_rad_s, sequence=len(commands_sent))
+            commands_sent.append((time.monotonic_ns(), stamp_ns))
             commands.publish(message)
 
-        _wait_for_simulator(commands, check)
-        first, _ = _receive(rotors, check, _START_S)
-        reports.append(_report(first))
-        command(first.stamp_ns)
-        begin, image_bytes, end_ns, warm_ns = 0, 0, 0, 0
-        before = (0, 0)
-        watching = True
-
         def idle() -> None:
-            """Answer rotor speeds if an image was lost: lockstep would not go on."""
-            nonlocal rotors, watching
-            if not watching:
-                rotors, watching = _subscribe_rotors(node, vehicle), True
-            reports.extend(_reports(rotors))
-            if reports[-1][0] > answered[-1]:
-                command(reports[-1][0])
-            check()
+            """Answer what the rotors say where an image was lost: in lockstep nothing would go on."""
+            try:
+                while True:
+                    stamp_ns = rotors.recv(0.0).stamp_ns
+                    if stamp_ns > commands_sent[-1][1]:
+                        command(stamp_ns)
+            except TimeoutError:
+                check()
 
+        _wait_for_simulator(commands, check)
+        first, _ = _receive(rotors, check, _START_S)  # from here on commands are taken
+        command(first.stamp_ns)
+        begin, image_bytes, end_ns, before = 0, 0, 0, (0, 0)
         while not end_ns or time.monotonic_ns() < end_ns or len(images) - begin < _IMAGES_MIN:
             if spin_s:
                 pictures.look_out(spin_s)
             image, info = _receive(pictures, idle, _SILENCE_S if images else _START_S)
-            if image.stamp_ns > answered[-1]:
+            if image.stamp_ns > commands_sent[-1][1]:
                 command(image.stamp_ns)
             images.append((image.stamp_ns, info.publish_ns, info.publish_ns + info.latency_ns))
-            if watching:
-                reports += _reports(rotors)  # while the simulator computes the next image
-            if not warm_ns:
-                warm_ns = images[0][2] + round(warm_up_s * 1e9)
-            if not end_ns and images[-1][2] >= warm_ns:
+            if not end_ns and images[-1][2] >= images[0][2] + round(warm_up_s * 1e9):
                 begin, image_bytes = len(images), image.data.nbytes
-                if not watch_rotors:
-                    rotors.close()
-                    watching = False
                 before = (pictures.counters.lost, pictures.counters.overtaken)
                 end_ns = time.monotonic_ns() + round(seconds * 1e9)
-        if watching:
-            reports += _reports(rotors)
         counters = pictures.counters
-    stamps, published, received = np.array(images, dtype=np.int64).T
-    rotor_stamps, sequences, speeds = zip(*reports, strict=True)
+    sent, answered = np.array(commands_sent, dtype=np.int64).T
+    stamps, published, received = np.array(images[begin:], dtype=np.int64).T
     return LoopTrace(
-        sent_ns=np.array(sent, dtype=np.int64),
-        answered_ns=np.array(answered, dtype=np.int64),
+        sent_ns=sent,
+        answered_ns=answered,
         image_stamp_ns=stamps,
         published_ns=published,
         received_ns=received,
-        rotor_stamp_ns=np.array(rotor_stamps, dtype=np.int64),
-        rotor_sequence=np.array(sequences, dtype=np.int64),
-        rotor_speed=np.array(speeds),
         image_bytes=image_bytes,
-        begin=begin,
         lost_count=counters.lost - before[0],
         overtaken_count=counters.overtaken - before[1],
     )
-
-
-def _subscribe_rotors(node: Node, vehicle: str) -> Subscriber[RotorSpeeds]:
-    topic = stream_topic(vehicle, "rotor_speeds")
-    return node.subscriber(topic, RotorSpeeds, policy=keep_last(_SMALL_DEPTH))
 
 
 def _wait_for_simulator(publisher: Publisher[Any], check: Check) -> None:
@@ -158,20 +150,6 @@ def _receive(subscriber: Subscriber[Any], check: Check, limit_s: float) -> tuple
             check()
             if time.monotonic() > deadline_s:
                 raise ProbeError(f"{subscriber.topic} was silent for {limit_s:g} s") from None
-
-
-def _reports(rotors: Subscriber[RotorSpeeds]) -> list[tuple[int, int, float]]:
-    """Return what has arrived: stamp [ns], sequence, speed of the first rotor [rad/s]."""
-    found: list[tuple[int, int, float]] = []
-    while True:
-        try:
-            found.append(_report(rotors.recv(0.0)))
-        except TimeoutError:
-            return found
-
-
-def _report(message: RotorSpeeds) -> tuple[int, int, float]:
-    return message.stamp_ns, message.sequence, float(message.speed[0])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

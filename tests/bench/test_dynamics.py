@@ -1,317 +1,159 @@
-"""`neurosim bench dynamics` on a small extent: errors and orders, never times; the chapter."""
+"""The study of dynamics: its oracle, its methods, and claims that see planted faults."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
-from neurosim_core.bench import rotorpy_peer
-from neurosim_core.bench.chapter import cell, cells
-from neurosim_core.bench.dynamics import QUICK, dynamics_chapter, measure_dynamics
-from neurosim_core.bench.dynamics_methods import DORMAND_PRINCE, EULER, FIXED_STEP, MIDPOINT, RK4, RKMK4
-from neurosim_core.bench.dynamics_result import DynamicsResult
-from neurosim_core.bench.dynamics_sweep import AT_ONCE, SWEEPS
-from neurosim_core.bench.figures import draw_plot
-
-SMALL = dataclasses.replace(
-    QUICK,
-    steps_s=(5e-3, 2e-3, 1e-3, 5e-4),
-    tolerances=(1e-6,),
-    repetitions=1,
-    cross_checked=("rotor step",),
-    peers=("rotor step",),
-    time_constants_s=(1e-1, 1e-4, 0.0),
-    cases=(
-        "mass 3 mg, 100 m/s wind, quadratic drag",
-        "inertia 1:10:100, 200 rad/s",
-        "pitch through 90 degrees at 20 rad/s",
-    ),
-    sweep_count=12,
-    hover_stamps_s=(1, 10),
-    top_stamps_s=(1, 10),
-    formats_stamps_s=(1, 10),
-    cpu_s=0.001,
+from neurosim_core.bench import dynamics, rotorpy_peer
+from neurosim_core.bench.dynamics import RKMK4, fit_order, order_claim
+from neurosim_core.bench.dynamics_flights import EXTREMES, FLIGHTS, HOLD_NS, Flight, at_rest, lagging, light
+from neurosim_core.bench.dynamics_oracle import (
+    EULER,
+    RK4,
+    TABLEAUX,
+    Equations,
+    attitude_error,
+    compare,
+    integrate,
+    make_reference,
+    solve,
 )
+from neurosim_core.bench.engine import Multirotor, preset
+
+STEPS_S = (5e-3, 2e-3, 1e-3)
 
 
 @pytest.fixture(scope="module")
-def result() -> DynamicsResult:
-    return measure_dynamics(extent=SMALL)
+def rotor_step():
+    flight = FLIGHTS["rotor step"]()
+    return flight, make_reference(flight)
 
 
-@pytest.fixture(scope="module")
-def chapter(result):
-    return dynamics_chapter(result)
+@pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "racer"])
+def test_equations_are_those_of_the_vehicle(name):
+    """Accelerations of random states: two independent statements of the same equations."""
+    config = preset(name, wind_m_s=(2.0, -1.0, 0.5), flapping_kg_m=1e-6)
+    rng, vehicle, equations = np.random.default_rng(0), Multirotor(config), Equations([config])
+    for _ in range(5):
+        q = rng.normal(size=4)
+        y = np.concatenate([rng.normal(size=6), q / np.linalg.norm(q), 5.0 * rng.normal(size=3)])
+        speed = rng.uniform(0.2, 0.9, 4) * config.rotor_speed_max_rad_s
+        vehicle.reset(y[0:3], y[3:6], y[6:10], y[10:13], speed)
+        vehicle.accelerate()
+        rate = equations.rate(y[:, None], speed[:, None])[:, 0]
+        linear, angular = (values[0] for values in vehicle.acceleration)
+        assert rate[3:6] == pytest.approx(linear, rel=1e-9, abs=1e-9)
+        assert rate[10:13] == pytest.approx(angular, rel=1e-8, abs=1e-8)
 
 
-# Errors and orders
+def test_a_fall_is_a_parabola():
+    """Rotors that stand still, no drag: z = -g t^2 / 2; explicit Euler is one step behind."""
+    config = preset("racer", motor_time_constant_s=0.0, rotor_speed_min_rad_s=0.0)
+    start = at_rest(config, rotor_speed=np.zeros(4))
+    flight = Flight(name="fall", config=config, start=start, commands=np.zeros((10, 4)))
+    for states in (solve(flight, "DOP853", 1e-12), *integrate([flight], [1e-3], RK4)):
+        assert states[-1, 2] == pytest.approx(-0.5 * 9.81 * 0.1**2, abs=1e-13)
+    (euler,) = integrate([flight], [1e-3], EULER)
+    assert euler[-1, 2] == pytest.approx(-0.5 * 9.81 * 0.1 * 0.099, abs=1e-13)
 
 
-@pytest.mark.parametrize(("flight", "bar_m"), [("figure eight", 1e-6), ("flip", 1e-10), ("tumble", 1e-8)])
-def test_our_method_keeps_its_bars_at_1_ms(flight, bar_m, result):
-    assert result.sample(flight, RKMK4.name, 1e-3).errors.position_m <= bar_m
+def test_a_batch_is_its_members():
+    """Flights of different lengths and steps, integrated together and alone."""
+    flights, steps_s = [FLIGHTS["flip"](), lagging(1e-2)], [5e-3, 1e-3]
+    for flight, step_s, states in zip(flights, steps_s, integrate(flights, steps_s, RK4), strict=True):
+        (alone,) = integrate([flight], [step_s], RK4)
+        assert states == pytest.approx(alone, rel=1e-12, abs=1e-15)
+        assert len(states) == len(flight.commands)
 
 
-def test_hover_is_kept_by_all(result):
-    for sample in result.samples:
-        if sample.flight == "hover":
-            assert sample.errors.position_m < 1e-10  # rounding of up to 4000 steps
+def sample(flight, reference, methods=TABLEAUX):
+    """Return the rows of our method and of some others at three steps."""
+    rows = [dynamics._ours(flight, flight.name, RKMK4, s, reference, 1) for s in STEPS_S]
+    for tableau in methods:
+        flown = zip(STEPS_S, integrate([flight] * len(STEPS_S), STEPS_S, tableau), strict=True)
+        rows += [dynamics._row(flight.name, tableau.name, s, states, reference) for s, states in flown]
+    return rows
 
 
-@pytest.mark.parametrize("flight", ["rotor step", "flip", "tumble", "figure eight"])
-def test_the_flights_tell_the_methods_apart(flight, result):
-    """Each of them: Euler is the worst, ours at least as good as RK4."""
-    error = {m.name: result.sample(flight, m.name, 1e-3).errors.position_m for m in FIXED_STEP}
-    assert error[RKMK4.name] <= error[RK4.name] < error[MIDPOINT.name] < error[EULER.name]
+def test_orders_are_found_and_a_wrong_one_is_seen(rotor_step):
+    """RK4 with two weights moved by 1 % is no longer of order 4, and its claim is missed."""
+    flight, reference = rotor_step
+    rows = sample(flight, reference)
+    orders = [fit_order(rows, method, flight.name, reference) for method in dynamics.ORDERS]
+    assert {row["method"]: round(row["attitude"]) for row in orders} == dynamics.ORDERS
+    assert order_claim(orders).met
+    wrong = dataclasses.replace(RK4, weights=(1 / 6 + 0.01, 1 / 3 - 0.01, 1 / 3, 1 / 6))
+    rows = sample(flight, reference, methods=(wrong,))
+    claim = order_claim([fit_order(rows, m, flight.name, reference) for m in (RKMK4, RK4.name)])
+    assert not claim.met
+    assert RK4.name in claim.measured
 
 
-@pytest.mark.parametrize(
-    ("method", "order", "tolerance"),
-    [(EULER, 1, 0.1), (MIDPOINT, 2, 0.05), (RK4, 4, 0.2), (RKMK4, 4, 0.2)],
-    ids=lambda value: getattr(value, "name", value),
-)
-def test_observed_order(method, order, tolerance, result):
-    """Whatever the flight that has an asymptotic range; flip and tumble do for every method."""
-    fits = [f for f in result.orders if f.method == method.name]
-    slopes = {f.flight: (f.position, f.attitude) for f in fits if f.flight != "hover"}
-    assert None not in slopes["flip"]
-    assert slopes["tumble"][0] is not None
-    for flight, pair in slopes.items():
-        for slope in pair:
-            assert slope is None or slope == pytest.approx(order, abs=tolerance), flight
+def test_a_wrong_integrator_of_the_vehicle_is_seen(rotor_step, monkeypatch):
+    """Steps that are longer than they say miss the order and the precision of an extreme flight."""
+    flight, reference = rotor_step
+    cases = {"light": (lambda: light("crazyflie", 3e-2), False)}
+    right = dynamics._hard(cases, True, lambda _: None)
+    limit_m = 2.0 * next(row["position [m]"] for row in right if row["method"] == RKMK4)
+    assert dynamics._hard_claim("light", right, limit_m).met
+
+    class Coarse(Multirotor):
+        def __init__(self, config, **options):
+            super().__init__(config, **{**options, "max_step_ns": HOLD_NS})
+
+    monkeypatch.setattr(dynamics, "Multirotor", Coarse)
+    rows = sample(flight, reference)
+    assert not order_claim([fit_order(rows, m, flight.name, reference) for m in dynamics.ORDERS]).met
+    wrong = dynamics._hard(cases, True, lambda _: None)
+    assert not dynamics._hard_claim("light", wrong, limit_m).met
 
 
-def test_references_agree(result):
-    """DOP853 at two tolerances on all flights, Radau on one."""
-    for solved in result.flights:
-        uncertainty = solved.reference.uncertainty
-        assert uncertainty.position_m < 1e-10  # a hundredth of the errors that are judged with it
-        assert uncertainty.attitude_rad < 1e-11
-    solvers = {s.flight.name: {c.solver for c in s.reference.checks} for s in result.flights}
-    assert solvers["rotor step"] == {"DOP853", "Radau"}
-
-
-def test_any_motor_is_flown_right(result):
-    for motor in result.motors:
-        ours = next(t for t in motor.trials if t.method == RKMK4.name)
-        assert ours.outcome == "flown"
-        assert ours.errors.position_m < 1e-8
-    stiff = result.motors[1]
-    outcomes = {t.method: t.outcome for t in stiff.trials}
-    assert outcomes[RK4.name] == outcomes[EULER.name] == "not finite"  # 1 ms against 0.1 ms
-
-
-def test_extremes_and_refusals(result):
-    assert [r.case for r in result.refusals] == ["inertia 1:10:100, 200 rad/s"]
-    assert "no body has principal moments" in result.refusals[0].message
-    dust = next(e for e in result.extremes if e.case.startswith("mass 3 mg"))
-    ours = next(t for t in dust.trials if t.method == RKMK4.name)
-    assert ours.redone_count >= 1
-    for extreme in result.extremes:
-        for trial in extreme.trials:
-            if trial.method in (RKMK4.name, DORMAND_PRINCE.name):
-                assert trial.errors.position_m < 1e-5
-
-
-def test_long_runs(result):
-    by_run = {(d.run, d.method): d for d in result.drifts}
-    assert by_run["hover", RKMK4.name].position_m[-1] < 1e-10
-    turning = by_run["spinning hover", RKMK4.name]
-    assert 0.0 < turning.position_m[-1] < 1e-10  # no fixed point: rounding moves it
-    assert turning.attitude_rad[-1] < 1e-9
-    top = by_run["free top", RKMK4.name]
-    assert top.attitude_rad[-1] < 3e-8  # 7.5e-9 after 10 s
-    assert top.energy[-1] < 1e-9
-    conserving = by_run["free top", MIDPOINT.name]
-    assert max(conserving.energy[-1], conserving.momentum[-1]) < 1e-12  # to rounding
-    assert conserving.attitude_rad[-1] > 1e-3  # and yet
-    double, single = by_run["spin", "float64, 1 ms"], by_run["spin", "float32, 1 ms"]
-    assert single.position_m[-1] > 1e6 * double.position_m[-1]
-
-
-def test_leaving_out_terms_changes_nothing(result):
-    for pruning in result.prunings:
-        assert pruning.difference < 1e-12
-
-
-# The chapter
-
-
-def test_chapter_has_every_flight_and_method(chapter, result):
-    rows = {(row["flight"], row["method"]) for row in table(chapter, "dynamics-1-ms").rows}
-    names = [m.name for m in (*FIXED_STEP, DORMAND_PRINCE)]
-    assert rows == {(s.flight.name, name) for s in result.flights for name in names}
-    everything = table(chapter, "dynamics-work-precision")
-    assert len(everything.rows) == 5 * (4 * len(SMALL.steps_s) + len(SMALL.tolerances))
-    orders = table(chapter, "dynamics-order").rows
-    assert {(row["flight"], row["method"]) for row in orders} == {
-        (s.flight.name, m.name) for s in result.flights for m in FIXED_STEP if s.flight.name != "hover"
+def test_stiff_flights_are_judged_and_refusals_kept():
+    cases = {
+        "1e-6 s": (lambda: lagging(1e-6), False),
+        "slender": EXTREMES["inertia 1:10:100, 200 rad/s"],
     }
+    rows = dynamics._hard(cases, True, lambda _: None)
+    outcome = {(row["flight"], row["method"]): row["outcome"] for row in rows}
+    assert outcome["1e-6 s", RKMK4] == "flown"
+    assert outcome["1e-6 s", EULER.name] == "not finite"
+    assert outcome["slender", RKMK4].startswith("refused: Value error")
+    claim = dynamics._hard_claim("all", rows, 1e-8)
+    assert claim.met
+    assert "slender" in claim.measured
+    silently_wrong = [{**row, "position [m]": 1.0} if row["outcome"] == "flown" else row for row in rows]
+    assert not dynamics._hard_claim("all", silently_wrong, 1e-8).met
+    (told, refused) = dynamics._pivot(rows)
+    assert told[EULER.name] == "not finite"
+    assert refused[RKMK4].startswith("refused")
 
 
-def test_chapter_has_every_stiff_and_extreme_flight(chapter):
-    motor = table(chapter, "dynamics-motor")
-    assert [row["time_constant_s"] for row in motor.rows] == list(SMALL.time_constants_s)
-    assert motor.rows[1]["rk4_quaternion"] == "not finite"
-    assert {row["case"] for row in table(chapter, "dynamics-extremes").rows} == set(SMALL.cases)
-    runs = {(row["run"], row["method"]) for row in table(chapter, "dynamics-long").rows}
-    assert {("free top", m.name) for m in (*FIXED_STEP, DORMAND_PRINCE)} < runs
-    assert {("hover", RKMK4.name), ("spin", "float32, 1 ms"), ("spin", "float64, 1 ms")} < runs
-
-
-def test_tables_name_only_columns_that_they_have(chapter):
-    for a_table in chapter.tables:
-        assert a_table.rows
-        assert len(cells(a_table)) == len(a_table.rows)
-
-
-def test_bars_are_judged_by_what_was_measured(chapter, result):
-    verdicts = {bar.text: bar for bar in chapter.bars}
-    assert len(verdicts) == 12
-    flip = verdicts["flip at 1 ms: position error <= 1e-10 m"]
-    assert flip.met
-    assert cell(result.sample("flip", RKMK4.name, 1e-3).errors.position_m) in flip.measured
-    hover = next(bar for text, bar in verdicts.items() if "hover" in text)
-    assert not hover.met  # it was not an hour
-    extremes = next(bar for text, bar in verdicts.items() if "extreme" in text)
-    assert "inertia 1:10:100" in extremes.measured
-
-
-def test_sweeps_are_fine_and_judged(chapter, result):
-    rows = {row["sweep"]: row for row in table(chapter, "dynamics-sweep").rows}
-    assert [*rows] == [*SWEEPS, AT_ONCE]
-    for sweep in result.sweeps:
-        edge = 2 if sweep.name.startswith(("mass of", "inertia of")) else 0
-        assert len(sweep.values) == SMALL.sweep_count * (2 if sweep.name == AT_ONCE else 1) + edge
-        assert rows[sweep.name]["worst_m"] == np.nanmax(sweep.position_m)
-        if sweep.name != AT_ONCE:
-            assert sweep.position_m.max() < 1e-5
-    masses = result.sweeps[0]
-    first = int(np.argmax(masses.redone == 0))  # both sides of the guard's edge
-    assert 1.0 < masses.values[first] / masses.values[first - 1] < 1.001
-    assert masses.redone[first - 1] > 0
-    for spoilt in (2e-5, np.nan):
-        position_m = masses.position_m.copy()
-        position_m[3] = spoilt
-        sweeps = (dataclasses.replace(masses, position_m=position_m), *result.sweeps[1:])
-        worse = dynamics_chapter(dataclasses.replace(result, sweeps=sweeps))
-        bar = next(bar for bar in worse.bars if "fine steps" in bar.text)
-        assert bar.met is False
-        assert cell(float(masses.values[3])) in bar.measured
-
-
-def test_inputs_that_mean_nothing_are_refused(chapter, result):
-    rows = table(chapter, "dynamics-inputs").rows
-    assert len(rows) == len(result.answers) > 60
-    assert {row["error"] for row in rows} == {"ValidationError", "ValueError", "TypeError", "DynamicsError"}
-    assert all(row["message"] for row in rows)
-    accepted = dataclasses.replace(result.answers[0], error="", message="")
-    worse = dynamics_chapter(dataclasses.replace(result, answers=(accepted, *result.answers[1:])))
-    bar = next(bar for bar in worse.bars if "typed errors" in bar.text and "negative" in bar.text)
-    assert bar.met is False
-    assert accepted.input in bar.measured
-
-
-def test_the_least_gain_of_leaving_terms_out_is_judged(result):
-    first, *rest = result.prunings
-    slow = dataclasses.replace(first, reduced_per_s=1.4 * first.full_per_s)
-    worse = dynamics_chapter(dataclasses.replace(result, prunings=(slow, *rest)))
-    bar = next(bar for bar in worse.bars if "unused terms" in bar.text)
-    assert bar.met is False
-    assert bar.measured.startswith("1.40 x")
-
-
-def test_a_bad_measurement_misses_its_bar(result):
-    samples = tuple(
-        dataclasses.replace(s, errors=dataclasses.replace(s.errors, position_m=2e-8)) for s in result.samples
-    )
-    worse = dynamics_chapter(dataclasses.replace(result, samples=samples))
-    verdicts = {bar.text.split(" at")[0]: bar.met for bar in worse.bars[:3]}
-    assert verdicts == {"figure eight": True, "flip": False, "tumble": False}
-
-
-def test_a_lost_flight_misses_the_bar_of_extremes(result):
-    first, *rest = result.extremes
-    lost = tuple(
-        dataclasses.replace(t, outcome="not finite", errors=None) if t.method == RKMK4.name else t
-        for t in first.trials
-    )
-    worse = dataclasses.replace(result, extremes=(dataclasses.replace(first, trials=lost), *rest))
-    bar = next(bar for bar in dynamics_chapter(worse).bars if "extreme" in bar.text)
-    assert bar.met is False
-
-
-def test_chapter_says_when_rotorpy_is_missing(result):
-    without = dataclasses.replace(
-        result,
-        rotorpy=None,
-        derivative_differences={},
-        peers=tuple(p for p in result.peers if p.method.startswith("ours")),
-    )
-    chapter = dynamics_chapter(without)
-    rows = table(chapter, "dynamics-rotorpy").rows
-    assert sum("pip install rotorpy==3.0.0" in str(row["method"]) for row in rows) == 5
-    bar = next(bar for bar in chapter.bars if "RotorPy" in bar.text)
-    assert bar.met is None
-    assert rotorpy_peer.INSTALL in bar.measured
-
-
-def test_measuring_without_rotorpy(monkeypatch):
-    monkeypatch.setattr(rotorpy_peer, "rotorpy_version", lambda: None)
-    extent = dataclasses.replace(
-        SMALL,
-        flights=("rotor step",),
-        steps_s=(1e-3,),
-        cross_checked=(),
-        time_constants_s=(0.1,),
-        cases=(),
-        stiff_peer_cpu_s=1.0,
-    )
-    result = measure_dynamics(extent=extent)
-    assert result.rotorpy is None
-    assert result.derivative_differences == {}
-    methods = [p.method for p in result.peers] + [t.method for t in result.motors[0].trials]
-    assert methods
-    assert not [m for m in methods if "RotorPy" in m]
-
-
-def test_rotorpy_flies_beside(result, chapter):
-    pytest.importorskip("rotorpy")
-    assert max(result.derivative_differences.values()) < 1e-12
-    errors = {p.method: p.errors for p in result.peers}
-    assert errors["RotorPy RK45, 1 ms"].position_m < 1e-12  # slow motors: at rounding
-    assert errors["RotorPy RK45, 10 ms"].position_m < 1e-8
-    assert 1e-3 < errors["RotorPy explicit Euler, 1 ms"].position_m < 1e-1
-    # the same equations and the same method: the same errors as our baseline
-    baseline = result.sample("rotor step", EULER.name, 1e-3).errors
-    assert errors["RotorPy explicit Euler, 1 ms"].position_m == pytest.approx(baseline.position_m, rel=1e-9)
-    rows = {row["method"]: row for row in table(chapter, "dynamics-rotorpy").rows}
-    assert rows["RotorPy RK45, 1 ms"]["ours"] == "none as exact"
-    match = rows["RotorPy RK45, 10 ms"]
-    assert match["ratio"] == pytest.approx(match["cpu_s_per_s"] / match["ours_cpu_s_per_s"])
-
-
-def test_summary_is_made_of_what_was_measured(chapter, result):
-    eight = result.sample("figure eight", RKMK4.name, 1e-3)
-    assert cell(eight.errors.position_m) in chapter.summary
-    assert not math.isnan(eight.cpu_s_per_s)
-
-
-def test_plots_are_drawn(chapter):
-    pytest.importorskip("matplotlib")
-    assert [plot.name for plot in chapter.plots] == [
-        "dynamics-work-precision",
-        "dynamics-work-precision-attitude",
-        "dynamics-step",
-        "dynamics-motor",
-        "dynamics-drift",
+def test_a_vehicle_that_drifts_is_seen():
+    rows = [
+        {"run": run, "method": RKMK4, "after [s]": 3600, "position [m]": 1e-9}
+        for run in ("hover", "spinning hover")
     ]
-    for plot in chapter.plots:
-        assert draw_plot(plot).startswith(b"\x89PNG")
+    assert dynamics._drift_claim(rows).met
+    assert not dynamics._drift_claim([rows[0], {**rows[1], "position [m]": 1e-3}]).met
+    assert not dynamics._drift_claim([rows[0], {**rows[1], "after [s]": 600}]).met
 
 
-def table(chapter, name):
-    return next(t for t in chapter.tables if t.name == name)
+@pytest.mark.skipif(rotorpy_peer.rotorpy_version() is None, reason="RotorPy is not installed")
+def test_rotorpy_flies_the_same_equations(rotor_step):
+    """Its RK45 at 1 ms is at rounding where motors are slow: the equations are the same."""
+    flight, reference = rotor_step
+    states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3)
+    assert compare(states, reference.states).position_m < 1e-12
+    assert cpu_s > 0.0
+    stopped, _ = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=0.0)
+    assert np.isnan(stopped[1:]).all()
+
+
+def test_attitude_errors_are_exact_for_small_ones():
+    half = np.array([0.5e-12, 0.05])
+    turned = np.stack([np.sin(half), 0 * half, 0 * half, np.cos(half)], axis=-1)
+    assert attitude_error(turned, np.array([0.0, 0.0, 0.0, 1.0])) == pytest.approx(2.0 * half, rel=1e-12)
+    assert not compare(np.full((2, 17), np.nan), np.zeros((2, 17))).finite

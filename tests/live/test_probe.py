@@ -11,13 +11,6 @@ from processes import SOON_S
 
 from cortex import Node, reliable
 from cortex.messages import Events, Image, Imu, MotorCommand, RotorSpeeds, SimulatorStatus
-from neurosim_core.bench.loop_trace import (
-    answered_commands,
-    command_speed,
-    felt_at_once,
-    felt_commands,
-    loop_latency_ns,
-)
 from neurosim_core.live import probe
 from neurosim_core.live.probe import ProbeError, StreamProbe, answer_images
 
@@ -26,13 +19,9 @@ PERIOD_NS = 5_000_000
 
 
 class Lockstep:
-    """A simulator in lockstep whose rotors obey at once; the image of one tick is lost.
+    """A simulator in lockstep whose rotors obey at once; the image of tick 40 is lost."""
 
-    It is that of tick 40 or, if so wished, the first from there on at which nobody listens to the rotors.
-    """
-
-    def __init__(self, *, lose_unheard: bool) -> None:
-        self.lose_unheard = lose_unheard
+    def __init__(self) -> None:
         self.lost_tick = 0
         self.node = Node("played simulator")
         self.rotors = self.node.publisher("/drone/rotor_speeds", RotorSpeeds, latch=True)
@@ -55,7 +44,7 @@ class Lockstep:
             if tick == 0:
                 self.show(0)
             tick += 1
-            if tick < 40 or self.lost_tick or (self.lose_unheard and self.rotors.subscriber_count):
+            if tick < 40 or self.lost_tick:
                 self.show(tick)
             else:
                 self.lost_tick = tick
@@ -78,49 +67,40 @@ class Lockstep:
         self.node.close()
 
 
-@pytest.mark.parametrize("watch_rotors", [True, False])
-def test_a_controller_answers_every_image_and_notes_it(runtime, watch_rotors):
-    with Lockstep(lose_unheard=not watch_rotors) as simulator:
+def test_a_controller_answers_every_image_and_notes_it(runtime):
+    """An image that is lost is made up for by what the rotors say: the flight goes on."""
+    with Lockstep() as simulator:
         trace = answer_images(
             vehicle="drone",
             camera="camera",
-            hover_rad_s=HOVER_RAD_S,
-            rotor_count=4,
-            seconds=0.4,
+            speed_rad_s=np.full(4, HOVER_RAD_S),
+            seconds=0.6,
             warm_up_s=0.1,
-            watch_rotors=watch_rotors,
             check=lambda: None,
         )
     sent = simulator.obeyed
-    assert [c.sequence for c in sent] == list(range(len(sent)))
-    assert [c.speed[2] for c in sent] == [command_speed(n, HOVER_RAD_S) for n in range(len(sent))]
+    assert [command.sequence for command in sent] == list(range(len(sent)))
+    assert trace.answered_ns[: len(sent)].tolist() == [command.stamp_ns for command in sent]
     stamps = trace.image_stamp_ns // PERIOD_NS
-    not_seen = set(range(stamps[-1])) - set(stamps.tolist())
-    assert not_seen - {0} == {simulator.lost_tick}  # that of 0 may be overtaken
+    assert stamps[-1] > simulator.lost_tick >= 40
+    assert simulator.lost_tick not in stamps
     assert trace.image_bytes == 64 * 48 * 3
     assert trace.lost_count == 0  # it was never published
-    assert 0 < trace.begin < len(stamps)
-    assert trace.received_ns[trace.begin] - trace.received_ns[0] >= 0.1e9
-    assert trace.received_ns[-1] - trace.received_ns[trace.begin - 1] >= 0.35e9
+    assert stamps[0] > 0  # the warm-up is left out
+    assert np.ptp(trace.received_ns) >= 0.5e9
     assert (trace.published_ns < trace.received_ns).all()
     assert (np.diff(trace.sent_ns) > 0).all()
-    felt = felt_commands(trace, hover_rad_s=HOVER_RAD_S, motor_time_constant_s=0.0)
-    assert (felt < 0).sum() <= (0 if watch_rotors else 1)  # where it did not listen
-    assert (felt[felt >= 0] == trace.rotor_sequence[:-1][felt >= 0]).all()
-    assert felt_at_once(trace, felt)
-    assert simulator.lost_tick >= 40
-    assert trace.rotor_sequence[-1] > stamps[trace.begin]  # at the latest after the loss it listens again
-    latency_ns = loop_latency_ns(trace, answered_commands(trace), trace.image_stamp_ns[1:])
-    assert len(latency_ns) >= len(stamps) - trace.begin - 1
-    assert 0 < np.median(latency_ns) < 1e9
+    felt = np.searchsorted(trace.answered_ns, trace.image_stamp_ns) - 1
+    assert (trace.answered_ns[felt] == trace.image_stamp_ns - PERIOD_NS).all()
+    assert (trace.sent_ns[felt] < trace.received_ns).all()
 
 
 def test_silence_is_an_error_that_names_the_topic(runtime, monkeypatch):
     monkeypatch.setattr(probe, "_START_S", 0.3)
-    flight = {"vehicle": "drone", "camera": "camera", "hover_rad_s": 1.0, "rotor_count": 4, "seconds": 1.0}
+    flight = {"vehicle": "drone", "camera": "camera", "speed_rad_s": np.ones(4), "seconds": 1.0}
     checked = []
     with pytest.raises(ProbeError, match=r"/drone/command/motor_speeds had no subscriber within 0\.3 s"):
-        answer_images(**flight, warm_up_s=0.0, watch_rotors=True, check=lambda: checked.append(1))
+        answer_images(**flight, warm_up_s=0.0, check=lambda: checked.append(1))
     assert checked
     with Node("deaf") as node, StreamProbe(vehicle="drone", imu="imu", camera="events") as listener:
         node.publisher("/drone/imu", Imu)

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from hall import hall
 
-from neurosim_core.bench.throughput_scene import hall
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.scene_arrays import upload_scene

@@ -1,0 +1,283 @@
+"""What the integrators of the vehicle are judged by: SciPy on equations of its own.
+
+`Equations` states the equations of motion a second time, in NumPy and for batches, independently of the
+kernels of the vehicle. SciPy solves them to rounding; small fixed-step methods integrate them for comparison.
+
+Reference: Svacha, Mohta, Kumar (2017), Improving quadrotor trajectory tracking by compensating for
+aerodynamic effects (the equations); Hairer, Norsett, Wanner (1993), Solving ordinary differential equations I
+(the methods).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from neurosim_core.bench.dynamics_flights import HOLD_NS, Flight
+from neurosim_core.bench.engine import MultirotorConfig
+
+Array = NDArray[np.float64]
+Solver = Literal["DOP853", "Radau"]
+
+POSITION, VELOCITY, ORIENTATION, BODY_RATE = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
+"""Where each part stands in a state; rotor speeds follow."""
+_HOLD_S = HOLD_NS * 1e-9
+
+
+def _cross(a: Any, b: Any) -> Array:
+    """Return the cross product along the first axis; `numpy.cross` takes several times as long."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+class Equations:
+    """Equations of motion of B vehicles with R rotors each; all arrays have B as their last axis.
+
+    Args:
+        configs: One for each vehicle, shape [B]: wind without gusts and turbulence, and no ground.
+    """
+
+    def __init__(self, configs: Sequence[MultirotorConfig]) -> None:
+        def stack(values: Sequence[Any]) -> Array:
+            return np.moveaxis(np.array(values, dtype=np.float64), 0, -1)
+
+        self._gravity = stack([c.gravity_m_s2 for c in configs])
+        self._mass = stack([c.mass_kg for c in configs])
+        self._inertia = stack([c.inertia_kg_m2 for c in configs])
+        self._inertia_inverse = stack([np.linalg.inv(c.inertia_kg_m2) for c in configs])
+        self._hub = np.swapaxes(stack([c.rotor_position_m for c in configs]), 0, 1)  # [3, R, B]
+        self._thrust = stack([c.thrust_coefficients_n_s2 for c in configs])
+        self._torque = stack([c.torque_coefficients_n_m_s2 * np.array(c.rotor_direction) for c in configs])
+        self._drag = stack([[c.rotor_drag_kg, c.rotor_drag_kg, c.rotor_inflow_kg] for c in configs])
+        self._lift = stack([c.translational_lift_kg_m for c in configs])
+        self._flapping = stack([c.flapping_kg_m for c in configs])
+        self._parasitic = stack([c.parasitic_drag_kg_m for c in configs])
+        self._wind = stack([c.wind_m_s for c in configs])
+        self.time_constant_s = stack([c.motor_time_constants_s for c in configs])
+        """Of the motors [s], shape [R, B]."""
+
+    def rate(self, y: Array, speed: Array) -> Array:
+        """Return d/dt of position, velocity, orientation and body rate.
+
+        Args:
+            y: p_WB [m], v_WB [m/s], q_WB (xyzw, of any length), w_WB in B [rad/s], shape [13, B].
+            speed: Rotor speeds [rad/s], shape [R, B].
+        """
+        velocity, q, w = y[VELOCITY], y[ORIENTATION], y[BODY_RATE]
+        unit = q / np.sqrt((q * q).sum(axis=0))
+        u, s = unit[:3], unit[3]
+
+        def turn(v: Array, sign: float) -> Array:
+            twice = 2.0 * sign * _cross(u, v)
+            return np.asarray(v + s * twice + sign * _cross(u, twice))
+
+        air = turn(velocity - self._wind, -1.0)
+        flow = air[:, None] + _cross(w[:, None], self._hub)
+        force = -speed * self._drag[:, None] * flow
+        force[2] += self._thrust * speed**2 + self._lift * (flow[0] ** 2 + flow[1] ** 2)
+        torque = _cross(self._hub, force).sum(axis=1)
+        torque[2] += (self._torque * speed**2).sum(axis=0)
+        torque[0] -= self._flapping * (speed * flow[1]).sum(axis=0)
+        torque[1] += self._flapping * (speed * flow[0]).sum(axis=0)
+        total = force.sum(axis=1) - np.sqrt((air * air).sum(axis=0)) * self._parasitic * air
+        acceleration = turn(total, 1.0) / self._mass
+        acceleration[2] -= self._gravity
+        momentum = (self._inertia * w).sum(axis=1)
+        angular = (self._inertia_inverse * (torque - _cross(w, momentum))).sum(axis=1)
+        return np.concatenate([velocity, acceleration, spin(q, w), angular])
+
+
+def spin(q: Array, w: Array) -> Array:
+    """Return the rate of a quaternion q_WB [xyzw] that turns at w in B [rad/s], shape [4, B]."""
+    vector = 0.5 * (q[3] * w + _cross(q[:3], w))
+    return np.concatenate([vector, -0.5 * (q[:3] * w).sum(axis=0)[None]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tableau:
+    """A method of fixed step: an explicit Runge-Kutta method, or the semi-implicit Euler method."""
+
+    name: str
+    order: int
+    stages: tuple[tuple[float, ...], ...] = ()
+    """Coefficients of the second and later stages, row by row."""
+    weights: tuple[float, ...] = (1.0,)
+    semi_implicit: bool = False
+    """Positions and attitudes move with the velocities at the end of the step."""
+
+
+EULER = Tableau(name="explicit Euler", order=1)
+SEMI_IMPLICIT = Tableau(name="semi-implicit Euler", order=1, semi_implicit=True)
+RK4 = Tableau(
+    name="RK4, quaternion",
+    order=4,
+    stages=((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
+    weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+)
+TABLEAUX = (EULER, SEMI_IMPLICIT, RK4)
+"""Methods to compare with. They integrate rotor speeds as part of the state, as most simulators do, normalise
+the quaternion after each step, and have no guard: what they cannot resolve becomes infinite or NaN."""
+
+
+def integrate(flights: Sequence[Flight], steps_s: Sequence[float], method: Tableau) -> list[Array]:
+    """Fly several flights with one method, all at once.
+
+    Args:
+        flights: One for each vehicle of the batch.
+        steps_s: The step of each [s], a divisor of the hold.
+        method: Of all.
+
+    Returns:
+        States at the end of each hold, one array of shape [K, 13 + R] for each flight.
+    """
+    equations = Equations([flight.config for flight in flights])
+    step_counts = np.array([round(_HOLD_S / step_s) for step_s in steps_s])
+    tau = equations.time_constant_s
+    lagging = tau > 0.0
+    hold_count = max(len(flight.commands) for flight in flights)
+    y = np.stack([np.concatenate(flight.start) for flight in flights], axis=-1)
+    ends = []
+
+    def rate(state: Array, command: Array) -> Array:
+        speed = state[13:]
+        motor = np.divide(command - speed, tau, out=np.zeros_like(speed), where=lagging)
+        return np.concatenate([equations.rate(state[:13], speed), motor])
+
+    with np.errstate(all="ignore"):  # what blows up is a result
+        for hold in range(hold_count):
+            held = (flight.held(min(hold, len(flight.commands) - 1)) for flight in flights)
+            command = np.stack(list(held), axis=-1)
+            y[13:] = np.where(lagging, y[13:], command)
+            for step in range(step_counts.max()):
+                h = np.where(step < step_counts, _HOLD_S / step_counts, 0.0)  # those that are done stay
+                y = _step(y, h, command, method, rate)
+            ends.append(y)
+    states = np.stack(ends)
+    return [states[: len(flight.commands), :, index] for index, flight in enumerate(flights)]
+
+
+def _step(y: Array, h: Array, command: Array, method: Tableau, rate: Any) -> Array:
+    rates = [rate(y, command)]
+    for row in method.stages:
+        shift = sum(a * k for a, k in zip(row, rates, strict=True) if a)
+        rates.append(rate(y + h * shift, command))
+    end = y + h * sum(b * k for b, k in zip(method.weights, rates, strict=True) if b)
+    if method.semi_implicit:
+        end[POSITION] = y[POSITION] + h * end[VELOCITY]
+        end[ORIENTATION] = y[ORIENTATION] + h * spin(y[ORIENTATION], end[BODY_RATE])
+    end[ORIENTATION] /= np.sqrt((end[ORIENTATION] ** 2).sum(axis=0))
+    return np.asarray(end)
+
+
+def solve(flight: Flight, solver: Solver, rtol: float) -> Array:
+    """Solve a flight, restarted at each change of command, with the rotor speeds in closed form.
+
+    Args:
+        flight: What to fly.
+        solver: Method of `scipy.integrate.solve_ivp`.
+        rtol: Its relative tolerance; the absolute one is a tenth of it.
+
+    Returns:
+        States at the end of each hold, shape [K, 13 + R].
+
+    Raises:
+        ArithmeticError: The solver gave up.
+    """
+    equations = Equations([flight.config])
+    tau_s = equations.time_constant_s[:, 0]
+    slowest_s, decay_rate = (
+        tau_s.max(),
+        np.divide(1.0, tau_s, out=np.full_like(tau_s, np.inf), where=tau_s > 0.0),
+    )
+    y, speed = np.concatenate(flight.start[:4]), flight.start.rotor_speed
+    states = []
+    for hold in range(len(flight.commands)):
+        held, first = flight.held(hold), speed
+
+        def rotor_speed(t: float, held: Array = held, first: Array = first) -> Array:
+            with np.errstate(invalid="ignore"):
+                return np.asarray(held + (first - held) * np.nan_to_num(np.exp(-t * decay_rate)))
+
+        def rate(t: float, y: Array, rotor_speed: Any = rotor_speed) -> Array:
+            return equations.rate(y[:, None], rotor_speed(t)[:, None])[:, 0]
+
+        solution = solve_ivp(
+            rate, (0.0, _HOLD_S), y, method=solver, t_eval=[_HOLD_S], rtol=rtol, atol=0.1 * rtol,
+            first_step=min(1e-4, 0.1 * slowest_s) if slowest_s > 0.0 else None,
+        )  # fmt: skip
+        if not solution.success:
+            raise ArithmeticError(f"{solver} gave up on {flight.name}: {solution.message}")
+        y, speed = solution.y[:, -1], rotor_speed(_HOLD_S)
+        y[ORIENTATION] /= np.linalg.norm(y[ORIENTATION])
+        states.append(np.concatenate([y, speed]))
+    return np.array(states)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Errors:
+    """The largest differences of two flights over the ends of all holds."""
+
+    position_m: float
+    attitude_rad: float
+    body_rate_rad_s: float
+
+    @property
+    def finite(self) -> bool:
+        """Whether the flight stayed finite, and within 1000 km."""
+        return (
+            math.isfinite(self.position_m + self.attitude_rad + self.body_rate_rad_s)
+            and self.position_m < 1e6
+        )
+
+
+def compare(flown: Array, exact: Array) -> Errors:
+    """Compare two flights, states of shape [K, 13 + R]; not finite where one is not."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        difference = flown - exact
+        return Errors(
+            position_m=float(np.linalg.norm(difference[:, POSITION], axis=1).max()),
+            attitude_rad=float(attitude_error(flown[:, ORIENTATION], exact[:, ORIENTATION]).max()),
+            body_rate_rad_s=float(np.linalg.norm(difference[:, BODY_RATE], axis=1).max()),
+        )
+
+
+def attitude_error(first: Array, second: Array) -> Array:
+    """Return the angles between unit quaternions [rad], shape [..., 4], exact for small ones.
+
+    The relative rotation is conj(first) * second; its angle is 2 atan2(|vector part|, |scalar part|).
+    """
+    v, s, u, t = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
+    vector = np.linalg.norm(s * u - t * v - np.cross(v, u), axis=-1)
+    scalar = np.abs(s * t + (v * u).sum(axis=-1, keepdims=True))[..., 0]
+    return np.asarray(2.0 * np.arctan2(vector, scalar))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A solution, and how well it is known."""
+
+    states: Array
+    """At the end of each hold, shape [K, 13 + R]."""
+    solver: Solver
+    uncertainty: Errors
+    """Difference of a solution at 10/3 of the tolerance, or of the other solver."""
+
+
+def make_reference(flight: Flight, *, stiff: bool = False, cross_check: bool = False) -> Reference:
+    """Solve a flight by DOP853 at rtol 3e-14, or by Radau at 1e-11 where it is stiff, and solve it again.
+
+    Args:
+        flight: What to fly.
+        stiff: Damped so fast that an explicit solver takes tiny steps.
+        cross_check: Compare with Radau at 1e-12, which takes ten times as long, instead of DOP853 at 1e-13.
+    """
+    solver: Solver = "Radau" if stiff else "DOP853"
+    rtol = 1e-11 if stiff else 3e-14
+    states = solve(flight, solver, rtol)
+    again = solve(flight, "Radau", 1e-12) if cross_check else solve(flight, solver, rtol * 10.0 / 3.0)
+    return Reference(states=states, solver=solver, uncertainty=compare(again, states))

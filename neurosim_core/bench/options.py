@@ -1,0 +1,84 @@
+"""The options of `neurosim bench`: each question takes some of them."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+Progress: TypeAlias = Callable[[str], None]
+"""Is told what is measured next."""
+
+
+def silent(_: str) -> None:
+    """Tell nobody."""
+
+
+def _numbers(kind: type) -> Callable[[str], tuple[Any, ...]]:
+    def read(text: str) -> tuple[Any, ...]:
+        try:
+            return tuple(kind(part) for part in text.split(","))
+        except ValueError:
+            what = "whole numbers" if kind is int else "numbers"
+            raise argparse.ArgumentTypeError(f"takes {what} with commas between them, got {text!r}") from None
+
+    return read
+
+
+def _option(text: str, default: Any = None, **argument: Any) -> Any:
+    return field(default=default, metadata={"help": text, **argument})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a question is asked with; what is None is up to the question."""
+
+    quick: bool = _option("a small version; its figures are rough", False, action="store_true")
+    scene: Path | None = _option("mesh file; default: a generated scene", type=Path, metavar="FILE")  # noqa: RUF009
+    device: str = _option("auto, cpu, cuda:0, ... (default: auto)", default="auto")
+    width: int | None = _option("columns of the camera", type=int, metavar="PX")
+    height: int | None = _option("rows of the camera", type=int, metavar="PX")
+    samples: tuple[int, ...] | None = _option("rays per pixel", type=_numbers(int), metavar="N,...")
+    seconds: float | None = _option("how long to measure or fly each case", type=float, metavar="S")
+    worlds: tuple[int, ...] | None = _option("numbers of worlds", type=_numbers(int), metavar="N,...")
+    instants: int = _option("renders per launch (default: 16)", 16, type=int, metavar="K")
+    steps: int = _option("steps per repetition (default: 1600)", 1600, type=int, metavar="N")
+    max_displacement: float | None = _option(
+        "render only so often that nothing moves further between two renders", type=float, metavar="PX"
+    )
+    rates: tuple[float, ...] | None = _option(
+        "commands and images a second", type=_numbers(float), metavar="HZ,..."
+    )
+    renderer: str = _option(
+        "synthetic: a test card, to measure all but rendering; warp: the scene (default: synthetic)",
+        "synthetic",
+        choices=["synthetic", "warp"],
+    )
+    sampling_rate: float | None = _option(
+        "renders of the event camera a second (default: a quarter of what the machine can do)",
+        type=float,
+        metavar="HZ",
+    )
+    delays: tuple[float, ...] | None = _option(
+        "what the controller sleeps before commands", type=_numbers(float), metavar="S,..."
+    )
+    tours: int | None = _option("how many paths to fly", type=int, metavar="N")
+    mode: str = _option(
+        "what is commanded (default: velocity)",
+        "velocity",
+        choices=["motor_speeds", "velocity", "position"],
+    )
+    factor: float = _option(
+        "real-time factor of the slow controller (default: 1)", 1.0, type=float, metavar="F"
+    )
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Further settings by dotted key."""
+
+
+def add_option(parser: argparse.ArgumentParser, name: str) -> None:
+    """Let a command take an option, a field of `Options`."""
+    (found,) = (field for field in dataclasses.fields(Options) if field.name == name)
+    parser.add_argument(f"--{name.replace('_', '-')}", default=found.default, **found.metadata)

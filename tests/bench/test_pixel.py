@@ -1,0 +1,51 @@
+"""The test bench of event pixels: claims that hold, and that see planted faults."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from neurosim_core.bench import pixel, pixel_noise
+from neurosim_core.bench.options import Options
+from neurosim_core.bench.pixel_bench import TestBench, make_pixel, rates_hz
+
+BENCH = TestBench(device="cpu", quick=True)
+
+
+def verdicts(curves):
+    """Return what is claimed of curves, and whether it is met."""
+    rules = [rule for rule in pixel._RULES if any(c.pattern.startswith(rule.patterns) for c in curves)]
+    return [pixel._claim(rule, curves).met for rule in rules]
+
+
+def test_the_chapter_meets_its_claims():
+    chapter = pixel.measure(Options(quick=True, device="cpu"))
+    assert [claim.text for claim in chapter.claims if not claim.met] == []
+    presets = {row["preset"]: row for row in chapter.tables[0].rows}
+    assert presets["v2e_noisy"]["C on"] == pytest.approx(0.2, rel=0.02)
+    assert len(chapter.plots[0].panels) == len({row["pattern"] for row in chapter.tables[1].rows})
+
+
+@pytest.mark.parametrize(
+    ("module", "pattern", "fault"),
+    [
+        (pixel, pixel.ramp, {"threshold_on": 0.2005}),
+        (pixel, pixel.staircase, {"threshold_on": 0.21, "threshold_off": 0.21}),
+        (pixel, pixel.latency, {"threshold_on": 0.201}),
+        (pixel_noise, pixel_noise.readout, {"shot_noise": {"rate_hz": 50.0, "bright_factor": 1.0}}),
+        (pixel_noise, pixel_noise.hot_pixels, {"hot_pixels": {"fraction": 0.02, "rate_hz": 100.0}}),
+    ],
+)
+def test_a_planted_fault_is_seen(module, pattern, fault, monkeypatch):
+    assert all(verdicts(pattern(BENCH)))
+    monkeypatch.setattr(module, "make_pixel", lambda **settings: make_pixel(**{**settings, **fault}))
+    assert not all(verdicts(pattern(BENCH)))
+
+
+def test_rates_are_from_the_first_to_the_last_event_of_a_pixel():
+    log = np.array([[0.0, 0.0], [2.1, 0.25]]).reshape(2, 1, 2)
+    rates = rates_hz(BENCH.expose(make_pixel(), log, [0.0, 1.0]), 2, 2)
+    assert rates[0] == pytest.approx(10.5, rel=1e-4)
+    assert math.isnan(rates[1])  # it has one event only
