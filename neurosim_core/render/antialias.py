@@ -4,16 +4,17 @@
 # ruff: noqa: UP018  (nested wp.static branches, typed literals: they have a meaning in kernels)
 """Adaptive antialiasing: more rays where the picture varies, so that a pixel integrates light over its area.
 
-1. The first pass casts one ray per pixel. The rays of neighbouring pixels go through different points of their
-   pixels: a bar as thin as a quarter of a pixel is hit in one of four adjacent rows or columns.
-2. A quad of 2 x 2 pixels is marked where log radiance differs by more than CONTRAST_MIN from that of a pixel up
-   to REACH_PX away in a row or a column. Each pixel of a marked quad becomes the mean of COARSE_COUNT rays.
-3. A pixel whose rays differ by more than CONTRAST_MIN is marked in turn, and becomes the mean of SAMPLE_COUNT
-   rays.
+1. The first pass casts one ray per pixel. The rays of neighbouring pixels go through different points of
+   their pixels: a bar as thin as a quarter of a pixel is hit in one of four adjacent rows or columns.
+2. A quad of 2 x 2 pixels is marked where log radiance differs by more than CONTRAST_MIN from that of a
+   pixel up to REACH_PX away in a row or a column. Each pixel of a marked quad becomes the mean of
+   COARSE_COUNT rays.
+3. A pixel whose rays differ by more than CONTRAST_MIN is marked in turn, and becomes the mean of
+   SAMPLE_COUNT rays.
 
 Means are taken in linear light. The points are fixed in the pixel: a still camera gives the same picture at
-every instant. They form a Hammersley set, which is stratified in 4 x 4 cells, in 16 rows and in 16 columns; the
-first COARSE_COUNT of them lie in different quarters.
+every instant. They form a Hammersley set, which is stratified in 4 x 4 cells, in 16 rows and in 16 columns;
+the first COARSE_COUNT of them lie in different quarters.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -79,9 +80,7 @@ def _point_of_pixel(height: int, width: int) -> NDArray[np.int64]:
 
 
 def _rays_through(lens: Lens, point: Any, sample_count: int, fill_factor: float) -> NDArray[np.float32]:
-    """Return rays through a point of the sensitive area of each pixel: direction and spread, shape [H * W,
-    4].
-    """
+    """Return rays through a point of the sensitive area of each pixel: direction, spread; [H * W, 4]."""
     column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
     spread = lens.ray_spread()[..., None] * np.float32(np.sqrt(fill_factor / sample_count))
     return np.concatenate([lens.ray_table((column, row)), spread], axis=-1).reshape(-1, 4)
