@@ -16,10 +16,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import warp as wp
+from neurosim_core.worlds.scan import make_noisy_scan
 
 import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
+from neurosim_core.render.antialias import sampling_kernels
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
 from neurosim_core.render.outputs import OUTPUTS
@@ -78,6 +80,7 @@ def make_kernels() -> None:
     ):
         raycast_kernel(OUTPUTS, terms)
         fallback_kernel(OUTPUTS, terms)
+        sampling_kernels(OUTPUTS, terms, is_cpu=False)
     frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

@@ -1,20 +1,19 @@
 # mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,assignment"
-# mypy: disable-error-code="return-value,call-overload"
+# mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc"
 # mypy: allow-untyped-calls, allow-untyped-decorators
-# ruff: noqa: UP018  (nested wp.static branches, typed literals: they have a meaning in kernels)
+# ruff: noqa: UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
 """Adaptive antialiasing: more rays where the picture varies, so that a pixel integrates light over its area.
 
 1. The first pass casts one ray per pixel. The rays of neighbouring pixels go through different points of
    their pixels: a bar as thin as a quarter of a pixel is hit in one of four adjacent rows or columns.
-2. A quad of 2 x 2 pixels is marked where log radiance differs by more than CONTRAST_MIN from that of a
-   pixel up to REACH_PX away in a row or a column. Each pixel of a marked quad becomes the mean of
-   COARSE_COUNT rays.
-3. A pixel whose rays differ by more than CONTRAST_MIN is marked in turn, and becomes the mean of
-   SAMPLE_COUNT rays.
+2. A quad of 2 x 2 pixels is marked where log radiance differs by more than QUAD_CONTRAST from that of a pixel
+   up to REACH_PX away in a row or a column. Each of its pixels becomes the mean of COARSE_COUNT rays.
+3. A pixel is marked where the log radiance of its rays differs by more than PIXEL_CONTRAST. It becomes the
+   mean of SAMPLE_COUNT rays.
 
 Means are taken in linear light. The points are fixed in the pixel: a still camera gives the same picture at
 every instant. They form a Hammersley set, which is stratified in 4 x 4 cells, in 16 rows and in 16 columns;
-the first COARSE_COUNT of them lie in different quarters.
+the first COARSE_COUNT of them are 5/16 of a pixel apart in columns and in rows.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -36,7 +35,7 @@ from neurosim_core.render.lighting import spread_order
 from neurosim_core.render.outputs import RenderOutputs, radiance_writer
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
-from neurosim_core.render.raycast_pixels import mark_pixel, turn_count
+from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, mark_pixel, turn_count
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
@@ -46,12 +45,14 @@ SAMPLE_COUNT = 16
 """Rays of a marked pixel."""
 COARSE_COUNT = 4
 """Rays of each pixel of a marked quad, of which there are as many."""
-CONTRAST_MIN = 0.05
-"""Difference of log radiance that marks quads and pixels."""
+QUAD_CONTRAST = 0.05
+"""Difference of log radiance between pixels that marks a quad."""
+PIXEL_CONTRAST = 0.05
+"""Difference of log radiance between the rays of a pixel that marks it."""
 REACH_PX = 2
 """Distance of the pixels that are compared [px]."""
 _CELLS = 4
-_COARSE = (1, 4, 11, 14)
+_COARSE = (0, 5, 10, 15)
 _BLOCKS_PER_MULTIPROCESSOR = 32
 _BLOCK = 64
 
@@ -64,23 +65,8 @@ def hammersley_points() -> NDArray[np.float64]:
     return (np.stack([index, reversed_bits], axis=-1) + 0.5) / SAMPLE_COUNT
 
 
-def _point_of_pixel(height: int, width: int) -> NDArray[np.int64]:
-    """Return which of the points the first ray of each pixel goes through, shape [H, W].
-
-    Blocks of 4 x 4 pixels use each point once. Four adjacent rows of a column have points of all four columns
-    of cells, and four adjacent columns of a row have points of all four rows of cells.
-    """
-    cells = (hammersley_points() * _CELLS).astype(int)
-    point = np.empty((_CELLS, _CELLS), dtype=np.int64)
-    point[cells[:, 0], cells[:, 1]] = np.arange(SAMPLE_COUNT)
-    row, col = np.indices((height, width))
-    cell_column = (row + 2 * (col & 1) + ((col >> 1) & 1)) % _CELLS
-    cell_row = (col + 2 * (row & 1) + ((row >> 1) & 1)) % _CELLS
-    return point[cell_column, cell_row]
-
-
 def _rays_through(lens: Lens, point: Any, sample_count: int, fill_factor: float) -> NDArray[np.float32]:
-    """Return rays through a point of the sensitive area of each pixel: direction, spread; [H * W, 4]."""
+    """Return rays through a point of the sensitive area of each pixel, shape [H * W, 4]."""
     column, row = 0.5 + np.sqrt(fill_factor) * (np.asarray(point) - 0.5)
     spread = lens.ray_spread()[..., None] * np.float32(np.sqrt(fill_factor / sample_count))
     return np.concatenate([lens.ray_table((column, row)), spread], axis=-1).reshape(-1, 4)
@@ -113,11 +99,17 @@ def sample_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
 
 
 def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
-    """Return the rays of the first pass, each through one of the points, shape [H * W, 4]."""
-    rays = sample_rays(lens, fill_factor)
-    rays[..., 3] *= np.sqrt(SAMPLE_COUNT)
-    chosen = _point_of_pixel(lens.height, lens.width).reshape(-1, 1, 1)
-    return np.take_along_axis(rays, chosen, axis=1)[:, 0]
+    """Return the rays of the first pass, shape [H * W, 4].
+
+    They go through the centres of 4 x 4 cells of the pixels. Four adjacent rows of a column use all columns
+    of cells, and four adjacent columns of a row use all rows of cells.
+    """
+    row, col = np.indices((lens.height, lens.width)).reshape(2, -1)
+    cell_column = (row + 2 * (col & 1) + ((col >> 1) & 1)) % _CELLS
+    cell_row = (col + 2 * (row & 1) + ((row >> 1) & 1)) % _CELLS
+    centres = (np.arange(_CELLS) + 0.5) / _CELLS
+    rays = np.stack([_rays_through(lens, (x, y), 1, fill_factor) for x in centres for y in centres])
+    return rays[_CELLS * cell_column + cell_row, np.arange(len(row))]
 
 
 @wp.struct
@@ -176,13 +168,6 @@ def _quad_kernel(terms: RenderTerms) -> wp.Kernel:
     """Return the kernel that marks quads."""
     find_pixel = _pixel_finder(terms)
 
-    @wp.func
-    def differs(log_radiance: wp.array3d[float], instant: int, row: int, col: int, own: float) -> bool:
-        inside = row >= 0 and col >= 0 and row < log_radiance.shape[1] and col < log_radiance.shape[2]
-        if not inside:
-            return False
-        return wp.abs(log_radiance[instant, row, col] - own) > wp.static(CONTRAST_MIN)
-
     @wp.kernel(module="unique", enable_backward=False)
     def mark_quads(
         first: int,
@@ -194,16 +179,20 @@ def _quad_kernel(terms: RenderTerms) -> wp.Kernel:
         samples: SampleData,
     ) -> None:
         quad = first + wp.tid()
-        marked = bool(False)
+        contrast = float(0.0)
         for member in range(4):
             instant, row, col, _world = find_pixel(_pixel_of_quad(quad, member), view, worlds)
-            if row >= 0 and not marked:
+            if row >= 0:
                 own = log_radiance[instant, row, col]
                 for reach in range(1, wp.static(REACH_PX + 1)):
-                    marked = marked or differs(log_radiance, instant, row - reach, col, own)
-                    marked = marked or differs(log_radiance, instant, row + reach, col, own)
-                    marked = marked or differs(log_radiance, instant, row, col - reach, own)
-                    marked = marked or differs(log_radiance, instant, row, col + reach, own)
+                    left = log_radiance[instant, row, wp.max(col - reach, 0)]
+                    right = log_radiance[instant, row, wp.min(col + reach, view.width - 1)]
+                    above = log_radiance[instant, wp.max(row - reach, 0), col]
+                    below = log_radiance[instant, wp.min(row + reach, view.height - 1), col]
+                    low = wp.min(wp.min(left, right), wp.min(above, below))
+                    high = wp.max(wp.max(left, right), wp.max(above, below))
+                    contrast = wp.max(contrast, wp.max(high - own, own - low))
+        marked = contrast > wp.static(QUAD_CONTRAST)
         mark_pixel(marked, quad, samples.quads, samples.quad_count)
 
     return mark_quads
@@ -259,7 +248,7 @@ def _sample_tracer(terms: RenderTerms, *, coarse: bool) -> wp.Function:
         origin = view.p_WC[instant]
         ray = wp.quat_rotate(q, direction_C)
         hit = intersect_scene(scene, origin, ray)
-        body = -1
+        body = int(-1)
         if wp.static(terms.bodies):
             hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
         return radiance_of(scene, bodies, instant, body, q, ray, origin, spread_rad, hit)
@@ -276,7 +265,7 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool)
     sum_lanes, max_lanes = _lane_functions(group)
     write_radiance = radiance_writer(outputs, supersampled=True)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
     def render_queue(
         first: int,
         # In:
@@ -300,11 +289,11 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool)
             count = samples.quad_count[0]
         for turn in range(turn_count(begin, count, step)):
             entry = begin + turn * step + (thread % _BLOCK) // SAMPLE_COUNT
-            index = 0
-            row = -1
-            col = 0
-            world = 0
-            instant = 0
+            index = int(0)
+            row = int(-1)
+            col = int(0)
+            world = int(0)
+            instant = int(0)
             if entry < count:
                 if wp.static(coarse):
                     index = _pixel_of_quad(samples.quads[entry], lane // group)
@@ -324,10 +313,10 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool)
                     before = out.log_radiance[instant, row, col]
                     highest = wp.max(highest, before)
                     lowest = wp.min(lowest, before)
-                varies = leads and highest - lowest > wp.static(CONTRAST_MIN)
+                varies = leads and highest - lowest > wp.static(PIXEL_CONTRAST)
                 mark_pixel(varies, index, samples.pixels, samples.pixel_count)
             if leads:
-                slot = -1
+                slot = int(-1)
                 if wp.static("rgb" in outputs):
                     slot = view.image_slot[instant]
                 write_radiance(scene, total, group + 1, instant, slot, row, col, out)
@@ -375,7 +364,7 @@ def _packet_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool
             normal = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
             spread_rad = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
         for lane in range(lanes):
-            index = 0
+            index = int(0)
             if wp.static(coarse):
                 index = _pixel_of_quad(samples.quads[entry], lane // group)
             else:
@@ -395,13 +384,13 @@ def _packet_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool
                         scene, view, bodies, worlds, samples, world, instant, row, col, lane % group
                     )
         # the packet has one origin: its pixels are of one instant
-        index = 0
+        index = int(0)
         if wp.static(coarse):
             index = _pixel_of_quad(samples.quads[entry], 0)
         else:
             index = samples.pixels[entry]
         instant, row, col, world = find_pixel(index, view, worlds)
-        slot = -1
+        slot = int(-1)
         if wp.static("rgb" in outputs):
             slot = view.image_slot[instant]
         if wp.static(bool(terms.embree)):
@@ -421,7 +410,7 @@ def _packet_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool
                         hit.u = u[lane]
                         hit.v = v[lane]
                         hit.normal = wp.normalize(normal[lane])
-                        body = -1
+                        body = int(-1)
                         if wp.static(terms.bodies):
                             direction_C = wp.quat_rotate_inv(q, ray[lane])
                             hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
@@ -444,11 +433,28 @@ def _packet_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool
                         highest = wp.max(highest, own)
                         lowest = wp.min(lowest, own)
                 if wp.static(coarse):
-                    varies = highest - lowest > wp.static(CONTRAST_MIN)
+                    varies = highest - lowest > wp.static(PIXEL_CONTRAST)
                     mark_pixel(varies, index, samples.pixels, samples.pixel_count)
                 write_radiance(scene, total, group + 1, instant, slot, row, col, out)
 
     return render_queue_packets
+
+
+def sampling_kernels(
+    outputs: Collection[str], terms: RenderTerms, *, is_cpu: bool
+) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
+    """Return the kernels that mark quads, render quads, and render pixels.
+
+    Args:
+        outputs: Outputs of the renderer; log radiance is always written, RGB if it is one of them.
+        terms: Terms of the first pass.
+        is_cpu: Whether the device is a CPU.
+    """
+    written = tuple(name for name in ("log_radiance", "rgb") if name in ("log_radiance", *outputs))
+    plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=True)
+    make_kernel = _packet_kernel if is_cpu else _block_kernel
+    coarse, fine = (make_kernel(written, plain, coarse=coarse) for coarse in (True, False))
+    return _quad_kernel(plain), coarse, fine
 
 
 class AdaptiveSampling:
@@ -475,12 +481,8 @@ class AdaptiveSampling:
             thread_count: Threads on a CPU device; all cores if None.
         """
         self._device, self._thread_count = device, thread_count
-        written = tuple(name for name in ("log_radiance", "rgb") if name in ("log_radiance", *outputs))
-        plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=True)
         self._is_cpu = wp.get_device(device).is_cpu
-        self._mark = _quad_kernel(plain)
-        make_kernel = _packet_kernel if self._is_cpu else _block_kernel
-        self._coarse, self._fine = (make_kernel(written, plain, coarse=coarse) for coarse in (True, False))
+        self._mark, self._coarse, self._fine = sampling_kernels(outputs, terms, is_cpu=self._is_cpu)
         data = self._data = SampleData()
         data.rays = wp.array(rays, dtype=wp.vec4, device=device)
         data.quads = wp.zeros(pixel_count // 4, dtype=int, device=device)

@@ -64,10 +64,11 @@ class RenderConfig(Settings):
     dark_floor: float = Field(default=1.0e-3, gt=0.0)
     """Radiance added before the logarithm that event cameras see: what a black surface gives."""
     samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = "adaptive"
-    """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray, and
-    16 where log radiance differs by more than 0.03 from a neighbouring pixel. An integer: as many rays in all
-    pixels; with 1, edges alias, and event cameras report aliasing as events. Geometry (depth, normal,
-    instance) is always that of the ray through the pixel's centre."""
+    """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray, 4
+    where log radiance differs by more than 0.05 between neighbouring pixels, and 16 where it differs by as
+    much within a pixel. An integer: as many rays in all pixels; with 1, edges alias, and event cameras
+    report aliasing as events. Geometry (depth, normal, instance) is always that of the ray through the
+    pixel's centre."""
     fill_factor: float = Field(default=1.0, gt=0.0, le=1.0)
     """Share of a pixel's area that is sensitive to light, a square around its centre."""
     mip_bias: float = Field(default=0.0, ge=-4.0, le=4.0)

@@ -29,7 +29,7 @@ from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 
-_BOUNDS = (64, 14)
+PIXEL_BOUNDS = (64, 14)
 """Threads of a block and, on CUDA, blocks of a multiprocessor: registers are limited to fit; fastest on an
 H200."""
 _CANDIDATE_BOUNDS = (64, 10)
@@ -38,7 +38,7 @@ _CANDIDATE_BOUNDS = (64, 10)
 
 def _bounds_of(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[int, int] | None:
     if terms.candidate_group == 0:
-        return _BOUNDS
+        return PIXEL_BOUNDS
     simple = len(outputs) == 1 and not (terms.worlds or terms.bodies or terms.supersampled)
     return _CANDIDATE_BOUNDS if simple else None
 

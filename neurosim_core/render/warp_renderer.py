@@ -56,7 +56,7 @@ ONE_WORLD = RenderWorlds()
 
 
 class WarpRenderer:
-    """Renders K instants of one lens in N worlds per launch.
+    """Renders K instants of one lens in N worlds per launch; `render` does not allocate.
 
     Instants are [world, K] in this order in all arrays: instant k of world n is row n K + k. On a device they
     are launched in the order world, tile, instant, pixel: the instants of a tile, which see the same
@@ -209,7 +209,10 @@ class WarpRenderer:
             )
         if self._sampling is not None:
             self._sampling.launch(
-                *inputs[:4],
+                self._arrays.data,
+                view,
+                self._body_data,
+                self._world_data,
                 self._render_outputs,
                 pixel_count=count * instant_count * self._tile_count * TILE * TILE,
             )

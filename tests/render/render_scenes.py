@@ -14,7 +14,8 @@ from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
 from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.scene import Ambient, Light, Material, Scene, Texture
 
-UNSHADOWED = RenderConfig(lighting=LightingConfig(mode="unshadowed"), exposure=1.0)
+UNSHADOWED = RenderConfig(lighting=LightingConfig(mode="unshadowed"), exposure=1.0, samples_per_pixel=1)
+"""Rays through the centres of pixels, without shadows."""
 DARK = Ambient(up=(0.0, 0.0, 0.0), down=(0.0, 0.0, 0.0))
 LOOK_DOWN = (1.0, 0.0, 0.0, 0.0)
 """q_WC of a camera that looks along -z with +x to its right: its y axis (down in the picture) is -y."""

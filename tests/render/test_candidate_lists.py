@@ -381,7 +381,7 @@ def test_what_kernels_cannot_count_is_refused():
 
 def test_events_of_a_flight_are_the_same():
     settings = {
-        "duration_s": 0.04,
+        "duration_s": 0.2,
         "device": "cpu",
         "scene": {"kind": "apartment", "rooms": 1},
         "sensors": {

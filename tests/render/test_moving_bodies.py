@@ -40,7 +40,9 @@ LENS = PinholeConfig(width=97, height=73, horizontal_fov_rad=1.2)
 MIDDLE = (slice(None), 36, 48)
 """Its pixel, of each instant."""
 BAKED = RenderConfig(
-    lighting=LightingConfig(edge_max_m=1.0, ambient_ray_count=4, shadow_ray_count=1), exposure=1.0
+    lighting=LightingConfig(edge_max_m=1.0, ambient_ray_count=4, shadow_ray_count=1),
+    exposure=1.0,
+    samples_per_pixel=1,
 )
 FORWARD = ((0.0, 0.0, 0.0), Q_FORWARD_OPTICAL)
 """A camera in the origin that looks along +x."""

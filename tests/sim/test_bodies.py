@@ -97,9 +97,12 @@ def content(packets: list[Packet]) -> list[tuple[Any, ...]]:
 def test_edges_of_a_board_give_events_when_they_pass(room, device):
     """Pixels fire between renders around the analytic instant: dark, then bright as the board leaves.
 
+    Each pixel is one ray, through its centre.
+
     A step between two renders is taken as linear in log radiance, so events lie in the interval of the step.
     """
-    packets = list(ns.run(settings(room, device, {"board": SLIDING})))
+    render = {"lighting": {"mode": "unshadowed"}, "samples_per_pixel": 1}
+    packets = list(ns.run(settings(room, device, {"board": SLIDING}, render=render)))
     fired = events_of(packets)
     fx = 0.5 * LENS["width"] / math.tan(0.5 * LENS["horizontal_fov_rad"])
     tick_us = 1e6 / RATE_HZ

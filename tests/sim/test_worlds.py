@@ -49,7 +49,7 @@ def test_each_world_is_a_single_simulation(mode, plain, device):
     """Events, pictures, IMU with noise and states, for commands of every level."""
     commands = commands_of(mode, 8, 3)
     seen = record(Simulation(settings(plain, device), worlds=3), commands, mode=mode)
-    assert event_count(seen) > 1000
+    assert event_count(seen) > 300
     for world in range(3):
         alone = fly_alone(settings(plain, device, seed=7 + world), commands[:, world], mode=mode)
         for step, packets in enumerate(alone):
@@ -118,7 +118,7 @@ def test_pixels_and_lenses_of_their_own(noisy, plain, device):
     commands = commands_of("rates", 6, 3)
     config = settings(plain, device, sensors=rig)
     seen = record(Simulation(config, worlds=3, parameters=given), commands)
-    assert event_count(seen) > 500
+    assert event_count(seen) > 100
     for world in range(3):
         own = {key.replace("front.", "sensors.front."): values[world] for key, values in given.items()}
         own = {
@@ -275,7 +275,7 @@ def test_new_seeds(plain):
 
 def test_more_events_than_fit(textured):
     """Of each render the rows from the top that fit are kept, as a single camera does; losses are counted."""
-    capacity = 1500
+    capacity = 1450
     rig = {"front": {**RIG["front"], "pixel": {"threshold_on": 0.03, "threshold_off": 0.03}}}
     config = settings(textured, sensors=rig)
     turning = {"body_rate": [0.0, 0.0, 3.0]}

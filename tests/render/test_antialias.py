@@ -1,0 +1,157 @@
+"""A pixel integrates light over its area: adaptive sampling against closed forms and many rays per pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from render_scenes import DARK, LOOK_DOWN, UNSHADOWED, box, plane, render, scene_of
+
+from neurosim_core.render.antialias import first_rays, hammersley_points, ray_layers
+from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.config import RenderConfig
+from neurosim_core.scene.scene import Ambient, Material
+
+LENS = PinholeConfig(width=33, height=18, fx=32.0, fy=32.0, cx=16.5, cy=9.0)
+"""At 1 m a pixel is 1/32 m wide. The width is odd: the last quads are cut."""
+PITCH_M = 1.0 / 32.0
+ADAPTIVE = UNSHADOWED.model_copy(update={"samples_per_pixel": "adaptive"})
+WHITE = Material(name="white", base_color=(0.0, 0.0, 0.0), emission=(1.0, 1.0, 1.0))
+GREY = Material(name="grey", base_color=(0.0, 0.0, 0.0), emission=(0.25, 0.25, 0.25))
+
+
+def strips(*spans_m):
+    """Return white strips along y between x limits, just above a grey floor."""
+    parts = [plane(8.0)]
+    for low, high in spans_m:
+        corners = [[low, -4.0, 1e-4], [high, -4.0, 1e-4], [high, 4.0, 1e-4], [low, 4.0, 1e-4]]
+        parts.append(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False))
+    return scene_of(*parts, materials=(GREY, WHITE), part_material=(0, *(1 for _ in spans_m)), ambient=DARK)
+
+
+def radiance(scene, offsets_m, *, config=ADAPTIVE, device="cpu", lens=LENS, **options):
+    """Return radiance of white and grey above the dark floor for cameras moved along x, shape [K, H, W]."""
+    poses = [((x, 0.0, 1.0), LOOK_DOWN) for x in offsets_m]
+    log = render(scene, lens, poses, outputs=("log_radiance",), config=config, device=device, **options)
+    return np.exp(log["log_radiance"]) - config.dark_floor
+
+
+@pytest.mark.parametrize("traversal", ["auto", "warp"])
+def test_an_edge_that_moves_through_a_pixel(device, traversal):
+    """Radiance is that of the box filter, to half the distance of the sample points: 1/32."""
+    config = ADAPTIVE.model_copy(update={"cpu_traversal": traversal})
+    offsets = np.linspace(0.0, PITCH_M, 41)
+    seen = radiance(strips((0.0, 3.0)), offsets, config=config, device=device)
+    column = np.arange(LENS.width)
+    left = (column - 16.5)[None] + offsets[:, None] / PITCH_M  # of each pixel, from the edge [px]
+    expected = 0.25 + 0.75 * np.clip(left + 1.0, 0.0, 1.0)
+    assert np.abs(seen - expected[:, None]).max() <= 0.75 / 32.0 + 1e-4
+    assert np.abs((seen - expected[:, None]).mean()) < 0.002  # no bias
+
+
+def test_bars_thinner_than_a_pixel_are_seen(device):
+    """Bars of 0.3 px at any place cover 4 or 5 of 16 points; the first rays miss one in 20 in some rows."""
+    period, width = 7.0 * PITCH_M, 0.3 * PITCH_M
+    bars = strips(*((k * period, k * period + width) for k in range(-4, 5)))
+    seen = radiance(bars, np.linspace(0.0, PITCH_M, 65), device=device)
+    share = (seen[:, 2:-2] - 0.25) / 0.75
+    coverage = np.stack([share[..., col - 2 : col + 3].sum(axis=-1) for col in (9, 16, 23)], axis=-1)
+    assert (coverage < 0.2).mean() < 0.05
+    assert coverage[coverage >= 0.2].min() > 4.0 / 16.0 - 1e-3
+    assert coverage.max() < 5.0 / 16.0 + 1e-3
+    assert (coverage.mean(axis=1) > 0.05).all()  # none is missed in all rows
+    assert coverage.mean() == pytest.approx(0.3, abs=0.015)
+
+
+def test_a_still_camera_sees_no_change(device):
+    seen = radiance(strips((-0.3, 0.01), (0.2, 0.21)), [0.013] * 5, device=device)
+    assert (seen == seen[0]).all()
+
+
+def test_only_pixels_that_vary_get_more_rays(device):
+    """Far from the edge pixels are those of one ray; at the edge they are means."""
+    seen = radiance(strips((0.3 * PITCH_M, 3.0)), [0.0], device=device)[0]
+    np.testing.assert_allclose(seen[:, :12], 0.25, rtol=1e-5)
+    np.testing.assert_allclose(seen[:, 21:], 1.0, rtol=1e-5)
+    assert ((seen[:, 16] > 0.3) & (seen[:, 16] < 0.95)).all()
+
+
+def test_the_sensitive_area_is_a_part_of_the_pixel(device):
+    """With a fill factor of 1/4 the edge takes half a pixel from dark to bright."""
+    config = ADAPTIVE.model_copy(update={"fill_factor": 0.25})
+    offsets = np.linspace(-0.5, 0.5, 21) * PITCH_M
+    seen = radiance(strips((0.0, 3.0)), offsets, config=config, device=device)[:, :, 16].mean(axis=1)
+    expected = 0.25 + 0.75 * np.clip(offsets / PITCH_M / 0.5 + 0.5, 0.0, 1.0)
+    assert np.abs(seen - expected).max() <= 0.75 / 32.0 + 1e-4
+
+
+def test_close_to_many_rays(device):
+    """Boxes before a wall: a tenth of the error of one ray per pixel, in log radiance and in pictures."""
+    rng = np.random.default_rng(3)
+    boxes = [
+        box(tuple(rng.uniform(0.02, 0.2, 3)), (*rng.uniform(-0.4, 0.4, 2), rng.uniform(0.1, 0.4)))
+        for _ in range(30)
+    ]
+    materials = tuple(
+        Material(name=str(k), base_color=(x, x, x)) for k, x in enumerate(rng.uniform(0.05, 1.0, 31))
+    )
+    scene = scene_of(
+        plane(8.0),
+        *boxes,
+        materials=materials,
+        part_material=tuple(range(31)),
+        ambient=Ambient(up=(1.0, 1.0, 1.0), down=(0.3, 0.3, 0.3)),
+    )
+    poses = [((0.05 * k, 0.03 * k, 1.5), LOOK_DOWN) for k in range(4)]
+    pictures = {}
+    for samples in (1, "adaptive", 64):
+        config = UNSHADOWED.model_copy(update={"samples_per_pixel": samples})
+        pictures[samples] = render(
+            scene, LENS, poses, outputs=("log_radiance", "rgb", "depth"), config=config, device=device
+        )
+    rms = {
+        (name, samples): float(
+            np.sqrt(np.mean((pictures[samples][name].astype(float) - pictures[64][name]) ** 2))
+        )
+        for name in ("log_radiance", "rgb")
+        for samples in (1, "adaptive")
+    }
+    for name in ("log_radiance", "rgb"):
+        assert rms[name, "adaptive"] < 0.25 * rms[name, 1]
+    np.testing.assert_array_equal(pictures["adaptive"]["depth"], pictures[1]["depth"])
+    alone = render(scene, LENS, poses, outputs=("rgb",), config=ADAPTIVE, device=device)
+    difference = np.abs(alone["rgb"].astype(int) - pictures["adaptive"]["rgb"])
+    assert difference.max() <= 1
+
+
+def test_threads_and_launches_change_nothing():
+    """Marked pixels are queued in any order, and rendered alike."""
+    scene, offsets = strips((-0.3, 0.01), (0.2, 0.21)), np.linspace(0.0, 0.05, 7)
+    one, two = (radiance(scene, offsets, thread_count=count) for count in (1, 3))
+    np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(one[3:4], radiance(scene, offsets[3:4]))
+
+
+def test_sample_points():
+    """One in each of 16 columns, 16 rows and 4 x 4 cells; four adjacent pixels look through four columns."""
+    points = hammersley_points()
+    for cells in (np.array([16, 1]), np.array([1, 16]), np.array([4, 4])):
+        assert len({tuple(cell) for cell in np.floor(points * cells)}) == 16
+    assert (np.abs(np.diff(np.sort(points[:4], axis=0), axis=0) - 5.0 / 16.0) < 1e-12).all()
+    lens = PinholeConfig(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0)
+    rays = first_rays(lens).reshape(8, 8, 4)
+    position = rays[..., :2] / rays[..., 2:3] * 8.0 + 4.0
+    cell = np.floor((position % 1.0) * 4.0).astype(int)
+    for start in range(5):
+        assert all(len(set(cell[start : start + 4, col, 0])) == 4 for col in range(8))
+        assert all(len(set(cell[row, start : start + 4, 1])) == 4 for row in range(8))
+    np.testing.assert_allclose(rays[..., 3], ray_layers(lens, 1)[0, :, 3].reshape(8, 8), rtol=1e-6)
+
+
+def test_settings():
+    assert RenderConfig().samples_per_pixel == "adaptive"
+    for bad in ("all", 0, 65):
+        with pytest.raises(ValueError, match="samples_per_pixel"):
+            RenderConfig(samples_per_pixel=bad)
+    with pytest.raises(ValueError, match="fill_factor"):
+        RenderConfig(fill_factor=0.0)
