@@ -134,9 +134,6 @@ class LiveSession:
         self.sensors = {name: [s.name for s in sensors] for name, sensors in self._vehicles.items()}
         self.phase = ""
         self._rotor_counts = {n: config.of(n).vehicle.airframe().rotor_count for n in config.vehicles}
-        self._has_links = any(
-            not link.delivers_at_once for name in config.vehicles for link in config.of(name).links.values()
-        )
         self._node = node
         self._outlet = outlet
         self._number = number
@@ -193,7 +190,6 @@ class LiveSession:
             scene=self._shapes,
             event_window_ns=self._options.event_window_ns,
             image_rate_max_hz=self._options.image_rate_hz,
-            links=self._has_links,
             compress=self._outlet.compress,
             live=True,
             keep_layout=number > 1,
