@@ -149,7 +149,7 @@ def test_sample_points():
 
 
 def test_settings():
-    assert RenderConfig().samples_per_pixel == "adaptive"
+    assert RenderConfig().samples_per_pixel == 1
     for bad in ("all", 0, 65):
         with pytest.raises(ValueError, match="samples_per_pixel"):
             RenderConfig(samples_per_pixel=bad)
