@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import warp as wp
-from neurosim_core.worlds.scan import make_noisy_scan
 
 import neurosim_core
 from neurosim_core import run

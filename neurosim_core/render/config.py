@@ -67,8 +67,8 @@ class RenderConfig(Settings):
     """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray, 4
     where log radiance differs by more than 0.05 between neighbouring pixels, and 16 where it differs by as
     much within a pixel; it takes about 7 times as long as one ray. An integer: as many rays in all pixels.
-    With 1, edges alias, and a quarter to a half of the events at 346x260 are aliasing. Geometry (depth, normal, instance) is always that of the ray through the
-    pixel's centre."""
+    With 1, edges alias, and a quarter to a half of the events at 346x260 are aliasing. Geometry (depth,
+    normal, instance) is always that of the ray through the pixel's centre."""
     fill_factor: float = Field(default=1.0, gt=0.0, le=1.0)
     """Share of a pixel's area that is sensitive to light, a square around its centre."""
     mip_bias: float = Field(default=0.0, ge=-4.0, le=4.0)
