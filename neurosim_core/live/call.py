@@ -18,6 +18,7 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.live.services import STEP_DEADLINE_S
 from neurosim_core.live.topics import SERVICES, STATUS
 
+_TABLE_WIDTH = 100
 GRACE_S = 1.0
 """How much longer than the steps may take the client waits to hear that they were not over [s]."""
 
@@ -40,7 +41,8 @@ def call(arguments: argparse.Namespace) -> int:
     if not timeout_s > 0.0:
         raise ValueError(f"--timeout must be > 0, got {timeout_s}")
     if arguments.what == "status":
-        console.print(Markdown(describe_status(_status(timeout_s))))
+        wide = Console(highlight=False, width=max(console.width, _TABLE_WIDTH))
+        wide.print(Markdown(describe_status(_status(timeout_s))))
         return 0
     service, request = _request(arguments)
     reply = _ask(service, request, timeout_s + GRACE_S * isinstance(request, Step))
