@@ -28,6 +28,12 @@ def _numbers(kind: type) -> Callable[[str], tuple[Any, ...]]:
     return read
 
 
+def _pixels(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number, at least 1, got {text}")
+    return int(text)
+
+
 def _option(text: str, default: Any = None, **argument: Any) -> Any:
     return field(default=default, metadata={"help": text, **argument})
 
@@ -39,8 +45,8 @@ class Options:
     quick: bool = _option("a small version; its figures are rough", False, action="store_true")
     scene: Path | None = _option("mesh file; default: a generated scene", type=Path, metavar="FILE")  # noqa: RUF009
     device: str = _option("auto, cpu, cuda:0, ... (default: auto)", default="auto")
-    width: int | None = _option("columns of the camera", type=int, metavar="PX")
-    height: int | None = _option("rows of the camera", type=int, metavar="PX")
+    width: int | None = _option("columns of the camera", type=_pixels, metavar="PX")
+    height: int | None = _option("rows of the camera", type=_pixels, metavar="PX")
     samples: tuple[int, ...] | None = _option("rays per pixel", type=_numbers(int), metavar="N,...")
     seconds: float | None = _option("how long to measure or fly each case", type=float, metavar="S")
     worlds: tuple[int, ...] | None = _option("numbers of worlds", type=_numbers(int), metavar="N,...")

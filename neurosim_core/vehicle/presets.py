@@ -24,9 +24,10 @@ CRAZYFLIE = MultirotorConfig(
     # Measured by others: Foerster (2015), "System Identification of the Crazyflie 2.0 Nano Quadrocopter";
     # Bitcraze, "Measuring propeller RPM: part 3" (2015); Crazyflie firmware, power_distribution_quadrotor.c;
     # mass and arm as in RotorPy 3.0.0, crazyflie_params.py.
-    # "Logs": identified from the two flights in the data of Eschmann et al. (2024), arXiv 2404.07837, such
-    # that rates 0.3 s ahead (`vehicle.replay`) are best on both and the torque ratio is the firmware's. Logs
-    # tell torque over inertia only; Foerster's inertia of the bare frame is 2.9 times smaller.
+    # "Logs": effective values, fitted on the two flights in the data of Eschmann et al. (2024), arXiv
+    # 2404.07837, so that the rates 0.3 s ahead (`vehicle.replay`) are nearer than "nothing changes". They
+    # were judged on the same flights, with none held out. The inertia is 2.9 times Foerster's for the bare
+    # frame and stands for what the model lacks; the drag is 7 times the published one.
     mass_kg=0.03,
     inertia_kg_m2=_diagonal((4.8e-5, 4.8e-5, 9.6e-5)),  # logs
     rotor_position_m=_cross(0.043 * _DIAGONAL, 0.043 * _DIAGONAL, 0.028),  # height: logs, where drag attacks
