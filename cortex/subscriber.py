@@ -268,10 +268,14 @@ class Subscriber(Generic[T]):
         except Closed:
             raise StopAsyncIteration from None
 
-    def _nothing_came(self, timeout_s: float | None) -> Exception:
+    def _nothing_came(self, timeout_s: float | None) -> TimeoutError:
         """What to raise when no message came in time: if all publishers have another type, that is why."""
         if self._mismatch is not None and self.refused and not self._links:
-            return self._mismatch
+            error = TimeoutError(
+                f"{self.topic}: no message within {timeout_s} s, because of its type. {self._mismatch}"
+            )
+            error.__cause__ = self._mismatch
+            return error
         others = f" ({len(self.refused)} publisher(s) of another type)" if self.refused else ""
         return TimeoutError(f"{self.topic}: no message within {timeout_s} s{others}")
 

@@ -105,17 +105,21 @@ def test_a_chunk_unpacks_to_no_more_than_it_claims(tmp_path):
     assert _decompress("lz4", lz4.compress(b"whole"), 5) == b"whole"
 
 
-def test_no_message_in_time_is_a_type_mismatch_while_all_publishers_have_another_type(runtime):
+def test_no_message_in_time_says_that_all_publishers_have_another_type(runtime):
     with Node("one") as one, Node("other") as other:
         subscriber = one.subscriber("/grid", Grid)
         other.publisher("/grid", Cells)
-        for _ in range(3):  # not only the first time
-            with pytest.raises(TypeMismatch, match="publishes another type"):
-                subscriber.recv(2.0)
+        with pytest.raises(TypeMismatch, match="publishes another type"):
+            subscriber.recv(2.0)
+        for _ in range(2):
+            with pytest.raises(TimeoutError, match="publishes another type") as caught:
+                subscriber.recv(0.05)
+            assert isinstance(caught.value.__cause__, TypeMismatch)
         right = other.publisher("/grid", Grid)
         right.wait_for_subscribers()
-        with pytest.raises(TimeoutError, match="of another type"):
+        with pytest.raises(TimeoutError) as caught:
             subscriber.recv(0.05)
+        assert caught.value.__cause__ is None
 
 
 def test_back_pressure_ends_when_the_publisher_says(runtime):
