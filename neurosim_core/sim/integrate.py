@@ -204,7 +204,7 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
     if reached:
         row = rows.states[len(reached) - 1, 0]
-        state.last = odometry(row, stamp_ns=reached[-1], sequence=0, sensor="odometry")
+        state.last = _odometry(row, reached[-1])
     return packets
 
 
@@ -226,12 +226,11 @@ def _failure(vehicle: Multirotor) -> DynamicsError:
     raise AssertionError("the status of a vehicle that is held does not change")
 
 
-def odometry(row: Any, *, stamp_ns: int, sequence: int, sensor: str) -> Odometry:
-    """Return a row of a trace as a packet."""
+def _odometry(row: Any, stamp_ns: int) -> Odometry:
+    """Return a row of a trace as the packet that `observe` gives."""
     return Odometry(
         stamp_ns=stamp_ns,
-        sequence=sequence,
-        sensor=sensor,
+        sensor="odometry",
         position=row[POSITION],
         orientation=row[ORIENTATION],
         velocity=row[VELOCITY],
