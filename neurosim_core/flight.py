@@ -6,6 +6,7 @@ import contextlib
 import importlib.util
 import itertools
 import shutil
+import sys
 import tempfile
 import threading
 import time
@@ -125,7 +126,7 @@ def fly(
         DynamicsError: The integration failed; the recording holds everything up to there.
         OSError: The folder cannot be written to, or the disk is full.
     """
-    console = console or Console()
+    console = console or Console(soft_wrap=not sys.stdout.isatty())  # no lines broken in a pipe
     report = FlightReport()
     begin = time.perf_counter()
     with _new_folder(folder), console.status("preparing") as status:

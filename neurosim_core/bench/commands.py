@@ -52,6 +52,12 @@ QUESTIONS: Sequence[Question] = (
         help="error against run time of the flight dynamics, and stiff and extreme flights",
     ),
     Question(
+        name="replay",
+        help="logs of real flights of a Crazyflie against the vehicle model, in open loop",
+        options=("logs",),
+        in_all=False,
+    ),
+    Question(
         name="events",
         help="error against run time of events, over renders a second and rays per pixel",
         options=(*_VIEW, "samples"),

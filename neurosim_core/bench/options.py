@@ -34,6 +34,10 @@ def _pixels(text: str) -> int:
     return int(text)
 
 
+def _paths(text: str) -> tuple[Path, ...]:
+    return tuple(Path(part) for part in text.split(","))
+
+
 def _option(text: str, default: Any = None, **argument: Any) -> Any:
     return field(default=default, metadata={"help": text, **argument})
 
@@ -79,6 +83,11 @@ class Options:
     )
     factor: float = _option(
         "real-time factor of the slow controller (default: 1)", 1.0, type=float, metavar="F"
+    )
+    logs: tuple[Path, ...] | None = _option(
+        "logs of flights: time [s], accelerometer [g], gyroscope [deg/s], commands of four motors [PWM]",
+        type=_paths,
+        metavar="FILE,...",
     )
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Further settings by dotted key."""

@@ -21,22 +21,20 @@ def _cross(x_m: float, y_m: float, z_m: float = 0.0) -> tuple[Vector3, ...]:
 
 
 CRAZYFLIE = MultirotorConfig(
-    # Measured by others: Foerster (2015), "System Identification of the Crazyflie 2.0 Nano Quadrocopter";
-    # Bitcraze, "Measuring propeller RPM: part 3" (2015); Crazyflie firmware, power_distribution_quadrotor.c;
-    # mass and arm as in RotorPy 3.0.0, crazyflie_params.py.
-    # "Logs": effective values, fitted on the two flights in the data of Eschmann et al. (2024), arXiv
-    # 2404.07837, so that the rates 0.3 s ahead (`vehicle.replay`) are nearer than "nothing changes". They
-    # were judged on the same flights, with none held out. The inertia is 2.9 times Foerster's for the bare
-    # frame and stands for what the model lacks; the drag is 7 times the published one.
+    # Foerster (2015), "System Identification of the Crazyflie 2.0 Nano Quadrocopter"; Crazyflie firmware,
+    # which carries its figures; Bitcraze, "Measuring propeller RPM: part 3" (2015); mass and arm as in
+    # RotorPy 3.0.0, crazyflie_params.py. `neurosim bench replay` flies it through logs of real flights.
     mass_kg=0.03,
-    inertia_kg_m2=_diagonal((4.8e-5, 4.8e-5, 9.6e-5)),  # logs
-    rotor_position_m=_cross(0.043 * _DIAGONAL, 0.043 * _DIAGONAL, 0.028),  # height: logs, where drag attacks
+    inertia_kg_m2=_diagonal(
+        (1.66e-5, 1.66e-5, 2.93e-5)
+    ),  # firmware, physical_constants.c, without its products
+    rotor_position_m=_cross(0.043 * _DIAGONAL, 0.043 * _DIAGONAL),
     rotor_direction=(1, -1, 1, -1),
     thrust_coefficient_n_s2=2.3e-8,  # Foerster (2015); Bitcraze: 14.5 g at 2500 rad/s
     torque_coefficient_n_m_s2=0.005964552 * 2.3e-8,  # firmware: thrustToTorque [m]
-    rotor_drag_kg=7e-06,  # logs
+    rotor_drag_kg=10.2506e-07,  # Foerster (2015)
     rotor_inflow_kg=7.553e-07,  # Foerster (2015)
-    motor_time_constant_s=0.05,  # logs; Eschmann et al. (2024): 0.072
+    motor_time_constant_s=0.072,  # Eschmann et al. (2024), arXiv 2404.07837
     rotor_speed_max_rad_s=2500.0,  # Bitcraze
 )
 """Bitcraze Crazyflie 2.x."""

@@ -176,13 +176,13 @@ def test_far_setpoint(name):
 
 def test_height_is_kept_before_distance():
     """A vehicle with little thrust to spare flies sideways only as hard as height allows."""
-    config = preset("hummingbird", mass_kg=4.36)  # thrust over weight 1.17
+    config = preset("crazyflie", mass_kg=0.05)  # thrust over weight 1.17
     vehicle = Multirotor(config)
     vehicle.reset()
     controller = make_controller("position", config)
     controller.set([20.0, 0.0, 0.0, 0.0])
     _, states = fly(vehicle, controller, rate_hz=100.0, duration_ns=4_000_000_000)
-    assert states[0][:, 0, 2].min() > -0.1
+    assert states[0][:, 0, 2].min() > -0.15  # 0.118 m while it tilts: a fifth of a second of falling free
     assert states[0][-1, 0, 0] > 5.0
 
 
@@ -235,17 +235,13 @@ def test_flip_is_followed(device):
 
 
 @pytest.mark.parametrize(
-    ("name", "fast", "error_2_m_s", "error_fast"),
-    [
-        ("crazyflie", (3.0, 6.0), 0.06, 0.07),  # drag takes as much thrust as its weight at 6 m/s
-        ("hummingbird", (9.0, 10.0), 0.02, 0.06),
-        ("racer", (9.0, 10.0), 0.003, 0.04),
-    ],
+    ("name", "length_9_m_s", "error_2_m_s", "error_9_m_s"),
+    [("crazyflie", 24.0, 0.010, 0.03), ("hummingbird", 10.0, 0.02, 0.06), ("racer", 10.0, 0.003, 0.04)],
 )
 @pytest.mark.parametrize("rate_hz", [100.0, 500.0])
-def test_presets_track(name, fast, error_2_m_s, error_fast, rate_hz):
+def test_presets_track(name, length_9_m_s, error_2_m_s, error_9_m_s, rate_hz):
     """All presets fly a figure eight with the same gains, at 100 Hz as at 500 Hz."""
     config = preset(name)
     # bounds are about 1.5 times what was measured
     assert path_error(config, eight(2.0, 3.0), rate_hz=rate_hz).max() < error_2_m_s
-    assert path_error(config, eight(*fast), rate_hz=rate_hz).max() < error_fast
+    assert path_error(config, eight(9.0, length_9_m_s), rate_hz=rate_hz).max() < error_9_m_s
