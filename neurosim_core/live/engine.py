@@ -183,7 +183,6 @@ class VehicleEngine:
             in_flight=1,
             flight_lane_count=pending,
             borrow_pictures=self._lockstep,
-            late_pictures=self.writes_in_place,
             make_room=self._acquire if self.writes_in_place else None,
             seed=seed,
             start=start,

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
@@ -14,7 +14,6 @@ from neurosim_core.sim.render_group import (
     RenderGroupState,
     RenderJob,
     acquire_room,
-    bring_images,
     choose_ticks,
     disable_frame_sensors,
     is_due,
@@ -27,17 +26,16 @@ from neurosim_core.sim.render_group import (
 from neurosim_core.sim.state import Batch, State
 
 
-def launch_cameras(model: Model, state: State, batch: Batch, groups: Collection[int] | None = None) -> None:
+def launch_cameras(model: Model, state: State, batch: Batch) -> None:
     """Let the cameras that are wanted see a batch, and launch the copies to the host.
 
     Args:
         model: What does not change.
         state: What does.
         batch: What was flown.
-        groups: Indices of those that render; None: all.
     """
     jobs = batch.jobs
-    due = choose(model, state, batch, groups) if jobs is None else ()
+    due = choose(model, state, batch) if jobs is None else ()
     stream = state.render_streams[batch.number % len(state.batch_done)]
     with timed(state.wall_s, "render"), use_stream(stream):
         state.flown[batch.number % state.flight_lane_count].wait_on_stream()
@@ -49,26 +47,17 @@ def launch_cameras(model: Model, state: State, batch: Batch, groups: Collection[
                 job.render()
             else:
                 state.graphs.run(launch_key(job), job.render)
-            bring_images(job.group, job.instants)
         state.rendered.set()
     with use_stream(state.event_stream):
         state.rendered.wait_on_stream()
         scan(state, batch, jobs)
 
 
-def choose(
-    model: Model, state: State, batch: Batch, groups: Collection[int] | None = None
-) -> list[list[int]]:
-    """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight.
-
-    Those that are not among `groups` have none.
-    """
+def choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
+    """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight."""
     chosen: list[list[int]] = []
     choices = []
     for index, group in enumerate(state.groups):
-        if groups is not None and index not in groups:
-            chosen.append([])
-            continue
         disable_frame_sensors(group, batch.wanted)
         always = bool(group.world_frames) or any(name in batch.wanted for name in group.frames)
         due = [
@@ -150,7 +139,7 @@ def read_cameras(state: State, batch: Batch, *, borrow: bool) -> list[Packet]:
     """
     packets: list[Packet] = []
     with timed(state.wall_s, "camera read-back"):
-        if not (state.late_pictures and _is_late(batch)):
+        if not (state.pictures_in_place and _is_late(batch)):
             state.batch_done[batch.number % len(state.batch_done)].wait()
     state.counts["renders"] += sum(len(instants.stamps_ns) for _, instants in batch.seen)
     for choice in batch.choices:

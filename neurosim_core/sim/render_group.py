@@ -116,11 +116,7 @@ class RenderGroupState:
     chosen_slots: Sequence[HostInput] = ()
     """Slots of the ticks chosen, for each batch in flight: they do not come again."""
     make_room: MakeRoom | None = None
-    """Gives memory that pictures are copied to; None: they get their own."""
-    brings_apart: bool = False
-    """`bring_images` launches the copies of pictures to the host, as they go to other places each time."""
-    brings_late: bool = False
-    """They are part of the rendering, and go to the few places that `acquire_room` is given in turn."""
+    """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +148,6 @@ def make_render_group(
     worlds: RenderWorlds = ONE_WORLD,
     on_host: bool = True,
     make_room: MakeRoom | None = None,
-    late: bool = False,
     world_context: Callable[[str, Any], WorldFrameContext] | None = None,
 ) -> RenderGroupState:
     """Allocate the buffers of a group.
@@ -168,8 +163,8 @@ def make_render_group(
         bodies: What moves in the scene.
         worlds: Who is rendered together.
         on_host: Bring pictures and events to the host, as packets.
-        make_room: Gives memory to copy a picture to, where the caller has a place for it.
-        late: It is asked for, by `acquire_room`, before pictures are rendered, not when they are read.
+        make_room: Gives memory to copy a picture to, where the caller has a place for it; `acquire_room` asks
+            for it before pictures are rendered.
         world_context: Without `on_host`: what the frame sensor of a name is made for, given its frames.
 
     Raises:
@@ -244,8 +239,6 @@ def make_render_group(
         body_poses=[make_body_poses(rows, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(group, scene, p_BC, q_BC),
         make_room=make_room,
-        brings_apart=make_room is not None and not late and wp.get_device(device).is_cuda,
-        brings_late=make_room is not None and late,
         chosen_slots=[HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(in_flight)]
         if group.max_displacement_px is not None
         else (),
@@ -425,11 +418,11 @@ def plan_render(
         for _, _, name in pictures:
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
-        if group.brings_late:
-            _bring(group, instants)
-        elif not group.brings_apart:
+        if group.make_room is None:
             for copy in group.picture_copies[lane].values():
                 copy.fetch(0, used)
+        else:
+            _bring(group, instants)
         return from_slots, to_slots
 
     instants = Instants(
@@ -444,19 +437,19 @@ def plan_render(
 def acquire_room(job: RenderJob) -> None:
     """Ask for memory for the pictures of a job that have none yet, if a device copies them there."""
     group, instants = job.group, job.instants
-    if not group.brings_late:
+    if group.make_room is None:
         return
     for stamp_ns, slot, name in instants.pictures:
         if (name, stamp_ns) not in instants.rooms:
             picture = group.picture_copies[instants.lane][group.images[name].output].view(slot, 1)[0]
-            room = _room_for(group, name, stamp_ns, picture)
+            room = group.make_room(name, stamp_ns, picture)
             if room is not None:
                 instants.rooms[name, stamp_ns] = room
 
 
 def launch_key(job: RenderJob) -> Hashable | None:
     """Return the key of the launches of a job: they copy pictures to where there is room now."""
-    if job.key is None or not job.group.brings_late:
+    if job.key is None or job.group.make_room is None:
         return job.key
     rooms = job.instants.rooms
     places = (rooms.get((name, stamp_ns)) for stamp_ns, _, name in job.instants.pictures)
@@ -497,21 +490,6 @@ def flush_frames(group: RenderGroupState, *, until_ns: int) -> list[Packet]:
     return [packet for sensor in group.frames.values() for packet in sensor.flush(until_ns=until_ns)]
 
 
-def bring_images(group: RenderGroupState, instants: Instants) -> None:
-    """Launch the copies of the pictures just rendered, unless that was part of the rendering.
-
-    The device copies a picture to where the caller has room for it, and there is nothing left to do.
-    """
-    if not group.brings_apart:
-        return
-    for stamp_ns, slot, name in instants.pictures:
-        copy = group.picture_copies[instants.lane][group.images[name].output]
-        room = _room_for(group, name, stamp_ns, copy.view(slot, 1)[0])
-        if room is not None:
-            instants.rooms[name, stamp_ns] = room
-    _bring(group, instants)
-
-
 def _bring(group: RenderGroupState, instants: Instants) -> None:
     """Launch the copies of pictures to the host: to the room that there is, or as usual."""
     for stamp_ns, slot, name in instants.pictures:
@@ -521,12 +499,6 @@ def _bring(group: RenderGroupState, instants: Instants) -> None:
             copy.fetch(slot, 1)
         else:
             copy.fetch_into(room, slot)
-
-
-def _room_for(
-    group: RenderGroupState, name: str, stamp_ns: int, picture: NDArray[Any]
-) -> NDArray[Any] | None:
-    return None if group.make_room is None else group.make_room(name, stamp_ns, picture)
 
 
 def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = False) -> list[Packet]:
@@ -545,11 +517,6 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
         if room is not None:
             return room
         picture: NDArray[Any] = group.picture_copies[instants.lane][image.output].view(slot, 1)[0]
-        if not (group.brings_apart or group.brings_late):
-            room = _room_for(group, name, stamp_ns, picture)
-        if room is not None:
-            np.copyto(room, picture)
-            return room
         if borrow:
             return picture
         key = (image.output, slot)  # cameras that take the same picture share the copy

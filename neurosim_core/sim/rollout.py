@@ -138,7 +138,7 @@ def acquire_rooms(state: State) -> None:
 
 
 def settle(state: State) -> None:
-    """Wait until the device has written all pictures that were handed out (`make_state`, `late_pictures`)."""
+    """Wait until the device has written all pictures that were handed out (`make_state`, `make_room`)."""
     for lane in state.batch_done:
         lane.wait()
 
@@ -215,18 +215,6 @@ def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
     packets = read_cameras(state, batch, borrow=state.borrow_pictures)
     state.rendered_count += 1
     return in_order(model, packets, batch.until_ns)
-
-
-def render_batch_by_group(model: Model, state: State, batch: Batch) -> Iterator[tuple[int, list[Packet]]]:
-    """Do what `render_batch` does, and yield each cast and its packets when it is done, the fastest first.
-
-    A picture does not wait for one that takes longer. For a CPU: a CUDA device would have less at a time.
-    All has to be taken; arguments as for `render_batch`.
-    """
-    for index in sorted(range(len(state.groups)), key=lambda index: -state.groups[index].rate.rate_hz):
-        launch_cameras(model, state, batch, {index})
-        yield index, in_order(model, read_cameras(state, batch, borrow=state.borrow_pictures), batch.until_ns)
-    state.rendered_count += 1
 
 
 def skip_batch(model: Model, state: State, batch: Batch) -> int:

@@ -131,7 +131,7 @@ class State:
     """The most batches that may be flown and not rendered."""
     borrow_pictures: bool
     """Pictures are views that the next batch with the same buffers overwrites."""
-    late_pictures: bool
+    pictures_in_place: bool
     """Pictures for which the caller has room are handed out before the device has finished them."""
     wanted: frozenset[str]
     """Cameras that look, from the next batch on."""
@@ -209,7 +209,6 @@ def make_state(
     in_flight: int | None = None,
     flight_lane_count: int | None = None,
     borrow_pictures: bool = False,
-    late_pictures: bool = False,
     make_room: MakeRoom | None = None,
     seed: int | None = None,
     start: StartState | None = None,
@@ -225,10 +224,8 @@ def make_state(
             `in_flight`.
         borrow_pictures: Do not copy pictures: with one batch in flight, each is valid until the next `step`
             or `render_batch`; those that a step would overwrite itself are copied.
-        late_pictures: Ask for room before pictures are rendered, and do not wait for those that a device
-            copies there: they are there after `settle`.
-        make_room: Gives memory to copy a picture to, where the caller has a place for it; called by the
-            thread that reads the cameras; with `late_pictures` by the one that launches.
+        make_room: Gives memory to copy a picture to, where the caller has a place for it; called before
+            pictures are rendered. Nothing waits for what a device copies there: it is there after `settle`.
         seed: Seed of the sensor noise and of turbulence; None: as configured.
         start: Where the vehicle starts; None: as configured.
         worlds: Many worlds whose results stay on the device, in place of one with packets.
@@ -300,9 +297,7 @@ def make_state(
             paths=paths[0] if all(path is paths[0] for path in paths) else paths,
         ),
         trace=trace,
-        groups=_make_groups(
-            model, worlds, in_flight=in_flight, on_host=on_host, make_room=make_room, late=late_pictures
-        ),
+        groups=_make_groups(model, worlds, in_flight=in_flight, on_host=on_host, make_room=make_room),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -310,11 +305,12 @@ def make_state(
             if on_host
         },
         seeds=seeds,
-        overlaps=on_host and (in_flight > 1 or late_pictures or not is_cuda or bool(model.schedule.sparse)),
+        overlaps=on_host
+        and (in_flight > 1 or make_room is not None or not is_cuda or bool(model.schedule.sparse)),
         batch_done=[Fence(device) for _ in range(in_flight)],
         flight_lane_count=flight_lane_count,
         borrow_pictures=borrow_pictures,
-        late_pictures=late_pictures,
+        pictures_in_place=make_room is not None,
         wanted=frozenset(name for group in model.groups for name in group.names),
         flight_stream=make_stream(device, high_priority=True) if in_flight > 1 else None,
         render_streams=[make_stream(device) if in_flight > 1 else None for _ in range(in_flight)],
@@ -337,7 +333,6 @@ def _make_groups(
     in_flight: int,
     on_host: bool,
     make_room: MakeRoom | None,
-    late: bool,
 ) -> list[RenderGroupState]:
     """Return the render groups; none where the scene is not on the device."""
     config, scenes = model.config, worlds.scenes
@@ -381,7 +376,6 @@ def _make_groups(
                 ),
                 on_host=on_host,
                 make_room=make_room,
-                late=late,
                 world_context=None if on_host else world_context,
             )
         )

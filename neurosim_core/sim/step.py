@@ -31,7 +31,7 @@ from neurosim_core.sim.cameras import (
 )
 from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, read_flight
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.render_group import acquire_room, bring_images, launch_key
+from neurosim_core.sim.render_group import acquire_room, launch_key
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.warp_start import refuse_forked_process
 
@@ -66,8 +66,6 @@ def launch(model: Model, state: State, batch: Batch, *, last_seen_ns: Sequence[i
 
         with timed(state.wall_s, "flight and render"):
             state.graphs.run((flight_key, worlds_key, *map(launch_key, jobs)), everything)
-            for job in jobs:
-                bring_images(job.group, job.instants)
         turn_parities(state, batch)
         scan(state, batch, jobs)  # log radiance -> events, in a world whose packets go to the host
     if state.on_host:

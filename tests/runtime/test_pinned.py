@@ -84,7 +84,7 @@ def test_launches_are_others_when_memory_was_pinned_anew(memory, monkeypatch):
     monkeypatch.setattr(pinned, "_driver", Driver)
     room = np.zeros((2, 3), dtype=np.uint8)
     seen = SimpleNamespace(rooms={("rgb", 0): room}, pictures=((0, 0, "rgb"), (5, 1, "rgb")))
-    look: Any = SimpleNamespace(key="look", group=SimpleNamespace(brings_late=True), instants=seen)
+    look: Any = SimpleNamespace(key="look", group=SimpleNamespace(make_room=True), instants=seen)
     before = launch_key(look)
     assert launch_key(look) == before
     PinnedMapping(memory, "cpu")

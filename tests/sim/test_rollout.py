@@ -467,10 +467,9 @@ class LateCopies:
         monkeypatch.setattr(cuda.Fence, "wait", wait)
 
 
-@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("names", [("rgb",), ("rgb", "depth"), ("events", "rgb", "depth")])
-def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch, late, names):
-    """They are there at once, or after `settle` where the caller asks for that and there is nothing else."""
+def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch, names):
+    """They are there after `settle`; nothing waits for them where there is nothing else."""
     copies = LateCopies(monkeypatch)
     sensors = {name: {**SENSORS[name], "rate_hz": 100.0} for name in names if name != "events"}
     if "events" in names:
@@ -485,9 +484,7 @@ def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch,
         rooms.append(np.full_like(picture, 77))
         return rooms[-1]
 
-    state = sim.make_state(model, late_pictures=late, make_room=make_room)
-    for cast in state.groups:
-        cast.brings_apart = not cast.brings_late
+    state = sim.make_state(model, make_room=make_room)
     packets = []
     unfinished_count = 0
     for _ in range(10):
@@ -500,36 +497,7 @@ def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch,
     pictures = [packet for packet in packets if isinstance(packet, Image)]
     assert len(pictures) == len(rooms) > 5
     assert all(picture.data is room for picture, room in zip(pictures, rooms, strict=True))
-    assert (unfinished_count > 4) == (late and "events" not in names)
-
-
-def test_the_fastest_camera_is_seen_first(settings):
-    """Cast by cast the packets are those of all at once; the first are there before others are rendered."""
-    lens = {"width": 20, "height": 16, "horizontal_fov_rad": 1.0}
-    slow = {"kind": "depth", "rate_hz": 50.0, "lens": lens}
-    sensors = {"slow": slow, **settings["sensors"]}  # the order of the rig is not that of their rates
-    model = sim.make_model(ns.load_config({**settings, "sensors": sensors}))
-    together, apart = (sim.make_state(model, flight_lane_count=64) for _ in range(2))
-    early_count = 0
-    for _ in range(10):
-        _, batches = sim.integrate_period(model, together, None)
-        expected = [sim.render_batch(model, together, batch) for batch in batches]
-        _, batches = sim.integrate_period(model, apart, None)
-        for batch, packets in zip(batches, expected, strict=True):
-            found, renders = [], []
-            for cast, part in sim.render_batch_by_group(model, apart, batch):
-                assert {packet.sensor for packet in part} <= set(model.groups[cast].names)
-                if part:
-                    renders.append(apart.counts["renders"])
-                    found.append(part)
-            assert sorted(content([p for part in found for p in part])) == sorted(content(packets))
-            if of(packets, "slow") and len(found) > 1:
-                assert {packet.sensor for packet in found[-1]} == {"slow"}
-                assert renders[-1] == renders[-2] + 1
-                early_count += 1
-    assert early_count >= 2
-    assert apart.rendered_count == together.rendered_count
-    assert apart.counts == together.counts
+    assert (unfinished_count > 4) == ("events" not in names)
 
 
 def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
