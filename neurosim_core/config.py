@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_validator, model_validator
 
 from neurosim_core.control import Se3Config
 from neurosim_core.live.config import LinkConfig, LiveConfig
@@ -20,7 +20,7 @@ from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
-from neurosim_core.sensors.base import SensorConfig
+from neurosim_core.sensors.base import SensorConfig, expand_stereo
 from neurosim_core.sensors.depth import DepthSensorConfig
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.imu import ImuSensorConfig
@@ -102,7 +102,7 @@ else:
     ]
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
-Sensors = dict[Name, AnySensor]
+Sensors = Annotated[dict[Name, AnySensor], AfterValidator(expand_stereo)]
 Links = dict[Name, LinkConfig]
 
 STREAMS = ("odometry", "rotor_speeds", "command")
@@ -253,7 +253,7 @@ def _take_new_kinds(seam: str) -> None:
     known: Any = Annotated[
         functools.reduce(operator.or_, kinds("sensor").values()), Field(discriminator="kind")
     ]
-    sensors: Any = dict[Name, known]
+    sensors: Any = Annotated[dict[Name, known], AfterValidator(expand_stereo)]
     FleetMember.model_fields["sensors"].annotation = sensors | None
     SimulationConfig.model_fields["sensors"].annotation = sensors
     for settings in (FleetMember, SimulationConfig):
@@ -273,7 +273,7 @@ def load_config(
 
     Args:
         source: A YAML file, a mapping with the same keys, or None for the defaults. Relative files of the
-            scene and of bodies are looked up beside the YAML file.
+            scene, of bodies and of lenses are looked up beside the YAML file.
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
             another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
             the default set are changed, and new ones added to it.
@@ -372,11 +372,13 @@ def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Make relative files of scene and bodies absolute: they are meant relative to the settings file."""
+    """Make relative files of scene, bodies and lenses absolute, from the settings file's folder."""
     places: list[tuple[str, ...]] = [("scene",)]
     bodies = raw.get("bodies")
     for name in bodies if isinstance(bodies, Mapping) else ():
         places += [("bodies", name, "shape"), ("bodies", name, "surface")]
+    sensors = raw.get("sensors")
+    places += [("sensors", name, "lens") for name in (sensors if isinstance(sensors, Mapping) else ())]
     for place in places:
         group: Any = raw
         for key in place:

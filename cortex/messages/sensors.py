@@ -60,7 +60,10 @@ class Image:
 
 @message(name="cortex/CameraInfo")
 class CameraInfo:
-    """How a camera projects: pixel column = fx * x / z + cx, row = fy * y / z + cy, in the camera's frame."""
+    """How a camera projects: pixel column = fx * x_d + cx, row = fy * y_d + cy, in the camera's frame.
+
+    (x_d, y_d) is (x / z, y / z) of a pinhole, or what the distortion model makes of it.
+    """
 
     stamp_ns: Annotated[int, Unit("ns")]
     """From when on it holds [ns]."""

@@ -187,8 +187,8 @@ def camera_info(vehicle: str, sensor: SensorDescription) -> msg.CameraInfo | Non
         width=lens.width,
         height=lens.height,
         matrix=np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]]),
-        distortion_model="",
-        distortion=np.zeros(0),
+        distortion_model=lens.distortion_model,
+        distortion=np.array(lens.distortion, dtype=np.float64),
         frame_id=sensor_frame(vehicle, sensor),
     )
 

@@ -9,7 +9,8 @@ and shuffle are used, which are part of HDF5 itself.
     /sensors/<name>          attributes: packet (name of the packet class), schema (JSON of its
                              `packets.PacketSchema`), each constant field of the packet; for sensors in the
                              header kind, rate_hz, p_BS, q_BS_xyzw, settings (JSON), and for cameras
-                             intrinsics (fx fy cx cy), resolution (width height)
+                             intrinsics (fx fy cx cy), resolution (width height), and unless they are
+                             pinholes distortion_model, distortion
         packet_count         how many packets are complete
         stamp_ns, sequence   one row per packet
         order                counts the packets of the whole file, as written
@@ -402,6 +403,9 @@ def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:
             lens = sensor.intrinsics
             group.attrs["intrinsics"] = [lens.fx, lens.fy, lens.cx, lens.cy]
             group.attrs["resolution"] = [lens.width, lens.height]
+            if lens.distortion_model:
+                group.attrs["distortion_model"] = lens.distortion_model
+                group.attrs["distortion"] = np.array(lens.distortion, np.float64)
     return groups
 
 

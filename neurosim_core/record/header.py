@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """A pinhole camera: u = fx x/z + cx, v = fy y/z + cy; pixel centres are at +0.5."""
+    """A camera: u = fx x_d + cx, v = fy y_d + cy; pixel centres are at +0.5.
+
+    (x_d, y_d) is (x/z, y/z) of a pinhole, or what distortion makes of it (`render.lenses`).
+    """
 
     width: int
     """Columns [px]."""
@@ -29,6 +32,11 @@ class Intrinsics:
     """Column of the optical axis [px]."""
     cy: float
     """Row of the optical axis [px]."""
+    distortion_model: str = ""
+    """Name in sensor_msgs/CameraInfo (plumb_bob, rational_polynomial, equidistant), or double_sphere, or
+    ray_table, whose fx to cy hold around the centre only; empty for a pinhole."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of the model."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,8 +95,13 @@ def _describe(name: str, sensor: Any) -> SensorDescription:
         orientation = mount.rotation().as_quat() if lens is None else mount.optical_quaternion()
     intrinsics = None
     if lens is not None:
-        K = lens.intrinsics()
-        intrinsics = Intrinsics(width=lens.width, height=lens.height, fx=K.fx, fy=K.fy, cx=K.cx, cy=K.cy)
+        intrinsics = Intrinsics(
+            width=lens.width,
+            height=lens.height,
+            **lens.intrinsics()._asdict(),
+            distortion_model=lens.distortion_model,
+            distortion=lens.distortion_coefficients,
+        )
     return SensorDescription(
         name=name,
         kind=sensor.kind,

@@ -271,7 +271,16 @@ def _read_sensor(group: Any) -> SensorDescription:
     if "intrinsics" in group.attrs:
         fx, fy, cx, cy = (float(v) for v in group.attrs["intrinsics"])
         width, height = (int(v) for v in group.attrs["resolution"])
-        intrinsics = Intrinsics(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+        intrinsics = Intrinsics(
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            distortion_model=str(group.attrs.get("distortion_model", "")),
+            distortion=tuple(float(v) for v in group.attrs.get("distortion", ())),
+        )
     return SensorDescription(
         name=group.name.rsplit("/", 1)[1],
         kind=str(group.attrs["kind"]),

@@ -1,4 +1,4 @@
-"""Lenses: which way each pixel of a camera looks.
+"""What a lens is to a renderer, and the pinhole; the other lenses are in `lenses.py`.
 
 A renderer knows nothing of a lens but its table of rays, so that any lens can be used.
 """
@@ -6,7 +6,7 @@ A renderer knows nothing of a lens but its table of rays, so that any lens can b
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ class Lens(Protocol):
     def ray_spread(self) -> NDArray[np.float32]:
         """Return the angle between the rays of neighbouring pixels [rad], shape [H, W]."""
 
+    def blind_pixels(self) -> NDArray[np.bool_] | None:
+        """Return which pixels see nothing, shape [H, W]; None: all see."""
+
 
 class Intrinsics(NamedTuple):
     """A pinhole in pixels: pixel column = fx * x / z + cx, pixel row = fy * y / z + cy."""
@@ -49,6 +52,7 @@ class Intrinsics(NamedTuple):
 class PinholeConfig(Settings):
     """A pinhole camera, given by its field of view or by fx, fy, cx, cy, not by both."""
 
+    kind: Literal["pinhole"] = "pinhole"
     width: int = Field(gt=0, le=16384)
     """Width of the picture [px]."""
     height: int = Field(gt=0, le=16384)
@@ -77,6 +81,16 @@ class PinholeConfig(Settings):
             missing = f": missing {[name for name in pixels if name not in given]}" if given else ""
             raise ValueError(f"give horizontal_fov_rad (such as 1.5), or all of fx, fy, cx, cy{missing}")
         return self
+
+    @property
+    def distortion_model(self) -> str:
+        """A pinhole does not distort."""
+        return ""
+
+    @property
+    def distortion_coefficients(self) -> tuple[float, ...]:
+        """There are none."""
+        return ()
 
     def intrinsics(self) -> Intrinsics:
         """Return fx, fy, cx, cy [px], whichever way the camera was given."""
@@ -116,3 +130,6 @@ class PinholeConfig(Settings):
         fx, fy, _, _ = self.intrinsics()
         cosine = self.ray_table()[..., 2].astype(np.float64)
         return np.sqrt(cosine**3 / (fx * fy)).astype(np.float32)
+
+    def blind_pixels(self) -> None:
+        """All pixels see."""

@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol
 
 import warp as wp
 
-from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
 from neurosim_core.render.scene_arrays import SceneArrays
@@ -110,7 +110,7 @@ def upload_scene(
 
 def make_renderer(
     scene: SceneOnDevice,
-    lens: PinholeConfig,
+    lens: Lens,
     *,
     outputs: Collection[str],
     instant_count: int,
@@ -128,11 +128,15 @@ def make_renderer(
         worlds: Who is rendered together: several only by `warp`.
 
     Raises:
-        ValueError: An output is unknown, or the renderer does not have it; or it renders one world only.
+        ValueError: An output is unknown, or the renderer does not have it; it renders one world only, or only
+            pinholes.
     """
     if worlds.count > 1 and not isinstance(scene, SceneArrays):
         raise ValueError(f"{worlds.count} worlds are rendered by renderer 'warp' only")
     if isinstance(scene, PyrenderScene):
+        if not isinstance(lens, PinholeConfig):
+            kind = getattr(lens, "kind", type(lens).__name__)
+            raise ValueError(f"pyrender renders pinholes, not a lens of kind {kind}: use renderer: warp")
         return PyrenderRenderer(scene, lens, outputs=outputs, image_count=image_count)
     if isinstance(scene, SyntheticScene):
         return SyntheticRenderer(

@@ -12,6 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.render.antialias import AdaptiveSampling, first_rays, ray_layers, sample_rays
+from neurosim_core.render.blind_pixels import BlindPixels
 from neurosim_core.render.body_arrays import (
     make_body_data,
     place_camera,
@@ -149,6 +150,13 @@ class WarpRenderer:
         self.instance = allocate("instance", images, int)
         arrays_of = {name: getattr(self, name) for name in OUTPUTS} | {"log_radiance": log_radiance}
         self._render_outputs = make_render_outputs(**arrays_of)
+        self._blind = BlindPixels(
+            lenses,
+            worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
+            stride=instant_count,
+            dark_floor=arrays.config.dark_floor,
+            device=str(device),
+        )
 
     def render(
         self,
@@ -216,6 +224,7 @@ class WarpRenderer:
                 self._render_outputs,
                 pixel_count=count * instant_count * self._tile_count * TILE * TILE,
             )
+        self._blind.darken(image_slot, self._render_outputs, instant_count=instant_count)
 
     def _layers(self, lens: Lens, adaptive: bool, has_geometry: bool) -> NDArray[np.float32]:
         """Return the rays of the first pass: of one layer, or that of the centres first."""

@@ -21,6 +21,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
 from neurosim_core.packets import Image, ImageEncoding, Packet
 from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.lenses import AnyLens
 from neurosim_core.settings import Settings
 from neurosim_core.vehicle import Multirotor
 
@@ -115,17 +116,48 @@ class StateSensorConfig(SensorConfig):
         raise NotImplementedError(f"{type(self).__name__} must say how it is made")
 
 
+class StereoConfig(Settings):
+    """A second camera beside the first."""
+
+    baseline_m: Annotated[float, Field(gt=0.0)]
+    """Distance from the left camera to the right one [m], along a row of the picture."""
+
+
 class CameraConfig(SensorConfig):
     """What every camera has: a lens and a place on the body."""
 
-    lens: PinholeConfig = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
-    """Resolution and field of view."""
+    lens: AnyLens = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
+    """Resolution and field of view: {kind: pinhole | radtan | rational | equidistant | double_sphere |
+    ray_table, ...}, a pinhole if no kind is given."""
     mount: Mount = Mount(position_m=(0.1, 0.0, 0.03))
     """Pose of the camera on the body."""
+    stereo: StereoConfig | None = None
+    """Makes two cameras of one, NAME_left where it is mounted, and NAME_right: {baseline_m: 0.12}."""
 
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
         raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
+
+
+def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig]:
+    """Return sensors with two cameras in place of each that has `stereo`.
+
+    Raises:
+        ValueError: A name of the pair is taken.
+    """
+    expanded: dict[str, SensorConfig] = {}
+    for name, sensor in sensors.items():
+        if not isinstance(sensor, CameraConfig) or sensor.stereo is None:
+            expanded[name] = sensor
+            continue
+        for taken in {f"{name}_left", f"{name}_right"} & sensors.keys():
+            raise ValueError(f"{name}.stereo makes a camera {taken!r}, and there is one of this name")
+        right = sensor.mount.rotation().apply([0.0, -sensor.stereo.baseline_m, 0.0])
+        position_m = tuple(float(a + b) for a, b in zip(sensor.mount.position_m, right, strict=True))
+        mounts = {"left": sensor.mount, "right": sensor.mount.model_copy(update={"position_m": position_m})}
+        for side, mount in mounts.items():
+            expanded[f"{name}_{side}"] = sensor.model_copy(update={"mount": mount, "stereo": None})
+    return expanded
 
 
 class ImageSensorConfig(CameraConfig):

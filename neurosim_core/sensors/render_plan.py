@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
-from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.lenses import AnyLens
 from neurosim_core.sensors.base import CameraConfig, RenderRequest, SensorConfig
 
 
@@ -16,7 +16,7 @@ from neurosim_core.sensors.base import CameraConfig, RenderRequest, SensorConfig
 class RenderGroup:
     """Cameras that share a pose, a lens and a clock, so that one ray answers all of them."""
 
-    lens: PinholeConfig
+    lens: AnyLens
     mount: Mount
     rate: Rate
     """The instants at which rays are cast."""
@@ -81,7 +81,7 @@ class _Clock(NamedTuple):
 class _Plan(NamedTuple):
     """A group that cameras may still join."""
 
-    lens: PinholeConfig
+    lens: AnyLens
     mount: Mount
     clock: _Clock
     members: list[str]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
+from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.renderer import (
     ONE_WORLD,
     Renderer,
@@ -270,6 +271,11 @@ def _make_rule(
         raise ValueError(
             f"max_displacement_px of {', '.join(group.frame_sensors)} needs the renderer 'warp': "
             "the others do not know where things are"
+        )
+    if not isinstance(group.lens, PinholeConfig):
+        raise ValueError(
+            f"max_displacement_px of {', '.join(group.frame_sensors)} needs a lens of kind pinhole, got "
+            f"{group.lens.kind}: leave it out, and all ticks are rendered"
         )
     return DisplacementRule(
         scene,
