@@ -160,7 +160,8 @@ class SimulationConfig(Settings):
     vehicle: VehicleConfig = VehicleConfig()
     """The multirotor."""
     path: PathConfig = TourConfig()
-    """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...}."""
+    """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...};
+    {kind: poses, file: poses.txt, format: tum} moves the sensors along poses, without a vehicle."""
     control: ControlConfig = ControlConfig()
     """What flies it."""
     sensors: Sensors = Field(default_factory=_default_sensors)
@@ -273,7 +274,7 @@ def load_config(
 
     Args:
         source: A YAML file, a mapping with the same keys, or None for the defaults. Relative files of the
-            scene, of bodies and of lenses are looked up beside the YAML file.
+            scene, the path, bodies and lenses are looked up beside the YAML file.
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
             another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
             the default set are changed, and new ones added to it.
@@ -372,8 +373,8 @@ def _merge(base: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Make relative files of scene, bodies and lenses absolute, from the settings file's folder."""
-    places: list[tuple[str, ...]] = [("scene",)]
+    """Make relative files of scene, bodies and lenses absolute, as poses, from the settings file's folder."""
+    places: list[tuple[str, ...]] = [("scene",), ("path",)]
     bodies = raw.get("bodies")
     for name in bodies if isinstance(bodies, Mapping) else ():
         places += [("bodies", name, "shape"), ("bodies", name, "surface")]

@@ -385,8 +385,11 @@ def _print_plan(console: Console, model: Model) -> None:
         console.print(f"  {note}", style="dim", highlight=False)
     beyond_s = (model.path.end_ns - model.duration_ns) / NS_PER_S
     rest = f"; the whole path takes {beyond_s:.1f} s more" if beyond_s > 0.0 else ""
+    who = f"[bold]{config.vehicle.preset}[/] flies"
+    if model.path.attitude is not None:
+        who = f"[bold]{getattr(config.path, 'file', None) or 'keyframes'}[/]: the rig moves"
     console.print(
-        f"[bold]{config.vehicle.preset}[/] flies {length:.1f} m in {config.duration_s:g} s, "
+        f"{who} {length:.1f} m in {config.duration_s:g} s, "
         f"at most {speed.max():.1f} m/s, on {model.device}{rest}",
         highlight=False,
     )
@@ -420,7 +423,8 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
         rms_cm = np.sqrt((errors_cm**2).mean())
         facts.add_row("path", f"followed to {rms_cm:.1f} cm RMS, {errors_cm.max():.1f} cm at most")
     ending = "; the run ended there" if state.ended else ""
-    facts.add_row("collisions", f"{_describe_collisions(report)}{ending}")
+    if model.path.attitude is None:
+        facts.add_row("collisions", f"{_describe_collisions(report)}{ending}")
     for name, terms in _terms(model, state).items():
         facts.add_row(f"compiled {name}", ", ".join(terms) or "nothing optional")
     for name, sensor in model.config.sensors.items():
@@ -452,6 +456,8 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
 
 def _describe_steps(model: Model, counts: Mapping[str, int]) -> str:
     """Say how the dynamics were integrated."""
+    if model.path.attitude is not None:
+        return "none: a motion is followed"
     vehicle, commands = model.config.vehicle, f"{counts['commands']:,} commands"
     if vehicle.integrator != "rkmk4":
         return f"adaptive, of {vehicle.integrator}; {commands}"

@@ -27,6 +27,7 @@ from neurosim_core.live.status import RunStats, StatusPublisher, SubscriberMonit
 from neurosim_core.live.streaming import StreamingLoop
 from neurosim_core.live.vehicle import ResetState, VehicleCollisions, VehicleNode, make_reset
 from neurosim_core.packets import Packet
+from neurosim_core.trajectory import PosesConfig
 from neurosim_core.vehicle import DynamicsError
 
 LATE_S = 0.1
@@ -68,9 +69,11 @@ class Simulator:
             on_phase: Called with the name of each part of the preparation when it begins.
 
         Raises:
-            ValueError: The scene cannot be loaded, no path exists, or there is no such device.
+            ValueError: The scene cannot be loaded, no path exists, there is no such device, or nothing can be
+                commanded.
             FileExistsError: There is a recording already.
         """
+        _require_vehicles(config)
         folders = None
         if record is not None:
             folders = open_folders(record, list(config.vehicles), overwrite=overwrite)
@@ -453,3 +456,12 @@ class Simulator:
         if self._recorder is not None:
             self._recorder.change(config, stamp_ns=self.stamp_ns)
         self.status.announce(config)
+
+
+def _require_vehicles(config: SimulationConfig) -> None:
+    """Refuse a rig that follows a file: controllers would wait for something to command."""
+    for name in config.vehicles:
+        if isinstance(config.of(name).path, PosesConfig):
+            raise ValueError(
+                f"vehicle {name!r} follows path.kind poses and takes no commands: `neurosim run` plays it"
+            )

@@ -17,6 +17,9 @@ from neurosim_core.render.scene_data import SceneData
 OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
 """The outputs of the ray caster."""
 
+INSTANT_OUTPUTS = frozenset({"log_radiance"})
+"""Those that all instants have, whether they have an image slot or not."""
+
 
 class RequestedOutputs(NamedTuple):
     """What a set of outputs requires."""

@@ -17,6 +17,7 @@ from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
+from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.reset import begin_batch, end_batch
@@ -84,11 +85,22 @@ def set_command(model: Model, state: State, command: Command, mode: CommandMode)
     """
     if command is None:
         return
+    refuse_commands(model)
     if isinstance(command, Setpoint):
         command, mode = command.row(), command.mode
     rows = checked_command(model, state, command, mode)
     state.commands[mode].stage(rows)
     state.command_mode = mode
+
+
+def refuse_commands(model: Model) -> None:
+    """Raise if what carries the sensors follows a motion that is prescribed.
+
+    Raises:
+        ValueError: It does.
+    """
+    if model.path.attitude is not None:
+        raise ValueError("path.kind poses is followed whatever is commanded: give no command")
 
 
 def plan_batch(
@@ -117,7 +129,10 @@ def plan_batch(
         ),
         closed_loop=closed_loop,
         step_count=sum(-(-span // state.vehicle.max_step_ns) for span in elapsed_ns),
-        command_count=sum(closed_loop and boundary.control for boundary in stretch),
+        command_count=sum(
+            closed_loop and boundary.control and not isinstance(state.vehicle, Carrier)
+            for boundary in stretch
+        ),
         number=number,
         slot=number % state.flight_lane_count * (state.trace.states.shape[0] // state.flight_lane_count),
         wanted=state.wanted,
@@ -171,7 +186,7 @@ def integrate(state: State, batch: Batch) -> None:
             samplers[index].measure(taken[index])
             taken[index] += 1
         state.trace.record(state.surfaces, state.fleet, slot, elapsed_ns)
-        if batch.closed_loop and boundary.control:
+        if batch.closed_loop and boundary.control and not isinstance(state.vehicle, Carrier):
             state.path_controller.update(state.vehicle.arrays)
     wp.launch(end_batch, dim=count, inputs=[elapsed_ns], outputs=[state.fleet.clock_ns], device=device)
 
@@ -217,7 +232,7 @@ def _count_redone(state: State, redone_count: int) -> None:
     state.counts["redone intervals"] = redone_count
 
 
-def _failure(vehicle: Multirotor) -> DynamicsError:
+def _failure(vehicle: Multirotor | Carrier) -> DynamicsError:
     """Return why a vehicle is held."""
     try:
         vehicle.check()

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
 from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.outputs import INSTANT_OUTPUTS
 from neurosim_core.render.renderer import (
     ONE_WORLD,
     Renderer,
@@ -169,13 +170,20 @@ def make_render_group(
         world_context: Without `on_host`: what the frame sensor of a name is made for, given its frames.
 
     Raises:
-        ValueError: The renderer cannot say what moves how far, and the group is adaptive.
+        ValueError: The renderer cannot say what moves how far, and the group is adaptive; or a picture is not
+            for many worlds.
     """
     images = {
         name: ImageChannel(config=sensor, rate=sensor.clock)
         for name in group.image_sensors
         if isinstance(sensor := sensors[name], ImageSensorConfig)
     }
+    instant_outputs = [name for name, image in images.items() if image.output in INSTANT_OUTPUTS]
+    if instant_outputs and not on_host:
+        raise ValueError(
+            f"{', '.join(instant_outputs)}: pictures of log radiance are for single runs; in worlds, "
+            "`rgb` and the results of event cameras stay on the device"
+        )
     # of n consecutive ticks of the group, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
     most = sum(int(capacity * i.rate.rate_hz / group.rate.rate_hz) + 1 for i in images.values())
     picture_count = max(1, min(capacity, most)) if on_host else 1
@@ -385,9 +393,12 @@ def plan_render(
     pictures = []
     image_slots = []
     used = 0
-    for stamp_ns in stamps_ns:
+    for instant, stamp_ns in enumerate(stamps_ns):
         due = _pictures_due(group, stamp_ns, wanted) if group.images else ()
-        pictures += [(stamp_ns, used, name) for name in due]
+        pictures += [
+            (stamp_ns, instant if group.images[name].output in INSTANT_OUTPUTS else used, name)
+            for name in due
+        ]
         image_slots.append(used if due else -1)
         used += bool(due)
     posed, placed = tuple(slots), tuple(image_slots)
@@ -425,8 +436,8 @@ def plan_render(
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
         if group.make_room is None:
-            for copy in group.picture_copies[lane].values():
-                copy.fetch(0, used)
+            for output, copy in group.picture_copies[lane].items():
+                copy.fetch(0, len(slots) if output in INSTANT_OUTPUTS else used)
         else:
             _bring(group, instants)
         return from_slots, to_slots

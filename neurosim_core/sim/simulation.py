@@ -23,7 +23,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.sim.inputs import as_device_array, make_seeds
-from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch
+from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, Samples, VehicleStates
 from neurosim_core.sim.parameters import lenses_differ, vary_sensors
@@ -172,8 +172,18 @@ class Simulation:
 
         Raises:
             ValueError: A shape is wrong or a number not finite; or only some worlds are to be reset, and
-                clocks of the rig, which all worlds share, do not tick together now (see `common_ns`).
+                clocks of the rig, which all worlds share, do not tick together now (see `common_ns`); or the
+                path is a motion that is prescribed, and a start is given.
         """
+        given = {
+            "position": position,
+            "velocity": velocity,
+            "orientation": orientation,
+            "body_rate": body_rate,
+        }
+        if self._model.path.attitude is not None and any(value is not None for value in given.values()):
+            names = ", ".join(name for name, value in given.items() if value is not None)
+            raise ValueError(f"path.kind poses says where an episode starts: give no {names}")
         if mask is not None:
             self._check_partial(seed)
         seeds = None if seed is None else make_seeds(seed, self.count)
@@ -314,6 +324,7 @@ class Simulation:
 
     def _take_commands(self, commands: Any, mode: CommandMode) -> None:
         """Copy commands into the fixed buffer that the graph reads."""
+        refuse_commands(self._model)
         buffer = command_buffer(self._model, self._state, mode)
         on_device = as_device_array(commands, self.device)
         if on_device is not None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from neurosim_core.sensors.base import (
     WorldFrameContext,
 )
 from neurosim_core.sensors.render_plan import RenderGroup
+from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import Rig, lens_tables
@@ -110,7 +112,7 @@ class State:
     world_count: int
     on_host: bool
     """Packets go to the host; else results stay on the device."""
-    vehicle: Multirotor
+    vehicle: Multirotor | Carrier
     fleet: Any
     """The vehicles and the clocks of their worlds as kernels see them (`trace.Fleet`)."""
     surfaces: Any
@@ -250,14 +252,10 @@ def make_state(
     flight_lane_count = max(in_flight, flight_lane_count or 0)
     slot_count = flight_lane_count * worlds.slot_count
     seeds: Any = wp.array(np.array(worlds.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
-    vehicle = Multirotor(
-        model.airframe,
-        count=count,
-        device=device,
-        max_step_ns=to_ns(config.vehicle.max_step_s),
-        integrator=config.vehicle.integrator,
-        seeds=seeds,
-    )
+    vehicle: Any = _make_vehicle(model, worlds, seeds)
+    carried = isinstance(vehicle, Carrier)
+    if carried and start is not None:
+        raise ValueError("path.kind poses says where an episode starts: give no start")
     fleet = _make_fleet(vehicle)
     samplers = {
         name: sensor.make(
@@ -283,7 +281,7 @@ def make_state(
         surfaces=make_surfaces(
             worlds.scenes.fields,
             worlds.scenes.scene,
-            radius_m=config.vehicle.collision_radius_m,
+            radius_m=-math.inf if carried else config.vehicle.collision_radius_m,  # it touches nothing
             ground_height_m=None if ground is None else ground.height_m,
             holds=config.vehicle.on_collision == "end",
         ),
@@ -324,6 +322,27 @@ def make_state(
     )
     reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
     return state
+
+
+def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Multirotor | Carrier:
+    """Return the vehicles of all worlds, or what carries the sensors along a motion that is prescribed."""
+    max_step_ns = to_ns(model.config.vehicle.max_step_s)
+    if model.path.attitude is not None:
+        return Carrier(
+            model.airframe,
+            [each.path for each in worlds.scenes.models],
+            path_of_world=worlds.scenes.scene_of_world,
+            device=model.device,
+            max_step_ns=max_step_ns,
+        )
+    return Multirotor(
+        model.airframe,
+        count=len(worlds.seeds),
+        device=model.device,
+        max_step_ns=max_step_ns,
+        integrator=model.config.vehicle.integrator,
+        seeds=seeds,
+    )
 
 
 def _make_groups(
@@ -406,7 +425,7 @@ def _make_start(worlds: WorldSettings, chosen: StartState | None, device: str) -
     return start
 
 
-def _make_fleet(vehicle: Multirotor) -> Any:
+def _make_fleet(vehicle: Multirotor | Carrier) -> Any:
     fleet = Fleet()
     for name in _FLEET_ARRAYS:
         setattr(fleet, name, getattr(vehicle.arrays, name))

@@ -27,6 +27,7 @@ from neurosim_core.trajectory.planner import (
     plan_tour,
     plan_waypoints,
 )
+from neurosim_core.trajectory.poses import PosesConfig, pose_path
 from neurosim_core.trajectory.shapes import (
     CircleConfig,
     FigureEightConfig,
@@ -48,7 +49,8 @@ PathConfig = Annotated[
     | LineConfig
     | CircleConfig
     | FigureEightConfig
-    | LissajousConfig,
+    | LissajousConfig
+    | PosesConfig,
     Field(discriminator="kind"),
 ]
 """Where to fly, as a user says it."""
@@ -70,6 +72,7 @@ __all__ = [
     "PathPoint",
     "PathSamples",
     "PlanningError",
+    "PosesConfig",
     "TourConfig",
     "WaypointsConfig",
     "circle",
@@ -83,6 +86,7 @@ __all__ = [
     "minimum_snap",
     "plan_tour",
     "plan_waypoints",
+    "pose_path",
     "prove_clearance",
     "upload_paths",
 ]
@@ -120,6 +124,8 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
             return figure_eight(config, center=space.seed_m)
         case LissajousConfig():
             return lissajous(config, center=space.seed_m)
+        case PosesConfig():
+            return pose_path(config)
 
 
 def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:

@@ -150,6 +150,17 @@ class PathSamples:
     """[rad/s^2], shape [n]."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attitude:
+    """Orientations that a path prescribes: R_WB = R(knot) exp(rotation vector) within each piece."""
+
+    knots: NDArray[np.float64]
+    """q_WB at the knots, xyzw, shape [S + 1, 4]."""
+    rotation_vectors: NDArray[np.float64]
+    """Coefficients of the rotation vector in rising powers of each piece's normalised time [rad], shape
+    [S, 4, 3]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Path:
     """An immutable piecewise polynomial in (x, y, z, yaw), in the world frame.
@@ -158,6 +169,7 @@ class Path:
         knots_ns: Stamps at which pieces meet [ns], strictly increasing int64, shape [S + 1].
         coefficients: Coefficients [m] and [rad] in rising powers of each piece's normalised time in [0, 1],
             float64, shape [S, 4, degree + 1].
+        attitude: Orientations, if the path is a motion that is followed exactly; None: a vehicle flies it.
 
     Raises:
         ValueError: If shapes do not fit, knots do not increase or a coefficient is not finite.
@@ -165,6 +177,7 @@ class Path:
 
     knots_ns: NDArray[np.int64]
     coefficients: NDArray[np.float64]
+    attitude: Attitude | None = None
 
     def __post_init__(self) -> None:
         knots_ns = np.array(self.knots_ns)

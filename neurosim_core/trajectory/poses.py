@@ -1,0 +1,229 @@
+"""Motions that a file or a list of keyframes prescribes: a rig follows them exactly, without dynamics.
+
+Between poses the position is a cubic spline, and the orientation a cubic spline of rotation vectors.
+Velocity, acceleration, angular rate and angular acceleration are continuous, and derivatives of the curve:
+an IMU agrees with the pictures.
+
+Reference: SciPy's `CubicSpline` (not-a-knot) and `RotationSpline`, whose coefficients a device evaluates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from neurosim_core.clock import NS_PER_S
+from neurosim_core.frames import Q_FORWARD_OPTICAL, UNIT_TOLERANCE, Vector3
+from neurosim_core.settings import Settings
+from neurosim_core.trajectory.path import Attitude, Path
+
+PoseFormat = Literal["tum", "euroc", "csv", "npy"]
+"""Names of file formats."""
+
+_FORMATS: dict[str, tuple[str, float, tuple[int, ...]]] = {
+    "tum": ("time_s x y z qx qy qz qw, apart by spaces", 1.0, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "euroc": ("time_ns,x,y,z,qw,qx,qy,qz and perhaps more", 1e-9, (0, 1, 2, 3, 5, 6, 7, 4)),
+    "csv": ("time_s,x,y,z,qx,qy,qz,qw", 1.0, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "npy": ("time_s, x, y, z, qx, qy, qz, qw", 1.0, (0, 1, 2, 3, 4, 5, 6, 7)),
+}
+"""What a row is, the length of its unit of time [s], and where time, position and quaternion (xyzw) stand."""
+
+
+class KeyframeConfig(Settings):
+    """A pose at an instant."""
+
+    time_s: float
+    """Time [s]."""
+    position_m: Vector3
+    """p_WB [m]."""
+    rpy_rad: Vector3 = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+
+
+class PosesConfig(Settings):
+    """A motion that is prescribed: the sensors follow it exactly, also through walls, without dynamics.
+
+    Time begins at the first pose. Before the first and after the last pose the rig rests. It takes no
+    commands, and touches nothing.
+    """
+
+    kind: Literal["poses"] = "poses"
+    file: FilePath | None = None
+    """File of poses."""
+    format: PoseFormat = "tum"
+    """`tum`: time_s x y z qx qy qz qw. `euroc`: time_ns,x,y,z,qw,qx,qy,qz,... `csv`:
+    time_s,x,y,z,qx,qy,qz,qw. `npy`: a NumPy array [n, 8] with the columns of csv. Lines that begin with #
+    are left out, and one line of names at the top of csv."""
+    keyframes: Annotated[tuple[KeyframeConfig, ...], Field(min_length=2)] | None = None
+    """Poses in place of a file: [{time_s: 0, position_m: [0, 0, 1]}, ...]."""
+    frame: Literal["body", "optical"] = "body"
+    """Whose poses they are. `body`: x forward, y left, z up. `optical`: a camera's, x right, y down, z
+    forward; the origin of the body is there, and a camera whose mount is at zero sees from there."""
+    start_s: Annotated[float, Field(ge=0.0)] = 0.0
+    """Time after the first pose at which the run begins [s]."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> PosesConfig:
+        if (self.file is None) == (self.keyframes is None):
+            raise ValueError("give file or keyframes" + ("" if self.file is None else ", not both"))
+        return self
+
+
+class Poses(NamedTuple):
+    """Poses of a body, in the order of time."""
+
+    stamps_ns: NDArray[np.int64]
+    """[ns], shape [n]."""
+    position: NDArray[np.float64]
+    """p_WB [m], shape [n, 3]."""
+    orientation: NDArray[np.float64]
+    """q_WB, xyzw, of unit length, shape [n, 4]."""
+
+
+def pose_path(config: PosesConfig) -> Path:
+    """Return the path through the poses of a configuration.
+
+    Raises:
+        ValueError: A file cannot be read, or a row is wrong; the message names file, row and value.
+    """
+    if config.keyframes is not None:
+        rotation = Rotation.from_euler("xyz", [frame.rpy_rad for frame in config.keyframes])
+        times = np.array([frame.time_s for frame in config.keyframes])
+        rows = [frame.position_m for frame in config.keyframes]
+        poses = check_poses(times, rows, rotation.as_quat(), name=lambda row: f"path.keyframes[{row}]")
+    else:
+        assert config.file is not None
+        poses = read_poses(config.file, config.format)
+    orientation = Rotation.from_quat(poses.orientation)
+    if config.frame == "optical":
+        orientation = orientation * Rotation.from_quat(Q_FORWARD_OPTICAL).inv()
+    stamps_ns = poses.stamps_ns - round(config.start_s * NS_PER_S)
+    if stamps_ns[-1] <= 0:
+        raise ValueError(
+            f"path.start_s must be before the last pose at {poses.stamps_ns[-1] / NS_PER_S:g} s, "
+            f"got {config.start_s:g}"
+        )
+    return spline_path(stamps_ns, poses.position, orientation)
+
+
+def read_poses(file: FilePath, kind: PoseFormat) -> Poses:
+    """Read a file of poses; stamps count from the first.
+
+    Raises:
+        ValueError: The file cannot be read, or a row is wrong; the message names file, row and value.
+    """
+    description, unit_s, columns = _FORMATS[kind]
+    try:
+        if kind == "npy":
+            table = np.load(file.expanduser(), allow_pickle=False)
+            lines = list(range(1, len(table) + 1))
+        else:
+            table, lines = _read_text(file, kind)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read {file}: {error}") from None
+    if table.ndim != 2 or table.shape[1] < 8 or not np.issubdtype(table.dtype, np.number):
+        raise ValueError(f"{file} must have rows of {description}, got shape {list(table.shape)}")
+    what = "row" if kind == "npy" else "line"
+    values = table[:, columns]
+    times = values[:, 0].astype(np.float64) * unit_s if kind != "euroc" else values[:, 0]
+    poses = check_poses(
+        times,
+        values[:, 1:4].astype(np.float64),
+        values[:, 4:].astype(np.float64),
+        name=lambda row: f"{file}, {what} {lines[row]}",
+        unit_s=1e-9 if kind == "euroc" else 1.0,
+    )
+    return poses
+
+
+def _read_text(file: FilePath, kind: PoseFormat) -> tuple[NDArray[Any], list[int]]:
+    """Return the numbers of a text file, float64 or, of nanoseconds, longdouble; and their lines."""
+    description = _FORMATS[kind][0]
+    rows: list[list[Any]] = []
+    lines: list[int] = []
+    number = np.longdouble if kind == "euroc" else float  # 19 digits of nanoseconds
+    for line, text in enumerate(file.expanduser().read_text(encoding="utf-8-sig").splitlines(), 1):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        words = text.split() if kind == "tum" else [word.strip() for word in text.split(",")]
+        try:
+            row = [number(word) for word in words[:8]]
+        except ValueError:
+            if not rows and kind != "tum":
+                continue  # names of columns
+            raise ValueError(f"{file}, line {line}: no numbers, {text!r}: {description}") from None
+        if len(row) < 8:
+            raise ValueError(f"{file}, line {line}: {len(row)} numbers, not 8, {text!r}: {description}")
+        rows.append(row)
+        lines.append(line)
+    return np.array(rows).reshape(len(rows), -1 if rows else 8), lines
+
+
+def check_poses(
+    times: NDArray[Any],
+    position: ArrayLike,
+    orientation: ArrayLike,
+    *,
+    name: Callable[[int], str],
+    unit_s: float = 1.0,
+) -> Poses:
+    """Return poses, with stamps from the first one on.
+
+    Args:
+        times: Strictly increasing, shape [n].
+        position: p_WB [m], shape [n, 3].
+        orientation: q_WB, xyzw, of length 1 to 1e-3, shape [n, 4].
+        name: What a message calls a row.
+        unit_s: Unit of time [s].
+
+    Raises:
+        ValueError: There are less than two, or a row is wrong.
+    """
+    p, q = np.asarray(position, np.float64), np.asarray(orientation, np.float64)
+    if len(times) < 2:
+        raise ValueError(f"a motion needs at least two poses, got {len(times)}")
+    finite = np.isfinite(times.astype(np.float64)) & np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
+    length = np.linalg.norm(q, axis=1)
+    for row in np.flatnonzero(~finite)[:1]:
+        raise ValueError(f"{name(row)}: not finite, got {[float(times[row]), *p[row], *q[row]]}")
+    for row in np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)[:1]:
+        raise ValueError(f"{name(row)}: no unit quaternion, {q[row].tolist()} has length {length[row]:.6g}")
+    stamps_ns = np.rint((times - times[0]) * (unit_s * NS_PER_S)).astype(np.int64)
+    for row in np.flatnonzero(np.diff(stamps_ns) <= 0)[:1] + 1:
+        before, after = float(times[row - 1]), float(times[row])
+        raise ValueError(f"{name(row)}: time must increase, got {after!r} after {before!r}")
+    return Poses(stamps_ns, p, q / length[:, None])
+
+
+def spline_path(stamps_ns: NDArray[np.int64], position: NDArray[np.float64], orientation: Rotation) -> Path:
+    """Return the path through poses, whose orientation is prescribed as well.
+
+    Args:
+        stamps_ns: Strictly increasing [ns], shape [n].
+        position: p_WB [m], shape [n, 3].
+        orientation: R_WB, n rotations.
+    """
+    times_s = (stamps_ns - stamps_ns[0]) / NS_PER_S
+    spans_s = np.diff(times_s)
+    rising = spans_s[:, None, None] ** np.arange(4)
+    place = _rising(CubicSpline(times_s, position).c) * rising
+    rotation = _rising(RotationSpline(times_s, orientation).interpolator.c) * rising
+    forward = orientation.apply([1.0, 0.0, 0.0])
+    yaw = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
+    heading = np.zeros((len(spans_s), 1, 4))
+    heading[:, 0, 0], heading[:, 0, 1] = yaw[:-1], np.diff(yaw)
+    attitude = Attitude(knots=orientation.as_quat(), rotation_vectors=rotation.transpose(0, 2, 1))
+    return Path(stamps_ns, np.concatenate([place, heading], axis=1), attitude)
+
+
+def _rising(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return coefficients [degree + 1, S, 3] in falling powers as [S, 3, 4] in rising ones."""
+    rising = coefficients[::-1].transpose(1, 2, 0)
+    return np.pad(rising, ((0, 0), (0, 0), (0, 4 - rising.shape[2])))
