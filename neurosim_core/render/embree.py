@@ -140,18 +140,19 @@ def embree_distance(
 
 
 @cache
-def packet_caster(width: int) -> Any:
+def packet_caster(width: int, *, origins: bool = False) -> Any:
     """Return the Warp function, for CPU kernels only, that casts 16 rays from one origin.
 
-    Its parameters: `EmbreeTree.intersect` and `.scene`; the origin; rays [16], unit length, of which those of
-    zero length are not cast; the distance beyond which hits do not count [m]. Its outputs, each [16]: face,
-    -1 where nothing is hit; distance [m]; u and v, the weights of the first and the second corner; normal of
-    the front, of any length.
+    Its parameters: `EmbreeTree.intersect` and `.scene`; the origin, or with `origins` that of each ray, [16];
+    rays [16], unit length, of which those of zero length are not cast; the distance beyond which hits do not
+    count [m]. Its outputs, each [16]: face, -1 where nothing is hit; distance [m]; u and v, the weights of
+    the first and the second corner; normal of the front, of any length.
 
     The last bits of a hit may depend on the other rays of its packet.
 
     Args:
         width: `packet_width()`.
+        origins: Rays have origins of their own.
     """
 
     @wp.func_native(read_native(__file__, "cast_packet", WIDTH=width))
@@ -168,4 +169,18 @@ def packet_caster(width: int) -> Any:
         normal_out: wp.array[wp.vec3],
     ): ...
 
-    return cast_packet
+    @wp.func_native(read_native(__file__, "cast_rays", WIDTH=width))
+    def cast_rays(
+        intersect: wp.uint64,
+        scene: wp.uint64,
+        origins: wp.array[wp.vec3],
+        rays: wp.array[wp.vec3],
+        far_m: float,
+        face_out: wp.array[int],
+        t_out: wp.array[float],
+        u_out: wp.array[float],
+        v_out: wp.array[float],
+        normal_out: wp.array[wp.vec3],
+    ): ...
+
+    return cast_rays if origins else cast_packet

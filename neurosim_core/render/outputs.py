@@ -12,9 +12,11 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neurosim_core.render.ray_intersection import Hit
+from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
+from neurosim_core.render.shading import albedo_reader
 
-OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance")
+OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance", "returns")
 """The outputs of the ray caster."""
 
 INSTANT_OUTPUTS = frozenset({"log_radiance"})
@@ -31,7 +33,7 @@ class RequestedOutputs(NamedTuple):
     radiance: bool
     """Log radiance or RGB is requested."""
     geometry: bool
-    """Depth, normal or instance is requested."""
+    """Depth, normal, instance or returns are requested."""
 
 
 def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
@@ -40,7 +42,7 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
         log="log_radiance" in outputs,
         images=any(name != "log_radiance" for name in outputs),
         radiance="log_radiance" in outputs or "rgb" in outputs,
-        geometry=any(name in outputs for name in ("depth", "normal", "instance")),
+        geometry=any(name in outputs for name in ("depth", "normal", "instance", "returns")),
     )
 
 
@@ -58,6 +60,9 @@ class RenderOutputs:
     """Of the triangle, in W, towards the camera, zero where nothing is hit, shape [M, H, W]."""
     instance: wp.array3d[int]
     """-1 where nothing is hit, shape [M, H, W]."""
+    returns: wp.array3d[wp.vec3]
+    """Length of the ray [m], inf where nothing is hit; |cosine| of incidence; luma of the albedo; shape
+    [M, H, W]."""
 
 
 def make_render_outputs(**outputs: Any) -> RenderOutputs:
@@ -77,14 +82,16 @@ def _to_srgb(linear: float) -> wp.uint8:
 
 
 @cache
-def geometry_writer(outputs: tuple[str, ...]) -> wp.Function:
-    """Return the function that writes depth, normal and instance of a pixel, those of them in `outputs`."""
+def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
+    """Return the function that writes the geometry of a pixel, that of it which is in `outputs`."""
+    surface_albedo = albedo_reader(terms)
 
     @wp.func
     def write_geometry(
         scene: SceneData,
         ray: wp.vec3,
         cosine: float,
+        spread_rad: float,
         hit: Hit,
         slot: int,
         row: int,
@@ -103,6 +110,14 @@ def geometry_writer(outputs: tuple[str, ...]) -> wp.Function:
             if hit.face >= 0:
                 name = scene.face_instance[hit.face]
             out.instance[slot, row, col] = name
+        if wp.static("returns" in outputs):
+            found = wp.vec3(wp.inf, 0.0, 0.0)
+            if hit.face >= 0:
+                facing = wp.dot(ray, hit.normal)
+                albedo = surface_albedo(scene, spread_rad, facing, hit)
+                luma = 0.2126 * albedo[0] + 0.7152 * albedo[1] + 0.0722 * albedo[2]
+                found = wp.vec3(hit.t, wp.abs(facing), luma)
+            out.returns[slot, row, col] = found
 
     return write_geometry
 

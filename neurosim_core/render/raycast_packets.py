@@ -36,17 +36,18 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     listed = terms.candidate_group > 0
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
-    write_geometry = geometry_writer(outputs)
+    write_geometry = geometry_writer(outputs, terms)
     write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
     side = TILE if terms.by_tile else 4
     lanes = side * side
     packets = (TILE // side) ** 2  # of a tile
-    cast_packet = packet_caster(terms.embree) if terms.embree else None
+    cast_packet = packet_caster(terms.embree, origins=terms.timed) if terms.embree else None
 
     packed = requested.radiance and terms.baked and not terms.bodies and not terms.finest_level
+    origin_count = lanes if terms.timed else 1
     each_lane = requested.geometry or listed or not packed
     shade_packet = packet_shader(lanes, textured=terms.textured, emissive=terms.emissive, unit_normals=listed)
-    fused = requested.log and packed and not listed  # for instants without an image slot
+    fused = requested.log and packed and not listed and not terms.timed  # for instants without an image slot
     render_packet = (
         packet_program(terms.embree, textured=terms.textured, emissive=terms.emissive) if fused else None
     )
@@ -118,6 +119,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         v = wp.zeros(shape=(lanes,), dtype=float)
         normal = wp.zeros(shape=(lanes,), dtype=wp.vec3)
         radiance = wp.zeros(shape=(lanes,), dtype=wp.vec3)
+        origins = wp.zeros(shape=(origin_count,), dtype=wp.vec3)
         spread_rad = wp.zeros(shape=(lanes if packed else 1,), dtype=float)
         for layer in range(view.rays.shape[0]):
             if wp.static(terms.supersampled):
@@ -126,6 +128,10 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             for y in range(rows):
                 for x in range(columns):
                     ray_C = view.rays[layer, first_ray + (top + y) * view.width + left + x]
+                    if wp.static(terms.timed):
+                        pose = instant * view.pose_count + view.pose[layer, (top + y) * view.width + left + x]
+                        q = view.q_WC[pose]
+                        origins[side * y + x] = view.p_WC[pose]
                     ray[side * y + x] = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
                     if wp.static(packed):
                         spread_rad[side * y + x] = ray_C[3]
@@ -143,6 +149,10 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     origin,
                     ray,
                     face,
+                )
+            elif wp.static(terms.timed):
+                cast_packet(
+                    scene.embree_intersect, scene.embree_scene, origins, ray, FAR_M, face, t, u, v, normal
                 )
             else:
                 cast_packet(
@@ -165,9 +175,15 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                             hit.v = v[lane]
                             hit.normal = wp.normalize(normal[lane])
                         body = int(-1)
+                        pose = instant
+                        if wp.static(terms.timed):
+                            own = view.pose[layer, (top + y) * view.width + left + x]
+                            pose = instant * view.pose_count + own
+                            origin = view.p_WC[pose]
+                            q = view.q_WC[pose]
                         if wp.static(terms.bodies):
                             hit, body = intersect_bodies(
-                                bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
+                                bodies, pose, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
                             )
                         if wp.static(listed and packed):
                             face[lane] = hit.face
@@ -178,7 +194,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                         if wp.static(requested.radiance and not packed):
                             if wp.static(not terms.supersampled) or layer > 0:
                                 radiance[lane] += radiance_of(
-                                    scene, bodies, instant, body, q, ray[lane], origin, ray_C[3], hit
+                                    scene, bodies, pose, body, q, ray[lane], origin, ray_C[3], hit
                                 )
                         if wp.static(requested.geometry):
                             if slot >= 0 and layer == 0:
@@ -186,6 +202,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                                     scene,
                                     ray[lane],
                                     ray_C[2],
+                                    ray_C[3],
                                     hit,
                                     slot,
                                     top + y,

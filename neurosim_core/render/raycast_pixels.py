@@ -99,7 +99,7 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
     requested = requested_outputs(outputs)
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
-    write_geometry = geometry_writer(outputs)
+    write_geometry = geometry_writer(outputs, terms)
     write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
 
     @wp.func
@@ -153,18 +153,23 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                 # Layer 0 goes through the centre and is for geometry, the others are for radiance.
                 if layer == 0 and (slot < 0 or wp.static(not requested.geometry)):
                     continue
+            pose = instant
+            if wp.static(terms.timed):
+                pose = instant * view.pose_count + view.pose[layer, pixel - first_ray]
+                origin = view.p_WC[pose]
+                q = view.q_WC[pose]
             ray_C = view.rays[layer, pixel]
             ray = wp.quat_rotate(q, wp.vec3(ray_C[0], ray_C[1], ray_C[2]))
             hit = intersect_scene(scene, origin, ray)
             body = int(-1)
             if wp.static(terms.bodies):
-                hit, body = intersect_bodies(bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
+                hit, body = intersect_bodies(bodies, pose, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
             if wp.static(requested.radiance):
                 if wp.static(not terms.supersampled) or layer > 0:
-                    radiance += radiance_of(scene, bodies, instant, body, q, ray, origin, ray_C[3], hit)
+                    radiance += radiance_of(scene, bodies, pose, body, q, ray, origin, ray_C[3], hit)
             if wp.static(requested.geometry):
                 if slot >= 0 and layer == 0:
-                    write_geometry(scene, ray, ray_C[2], hit, slot, row, col, out)
+                    write_geometry(scene, ray, ray_C[2], ray_C[3], hit, slot, row, col, out)
         if wp.static(requested.radiance):
             write_radiance(scene, radiance, view.rays.shape[0], instant, slot, row, col, out)
 
@@ -178,7 +183,7 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
     find_tile = tile_finder(terms)
     intersect_candidates = candidate_intersector(group)
     radiance_of = pixel_shader(terms)
-    write_geometry = geometry_writer(outputs)
+    write_geometry = geometry_writer(outputs, terms)
     write_radiance = radiance_writer(outputs, supersampled=terms.supersampled)
 
     @wp.func
@@ -261,6 +266,7 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                                     scene,
                                     ray,
                                     ray_C[2],
+                                    ray_C[3],
                                     hit,
                                     slot,
                                     row,

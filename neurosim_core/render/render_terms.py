@@ -40,6 +40,8 @@ class RenderTerms(NamedTuple):
     """The kernel renders the unresolved pixels of one with `candidate_group`; each ray traverses the tree."""
     by_tile: bool = False
     """With `candidate_group`: a thread renders a tile and resolves all of its pixels, on a CPU."""
+    timed: bool = False
+    """Each ray has an instant of its own (`ray_times`); rays traverse the tree."""
 
 
 def with_candidate_lists(

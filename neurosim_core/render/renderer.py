@@ -10,6 +10,7 @@ import warp as wp
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
+from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.scene_arrays import upload_scene as upload_warp_scene
 from neurosim_core.render.synthetic_renderer import SyntheticRenderer, SyntheticScene
@@ -53,6 +54,8 @@ class Renderer(Protocol):
     instance: Any
     """Index into the names of the scene's instances and then of the bodies (`SceneArrays.instance_names`), -1
     where nothing is hit, int32 [M, H, W]."""
+    returns: Any
+    """Length of the ray [m], |cosine| of incidence and luma of the albedo, vec3 [M, H, W]."""
 
     def render(
         self,
@@ -67,7 +70,7 @@ class Renderer(Protocol):
         """Render the first `instant_count` poses of each world.
 
         Args:
-            p_WC: Position of the camera [m], shape [N K].
+            p_WC: Position of the camera [m], shape [N K]; where rays have times of their own [N K J].
             q_WC: Orientation of the camera's optical frame, xyzw, shape [N K].
             image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
             instant_count: How many of the K instants of each world are rendered.
@@ -116,16 +119,18 @@ def make_renderer(
     instant_count: int,
     image_count: int = 1,
     worlds: RenderWorlds = ONE_WORLD,
+    times: RayTimes | None = None,
 ) -> Renderer:
     """Return a renderer for one lens.
 
     Args:
         scene: What `upload_scene` returned.
         lens: The camera.
-        outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance".
+        outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance", "returns".
         instant_count: K, the most instants of a world per call.
         image_count: M, number of image slots, of all worlds together.
         worlds: Who is rendered together: several only by `warp`.
+        times: When rays are cast; None: all at the stamp.
 
     Raises:
         ValueError: An output is unknown, or the renderer does not have it; it renders one world only, or only
@@ -143,5 +148,11 @@ def make_renderer(
             scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count
         )
     return WarpRenderer(
-        scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count, worlds=worlds
+        scene,
+        lens,
+        outputs=outputs,
+        instant_count=instant_count,
+        image_count=image_count,
+        worlds=worlds,
+        times=times,
     )

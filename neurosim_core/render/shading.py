@@ -53,7 +53,7 @@ def pixel_shader(terms: RenderTerms) -> wp.Function:
 @cache
 def _scene_shader(terms: RenderTerms) -> wp.Function:
     """Return the function that says what light comes from what stands still, or from the sky."""
-    surface_albedo, emitted = _albedo(terms), _emission(terms)
+    surface_albedo, emitted = albedo_reader(terms), _emission(terms)
 
     @wp.func
     def shade(scene: SceneData, ray: wp.vec3, origin: wp.vec3, spread_rad: float, hit: Hit) -> wp.vec3:
@@ -102,7 +102,7 @@ def _body_shader(terms: RenderTerms) -> wp.Function:
     It is ambient light, and that of the lamps that no part of the scene hides (all lamps, where the scene
     itself is unshadowed). Bodies move under lights that stand still, so nothing is baked.
     """
-    surface_albedo, emitted = _albedo(terms), _emission(terms)
+    surface_albedo, emitted = albedo_reader(terms), _emission(terms)
 
     @wp.func
     def shade_body(
@@ -148,7 +148,7 @@ def _body_shader(terms: RenderTerms) -> wp.Function:
 
 
 @cache
-def _albedo(terms: RenderTerms) -> wp.Function:
+def albedo_reader(terms: RenderTerms) -> wp.Function:
     """Return the function that reads the base colour and the texture of what is hit.
 
     The texture level comes from the footprint of the ray: ray spread times distance over |cos|, its long

@@ -28,9 +28,13 @@ class ViewData:
     instant_count: int
     """How many of the K instants are rendered, of each world."""
     p_WC: wp.array[wp.vec3]
-    """Position of the camera [m], shape [K]."""
+    """Position of the camera [m], shape [K]; with `RenderTerms.timed` [K, J], flattened."""
     q_WC: wp.array[wp.quat]
-    """Orientation of the camera's optical frame, xyzw, shape [K]."""
+    """Orientation of the camera's optical frame, xyzw, likewise."""
+    pose_count: int
+    """With `RenderTerms.timed`: J, instants of one picture."""
+    pose: wp.array2d[int]
+    """With `RenderTerms.timed`: which of them each ray has, shape [layer, H * W]."""
     image_slot: wp.array[int]
     """Where the images of an instant go, shape [K]; -1: nowhere."""
 

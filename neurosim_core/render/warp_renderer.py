@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.antialias import AdaptiveSampling, first_rays, ray_layers, sample_rays
+from neurosim_core.render.antialias import SAMPLE_COUNT, AdaptiveSampling, first_rays, ray_layers, sample_rays
 from neurosim_core.render.blind_pixels import BlindPixels
 from neurosim_core.render.body_arrays import (
     make_body_data,
@@ -24,6 +24,7 @@ from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.outputs import OUTPUTS, make_render_outputs, requested_outputs
+from neurosim_core.render.ray_times import RayTimes, RayTiming
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists
 from neurosim_core.render.scene_arrays import SceneArrays
@@ -52,6 +53,15 @@ class RenderWorlds:
     """What some scene needs in the kernel; None: as the scene of the renderer says."""
 
 
+def ray_times_of(timing: RayTiming | None, lens: Lens, arrays: SceneArrays) -> RayTimes | None:
+    """Return when the rays of a lens are cast, for `WarpRenderer`; None: all at the stamp.
+
+    Antialiasing cannot adapt to what moves within a picture: in its place there are SAMPLE_COUNT rays.
+    """
+    wanted = arrays.config.samples_per_pixel
+    return None if timing is None else timing.times(lens, SAMPLE_COUNT if wanted == "adaptive" else wanted)
+
+
 ONE_WORLD = RenderWorlds()
 """A single world."""
 
@@ -70,6 +80,7 @@ class WarpRenderer:
         depth: float32, shape [M, H, W].
         normal: vec3, shape [M, H, W].
         instance: int32, shape [M, H, W].
+        returns: vec3, shape [M, H, W].
         rays: Rays of the pixels: direction in C and spread [rad], vec4, shape [layer, H * W]; of several
             lenses, one after the other.
         candidates: Candidate lists of tiles; None: rays traverse the tree.
@@ -86,6 +97,7 @@ class WarpRenderer:
         image_count: int = 1,
         thread_count: int | None = None,
         worlds: RenderWorlds = ONE_WORLD,
+        times: RayTimes | None = None,
     ) -> None:
         """Allocate the outputs and choose the kernel.
 
@@ -97,6 +109,7 @@ class WarpRenderer:
             image_count: M, number of image slots, of all worlds together.
             thread_count: Threads on a CPU device; all cores if None.
             worlds: Who is rendered together.
+            times: When rays are cast (`ray_times_of`); None: all at the stamp.
 
         Raises:
             ValueError: An output is unknown, none is requested, the instants have more than 2^31 - 1 rays of
@@ -108,9 +121,11 @@ class WarpRenderer:
         self._arrays = arrays
         self._thread_count = thread_count
         self._stride = instant_count
+        self._times = times
         device = arrays.device
         lenses = worlds.lenses or (lens,)
         adaptive = arrays.config.samples_per_pixel == "adaptive" and requested_outputs(outputs).radiance
+        adaptive = adaptive and times is None
         has_geometry = requested_outputs(outputs).geometry
         rays = np.concatenate([self._layers(each, adaptive, has_geometry) for each in lenses], axis=1)
         shared = self._choose_terms(rays, several=worlds.count > 1)
@@ -122,7 +137,12 @@ class WarpRenderer:
         self._instant_threads = self._tile_count * TILE * TILE // rays_together
         self.rays: wp.array2d[wp.vec4] = wp.array(rays, dtype=wp.vec4, device=device)
         self._view = make_view(self.rays, lens.width, lens.height)
-        self._body_data = make_body_data(arrays.bodies, worlds.count * instant_count, device)
+        self._pose_count = 1 if times is None else len(times.offsets_ns)
+        if times is not None:
+            self._view.pose_count = self._pose_count
+            self._view.pose = wp.array(times.instant, dtype=int, device=device)
+        rows = worlds.count * instant_count * self._pose_count
+        self._body_data = make_body_data(arrays.bodies, rows, device)
         self._world_data = self._make_world_data()
         self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
         self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
@@ -148,6 +168,7 @@ class WarpRenderer:
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
+        self.returns = allocate("returns", images, wp.vec3)
         arrays_of = {name: getattr(self, name) for name in OUTPUTS} | {"log_radiance": log_radiance}
         self._render_outputs = make_render_outputs(**arrays_of)
         self._blind = BlindPixels(
@@ -171,11 +192,11 @@ class WarpRenderer:
         """Render the first `instant_count` poses of each world into the outputs.
 
         Args:
-            p_WC: Position of the camera [m], shape [N K].
-            q_WC: Orientation of the camera's optical frame, xyzw, shape [N K].
+            p_WC: Position of the camera [m], shape [N K]; with `times` [N K J], at the instants of the rays.
+            q_WC: Orientation of the camera's optical frame, xyzw, likewise.
             image_slot: Where the images of an instant go, shape [N K]; -1: nowhere.
             instant_count: How many of the K instants of each world are rendered.
-            bodies: Where bodies are at the instants; not needed without bodies.
+            bodies: Where bodies are at each of these poses; not needed without bodies.
             active: With several worlds: 1 where a world is rendered, int32, shape [N].
 
         Raises:
@@ -187,9 +208,8 @@ class WarpRenderer:
             if bodies is None:
                 names = ", ".join(body.name for body in self._arrays.bodies.bodies)
                 raise ValueError(f"bodies move in this scene ({names}): render() needs their poses")
-            place_camera(
-                self._arrays.bodies, bodies, p_WC, q_WC, instant_count=pose_count, data=self._body_data
-            )
+            rows = pose_count * self._pose_count
+            place_camera(self._arrays.bodies, bodies, p_WC, q_WC, instant_count=rows, data=self._body_data)
         if self.candidates is not None:
             self.candidates.update(self.rays, p_WC, q_WC, instant_count=pose_count)
         if active is not None:
@@ -229,6 +249,8 @@ class WarpRenderer:
     def _layers(self, lens: Lens, adaptive: bool, has_geometry: bool) -> NDArray[np.float32]:
         """Return the rays of the first pass: of one layer, or that of the centres first."""
         config = self._arrays.config
+        if self._times is not None:
+            return ray_layers(lens, self._times.sample_count, config.fill_factor)
         if config.samples_per_pixel != "adaptive":
             return ray_layers(lens, config.samples_per_pixel, config.fill_factor)
         centres = ray_layers(lens, 1)
@@ -244,9 +266,12 @@ class WarpRenderer:
             worlds=several,
             world_lenses=len(worlds.lenses) > 1,
             supersampled=len(rays) > 1,
+            timed=self._times is not None,
         )
         shared = None
-        if not (terms.world_scenes or terms.world_lenses):  # lists change nothing but the speed
+        if not (
+            terms.timed or terms.world_scenes or terms.world_lenses
+        ):  # lists change nothing but the speed
             shared = choose_candidate_lists(
                 arrays.config.candidate_lists,
                 rays,

@@ -10,7 +10,7 @@ it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -20,8 +20,9 @@ from pydantic import Field
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
 from neurosim_core.packets import Image, ImageEncoding, Packet
-from neurosim_core.render.camera import PinholeConfig
+from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import AnyLens
+from neurosim_core.render.ray_times import RayTiming, ShutterConfig
 from neurosim_core.settings import Settings
 from neurosim_core.vehicle import Multirotor
 
@@ -123,20 +124,40 @@ class StereoConfig(Settings):
     """Distance from the left camera to the right one [m], along a row of the picture."""
 
 
-class CameraConfig(SensorConfig):
+class RenderedConfig(SensorConfig):
+    """A sensor that casts rays from a place on the body."""
+
+    mount: Mount = Mount(position_m=(0.1, 0.0, 0.03))
+    """Pose of the camera on the body."""
+
+    @property
+    def optics(self) -> Lens:
+        """Which ways its rays go."""
+        raise NotImplementedError(f"{type(self).__name__} must say where it looks")
+
+    @property
+    def timing(self) -> RayTiming | None:
+        """When its rays are cast; None: all at the stamp."""
+        return None
+
+    def render_request(self) -> RenderRequest:
+        """Return what it asks of the renderer."""
+        raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
+
+
+class CameraConfig(RenderedConfig):
     """What every camera has: a lens and a place on the body."""
 
     lens: AnyLens = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
     """Resolution and field of view: {kind: pinhole | radtan | rational | equidistant | double_sphere |
     ray_table, ...}, a pinhole if no kind is given."""
-    mount: Mount = Mount(position_m=(0.1, 0.0, 0.03))
-    """Pose of the camera on the body."""
     stereo: StereoConfig | None = None
     """Makes two cameras of one, NAME_left where it is mounted, and NAME_right: {baseline_m: 0.12}."""
 
-    def render_request(self) -> RenderRequest:
-        """Return what it asks of the renderer."""
-        raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
+    @property
+    def optics(self) -> Lens:
+        """The lens."""
+        return self.lens
 
 
 def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig]:
@@ -160,17 +181,14 @@ def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig
     return expanded
 
 
-class ImageSensorConfig(CameraConfig):
-    """A camera that takes pictures of one output of the renderer."""
+class PictureSensorConfig(RenderedConfig):
+    """A sensor whose packet is made of one picture of one output of the renderer."""
 
     rate_hz: RateHz = 20.0
     """Pictures a second [Hz]."""
 
-    packet_type: ClassVar[type[Packet]] = Image
     output: ClassVar[str]
     """What it takes pictures of, one of `render.outputs.OUTPUTS`."""
-    encoding: ClassVar[ImageEncoding]
-    """What a pixel of its pictures is."""
 
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
@@ -183,6 +201,31 @@ class ImageSensorConfig(CameraConfig):
             picture: The output of the renderer on the host, shape [H, W] or [H, W, C]; the packet's to keep.
             header: `stamp_ns`, `sequence` and `sensor` of the packet.
         """
+        raise NotImplementedError(f"{type(self).__name__} must say what its packets are")
+
+    def packet_maker(self, seed: int) -> Callable[..., Packet]:
+        """Return what makes its packets, called as `packet` is; noise comes from a seed."""
+        return self.packet
+
+
+class ImageSensorConfig(CameraConfig, PictureSensorConfig):
+    """A camera that takes pictures of one output of the renderer."""
+
+    shutter: ShutterConfig = ShutterConfig()
+    """When lines are exposed: {readout_s: 0.02} rolls, {exposure_s: 0.005} blurs what moves; by default
+    all rays are cast at the stamp."""
+
+    packet_type: ClassVar[type[Packet]] = Image
+    encoding: ClassVar[ImageEncoding]
+    """What a pixel of its pictures is."""
+
+    @property
+    def timing(self) -> RayTiming | None:
+        """The shutter, unless it is global and takes no time."""
+        return self.shutter if self.shutter.window_ns else None
+
+    def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
+        """Return a picture as a packet."""
         return Image(data=picture, encoding=self.encoding, **header)
 
 

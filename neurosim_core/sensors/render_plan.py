@@ -1,4 +1,4 @@
-"""How cameras share the work of rendering: one ray answers all that share pose, lens and clock."""
+"""How cameras share the work of rendering: one ray answers all that share pose, lens, shutter and clock."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from typing import NamedTuple
 
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
-from neurosim_core.render.lenses import AnyLens
-from neurosim_core.sensors.base import CameraConfig, RenderRequest, SensorConfig
+from neurosim_core.render.camera import Lens
+from neurosim_core.render.ray_times import RayTiming
+from neurosim_core.sensors.base import RenderedConfig, RenderRequest, SensorConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderGroup:
     """Cameras that share a pose, a lens and a clock, so that one ray answers all of them."""
 
-    lens: AnyLens
+    lens: Lens
     mount: Mount
     rate: Rate
     """The instants at which rays are cast."""
@@ -26,6 +27,8 @@ class RenderGroup:
     """Names of the cameras that take a picture at every n-th instant."""
     outputs: frozenset[str]
     """What a ray answers."""
+    timing: RayTiming | None = None
+    """When rays are cast; None: all at the stamp."""
     max_displacement_px: float | None = None
     """Rays are cast only at the instants that this asks for (`sensors.displacement`); None: at all."""
 
@@ -33,6 +36,11 @@ class RenderGroup:
     def names(self) -> tuple[str, ...]:
         """All cameras of the group."""
         return (*self.frame_sensors, *self.image_sensors)
+
+    @property
+    def window_ns(self) -> int:
+        """How long before a stamp its first ray is cast [ns]."""
+        return 0 if self.timing is None else self.timing.window_ns
 
 
 def plan_render_groups(sensors: Mapping[str, SensorConfig]) -> tuple[RenderGroup, ...]:
@@ -44,7 +52,7 @@ def plan_render_groups(sensors: Mapping[str, SensorConfig]) -> tuple[RenderGroup
     for the same renders, and image sensors do not join them.
     """
     plans: list[_Plan] = []
-    cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, CameraConfig)}
+    cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, RenderedConfig)}
     requests = {name: camera.render_request() for name, camera in cameras.items()}
 
     def join(name: str) -> None:
@@ -52,10 +60,11 @@ def plan_render_groups(sensors: Mapping[str, SensorConfig]) -> tuple[RenderGroup
         clock = _Clock(request.rate_hz, request.max_displacement_px, request.required)
         for plan in plans:
             fits = clock == plan.clock if request.every_instant else plan.clock.contains(clock)
-            if plan.lens == camera.lens and plan.mount == camera.mount and fits:
+            same = (plan.lens, plan.mount, plan.timing) == (camera.optics, camera.mount, camera.timing)
+            if same and fits:
                 plan.members.append(name)
                 return
-        plans.append(_Plan(camera.lens, camera.mount, clock, [name]))
+        plans.append(_Plan(camera.optics, camera.mount, camera.timing, clock, [name]))
 
     for name, request in requests.items():
         if request.every_instant:
@@ -81,8 +90,9 @@ class _Clock(NamedTuple):
 class _Plan(NamedTuple):
     """A group that cameras may still join."""
 
-    lens: AnyLens
+    lens: Lens
     mount: Mount
+    timing: RayTiming | None
     clock: _Clock
     members: list[str]
 
@@ -92,6 +102,7 @@ def _group(plan: _Plan, requests: Mapping[str, RenderRequest]) -> RenderGroup:
     return RenderGroup(
         lens=plan.lens,
         mount=plan.mount,
+        timing=plan.timing,
         rate=Rate(plan.clock.rate_hz),
         frame_sensors=frames,
         image_sensors=tuple(name for name in plan.members if name not in frames),

@@ -73,7 +73,7 @@ def lens_tables(group: RenderGroup, rigs: Sequence[Rig]) -> tuple[list[Any], lis
     lenses: dict[Any, int] = {}
     chosen = []
     for world, rig in enumerate(rigs):
-        found = {name: rig[name].lens for name in group.names}  # type: ignore[attr-defined]
+        found = {name: rig[name].optics for name in group.names}  # type: ignore[attr-defined]
         lens = found[group.names[0]]
         for name, other in found.items():
             if other != lens:

@@ -19,6 +19,7 @@ from neurosim_core.clock import Rate
 from neurosim_core.packets import Packet
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.outputs import INSTANT_OUTPUTS
+from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.render.renderer import (
     ONE_WORLD,
     Renderer,
@@ -27,6 +28,7 @@ from neurosim_core.render.renderer import (
     make_renderer,
 )
 from neurosim_core.render.scene_arrays import SceneArrays
+from neurosim_core.render.warp_renderer import ray_times_of
 from neurosim_core.runtime.cuda import HostCopy, HostInput
 from neurosim_core.runtime.pinned import PinnedMapping
 from neurosim_core.scene.bodies import (
@@ -41,7 +43,7 @@ from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensor,
     FrameSensorConfig,
-    ImageSensorConfig,
+    PictureSensorConfig,
     SensorConfig,
     WorldFrameContext,
     WorldFrameSensor,
@@ -61,7 +63,9 @@ On a CUDA device it is pinned, and the picture is there when the device has fini
 class ImageChannel:
     """An image sensor of a group."""
 
-    config: ImageSensorConfig
+    config: PictureSensorConfig
+    packet: Callable[..., Packet]
+    """Makes a packet of a picture (`PictureSensorConfig.packet`)."""
     rate: Rate
     sequence: int = 0
 
@@ -99,8 +103,11 @@ class RenderGroupState:
     """Which of the two states of `world_frames` is the present one."""
     p_BC: wp.vec3d
     q_BC: wp.quatd
+    offsets_ns: Any
+    """From an instant to its J rays [ns], device array; None: all are cast at the instant."""
     p_WC: Sequence[wp.array[wp.vec3]]
-    """Where the camera is at the instants [m], for each batch in flight, shape [N K]."""
+    """Where the camera is at the instants [m], for each batch in flight, shape [N K]; [N K J] with
+    `offsets_ns`."""
     q_WC: Sequence[wp.array[wp.quat]]
     stamps: Sequence[Any]
     """Times of the instants [ns], shape [N K, 1]; empty without bodies."""
@@ -174,9 +181,9 @@ def make_render_group(
             for many worlds.
     """
     images = {
-        name: ImageChannel(config=sensor, rate=sensor.clock)
+        name: ImageChannel(config=sensor, packet=sensor.packet_maker(seed), rate=sensor.clock)
         for name in group.image_sensors
-        if isinstance(sensor := sensors[name], ImageSensorConfig)
+        if isinstance(sensor := sensors[name], PictureSensorConfig)
     }
     instant_outputs = [name for name, image in images.items() if image.output in INSTANT_OUTPUTS]
     if instant_outputs and not on_host:
@@ -187,6 +194,7 @@ def make_render_group(
     # of n consecutive ticks of the group, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
     most = sum(int(capacity * i.rate.rate_hz / group.rate.rate_hz) + 1 for i in images.values())
     picture_count = max(1, min(capacity, most)) if on_host else 1
+    times = _ray_times(group, scene)
     renderers = [
         make_renderer(
             scene,
@@ -195,6 +203,7 @@ def make_render_group(
             instant_count=capacity,
             image_count=worlds.count * picture_count,
             worlds=worlds,
+            times=times,
         )
         for _ in range(in_flight)
     ]
@@ -211,7 +220,8 @@ def make_render_group(
         if on_host
     }
     p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
-    rows = worlds.count * capacity
+    offsets_ns: Any = None if times is None else wp.array(times.offsets_ns, dtype=wp.int64, device=device)
+    rows = worlds.count * capacity * (1 if offsets_ns is None else offsets_ns.shape[0])
     moving_rows = rows if bodies else 0
     pictures, shared = ({}, {}) if on_host else _picture_arrays(images, renderers[0])
     return RenderGroupState(
@@ -240,6 +250,7 @@ def make_render_group(
         shared_pictures=shared,
         p_BC=p_BC,
         q_BC=q_BC,
+        offsets_ns=offsets_ns,
         p_WC=[wp.zeros(rows, dtype=wp.vec3, device=device) for _ in renderers],
         q_WC=[wp.zeros(rows, dtype=wp.quat, device=device) for _ in renderers],
         stamps=[wp.zeros((moving_rows, 1), dtype=wp.int64, device=device) for _ in renderers],
@@ -252,6 +263,16 @@ def make_render_group(
         if group.max_displacement_px is not None
         else (),
     )
+
+
+def _ray_times(group: RenderGroup, scene: SceneOnDevice) -> RayTimes | None:
+    """Return when the rays of a group are cast; None: all at the stamp."""
+    if group.timing is None:
+        return None
+    if not isinstance(scene, SceneArrays):
+        names = ", ".join(group.names)
+        raise ValueError(f"{names}: rays with times of their own need renderer: warp")
+    return ray_times_of(group.timing, group.lens, scene)
 
 
 def _picture_arrays(
@@ -283,7 +304,7 @@ def _make_rule(
     if not isinstance(group.lens, PinholeConfig):
         raise ValueError(
             f"max_displacement_px of {', '.join(group.frame_sensors)} needs a lens of kind pinhole, got "
-            f"{group.lens.kind}: leave it out, and all ticks are rendered"
+            f"{getattr(group.lens, 'kind', 'none')}: leave it out, and all ticks are rendered"
         )
     return DisplacementRule(
         scene,
@@ -417,17 +438,15 @@ def plan_render(
         if chosen is not None:
             chosen.upload()
         stamps = group.stamps[lane]
-        trace.camera_poses(
-            from_slots,
-            count=len(posed),
-            p_BC=group.p_BC,
-            q_BC=group.q_BC,
-            p_WC=p_WC,
-            q_WC=q_WC,
-            stamps=stamps,
-        )
+        mount = {"p_BC": group.p_BC, "q_BC": group.q_BC}
+        poses = {"count": len(posed), **mount, "p_WC": p_WC, "q_WC": q_WC, "stamps": stamps}
+        if group.offsets_ns is None:
+            trace.camera_poses(from_slots, **poses)
+        else:
+            trace.ray_poses(from_slots, group.offsets_ns, **poses)
         if group.motions is not None and body_poses is not None:
-            count = len(slots) if group.world_count == 1 else stamps.shape[0]
+            rays = 1 if group.offsets_ns is None else group.offsets_ns.shape[0]
+            count = len(slots) * rays if group.world_count == 1 else stamps.shape[0]
             pose_bodies(group.motions, stamps, group.instants, count=count, poses=body_poses)
         group.renderers[lane].render(
             p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses, active=active
@@ -545,7 +564,7 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
     for stamp_ns, slot, name in instants.pictures:
         image = group.images[name]
         picture = copy_of(image, slot, name, stamp_ns)
-        packets.append(image.config.packet(picture, stamp_ns=stamp_ns, sequence=image.sequence, sensor=name))
+        packets.append(image.packet(picture, stamp_ns=stamp_ns, sequence=image.sequence, sensor=name))
         image.sequence += 1
     return packets
 

@@ -32,6 +32,8 @@ class Schedule:
     """The most instants of one group in one batch; of a sparse group, times TICKS_PER_INSTANT."""
     sparse: frozenset[int] = frozenset()
     """Indices of the groups that render only some of their ticks."""
+    poses: tuple[Rate, ...] = ()
+    """Clocks at which nothing is due but the pose is recorded, for rays with times of their own."""
 
     def ticks_per_batch(self, group: int) -> int:
         """Return the most ticks of a group in one batch."""
@@ -64,7 +66,8 @@ def batch_end_ns(schedule: Schedule, start_ns: int, limit_ns: int) -> int:
 def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]:
     """Return the boundaries in (start_ns, end_ns] in order of time; the last is always at `end_ns`."""
     marks = {end_ns: 0}
-    for place, rate in enumerate((schedule.control, *schedule.samplers, *schedule.groups)):
+    clocks = (schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses)
+    for place, rate in enumerate(clocks):
         mark = 1 << place
         for stamp_ns in rate.stamps(start_ns + 1, end_ns + 1):
             marks[stamp_ns] = marks.get(stamp_ns, 0) | mark
@@ -76,10 +79,16 @@ def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]
 
 def boundary_count_max(schedule: Schedule) -> int:
     """Return a bound on the number of boundaries in any batch."""
-    rates = [schedule.control, *schedule.samplers, *schedule.groups]
+    rates = [schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses]
     shortest = schedule.groups or (schedule.control,)
     span_s = min(schedule.ticks_per_batch(group) / rate.rate_hz for group, rate in enumerate(shortest))
     return sum(int(span_s * rate.rate_hz) + 2 for rate in rates) + 1
+
+
+def boundary_count_within(schedule: Schedule, span_ns: int) -> int:
+    """Return a bound on the number of boundaries in any stretch of a length."""
+    rates = [schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses]
+    return sum(int(span_ns * 1e-9 * rate.rate_hz) + 2 for rate in rates)
 
 
 def _tick_after(rate: Rate, stamp_ns: int, count: int) -> int:
@@ -135,7 +144,7 @@ class Timetable:
         self._schedule = schedule
         self._images = images
         self._periods: dict[int, Period] = {}
-        rates = [schedule.control, *schedule.samplers, *schedule.groups]
+        rates = [schedule.control, *schedule.samplers, *schedule.groups, *schedule.poses]
         rates += [rate for cameras in images for rate in cameras.values()]
         self.common_ns = _common_period_ns(rates)
 
@@ -167,7 +176,7 @@ class Timetable:
     def boundary_count_max(self) -> int:
         """Return a bound on the number of boundaries in a period."""
         period_s = 1.0 / self._schedule.control.rate_hz
-        rates = (*self._schedule.samplers, *self._schedule.groups)
+        rates = (*self._schedule.samplers, *self._schedule.groups, *self._schedule.poses)
         return 1 + sum(int(period_s * rate.rate_hz) + 2 for rate in rates)
 
     def _kinds(self) -> Iterator[Period]:

@@ -41,7 +41,7 @@ from neurosim_core.sim.render_group import (
 )
 from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
 from neurosim_core.sim.scene_table import SceneTable, single_scene
-from neurosim_core.sim.schedule import Boundary, boundary_count_max
+from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
 from neurosim_core.sim.trace import Fleet, Trace, make_surfaces
 from neurosim_core.vehicle import DynamicsError, Multirotor
 
@@ -267,7 +267,11 @@ def make_state(
         if isinstance(sensor, StateSensorConfig)
     }
     trace = Trace(
-        capacity=slot_count, world_count=count, rotor_count=model.airframe.rotor_count, device=device
+        capacity=slot_count,
+        world_count=count,
+        rotor_count=model.airframe.rotor_count,
+        device=device,
+        history_length=_history_length(model, slot_count),
     )
     if on_host:
         trace.bring_to_host()
@@ -322,6 +326,12 @@ def make_state(
     )
     reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
     return state
+
+
+def _history_length(model: Model, slot_count: int) -> int:
+    """Return how many boundaries are kept for rays with times of their own, whatever is flown ahead."""
+    window_ns = max((group.window_ns for group in model.groups), default=0)
+    return boundary_count_within(model.schedule, window_ns) + slot_count + 1 if window_ns else 0
 
 
 def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Multirotor | Carrier:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy
 from neurosim_core.scene.freespace import DistanceField, room_around
+from neurosim_core.sim.ray_poses import History, append_history, make_history, write_ray_poses
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
@@ -72,6 +73,10 @@ class Rows:
     clearance: wp.array2d[wp.float32]
     redone: wp.array2d[wp.int64]
     stamps: wp.array2d[wp.int64]
+    history: History
+    """Of all boundaries, as far back as rays with times of their own need it."""
+    entries: wp.array2d[wp.int64]
+    """Number of the entry of each slot in `history`; empty without one."""
 
 
 @wp.kernel
@@ -99,6 +104,17 @@ def _record(
     rows_out.status[slot, world] = fleet.status[world]
     rows_out.stamps[slot, world] = fleet.clock_ns[world] + elapsed_ns
     rows_out.redone[slot, world] = fleet.redone_count[world]
+    if rows_out.entries.shape[0] > 0:
+        moves = wp.where(fleet.status[world] == STATUS_OK, wp.float64(1.0), wp.float64(0.0))
+        rows_out.entries[slot, world] = append_history(
+            rows_out.history,
+            world,
+            fleet.clock_ns[world] + elapsed_ns,
+            position,
+            moves * fleet.velocity[world],
+            fleet.orientation[world],
+            moves * fleet.body_rate[world],
+        )
     field = surfaces.fields[surfaces.scene[world]]
     room = room_around(
         field, surfaces.radius_m, surfaces.radius_m + field.voxel, surfaces.ground_height_m, position
@@ -182,7 +198,9 @@ class Trace:
             [slot, world].
     """
 
-    def __init__(self, *, capacity: int, world_count: int, rotor_count: int, device: str) -> None:
+    def __init__(
+        self, *, capacity: int, world_count: int, rotor_count: int, device: str, history_length: int = 0
+    ) -> None:
         shape = (capacity, world_count)
 
         def zeros(shape: Any, dtype: Any) -> Any:
@@ -194,6 +212,8 @@ class Trace:
         self._rows.clearance = self.clearance = zeros(shape, wp.float32)
         self._rows.redone = self.redone = zeros(shape, wp.int64)
         self._rows.stamps = self.stamps = zeros(shape, wp.int64)
+        self._rows.history = make_history(world_count, history_length, device)
+        self._rows.entries = zeros(shape if history_length else (0, world_count), wp.int64)
         self._is_cuda = wp.get_device(device).is_cuda
         self._copies: list[HostCopy] = []
         self._rows_on_host = Rows()
@@ -261,6 +281,10 @@ class Trace:
                 self._pose_launches.clear()
             self._pose_launches[key] = (slots, launch)
         self._pose_launches[key][1].launch()
+
+    def ray_poses(self, slots: wp.array[int], offsets_ns: Any, **poses: Any) -> None:
+        """Write the poses of a camera when its rays are cast; see `ray_poses.write_ray_poses`."""
+        write_ray_poses(self._rows.history, self._rows.entries, slots, offsets_ns, **poses)
 
     def bring_to_host(self) -> None:
         """Allocate the copies on the host that `fetch` writes to."""

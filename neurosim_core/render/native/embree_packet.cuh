@@ -1,4 +1,4 @@
-// Casts the 16 rays `ray` [3][16] from `origin`; rays of zero length are not cast. The results are `faces`,
+// Casts the 16 rays `ray` [3][16] from `origin_of(axis, lane)`; rays of zero length are not cast. The results are `faces`,
 // `ts`, `us`, `vs` [16] and `normal` [3][16]. Embree's u and v weigh the second and the third corner of a
 // triangle, Warp's weigh the first and the second. The packet has the layout of RTCRayHit4, 8 or 16.
 alignas(64) float ts[16], us[16], vs[16], normal[3][16];
@@ -19,7 +19,7 @@ for (int begin = 0; begin < 16; begin += WIDTH) {
         const int from = begin + lane;
         valid[lane] = ray[0][from] != 0.0f || ray[1][from] != 0.0f || ray[2][from] != 0.0f ? -1 : 0;
         for (int axis = 0; axis < 3; ++axis) {
-            packet.origin[axis][lane] = origin[axis];
+            packet.origin[axis][lane] = origin_of(axis, from);
             packet.ray[axis][lane] = ray[axis][from];
         }
         packet.near_t[lane] = packet.time[lane] = 0.0f;

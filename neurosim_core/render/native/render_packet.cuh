@@ -1,3 +1,4 @@
+auto origin_of = [&](int axis, int) { return origin[axis]; };
 const uint64_t embree_intersect = scene.embree_intersect, embree_scene = scene.embree_scene;
 alignas(64) float total[3][N] = {};
 const int layers = rays.shape[0];
