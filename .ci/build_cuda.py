@@ -20,7 +20,7 @@ import warp as wp
 import neurosim_core
 from neurosim_core import run
 from neurosim_core.control import MODES, make_controller
-from neurosim_core.render.antialias import sampling_kernels
+from neurosim_core.render.antialias import antialiasing_kernel
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
 from neurosim_core.render.outputs import OUTPUTS
@@ -79,7 +79,7 @@ def make_kernels() -> None:
     ):
         raycast_kernel(OUTPUTS, terms)
         fallback_kernel(OUTPUTS, terms)
-        sampling_kernels(OUTPUTS, terms, is_cpu=False)
+        antialiasing_kernel(OUTPUTS, terms)
     frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

@@ -1,19 +1,25 @@
 # mypy: disable-error-code="index,attr-defined,no-any-return,operator,arg-type,no-untyped-def,assignment"
-# mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc"
+# mypy: disable-error-code="return-value,call-overload,empty-body,untyped-decorator,misc,valid-type"
 # mypy: allow-untyped-calls, allow-untyped-decorators
-# ruff: noqa: UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
-"""Adaptive antialiasing: more rays where the picture varies, so that a pixel integrates light over its area.
+# ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning in kernels)
+"""Antialiasing: a pixel is the mean of the faces that it shows, weighed by how much of it each covers.
 
-1. The first pass casts one ray per pixel. The rays of neighbouring pixels go through different points of
-   their pixels: a bar as thin as a quarter of a pixel is hit in one of four adjacent rows or columns.
-2. A quad of 2 x 2 pixels is marked where log radiance differs by more than QUAD_CONTRAST from that of a pixel
-   up to REACH_PX away in a row or a column. Each of its pixels becomes the mean of COARSE_COUNT rays.
-3. A pixel is marked where the log radiance of its rays differs by more than PIXEL_CONTRAST. It becomes the
-   mean of SAMPLE_COUNT rays.
+1. The first pass casts one ray per pixel and notes the face that it hits. The rays of neighbouring pixels go
+   through different points of their pixels: a bar as thin as a quarter of a pixel is hit in one of four
+   adjacent rows or columns.
+2. A block of 4 x 4 pixels may show the faces that the first rays hit in it and in a ring of one pixel around
+   it, and those beyond their edges that cross the block. Each of SAMPLE_COUNT points of a pixel shows the
+   nearest of them. That takes products and sums: no ray is cast. A plane surface is shaded once per pixel, at
+   the middle of the points that show it.
+3. Blocks with more than FACE_COUNT_MAX faces or with moving bodies, and pixels that show for the most part
+   none of the faces, are the mean of SAMPLE_COUNT rays.
+
+Faces are those of the scene before they are cut for baked light, which makes many of one.
 
 Means are taken in linear light. The points are fixed in the pixel: a still camera gives the same picture at
-every instant. They form a Hammersley set, which is stratified in 4 x 4 cells, in 16 rows and in 16 columns;
-the first COARSE_COUNT of them are 5/16 of a pixel apart in columns and in rows.
+every instant. They form a Hammersley set.
+
+Reference: Akeley (1993), RealityEngine graphics (multisampling); Aila, Laine (2004), Alias-free shadow maps.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -35,34 +41,21 @@ from neurosim_core.render.lighting import spread_order
 from neurosim_core.render.outputs import RenderOutputs, radiance_writer
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
-from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, mark_pixel, turn_count
+from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 
 SAMPLE_COUNT = 16
-"""Rays of a marked pixel."""
-COARSE_COUNT = 4
-"""Rays of each pixel of a marked quad, of which there are as many."""
-QUAD_CONTRAST = 0.05
-"""Difference of log radiance between pixels that marks a quad."""
-PIXEL_CONTRAST = 0.05
-"""Difference of log radiance between the rays of a pixel that marks it."""
-REACH_PX = 2
-"""Distance of the pixels that are compared [px]."""
+"""Points of a pixel."""
+FACE_COUNT_MAX = 16
+"""Most faces of a block of 4 x 4 pixels and the ring around it."""
+SHARPNESS = wp.constant(0.7)
+"""Width of the footprint that a texture is averaged over [px]: a lookup blurs more than a mean does."""
 _CELLS = 4
-_COARSE = (0, 5, 10, 15)
-_BLOCKS_PER_MULTIPROCESSOR = 32
-_BLOCK = 64
-
-
-def hammersley_points() -> NDArray[np.float64]:
-    """Return SAMPLE_COUNT points (column, row) of the unit square, shape [SAMPLE_COUNT, 2]."""
-    rest = [k for k in range(SAMPLE_COUNT) if k not in _COARSE]
-    index = np.array([*_COARSE, *rest])
-    reversed_bits = sum(((index >> bit) & 1) << (3 - bit) for bit in range(4))
-    return (np.stack([index, reversed_bits], axis=-1) + 0.5) / SAMPLE_COUNT
+_SIDE = 4
+_LANES = _SIDE * _SIDE
 
 
 def _rays_through(lens: Lens, point: Any, sample_count: int, fill_factor: float) -> NDArray[np.float32]:
@@ -92,12 +85,6 @@ def ray_layers(lens: Lens, sample_count: int, fill_factor: float = 1.0) -> NDArr
     return np.stack([_rays_through(lens, point, sample_count, fill_factor) for point in points])
 
 
-def sample_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
-    """Return the rays of marked pixels: direction in C and spread [rad], shape [H * W, SAMPLE_COUNT, 4]."""
-    points = hammersley_points()
-    return np.stack([_rays_through(lens, point, SAMPLE_COUNT, fill_factor) for point in points], axis=1)
-
-
 def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     """Return the rays of the first pass, shape [H * W, 4].
 
@@ -112,353 +99,347 @@ def first_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     return rays[_CELLS * cell_column + cell_row, np.arange(len(row))]
 
 
-@wp.struct
-class SampleData:
-    """The queues of a launch, and the rays of their pixels."""
+def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
+    """Return, of each pixel, the ray through its centre and its change across columns and rows.
 
-    rays: wp.array2d[wp.vec4]
-    """Direction in C and spread [rad], shape [H * W, SAMPLE_COUNT]; of several lenses one after the other."""
-    quads: wp.array[int]
-    """Indices of marked quads, in any order: 16 of a tile and instant, then its instants, then tiles."""
-    quad_count: wp.array[int]
-    """Number of marked quads, shape [1]."""
-    pixels: wp.array[int]
-    """Indices of marked pixels, in any order: 64 of a tile and instant, then its instants, then tiles."""
-    pixel_count: wp.array[int]
-    """Number of marked pixels, shape [1]."""
+    Returns:
+        Direction in C and spread [rad]; difference of the directions at the right and the left border of the
+        sensitive area, and of those at its lower and upper border; shape [3, H * W, 4].
+    """
+    center = _rays_through(lens, (0.5, 0.5), 1, fill_factor)
+    right, left, lower, upper = (
+        _rays_through(lens, point, 1, fill_factor)
+        for point in ((1.0, 0.5), (0.0, 0.5), (0.5, 1.0), (0.5, 0.0))
+    )
+    return np.stack([center, right - left, lower - upper])
+
+
+@wp.func_native(read_native(__file__, "sample_point", SAMPLES=SAMPLE_COUNT))
+def _sample_point(sample: int) -> wp.vec2:
+    """Return a point of a pixel, from its centre [px]."""
+    ...
+
+
+@wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+def _cover_pixel(
+    scene: SceneData,
+    faces: wp.array3d[int],
+    instant: int,
+    row: int,
+    col: int,
+    height: int,
+    width: int,
+    origin: wp.vec3,
+    center: wp.vec3,
+    across: wp.vec3,
+    down: wp.vec3,
+    face_out: wp.array[int],
+    number_out: wp.array[float],
+    ray_out: wp.array[wp.vec3],
+    hit_out: wp.array[wp.vec3],
+    normal_out: wp.array[wp.vec3],
+) -> int:
+    """Find the faces that a pixel shows, -1: the sky; how many points show each; where to shade it.
+
+    Returns:
+        Number of faces; -1: the pixel has to be rendered by rays.
+    """
+    ...
 
 
 @cache
-def _pixel_finder(terms: RenderTerms) -> wp.Function:
-    """Return the Warp function that locates a pixel of a launch by its index; row -1: it is not rendered.
-
-    It returns instant, row, column and world.
-    """
+def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
+    """Return the kernel whose threads are pixels, for any device and all terms."""
     find_tile = tile_finder(terms)
+    radiance_of = pixel_shader(terms)
+    write_radiance = radiance_writer(outputs, supersampled=False)
+    cast_packet = packet_caster(terms.embree) if terms.embree else None
 
-    @wp.func
-    def find_pixel(index: int, view: ViewData, worlds: WorldData):
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
+    def average_pixels(
+        first: int,
+        # In:
+        scene: SceneData,
+        view: ViewData,
+        bodies: BodyData,
+        worlds: WorldData,
+        rays: wp.array2d[wp.vec4],
+        # Out:
+        out: RenderOutputs,
+    ) -> None:
+        index = first + wp.tid()
+        # 64 threads are a tile of 8 x 8 pixels, and 16 side by side a block of 4 x 4
         in_tile = index % 64
         block = index // 64
         instant = block % view.instant_count
         world, _tile, left, top = find_tile(block // view.instant_count, view.width, view.height)
-        col = left + in_tile % 8
-        row = top + in_tile // 8
+        first_ray = int(0)
         if wp.static(terms.worlds):
             instant += world * worlds.stride
             if worlds.active[world] == 0:
-                row = -1
-        if col >= view.width or row >= view.height:
-            row = -1
-        return instant, row, col, world
-
-    return find_pixel
-
-
-@wp.func
-def _pixel_of_quad(quad: int, member: int) -> int:
-    """Return the index of a pixel of a quad."""
-    in_tile = quad % 16
-    row = 2 * (in_tile // 4) + member // 2
-    return (quad // 16) * 64 + 8 * row + 2 * (in_tile % 4) + member % 2
-
-
-@cache
-def _quad_kernel(terms: RenderTerms) -> wp.Kernel:
-    """Return the kernel that marks quads."""
-    find_pixel = _pixel_finder(terms)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def mark_quads(
-        first: int,
-        # In:
-        view: ViewData,
-        worlds: WorldData,
-        log_radiance: wp.array3d[float],
-        # Out:
-        samples: SampleData,
-    ) -> None:
-        quad = first + wp.tid()
-        contrast = float(0.0)
-        for member in range(4):
-            instant, row, col, _world = find_pixel(_pixel_of_quad(quad, member), view, worlds)
-            if row >= 0:
-                own = log_radiance[instant, row, col]
-                for reach in range(1, wp.static(REACH_PX + 1)):
-                    left = log_radiance[instant, row, wp.max(col - reach, 0)]
-                    right = log_radiance[instant, row, wp.min(col + reach, view.width - 1)]
-                    above = log_radiance[instant, wp.max(row - reach, 0), col]
-                    below = log_radiance[instant, wp.min(row + reach, view.height - 1), col]
-                    low = wp.min(wp.min(left, right), wp.min(above, below))
-                    high = wp.max(wp.max(left, right), wp.max(above, below))
-                    contrast = wp.max(contrast, wp.max(high - own, own - low))
-        marked = contrast > wp.static(QUAD_CONTRAST)
-        mark_pixel(marked, quad, samples.quads, samples.quad_count)
-
-    return mark_quads
-
-
-@wp.func
-def _log_of(radiance: wp.vec3, dark_floor: float) -> float:
-    return wp.log(0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2] + dark_floor)
-
-
-@cache
-def _lane_functions(group: int) -> tuple[wp.Function, wp.Function]:
-    """Return functions that give the sum and the largest of the values of `group` threads side by side."""
-
-    @wp.func_native(read_native(__file__, "sum_lanes", LANES=group))
-    def sum_lanes(value: wp.vec3) -> wp.vec3: ...
-
-    @wp.func_native(read_native(__file__, "max_lanes", LANES=group))
-    def max_lanes(value: float) -> float: ...
-
-    return sum_lanes, max_lanes
-
-
-@cache
-def _sample_tracer(terms: RenderTerms, *, coarse: bool) -> wp.Function:
-    """Return the Warp function that gives the radiance of a ray of a pixel; rays traverse the tree."""
-    radiance_of = pixel_shader(terms)
-
-    @wp.func
-    def trace(
-        scene: SceneData,
-        view: ViewData,
-        bodies: BodyData,
-        worlds: WorldData,
-        samples: SampleData,
-        world: int,
-        instant: int,
-        row: int,
-        col: int,
-        sample: int,
-    ) -> wp.vec3:
+                return
         if wp.static(terms.world_scenes):
             scene = worlds.scenes[worlds.scene[world]]
-        pixel = row * view.width + col
         if wp.static(terms.world_lenses):
-            pixel += worlds.lens[world] * view.width * view.height
-        ray_C = samples.rays[pixel, sample]
-        direction_C = wp.vec3(ray_C[0], ray_C[1], ray_C[2])
-        spread_rad = ray_C[3]
-        if wp.static(coarse):
-            spread_rad *= wp.static(float(np.sqrt(SAMPLE_COUNT / COARSE_COUNT)))
-        q = view.q_WC[instant]
-        origin = view.p_WC[instant]
-        ray = wp.quat_rotate(q, direction_C)
-        hit = intersect_scene(scene, origin, ray)
-        body = int(-1)
-        if wp.static(terms.bodies):
-            hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
-        return radiance_of(scene, bodies, instant, body, q, ray, origin, spread_rad, hit)
-
-    return trace
-
-
-@cache
-def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool) -> wp.Kernel:
-    """Return the kernel of a CUDA device that renders queued quads (`coarse`) or pixels, 16 threads each."""
-    find_pixel = _pixel_finder(terms)
-    trace = _sample_tracer(terms, coarse=coarse)
-    group = COARSE_COUNT if coarse else SAMPLE_COUNT
-    sum_lanes, max_lanes = _lane_functions(group)
-    write_radiance = radiance_writer(outputs, supersampled=True)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
-    def render_queue(
-        first: int,
-        # In:
-        scene: SceneData,
-        view: ViewData,
-        bodies: BodyData,
-        worlds: WorldData,
-        thread_count: int,
-        # In/out:
-        samples: SampleData,
-        # Out:
-        out: RenderOutputs,
-    ) -> None:
-        thread = first + wp.tid()
-        lane = thread % SAMPLE_COUNT
-        # all threads of a block take as many turns, and come together to what warps do together
-        begin = thread // _BLOCK * wp.static(_BLOCK // SAMPLE_COUNT)
-        step = thread_count // SAMPLE_COUNT
-        count = samples.pixel_count[0]
-        if wp.static(coarse):
-            count = samples.quad_count[0]
-        for turn in range(turn_count(begin, count, step)):
-            entry = begin + turn * step + (thread % _BLOCK) // SAMPLE_COUNT
-            index = int(0)
-            row = int(-1)
-            col = int(0)
-            world = int(0)
-            instant = int(0)
-            if entry < count:
-                if wp.static(coarse):
-                    index = _pixel_of_quad(samples.quads[entry], lane // group)
-                else:
-                    index = samples.pixels[entry]
-                instant, row, col, world = find_pixel(index, view, worlds)
-            radiance = wp.vec3(0.0)
-            if row >= 0:
-                radiance = trace(scene, view, bodies, worlds, samples, world, instant, row, col, lane % group)
-            total = sum_lanes(radiance)
-            leads = row >= 0 and lane % group == 0
-            if wp.static(coarse):
-                own = _log_of(radiance, scene.dark_floor)
-                highest = max_lanes(own)
-                lowest = -max_lanes(-own)
-                if leads:
-                    before = out.log_radiance[instant, row, col]
-                    highest = wp.max(highest, before)
-                    lowest = wp.min(lowest, before)
-                varies = leads and highest - lowest > wp.static(PIXEL_CONTRAST)
-                mark_pixel(varies, index, samples.pixels, samples.pixel_count)
-            if leads:
-                slot = int(-1)
-                if wp.static("rgb" in outputs):
-                    slot = view.image_slot[instant]
-                write_radiance(scene, total, group + 1, instant, slot, row, col, out)
-
-    return render_queue
-
-
-@cache
-def _packet_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool) -> wp.Kernel:
-    """Return the kernel of a CPU that renders queued quads (`coarse`) or pixels, a packet of 16 rays each."""
-    find_pixel = _pixel_finder(terms)
-    trace = _sample_tracer(terms, coarse=coarse)
-    radiance_of = pixel_shader(terms)
-    group = COARSE_COUNT if coarse else SAMPLE_COUNT
-    widening = float(np.sqrt(SAMPLE_COUNT / group))
-    write_radiance = radiance_writer(outputs, supersampled=True)
-    cast_packet = packet_caster(terms.embree) if terms.embree else None
-    packed = bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
-    shade_packet = packet_shader(
-        SAMPLE_COUNT, textured=terms.textured, emissive=terms.emissive, unit_normals=False
-    )
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={} if terms.embree else UNFUSED)
-    def render_queue_packets(
-        first: int,
-        # In:
-        scene: SceneData,
-        view: ViewData,
-        bodies: BodyData,
-        worlds: WorldData,
-        # In/out:
-        samples: SampleData,
-        # Out:
-        out: RenderOutputs,
-    ) -> None:
-        entry = first + wp.tid()
-        lanes = int(SAMPLE_COUNT)  # a variable: loops stay loops
-        radiance = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-        if wp.static(bool(terms.embree)):
-            ray = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-            face = wp.zeros(shape=(SAMPLE_COUNT,), dtype=int)
-            t = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-            u = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-            v = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-            normal = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-            spread_rad = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-        for lane in range(lanes):
-            index = int(0)
-            if wp.static(coarse):
-                index = _pixel_of_quad(samples.quads[entry], lane // group)
-            else:
-                index = samples.pixels[entry]
-            instant, row, col, world = find_pixel(index, view, worlds)
-            if row >= 0:
-                if wp.static(bool(terms.embree)):
-                    pixel = row * view.width + col
-                    if wp.static(terms.world_lenses):
-                        pixel += worlds.lens[world] * view.width * view.height
-                    ray_C = samples.rays[pixel, lane % group]
-                    direction_C = wp.vec3(ray_C[0], ray_C[1], ray_C[2])
-                    ray[lane] = wp.quat_rotate(view.q_WC[instant], direction_C)
-                    spread_rad[lane] = widening * ray_C[3]
-                else:
-                    radiance[lane] = trace(
-                        scene, view, bodies, worlds, samples, world, instant, row, col, lane % group
-                    )
-        # the packet has one origin: its pixels are of one instant
-        index = int(0)
-        if wp.static(coarse):
-            index = _pixel_of_quad(samples.quads[entry], 0)
-        else:
-            index = samples.pixels[entry]
-        instant, row, col, world = find_pixel(index, view, worlds)
+            first_ray = worlds.lens[world] * view.width * view.height
+        col = left + 4 * (in_tile // 16 % 2) + in_tile % 4
+        row = top + 4 * (in_tile // 32) + in_tile // 4 % 4
+        if col >= view.width or row >= view.height:
+            return
         slot = int(-1)
         if wp.static("rgb" in outputs):
             slot = view.image_slot[instant]
-        if wp.static(bool(terms.embree)):
-            if wp.static(terms.world_scenes):
-                scene = worlds.scenes[worlds.scene[world]]
-            origin = view.p_WC[instant]
-            cast_packet(scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal)
-            if wp.static(packed):
-                shade_packet(scene, ray, spread_rad, face, t, u, v, normal, radiance)
-            else:
-                q = view.q_WC[instant]
-                for lane in range(lanes):
-                    if wp.length_sq(ray[lane]) > 0.0:
-                        hit = Hit()
-                        hit.face = face[lane]
-                        hit.t = t[lane]
-                        hit.u = u[lane]
-                        hit.v = v[lane]
-                        hit.normal = wp.normalize(normal[lane])
-                        body = int(-1)
-                        if wp.static(terms.bodies):
-                            direction_C = wp.quat_rotate_inv(q, ray[lane])
-                            hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
-                        radiance[lane] = radiance_of(
-                            scene, bodies, instant, body, q, ray[lane], origin, spread_rad[lane], hit
-                        )
-        members = int(SAMPLE_COUNT // group)
-        for member in range(members):
-            if wp.static(coarse):
-                index = _pixel_of_quad(samples.quads[entry], member)
-                _instant, row, col, _world = find_pixel(index, view, worlds)
-            if row >= 0:
-                total = wp.vec3(0.0)
-                highest = out.log_radiance[instant, row, col]
-                lowest = highest
-                for lane in range(member * group, (member + 1) * group):
-                    total += radiance[lane]
-                    if wp.static(coarse):
-                        own = _log_of(radiance[lane], scene.dark_floor)
-                        highest = wp.max(highest, own)
-                        lowest = wp.min(lowest, own)
-                if wp.static(coarse):
-                    varies = highest - lowest > wp.static(PIXEL_CONTRAST)
-                    mark_pixel(varies, index, samples.pixels, samples.pixel_count)
-                write_radiance(scene, total, group + 1, instant, slot, row, col, out)
+            if wp.static("log_radiance" not in outputs):
+                if slot < 0:
+                    return
+        origin = view.p_WC[instant]
+        q = view.q_WC[instant]
+        pixel = first_ray + row * view.width + col
+        center = wp.vec3(rays[0, pixel][0], rays[0, pixel][1], rays[0, pixel][2])
+        across = wp.vec3(rays[1, pixel][0], rays[1, pixel][1], rays[1, pixel][2])
+        down = wp.vec3(rays[2, pixel][0], rays[2, pixel][1], rays[2, pixel][2])
+        spread_rad = rays[0, pixel][3]
+        face = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=int)
+        number = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=float)
+        ray = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
+        place = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
+        normal = wp.zeros(shape=(wp.static(FACE_COUNT_MAX + 1),), dtype=wp.vec3)
+        count = _cover_pixel(
+            scene,
+            out.face,
+            instant,
+            row,
+            col,
+            view.height,
+            view.width,
+            origin,
+            wp.quat_rotate(q, center),
+            wp.quat_rotate(q, across),
+            wp.quat_rotate(q, down),
+            face,
+            number,
+            ray,
+            place,
+            normal,
+        )
+        total = wp.vec3(0.0)
+        whole = float(0.0)
+        for entry in range(count):
+            hit = Hit()
+            hit.face = face[entry]
+            hit.t = place[entry][0]
+            hit.u = place[entry][1]
+            hit.v = place[entry][2]
+            hit.normal = normal[entry]
+            light = radiance_of(
+                scene, bodies, instant, -1, q, ray[entry], origin, SHARPNESS * spread_rad, hit
+            )
+            total += number[entry] * light
+            whole += number[entry]
+        if count < 0:
+            whole = float(SAMPLE_COUNT)
+            if wp.static(bool(terms.embree)):
+                toward = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
+                part = wp.zeros(shape=(SAMPLE_COUNT,), dtype=int)
+                t = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
+                u = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
+                v = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
+                front = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
+                for sample in range(SAMPLE_COUNT):
+                    point = _sample_point(sample)
+                    toward[sample] = wp.quat_rotate(
+                        q, wp.normalize(center + point[0] * across + point[1] * down)
+                    )
+                cast_packet(
+                    scene.embree_intersect, scene.embree_scene, origin, toward, FAR_M, part, t, u, v, front
+                )
+            for sample in range(SAMPLE_COUNT):
+                point = _sample_point(sample)
+                direction_C = wp.normalize(center + point[0] * across + point[1] * down)
+                direction = wp.quat_rotate(q, direction_C)
+                hit = Hit()
+                if wp.static(bool(terms.embree)):
+                    hit.face = part[sample]
+                    hit.t = t[sample]
+                    hit.u = u[sample]
+                    hit.v = v[sample]
+                    hit.normal = wp.normalize(front[sample])
+                else:
+                    hit = intersect_scene(scene, origin, direction)
+                body = int(-1)
+                if wp.static(terms.bodies):
+                    hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
+                total += radiance_of(
+                    scene, bodies, instant, body, q, direction, origin, 0.25 * spread_rad, hit
+                )
+        write_radiance(scene, total / whole, 1, instant, slot, row, col, out)
 
-    return render_queue_packets
+    return average_pixels
 
 
-def sampling_kernels(
-    outputs: Collection[str], terms: RenderTerms, *, is_cpu: bool
-) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
-    """Return the kernels that mark quads, render quads, and render pixels.
+@cache
+def _block_shader(*, textured: bool, emissive: bool) -> Any:
+    """Return the Warp function, for CPU kernels only, that renders 4 x 4 pixels from the faces around them.
+
+    Its last output, shape [1], has a bit for each pixel that has to be rendered by rays.
+    """
+
+    def shade_block(
+        scene: SceneData,
+        faces: wp.array3d[int],
+        rays: wp.array2d[wp.vec4],
+        first_pixel: int,
+        instant: int,
+        top: int,
+        left: int,
+        height: int,
+        width: int,
+        rows: int,
+        columns: int,
+        origin: wp.vec3,
+        q_WC: wp.quat,
+        radiance_out: wp.array[wp.vec3],
+        unresolved_out: wp.array[int],
+    ): ...
+
+    if textured:
+        shade_block.__name__ = shade_block.__qualname__ = "shade_textured_block"
+    code = read_native(
+        __file__,
+        "shade_block",
+        SAMPLES=SAMPLE_COUNT,
+        MOST=FACE_COUNT_MAX,
+        TEXTURED=textured,
+        EMISSIVE=emissive,
+        UNIT=False,
+        SHARPNESS=round(100 * SHARPNESS),
+    )
+    return wp.func_native(code)(shade_block)
+
+
+@cache
+def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
+    """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
+    find_tile = tile_finder(terms)
+    write_radiance = radiance_writer(outputs, supersampled=False)
+    cast_packet = packet_caster(terms.embree)
+    shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
+    shade_packet = packet_shader(_LANES, textured=terms.textured, emissive=terms.emissive, unit_normals=False)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def average_blocks(
+        first: int,
+        # In:
+        scene: SceneData,
+        view: ViewData,
+        bodies: BodyData,
+        worlds: WorldData,
+        rays: wp.array2d[wp.vec4],
+        # Out:
+        out: RenderOutputs,
+    ) -> None:
+        index = first + wp.tid()
+        in_tile = index % 4
+        block = index // 4
+        instant = block % view.instant_count
+        world, _tile, left, top = find_tile(block // view.instant_count, view.width, view.height)
+        first_ray = int(0)
+        if wp.static(terms.worlds):
+            instant += world * worlds.stride
+            if worlds.active[world] == 0:
+                return
+        if wp.static(terms.world_scenes):
+            scene = worlds.scenes[worlds.scene[world]]
+        if wp.static(terms.world_lenses):
+            first_ray = worlds.lens[world] * view.width * view.height
+        left += (in_tile % 2) * _SIDE
+        top += (in_tile // 2) * _SIDE
+        if left >= view.width or top >= view.height:
+            return
+        slot = int(-1)
+        if wp.static("rgb" in outputs):
+            slot = view.image_slot[instant]
+            if wp.static("log_radiance" not in outputs):
+                if slot < 0:
+                    return
+        origin = view.p_WC[instant]
+        q = view.q_WC[instant]
+        rows = wp.min(view.height - top, _SIDE)
+        columns = wp.min(view.width - left, _SIDE)
+        first_ray += top * view.width + left
+        radiance = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+        unresolved_bits = wp.zeros(shape=(1,), dtype=int)
+        shade_block(
+            scene,
+            out.face,
+            rays,
+            first_ray,
+            instant,
+            top,
+            left,
+            view.height,
+            view.width,
+            rows,
+            columns,
+            origin,
+            q,
+            radiance,
+            unresolved_bits,
+        )
+        unresolved = unresolved_bits[0]
+        if unresolved != 0:
+            ray = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+            face = wp.zeros(shape=(_LANES,), dtype=int)
+            t = wp.zeros(shape=(_LANES,), dtype=float)
+            u = wp.zeros(shape=(_LANES,), dtype=float)
+            v = wp.zeros(shape=(_LANES,), dtype=float)
+            normal = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+            spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
+            total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+            for sample in range(SAMPLE_COUNT):
+                point = _sample_point(sample)
+                for y in range(rows):
+                    for x in range(columns):
+                        lane = _SIDE * y + x
+                        if (unresolved >> lane) & 1:
+                            pixel = first_ray + y * view.width + x
+                            sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
+                            toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
+                            ray[lane] = wp.quat_rotate(q, toward)
+                            spread_rad[lane] = 0.25 * rays[0, pixel][3]
+                cast_packet(
+                    scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
+                )
+                shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
+            for lane in range(_LANES):
+                if (unresolved >> lane) & 1:
+                    radiance[lane] = total[lane] / float(SAMPLE_COUNT)
+        for y in range(rows):
+            for x in range(columns):
+                write_radiance(scene, radiance[_SIDE * y + x], 1, instant, slot, top + y, left + x, out)
+
+    return average_blocks
+
+
+def antialiasing_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
+    """Return the kernel of the second pass.
 
     Args:
-        outputs: Outputs of the renderer; log radiance is always written, RGB if it is one of them.
+        outputs: Outputs of the renderer, of which log radiance and RGB are written.
         terms: Terms of the first pass.
-        is_cpu: Whether the device is a CPU.
     """
-    written = tuple(name for name in ("log_radiance", "rgb") if name in ("log_radiance", *outputs))
-    plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=True)
-    make_kernel = _packet_kernel if is_cpu else _block_kernel
-    coarse, fine = (make_kernel(written, plain, coarse=coarse) for coarse in (True, False))
-    return _quad_kernel(plain), coarse, fine
+    written = tuple(name for name in ("log_radiance", "rgb") if name in outputs)
+    plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
+    in_blocks = _in_blocks(terms)
+    return (_block_kernel if in_blocks else _pixel_kernel)(written, plain)
 
 
-class AdaptiveSampling:
-    """The second and the third step for one renderer."""
+def _in_blocks(terms: RenderTerms) -> bool:
+    return bool(terms.embree) and terms.baked and not terms.bodies and not terms.finest_level
+
+
+class Antialiasing:
+    """The second pass of one renderer."""
 
     def __init__(
         self,
@@ -466,31 +447,22 @@ class AdaptiveSampling:
         *,
         outputs: Collection[str],
         terms: RenderTerms,
-        pixel_count: int,
         device: str,
         thread_count: int | None,
     ) -> None:
-        """Allocate queues that hold all pixels.
+        """Choose the kernel.
 
         Args:
-            rays: `sample_rays`, of several lenses one after the other, shape [H * W, SAMPLE_COUNT, 4].
+            rays: `pixel_rays`, of several lenses one after the other, shape [3, H * W, 4].
             outputs: Outputs of the renderer.
             terms: Terms of the first pass.
-            pixel_count: The most pixels of a launch: those of all tiles, instants and worlds.
             device: Where to render.
             thread_count: Threads on a CPU device; all cores if None.
         """
         self._device, self._thread_count = device, thread_count
-        self._is_cpu = wp.get_device(device).is_cpu
-        self._mark, self._coarse, self._fine = sampling_kernels(outputs, terms, is_cpu=self._is_cpu)
-        data = self._data = SampleData()
-        data.rays = wp.array(rays, dtype=wp.vec4, device=device)
-        data.quads = wp.zeros(pixel_count // 4, dtype=int, device=device)
-        data.pixels = wp.zeros(pixel_count, dtype=int, device=device)
-        self._counts = wp.zeros(2, dtype=int, device=device)
-        data.quad_count, data.pixel_count = self._counts[:1], self._counts[1:]
-        processors = 0 if self._is_cpu else wp.get_device(device).sm_count
-        self._threads = processors * _BLOCKS_PER_MULTIPROCESSOR * _BLOCK
+        self._kernel = antialiasing_kernel(outputs, terms)
+        self._pixels_per_thread = _LANES if _in_blocks(terms) else 1
+        self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
 
     def launch(
         self,
@@ -502,33 +474,21 @@ class AdaptiveSampling:
         *,
         pixel_count: int,
     ) -> None:
-        """Mark quads of the first pass, and render them again.
+        """Write log radiance and RGB.
 
         Args:
             scene: As for the first pass, as the next three.
             view: Rays and poses.
             bodies: Bodies that move.
             worlds: Worlds that are rendered together.
-            out: Outputs of the first pass; log radiance and RGB of marked pixels are overwritten.
+            out: Outputs of the first pass, which include the faces.
             pixel_count: Pixels of the first pass: those of all tiles, instants and worlds.
         """
-        data = self._data
-        self._counts.zero_()
-        self._launch(self._mark, pixel_count // 4, [view, worlds, out.log_radiance], [data])
-        inputs = [scene, view, bodies, worlds]
-        for kernel, count in ((self._coarse, data.quad_count), (self._fine, data.pixel_count)):
-            if self._is_cpu:
-                self._launch(kernel, int(count.numpy()[0]), inputs, [data, out])
-            else:
-                self._launch(kernel, self._threads, [*inputs, self._threads], [data, out])
-
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
-        if dim > 0:
-            launch_split(
-                kernel,
-                dim=dim,
-                inputs=inputs,
-                outputs=outputs,
-                device=self._device,
-                thread_count=self._thread_count,
-            )
+        launch_split(
+            self._kernel,
+            dim=pixel_count // self._pixels_per_thread,
+            inputs=[scene, view, bodies, worlds, self._rays],
+            outputs=[out],
+            device=self._device,
+            thread_count=self._thread_count,
+        )

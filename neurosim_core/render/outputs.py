@@ -22,12 +22,17 @@ OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance", "returns")
 INSTANT_OUTPUTS = frozenset({"log_radiance"})
 """Those that all instants have, whether they have an image slot or not."""
 
+FACE = "face"
+"""The output of a first pass (`antialias.py`), which all instants have."""
+
 
 class RequestedOutputs(NamedTuple):
     """What a set of outputs requires."""
 
     log: bool
     """Log radiance, which all instants have, is requested."""
+    faces: bool
+    """Faces, which all instants have, are requested."""
     images: bool
     """Another output, which instants with an image slot have, is requested."""
     radiance: bool
@@ -40,7 +45,8 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
     """Return what `outputs` require of a kernel."""
     return RequestedOutputs(
         log="log_radiance" in outputs,
-        images=any(name != "log_radiance" for name in outputs),
+        faces=FACE in outputs,
+        images=any(name not in ("log_radiance", FACE) for name in outputs),
         radiance="log_radiance" in outputs or "rgb" in outputs,
         geometry=any(name in outputs for name in ("depth", "normal", "instance", "returns")),
     )
@@ -48,10 +54,12 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
 
 @wp.struct
 class RenderOutputs:
-    """The arrays of outputs; those not requested are empty. All but the first have image slots."""
+    """The arrays of outputs; those not requested are empty. All but the first two have image slots."""
 
     log_radiance: wp.array3d[float]
     """log(Rec. 709 luma + dark floor) of each instant, shape [K, H, W]."""
+    face: wp.array3d[int]
+    """Index of the face that the last ray of a pixel hits, -1: none, shape [K, H, W]."""
     rgb: wp.array4d[wp.uint8]
     """sRGB of exposure times radiance, shape [M, H, W, 3]."""
     depth: wp.array3d[float]

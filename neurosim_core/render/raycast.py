@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from neurosim_core.render.outputs import OUTPUTS
+from neurosim_core.render.outputs import FACE, OUTPUTS
 from neurosim_core.render.raycast_packets import packet_kernel
 from neurosim_core.render.raycast_pixels import pixel_kernel
 from neurosim_core.render.render_terms import RenderTerms
@@ -32,10 +32,10 @@ def raycast_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
         raise ValueError("candidate lists need worlds with one scene and one lens")
     if not terms.candidate_group:
         terms = terms._replace(by_tile=False)
-    unknown = sorted(set(outputs) - set(OUTPUTS))
+    unknown = sorted(set(outputs) - {*OUTPUTS, FACE})
     if unknown or not outputs:
         raise ValueError(f"outputs must be some of {list(OUTPUTS)}, got {sorted(outputs)}")
-    return _kernel(tuple(name for name in OUTPUTS if name in outputs), terms)
+    return _kernel(tuple(name for name in (*OUTPUTS, FACE) if name in outputs), terms)
 
 
 def fallback_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel | None:

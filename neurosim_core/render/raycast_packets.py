@@ -87,7 +87,7 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         slot = int(-1)
         if wp.static(requested.images):
             slot = view.image_slot[instant]
-            if wp.static(not requested.log):
+            if wp.static(not (requested.log or requested.faces)):
                 if slot < 0:
                     return
         origin = view.p_WC[instant]
@@ -191,6 +191,9 @@ def packet_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                             u[lane] = hit.u
                             v[lane] = hit.v
                             normal[lane] = hit.normal
+                        if wp.static(requested.faces):
+                            if layer == view.rays.shape[0] - 1:
+                                out.face[instant, top + y, left + x] = hit.face
                         if wp.static(requested.radiance and not packed):
                             if wp.static(not terms.supersampled) or layer > 0:
                                 radiance[lane] += radiance_of(

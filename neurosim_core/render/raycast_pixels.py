@@ -141,7 +141,7 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
         slot = int(-1)
         if wp.static(requested.images):
             slot = view.image_slot[instant]
-            if wp.static(not requested.log):
+            if wp.static(not (requested.log or requested.faces)):
                 if slot < 0:
                     return
         origin = view.p_WC[instant]
@@ -164,6 +164,9 @@ def _pixel_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
             body = int(-1)
             if wp.static(terms.bodies):
                 hit, body = intersect_bodies(bodies, pose, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit)
+            if wp.static(requested.faces):
+                if layer == view.rays.shape[0] - 1:
+                    out.face[instant, row, col] = hit.face
             if wp.static(requested.radiance):
                 if wp.static(not terms.supersampled) or layer > 0:
                     radiance += radiance_of(scene, bodies, pose, body, q, ray, origin, ray_C[3], hit)
@@ -239,7 +242,7 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                 if wp.static(requested.images):
                     slot = view.image_slot[instant]
                 rendered = not outside and not unresolved
-                if wp.static(requested.images and not requested.log):
+                if wp.static(requested.images and not (requested.log or requested.faces)):
                     rendered = rendered and slot >= 0
                 if wp.static(terms.supersampled):
                     rendered = rendered and (layer > 0 or (slot >= 0 and wp.static(requested.geometry)))
@@ -255,6 +258,9 @@ def _group_program(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function:
                             hit, body = intersect_bodies(
                                 bodies, instant, wp.vec3(ray_C[0], ray_C[1], ray_C[2]), q, hit
                             )
+                        if wp.static(requested.faces):
+                            if layer == layer_count - 1:
+                                out.face[instant, row, col] = hit.face
                         if wp.static(requested.radiance):
                             if wp.static(not terms.supersampled) or layer > 0:
                                 radiance += radiance_of(

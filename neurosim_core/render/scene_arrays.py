@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from neurosim_core.render.body_arrays import BodyArrays, JoinedBodies, join_bodies, upload_bodies
 from neurosim_core.render.config import CandidateListConfig, RenderConfig
@@ -29,6 +31,7 @@ _logger = logging.getLogger(__name__)
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _MIDDLE_GREY = 0.2
 _BRIGHT = 0.6
+_PLANE_COSINE = 1.0 - 1e-5  # normals of a plane surface differ by less than a quarter of a degree
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,6 +116,8 @@ def upload_scene(
         data.face_normal = face_normals(tree)
     _upload_surfaces(data, scene, mesh, joined, packed, terms, device)
     _upload_light(data, scene, mesh, light, config, lamps=bool(bodies) or not baked, device=device)
+    if config.samples_per_pixel == "adaptive":
+        _upload_wholes(data, scene, mesh, device)
     data.mip_bias = config.mip_bias
     data.dark_floor = config.dark_floor
     data.exposure = exposure
@@ -231,6 +236,52 @@ def _embree_width(config: RenderConfig, device: str) -> int:
 
 def _rows(values: list[tuple[float, float, float]]) -> NDArray[np.float32]:
     return np.array(values, dtype=np.float32).reshape(-1, 3)
+
+
+def _upload_wholes(data: SceneData, scene: Scene, mesh: RefinedMesh, device: str) -> None:
+    """Write what antialiasing reads: faces as they were before they were cut."""
+    neighbor, surface = connect_faces(scene)
+    first = np.searchsorted(mesh.origin, np.arange(len(scene.faces) + 1)).astype(np.int32)
+    data.whole_of_face = wp.array(mesh.origin, dtype=int, device=device)
+    data.whole_first = wp.array(first, dtype=int, device=device)
+    corners = scene.vertices[scene.faces].reshape(-1, 3).astype(np.float32)
+    data.whole_corner = wp.array(corners, dtype=wp.vec3, device=device)
+    data.whole_neighbor = wp.array(neighbor, dtype=int, device=device)
+    data.whole_surface = wp.array(surface, dtype=int, device=device)
+
+
+def connect_faces(scene: Scene) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return which faces share edges, and which are parts of one surface.
+
+    Vertices at one place are one. Of several faces at an edge each has one of the others.
+
+    Returns:
+        The face beyond the edge opposite each corner, -1: none, shape [3 F]. The surface of each face, shape
+        [F]: a surface is plane, has one material, and its texture coordinates are continuous.
+    """
+    material, vertices = scene.face_material, np.ascontiguousarray(scene.vertices, dtype=np.float32)
+    mesh = scene
+    count = len(mesh.faces)
+    tips = mesh.vertices[mesh.faces]
+    place = np.unique(vertices.view([("", np.float32)] * 3), return_inverse=True)[1].reshape(-1)
+    corner, others = place[mesh.faces].astype(np.int64), ((1, 2), (2, 0), (0, 1))
+    ends = np.sort(corner[:, others].reshape(-1, 2), axis=1)
+    key = ends[:, 0] << 32 | ends[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = key[order[1:]] == key[order[:-1]]
+    one, other = order[:-1][same], order[1:][same]
+    neighbor = np.full(3 * count, -1, dtype=np.int32)
+    neighbor[other], neighbor[one] = one // 3, other // 3
+
+    normal = np.cross(tips[:, 1] - tips[:, 0], tips[:, 2] - tips[:, 0]).astype(np.float64)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    along = np.argsort(corner[:, others].reshape(-1, 2), axis=1)
+    uv = np.take_along_axis(mesh.uv[mesh.faces][:, others].reshape(-1, 2, 2), along[..., None], axis=1)
+    joined = (material[one // 3] == material[other // 3]) & (uv[one] == uv[other]).all(axis=(1, 2))
+    joined &= np.einsum("ec,ec->e", normal[one // 3], normal[other // 3]) > _PLANE_COSINE
+    pairs = (one[joined] // 3, other[joined] // 3)
+    graph = coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(count, count))
+    return neighbor, connected_components(graph, directed=False)[1].astype(np.int32)
 
 
 def _areas_m2(mesh: RefinedMesh) -> NDArray[np.float64]:

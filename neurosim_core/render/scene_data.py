@@ -25,6 +25,17 @@ class SceneData:
     face_instance: wp.array[int]
     face_normal: wp.array[wp.vec3]
     """Unit normal of each face's front; not filled if Embree intersects rays."""
+    whole_of_face: wp.array[int]
+    """The face, before faces were cut for baked light, that each is a part of; as the following, filled for
+    antialiasing."""
+    whole_first: wp.array[int]
+    """First part of each face before the cuts, and the number of parts, shape [W + 1]."""
+    whole_corner: wp.array[wp.vec3]
+    """Positions of its corners [m], shape [3 W]."""
+    whole_neighbor: wp.array[int]
+    """The one beyond the edge opposite each corner, -1: none, shape [3 W]."""
+    whole_surface: wp.array[int]
+    """The plane surface of one material and without seams that it is a part of, shape [W]."""
     face_lod: wp.array[float]
     """log2 of texels per metre on each face."""
     corner_uv: wp.array[wp.vec2]

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.antialias import SAMPLE_COUNT, AdaptiveSampling, first_rays, ray_layers, sample_rays
+from neurosim_core.render.antialias import SAMPLE_COUNT, Antialiasing, first_rays, pixel_rays, ray_layers
 from neurosim_core.render.blind_pixels import BlindPixels
 from neurosim_core.render.body_arrays import (
     make_body_data,
@@ -23,7 +23,7 @@ from neurosim_core.render.candidate_lists import CandidateLists, choose_candidat
 from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.outputs import OUTPUTS, make_render_outputs, requested_outputs
+from neurosim_core.render.outputs import FACE, OUTPUTS, make_render_outputs, requested_outputs
 from neurosim_core.render.ray_times import RayTimes, RayTiming
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists
@@ -129,7 +129,7 @@ class WarpRenderer:
         has_geometry = requested_outputs(outputs).geometry
         rays = np.concatenate([self._layers(each, adaptive, has_geometry) for each in lenses], axis=1)
         shared = self._choose_terms(rays, several=worlds.count > 1)
-        rendered = {*outputs, "log_radiance"} if adaptive else set(outputs)
+        rendered = {FACE, *outputs} - {"log_radiance", "rgb"} if adaptive else set(outputs)
         self._kernel = raycast_kernel(rendered, self.terms)
         self._fallback = fallback_kernel(rendered, self.terms)
         self._group = instants_per_thread(self.terms)
@@ -147,30 +147,29 @@ class WarpRenderer:
         self.candidates = None if shared is None else self._make_candidates(lens, rays, shared)
         self._candidate_data = CandidateListData() if self.candidates is None else self.candidates.data
         images = (image_count, lens.height, lens.width)
-        self._sampling = None
+        self._antialiasing = None
         if adaptive:
             fill_factor = arrays.config.fill_factor
-            self._sampling = AdaptiveSampling(
-                np.concatenate([sample_rays(each, fill_factor) for each in lenses]),
+            self._antialiasing = Antialiasing(
+                np.concatenate([pixel_rays(each, fill_factor) for each in lenses], axis=1),
                 outputs=outputs,
                 terms=self.terms,
-                pixel_count=worlds.count * instant_count * self._tile_count * TILE * TILE,
                 device=device,
                 thread_count=thread_count,
             )
 
         def allocate(name: str, shape: tuple[int, ...], dtype: object) -> wp.array | None:
-            return wp.zeros(shape, dtype=dtype, device=device) if name in rendered else None
+            return wp.zeros(shape, dtype=dtype, device=device) if name in {*rendered, *outputs} else None
 
-        log_radiance = allocate("log_radiance", (worlds.count * instant_count, *images[1:]), float)
-        self.log_radiance = log_radiance if "log_radiance" in outputs else None
+        instants = (worlds.count * instant_count, *images[1:])
+        self.log_radiance = allocate("log_radiance", instants, float)
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
         self.depth = allocate("depth", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
         self.returns = allocate("returns", images, wp.vec3)
-        arrays_of = {name: getattr(self, name) for name in OUTPUTS} | {"log_radiance": log_radiance}
-        self._render_outputs = make_render_outputs(**arrays_of)
+        arrays_of = {name: getattr(self, name) for name in OUTPUTS}
+        self._render_outputs = make_render_outputs(**arrays_of, face=allocate(FACE, instants, int))
         self._blind = BlindPixels(
             lenses,
             worlds.lens_of_world if worlds.lenses else [0] * worlds.count,
@@ -235,8 +234,8 @@ class WarpRenderer:
                 outputs=outputs,
                 device=device,
             )
-        if self._sampling is not None:
-            self._sampling.launch(
+        if self._antialiasing is not None:
+            self._antialiasing.launch(
                 self._arrays.data,
                 view,
                 self._body_data,

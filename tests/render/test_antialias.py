@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from render_scenes import DARK, LOOK_DOWN, UNSHADOWED, box, plane, render, scene_of
 
-from neurosim_core.render.antialias import first_rays, hammersley_points, ray_layers
+from neurosim_core.render.antialias import first_rays, ray_layers
 from neurosim_core.render.camera import PinholeConfig
-from neurosim_core.render.config import RenderConfig
+from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.scene.scene import Ambient, Material
 
 LENS = PinholeConfig(width=33, height=18, fx=32.0, fy=32.0, cx=16.5, cy=9.0)
@@ -50,16 +50,14 @@ def test_an_edge_that_moves_through_a_pixel(device, traversal):
 
 
 def test_bars_thinner_than_a_pixel_are_seen(device):
-    """Bars of 0.3 px at any place cover 4 or 5 of 16 points; the first rays miss one in 20 in some rows."""
+    """Bars of 0.3 px are seen in all rows at any place: they cover 3 to 5 of 16 points."""
     period, width = 7.0 * PITCH_M, 0.3 * PITCH_M
     bars = strips(*((k * period, k * period + width) for k in range(-4, 5)))
     seen = radiance(bars, np.linspace(0.0, PITCH_M, 65), device=device)
     share = (seen[:, 2:-2] - 0.25) / 0.75
     coverage = np.stack([share[..., col - 2 : col + 3].sum(axis=-1) for col in (9, 16, 23)], axis=-1)
-    assert (coverage < 0.2).mean() < 0.05
-    assert coverage[coverage >= 0.2].min() > 4.0 / 16.0 - 1e-3
+    assert coverage.min() > 3.0 / 16.0 - 1e-3
     assert coverage.max() < 5.0 / 16.0 + 1e-3
-    assert (coverage.mean(axis=1) > 0.05).all()  # none is missed in all rows
     assert coverage.mean() == pytest.approx(0.3, abs=0.015)
 
 
@@ -124,6 +122,21 @@ def test_close_to_many_rays(device):
     assert difference.max() <= 1
 
 
+@pytest.mark.parametrize("traversal", ["auto", "warp"])
+def test_faces_that_are_cut_for_baked_light(traversal):
+    """Two bars on a slant, cut into slivers of which first rays miss many, look as they do to many rays."""
+    part = strips((-0.05, -0.03), (0.04, 0.07))
+    lighting = LightingConfig(edge_max_m=0.02, ambient_ray_count=1, shadow_ray_count=1)
+    poses = [((0.0013 * k, 0.0, 1.0), LOOK_DOWN) for k in range(8)]
+    seen = {}
+    for samples in ("adaptive", 64):
+        config = ADAPTIVE.model_copy(
+            update={"samples_per_pixel": samples, "lighting": lighting, "cpu_traversal": traversal}
+        )
+        seen[samples] = render(part, LENS, poses, outputs=("log_radiance",), config=config)["log_radiance"]
+    assert np.abs(np.exp(seen["adaptive"]) - np.exp(seen[64])).max() < 0.75 * (1.0 / 16.0 + 1.0 / 64.0) + 1e-3
+
+
 def test_threads_and_launches_change_nothing():
     """Marked pixels are queued in any order, and rendered alike."""
     scene, offsets = strips((-0.3, 0.01), (0.2, 0.21)), np.linspace(0.0, 0.05, 7)
@@ -132,12 +145,8 @@ def test_threads_and_launches_change_nothing():
     np.testing.assert_array_equal(one[3:4], radiance(scene, offsets[3:4]))
 
 
-def test_sample_points():
-    """One in each of 16 columns, 16 rows and 4 x 4 cells; four adjacent pixels look through four columns."""
-    points = hammersley_points()
-    for cells in (np.array([16, 1]), np.array([1, 16]), np.array([4, 4])):
-        assert len({tuple(cell) for cell in np.floor(points * cells)}) == 16
-    assert (np.abs(np.diff(np.sort(points[:4], axis=0), axis=0) - 5.0 / 16.0) < 1e-12).all()
+def test_first_rays():
+    """Four adjacent pixels look through four columns or rows of cells."""
     lens = PinholeConfig(width=8, height=8, fx=8.0, fy=8.0, cx=4.0, cy=4.0)
     rays = first_rays(lens).reshape(8, 8, 4)
     position = rays[..., :2] / rays[..., 2:3] * 8.0 + 4.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from neurosim_core.render import lighting
-from neurosim_core.render.antialias import sampling_kernels
+from neurosim_core.render.antialias import antialiasing_kernel
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
 from neurosim_core.render.outputs import OUTPUTS
@@ -19,7 +19,7 @@ def test_kernels_build_for_sm_90(tmp_path):
         raycast_kernel(OUTPUTS, everything),
         raycast_kernel(("log_radiance",), everything._replace(candidate_group=4)),
         frustum_search_kernel(BLOCK),
-        *sampling_kernels(OUTPUTS, everything, is_cpu=False),
+        antialiasing_kernel(OUTPUTS, everything),
     )
     for module in (*(kernel.module for kernel in kernels), lighting):
         wp.compile_aot_module(module, module_dir=str(tmp_path), arch=90)

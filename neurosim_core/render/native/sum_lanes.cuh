@@ -1,6 +1,0 @@
-#ifdef __CUDA_ARCH__
-const unsigned mask = ((1u << LANES) - 1) << (threadIdx.x & 31 & ~(LANES - 1));
-for (int step = LANES / 2; step > 0; step >>= 1)
-    for (int axis = 0; axis < 3; ++axis) value[axis] += __shfl_xor_sync(mask, value[axis], step);
-#endif
-return value;
