@@ -228,8 +228,8 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             hit = Hit()
             hit.face = face[entry]
             hit.t = place[entry][0]
-            hit.u = place[entry][1]
-            hit.v = place[entry][2]
+            hit.u = wp.clamp(place[entry][1], 0.0, 1.0)
+            hit.v = wp.clamp(place[entry][2], 0.0, 1.0 - hit.u)
             hit.normal = normal[entry]
             light = radiance_of(
                 scene, bodies, instant, -1, q, ray[entry], origin, SHARPNESS * spread_rad, hit
@@ -312,6 +312,7 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
         TEXTURED=textured,
         EMISSIVE=emissive,
         UNIT=False,
+        LIGHT_WITHIN=True,
         SHARPNESS=round(100 * SHARPNESS),
     )
     return wp.func_native(code)(shade_block)

@@ -48,7 +48,13 @@ def packet_shader(lanes: int, *, textured: bool, emissive: bool, unit_normals: b
     if textured:  # by its name the code of a kernel tells whether it samples textures
         shade_packet.__name__ = shade_packet.__qualname__ = "shade_textured_packet"
     code = read_native(
-        __file__, "shade_packet", N=lanes, TEXTURED=textured, EMISSIVE=emissive, UNIT=unit_normals
+        __file__,
+        "shade_packet",
+        N=lanes,
+        TEXTURED=textured,
+        EMISSIVE=emissive,
+        UNIT=unit_normals,
+        LIGHT_WITHIN=False,
     )
     return wp.func_native(code)(shade_packet)
 
@@ -99,5 +105,6 @@ def packet_program(width: int, *, textured: bool, emissive: bool) -> Any:
         TEXTURED=textured,
         EMISSIVE=emissive,
         UNIT=False,
+        LIGHT_WITHIN=False,
     )
     return wp.func_native(code)(render_packet)

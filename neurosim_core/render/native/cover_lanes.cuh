@@ -2,6 +2,7 @@
 // the pixels. A pixel's directions are `ray`[0] + x `ray`[1] + y `ray`[2], each [3][LANES], with x and y in `points`.
 // Faces of one surface are taken together. For each of `layer_count` surfaces `number` [LANES] is how many points show it,
 // and `middle` [2][LANES] their mean. Where the first rays hit one surface only, all points show it.
+constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is extrapolated beyond its horizon
 constexpr float OVERLAP = 1e-5f; // of a triangle's size: no point falls between two that share an edge
 // Functions of a direction whose values are the weights of a triangle's corners over the distance to its plane along it.
 auto functions_of = [&](const wp::vec3& a, const wp::vec3& b, const wp::vec3& c, auto& function) {

@@ -20,7 +20,7 @@ for (int layer = 0; layer < layer_count; ++layer) {
                                       mesh.points[index[2]] - origin, function);
     for (int side = 0; side < 3; ++side)
         corner[side] = function[side][0] * toward[0] + function[side][1] * toward[1] + function[side][2] * toward[2];
-    const float near = 1.0f / (corner[0] + corner[1] + corner[2]), length = wp::length(toward);
+    const float near = 1.0f / wp::max(corner[0] + corner[1] + corner[2], NEARNESS_MIN), length = wp::length(toward);
     wp::vec3 normal;
     for (int axis = 0; axis < 3; ++axis)
         normal[axis] = (volume < 0.0f ? -1.0f : 1.0f) * (function[0][axis] + function[1][axis] + function[2][axis]);

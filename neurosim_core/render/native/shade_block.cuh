@@ -59,7 +59,7 @@ auto shade = [&]() {
 #else
         const float length = __builtin_elementwise_sqrt(square);
 #endif
-        const float near = 1.0f / (corner[0][lane] + corner[1][lane] + corner[2][lane]);
+        const float near = 1.0f / wp::max(corner[0][lane] + corner[1][lane] + corner[2][lane], NEARNESS_MIN);
         ts[lane] = length * near;
         us[lane] = corner[0][lane] * near;
         vs[lane] = corner[1][lane] * near;

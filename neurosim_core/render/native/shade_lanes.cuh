@@ -154,6 +154,12 @@ for (int channel = 0; channel < 3; ++channel)
     for (int lane = 0; lane < N; ++lane)
         emitted[channel][lane] =
             EMISSIVE ? scene.emission.data[EMISSIVE ? material[lane] : 0][channel] : 0.0f;
+if constexpr (LIGHT_WITHIN) // no light is extrapolated beyond the face
+    for (int lane = 0; lane < N; ++lane) {
+        us[lane] = wp::clamp(us[lane], 0.0f, 1.0f);
+        vs[lane] = wp::clamp(vs[lane], 0.0f, 1.0f - us[lane]);
+        w[lane] = 1.0f - us[lane] - vs[lane];
+    }
 for (int channel = 0; channel < 3; ++channel) {
     const float* albedo = channel == 0 ? red : channel == 1 ? green : blue;
     for (int lane = 0; lane < N; ++lane) {
