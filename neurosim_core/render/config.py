@@ -66,7 +66,7 @@ class RenderConfig(Settings):
     samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = 1
     """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray
     finds the surfaces around a pixel, and 16 points of the pixel tell how much of it each covers; where there
-    are many small ones, 16 rays. It takes about 2.7 times as long as one ray. An integer: as many rays in all
+    are many small ones, 16 rays. It takes 2.6 to 2.8 times as long as one ray. An integer: as many rays in all
     pixels.
     With 1, edges alias, and a quarter to a half of the events at 346x260 are aliasing. Geometry (depth,
     normal, instance) is always that of the ray through the pixel's centre."""
