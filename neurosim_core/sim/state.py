@@ -299,7 +299,7 @@ def make_state(
             paths=paths[0] if all(path is paths[0] for path in paths) else paths,
         ),
         trace=trace,
-        groups=_make_groups(model, worlds, in_flight=in_flight, on_host=on_host, make_room=make_room),
+        groups=_make_groups(model, worlds, seeds, in_flight=in_flight, on_host=on_host, make_room=make_room),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -358,6 +358,7 @@ def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Multirotor
 def _make_groups(
     model: Model,
     worlds: WorldSettings,
+    seeds: Any,
     *,
     in_flight: int,
     on_host: bool,
@@ -394,6 +395,7 @@ def _make_groups(
                 in_flight=in_flight,
                 device=model.device,
                 seed=worlds.seeds[0],
+                seeds=seeds,
                 bodies=config.bodies,
                 worlds=RenderWorlds(
                     count=len(worlds.seeds),
