@@ -24,7 +24,6 @@ from neurosim_core.render.renderer import (
     ONE_WORLD,
     Renderer,
     RenderWorlds,
-    SceneOnDevice,
     make_renderer,
 )
 from neurosim_core.render.scene_arrays import SceneArrays
@@ -152,7 +151,7 @@ class Instants:
 def make_render_group(
     group: RenderGroup,
     sensors: Mapping[str, SensorConfig],
-    scene: SceneOnDevice,
+    scene: Any,
     *,
     capacity: int,
     in_flight: int,
@@ -282,7 +281,7 @@ def make_render_group(
     )
 
 
-def _ray_times(group: RenderGroup, scene: SceneOnDevice) -> RayTimes | None:
+def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
     """Return when the rays of a group are cast; None: all at the stamp."""
     if group.timing is None:
         return None
@@ -322,9 +321,7 @@ def _frames_of(renderer: Renderer, world_count: int, capacity: int) -> Any:
     return frames.reshape((world_count, capacity, frames.shape[1] * frames.shape[2]))
 
 
-def _make_rule(
-    group: RenderGroup, scene: SceneOnDevice, p_BC: wp.vec3d, q_BC: wp.quatd
-) -> DisplacementRule | None:
+def _make_rule(group: RenderGroup, scene: Any, p_BC: wp.vec3d, q_BC: wp.quatd) -> DisplacementRule | None:
     if group.max_displacement_px is None:
         return None
     if not isinstance(scene, SceneArrays):
