@@ -30,7 +30,6 @@ from neurosim_core.render.projection import LensData, make_lens_data, projector
 from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.scene.bodies import Motion, body_velocity, make_body_poses
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
-from neurosim_core.settings import Settings
 
 VISIBLE, HIDDEN, OUTSIDE = 0, 1, 2
 """Values of the mask: seen at both times; hidden by something at the other time; outside the picture then."""
@@ -59,7 +58,8 @@ class OpticalFlow(Packet):
     """What a pixel of `data` is, named as in ROS."""
 
 
-class _Before(Settings):
+@dataclass(frozen=True)
+class _Before:
     """All rays are cast before the stamp."""
 
     span_ns: int
@@ -110,7 +110,7 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
     @property
     def timing(self) -> _Before | None:
         """Forward flow casts its rays at the earlier time."""
-        return _Before(span_ns=self.window_ns) if self.direction == "forward" and self.window_ns else None
+        return _Before(self.window_ns) if self.direction == "forward" and self.window_ns else None
 
     @property
     def pose_offset_ns(self) -> int | None:
