@@ -305,9 +305,13 @@ def load_config(
         patches.insert(0, {"sensors": raw[_ADDED]})
         raw = {key: value for key, value in raw.items() if key != _ADDED}
     if "sensors" not in raw and any("sensors" in patch for patch in patches):
-        # pixels are ideal where nothing is said of them, which leaves a preset free to say it
-        sensors = _default_sensors()
-        raw["sensors"] = {name: sensor.model_dump(exclude={"pixel"}) for name, sensor in sensors.items()}
+        # of what a preset may say, nothing is said: errors and pixels are ideal anyway
+        raw["sensors"] = {
+            name: {"kind": sensor.kind}
+            if "preset" in type(sensor).model_fields
+            else sensor.model_dump(exclude={"pixel"})
+            for name, sensor in _default_sensors().items()
+        }
     given = raw
     for patch in patches:
         raw = _merge(raw, patch)
