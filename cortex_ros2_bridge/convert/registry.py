@@ -34,6 +34,7 @@ from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer, Qos
 from cortex_ros2_bridge.convert.camera import image
 from cortex_ros2_bridge.convert.context import Context, ConvertError, In, Out
+from cortex_ros2_bridge.convert.measurements import MEASUREMENTS
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.typestore import define, typestore
 
@@ -143,11 +144,15 @@ def adopt(schema: str, fingerprint: int) -> str:
         ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=tuple(_picture_rules(plain)))
     if name in ADDED:
         return "" if ADDED[name].fingerprint == fingerprint else f"another {name} is known already"
-    try:
-        ros_type = _define(plain, None)
-    except ValueError as error:
-        return str(error)
-    OUT[name, ros_type] = _writer(plain, ros_type)
+    standard = MEASUREMENTS.get(name)
+    if standard is not None and standard.fields <= {field["name"] for field in plain["fields"]}:
+        ros_type, OUT[name, standard.ros_type] = standard.ros_type, standard.convert
+    else:
+        try:
+            ros_type = _define(plain, None)
+        except ValueError as error:
+            return str(error)
+        OUT[name, ros_type] = _writer(plain, ros_type)
     ADDED[name] = Added(
         kind=None, fingerprint=fingerprint, rules=(Rule(name, ros_type, "out", "{topic}", PACKETS),)
     )
