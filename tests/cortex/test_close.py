@@ -348,7 +348,7 @@ def test_a_publisher_that_dies_after_its_first_large_message(start_child, policy
 
 @pytest.mark.parametrize("listen", [{}, {"listen": "127.0.0.1", "host": "elsewhere"}], ids=["ipc", "tcp"])
 def test_a_publisher_leaves_while_its_reader_reads(make_node, start_child, monkeypatch, listen):
-    """Through sockets: what a socket has taken is not yet with the reader: the publisher waits for its word."""
+    """What a socket has taken is not yet with the reader: the publisher waits for its word."""
     monkeypatch.setattr(cortex.link, "Offer", no_pipe)
     subscriber = make_node(listen=listen.get("listen")).subscriber("/blocks", Block, policy=reliable())
     child = start_child("peer", **listen)
