@@ -21,6 +21,7 @@ from pydantic import (
 
 from neurosim_core.control import Se3Config
 from neurosim_core.live.config import LinkConfig, LiveConfig
+from neurosim_core.live.remote_renderer import RemoteRendererConfig  # noqa: F401  registers a kind
 from neurosim_core.mistakes import explain, suggestion
 from neurosim_core.registry import kinds, on_change
 from neurosim_core.render.renderer import RenderConfig, RendererConfig, WarpRendererConfig
