@@ -267,6 +267,10 @@ class EventArrays(NamedTuple):
     polarity: NDArray[np.uint8]
     """1: brighter, 0: darker."""
 
+    def rows(self, index: slice | NDArray[Any]) -> EventArrays:
+        """Return some of the events: of a slice, a mask, or an array of indices."""
+        return EventArrays(self.t[index], self.x[index], self.y[index], self.polarity[index])
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Events(Packet):
