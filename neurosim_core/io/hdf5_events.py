@@ -16,7 +16,7 @@ import numpy as np
 
 from neurosim_core import __version__
 from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, find_size
-from neurosim_core.packets import EventArrays, Events, Packet, packet_class
+from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, packet_class
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
 from neurosim_core.record.header import SensorDescription
@@ -24,7 +24,6 @@ from neurosim_core.record.header import SensorDescription
 PACKET_US = 10_000
 """Events that come without packets are put into packets of this length [us]."""
 _NAMES = ("t", "x", "y", "p")
-_NONE = EventArrays(*(np.zeros(0, kind) for kind in (np.int64, np.uint16, np.uint16, np.uint8)))
 _SPAN_MAX_US = 30 * 24 * 3_600_000_000
 
 
@@ -197,7 +196,7 @@ class RecordingEventWriter:
         if not self._pending and not always:
             return
         self._sequence += 1
-        columns = [np.concatenate(part) for part in zip(_NONE, *self._pending, strict=True)]
+        columns = [np.concatenate(part) for part in zip(NO_EVENTS, *self._pending, strict=True)]
         self._writer.write(
             Events(
                 stamp_ns=self._end_us * 1000, start_ns=self._start_us * 1000, sequence=self._sequence - 1,

@@ -105,13 +105,23 @@ def as_recording(path: Path) -> Iterator[Path]:
         EventFileError: It is damaged.
         OSError: It cannot be read, or there is no room for the copy.
     """
-    if format_of(path) == "recording":
-        with open_hdf5(path) as file:
-            is_recording = file.attrs.get("format") == FORMAT
-        if is_recording:
-            yield path
-            return
+    if is_recording(path):
+        yield path
+        return
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "events.h5"
         transfer(path, copy, from_zero=True)
         yield copy
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording of Neurosim.
+
+    Raises:
+        EventFileError: Its name says HDF5, and it is not.
+        OSError: It cannot be read.
+    """
+    if path.suffix.lower() not in (".h5", ".hdf5"):
+        return False
+    with open_hdf5(path) as file:
+        return bool(file.attrs.get("format") == FORMAT)
