@@ -220,25 +220,19 @@ class _Column:
     ) -> None:
         # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
         filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
+        room = [max(1, length) for length in shape]  # an axis may be empty
         self._dataset = group.create_dataset(
-            name,
-            shape=(0, *shape),
-            maxshape=(None, *(n or None for n in shape)),
-            dtype=dtype,
-            chunks=(
-                chunk,
-                *(max(n, 1) for n in shape),
-            ),  # an axis may have no items, such as that of no rotors
-            **filters,
+            name, shape=(0, *shape), maxshape=(None, *room), dtype=dtype, chunks=(chunk, *room), **filters
         )
         self._shape = shape
         self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
         self._rows: list[NDArray[Any]] = []
 
     def append(self, rows: Any) -> int:
-        block = np.asarray(rows).astype(self._dtype, casting="same_kind")  # a copy
-        if block.ndim == len(self._shape):
-            block = block[None]
+        count = len(rows) if 0 in self._shape else -1
+        block = (
+            np.asarray(rows).astype(self._dtype, casting="same_kind").reshape(count, *self._shape)
+        )  # a copy
         self._rows.append(block)
         return block.nbytes
 
