@@ -272,7 +272,9 @@ class EventArrays(NamedTuple):
         return EventArrays(self.t[index], self.x[index], self.y[index], self.polarity[index])
 
 
-NO_EVENTS = EventArrays(np.zeros(0, np.int64), *np.zeros((2, 0), np.uint16), np.zeros(0, np.uint8))
+NO_EVENTS = EventArrays(
+    np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
