@@ -173,21 +173,23 @@ def make_flights(
             yield _fly(plan, number)
         return
     count = min(workers, max(1, len(missing)))
-    # Consecutive flights share a scene: each worker takes a stretch of them at a time.
+    # Consecutive flights share a scene: a worker takes a stretch of them at a time.
     size = max(1, min(plan.flights_per_scene, -(-len(missing) // count)))
+    stretches = [(plan, missing[begin : begin + size]) for begin in range(0, len(missing), size)]
     with multiprocessing.get_context("spawn").Pool(count, _begin_worker, (os.getpid(),)) as pool:
         known = {process.pid for process in pool._pool}  # type: ignore[attr-defined]
-        results = pool.imap_unordered(_fly_one, [(plan, number) for number in missing], chunksize=size)
-        done = 0
-        while done < len(missing):
-            try:
-                yield results.next(timeout=seconds)
-                done += 1
-            except multiprocessing.TimeoutError:
-                if stopped():
-                    return
-                if known != {process.pid for process in pool._pool}:  # type: ignore[attr-defined]
-                    raise RuntimeError("a worker died; start again to go on") from None
+        result = pool.map_async(_fly_stretch, stretches, chunksize=1)
+        while missing:
+            result.wait(seconds)
+            there = [number for number in missing if plan.path(number).exists()]
+            missing = [number for number in missing if number not in there]
+            yield from there
+            if result.ready():
+                result.get()  # raises what a worker has raised
+            if stopped():
+                return
+            if known != {process.pid for process in pool._pool}:  # type: ignore[attr-defined]
+                raise RuntimeError("a worker died; the same command goes on")
 
 
 _parent = 0
@@ -206,8 +208,10 @@ def _begin_worker(parent: int) -> None:
     start_warp()
 
 
-def _fly_one(task: tuple[DatasetPlan, int]) -> int:
-    return _fly(*task)
+def _fly_stretch(task: tuple[DatasetPlan, list[int]]) -> None:
+    plan, numbers = task
+    for number in numbers:
+        _fly(plan, number)
 
 
 def _fly(plan: DatasetPlan, number: int) -> int:
