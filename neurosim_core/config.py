@@ -6,18 +6,27 @@ import functools
 import operator
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from neurosim_core.control import Se3Config
 from neurosim_core.live.config import LinkConfig, LiveConfig
 from neurosim_core.mistakes import explain, suggestion
 from neurosim_core.registry import kinds, on_change
-from neurosim_core.render.renderer import RenderConfig, RendererName
+from neurosim_core.render.renderer import RenderConfig, RendererConfig, WarpRendererConfig
 from neurosim_core.scene.apartment import ApartmentConfig
 from neurosim_core.scene.bodies import BodyConfig
+from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import MeshSceneConfig
 from neurosim_core.sensors.base import SensorConfig, expand_stereo
@@ -28,49 +37,12 @@ from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
-from neurosim_core.vehicle import Integrator, MultirotorConfig, preset
+from neurosim_core.vehicle import MultirotorConfig
+from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
 
 
 class ConfigError(ValueError):
     """A settings file or dict is wrong; the message names each key, its value and what is allowed."""
-
-
-class VehicleConfig(Settings):
-    """The multirotor that carries the sensors."""
-
-    preset: str = "hummingbird"
-    """Name of the airframe: crazyflie, hummingbird or racer."""
-    parameters: dict[str, Any] = Field(default_factory=dict)
-    """Parameters to change, by name (see `MultirotorConfig`), of the airframe, such as {mass_kg: 0.6}, and of
-    what it flies in: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5,
-    hold_s: 2}], turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}. A gust without
-    hold_s stays for good."""
-    max_step_s: Annotated[float, Field(gt=0.0, le=0.1)] = 0.001
-    """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
-    integrator: Integrator = "rkmk4"
-    """rkmk4: fixed steps, and adaptive ones for intervals that these cannot resolve. dormand_prince: adaptive
-    steps only."""
-    collision_radius_m: Annotated[float, Field(gt=0.0)] = 0.2
-    """Radius of the sphere around the vehicle that must not touch the scene [m]. Where `parameters.ground`
-    is set, the sphere shrinks near that plane to end 1 cm above it: to land is no collision."""
-    on_collision: Literal["end", "report"] = "end"
-    """end: the run stops at the first touch; report: it flies on, through things, and yields Collision
-    packets."""
-
-    @model_validator(mode="after")
-    def _airframe_exists(self) -> VehicleConfig:
-        try:
-            self.airframe()
-        except ValidationError as error:
-            lines = explain(MultirotorConfig, error)
-            whole = any(not item["loc"] for item in error.errors())
-            before = "parameters: " if whole else "parameters."
-            raise ValueError("; ".join(f"{before}{line}" for line in lines)) from None
-        return self
-
-    def airframe(self) -> MultirotorConfig:
-        """Return all parameters of the airframe."""
-        return preset(self.preset, **self.parameters)
 
 
 class ControlConfig(Settings):
@@ -92,14 +64,43 @@ def _default_sensors() -> dict[str, SensorConfig]:
     }
 
 
-SceneConfig = Annotated[ApartmentConfig | MeshSceneConfig, Field(discriminator="kind")]
+_DEFAULT_KINDS = {"scene": "apartment", "vehicle": "multirotor", "renderer": "warp"}
+"""Kinds of settings that do not say which they are."""
+
+
+def _any_kind(seam: str, *, default: str | None = None) -> Any:
+    """Return the type of settings that are of one of the kinds of a seam.
+
+    Args:
+        seam: Which table.
+        default: The kind where none is said; then a name alone is a kind, too.
+    """
+    classes = list(kinds(seam).values())
+    union: Any = functools.reduce(operator.or_, classes)
+    if len(classes) > 1:
+        union = Annotated[union, Field(discriminator="kind")]
+
+    def complete(value: Any) -> Any:
+        if isinstance(value, str):
+            return {"kind": value}
+        if isinstance(value, Mapping) and "kind" not in value:
+            return {"kind": default, **value}
+        return value
+
+    return union if default is None else Annotated[union, BeforeValidator(complete)]
+
+
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 if TYPE_CHECKING:
     AnySensor = SensorConfig
+    AnyScene = SceneConfig
+    AnyVehicle = VehicleConfig
+    AnyRenderer = RendererConfig
 else:
-    AnySensor = Annotated[
-        functools.reduce(operator.or_, kinds("sensor").values()), Field(discriminator="kind")
-    ]
+    AnySensor = _any_kind("sensor")
+    AnyScene = _any_kind("scene", default=_DEFAULT_KINDS["scene"])
+    AnyVehicle = _any_kind("vehicle", default=_DEFAULT_KINDS["vehicle"])
+    AnyRenderer = _any_kind("renderer", default=_DEFAULT_KINDS["renderer"])
 _ONLY_MESH = MeshSceneConfig.model_fields.keys() - ApartmentConfig.model_fields.keys() | {"path"}
 """Keys of a scene that say that it is of kind mesh."""
 Sensors = Annotated[dict[Name, AnySensor], AfterValidator(expand_stereo)]
@@ -121,7 +122,7 @@ _SEED_STRIDE = 0x9E3779B97F4A7C15
 class FleetMember(Settings):
     """One of several vehicles: what differs from the settings of the same name above it."""
 
-    vehicle: VehicleConfig | None = None
+    vehicle: AnyVehicle | None = None
     """The multirotor; null: the common one."""
     path: PathConfig | None = None
     """Where it flies; null: as the common one, a tour with a seed of its own."""
@@ -145,20 +146,20 @@ class SimulationConfig(Settings):
     instants_per_launch: Annotated[int, Field(ge=1, le=1024)] = 16
     """How many instants of the fastest camera are rendered together; changes speed and memory, not the
     result."""
-    scene: SceneConfig = ApartmentConfig()
+    scene: AnyScene = ApartmentConfig()
     """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
     bodies: dict[Name, BodyConfig] = Field(default_factory=dict)
     """What moves by itself in the scene, by name: {ball: {shape: {kind: sphere}, motion: {...}}}. Cameras see
     bodies; paths are not planned around them, and running into one is no collision."""
-    renderer: RendererName = "warp"
+    renderer: AnyRenderer = WarpRendererConfig()
     """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only.
     `synthetic`: a test card that costs next to nothing, to measure everything else."""
     render: RenderConfig = RenderConfig()
     """How the scene is lit and rendered."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()
     """The map that the path is planned on."""
-    vehicle: VehicleConfig = VehicleConfig()
-    """The multirotor."""
+    vehicle: AnyVehicle = MultirotorVehicleConfig()
+    """What carries the sensors: a multirotor, or a vehicle of a plug-in by its kind."""
     path: PathConfig = TourConfig()
     """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...};
     {kind: poses, file: poses.txt, format: tum} moves the sensors along poses, without a vehicle."""
@@ -248,15 +249,19 @@ class SimulationConfig(Settings):
 
 
 def _take_new_kinds(seam: str) -> None:
-    """Let settings name kinds of sensors that were registered after this module was imported."""
-    if seam != "sensor":
+    """Let settings name kinds that were registered after this module was imported."""
+    if seam == "sensor":
+        sensors: Any = Annotated[dict[Name, _any_kind("sensor")], AfterValidator(expand_stereo)]  # type: ignore[misc]
+        SimulationConfig.model_fields["sensors"].annotation = sensors
+        FleetMember.model_fields["sensors"].annotation = sensors | None
+    elif seam in _DEFAULT_KINDS:
+        field = SimulationConfig.model_fields[seam]  # which keeps its validator
+        field.annotation = functools.reduce(operator.or_, kinds(seam).values())
+        field.discriminator = "kind"
+        if seam in FleetMember.model_fields:
+            FleetMember.model_fields[seam].annotation = _any_kind(seam, default=_DEFAULT_KINDS[seam]) | None
+    else:
         return
-    known: Any = Annotated[
-        functools.reduce(operator.or_, kinds("sensor").values()), Field(discriminator="kind")
-    ]
-    sensors: Any = Annotated[dict[Name, known], AfterValidator(expand_stereo)]
-    FleetMember.model_fields["sensors"].annotation = sensors | None
-    SimulationConfig.model_fields["sensors"].annotation = sensors
     for settings in (FleetMember, SimulationConfig):
         settings.model_rebuild(force=True)
 

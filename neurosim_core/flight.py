@@ -31,11 +31,12 @@ from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.signals import stop_at_signals
-from neurosim_core.sim.model import Model, load_scene, make_model
+from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.render_group import render_terms
 from neurosim_core.sim.rollout import run_model
 from neurosim_core.sim.state import State, make_state
 from neurosim_core.vehicle import DynamicsError
+from neurosim_core.vehicle.config import MultirotorVehicleConfig
 from neurosim_core.view.overview import FlightSummary, Track
 from neurosim_core.view.overview_plot import save_overview
 from neurosim_core.view.rerun_log import RerunLogger
@@ -210,7 +211,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
         if "conversion" not in settings:
             config = load_config(settings)
             vehicle = next(iter(config.vehicles))
-            scene = scene_shapes(load_scene(config.scene), make_bodies(config.bodies))
+            scene = scene_shapes(config.scene.load(), make_bodies(config.bodies))
         recording = open_rerun(save or made)
         try:
             with RerunLogger(recording, vehicles={vehicle: header.sensors}, scene=scene) as logger:
@@ -385,7 +386,7 @@ def _print_plan(console: Console, model: Model) -> None:
         console.print(f"  {note}", style="dim", highlight=False)
     beyond_s = (model.path.end_ns - model.duration_ns) / NS_PER_S
     rest = f"; the whole path takes {beyond_s:.1f} s more" if beyond_s > 0.0 else ""
-    who = f"[bold]{config.vehicle.preset}[/] flies"
+    who = f"[bold]{config.vehicle.title}[/] flies"
     if model.path.attitude is not None:
         who = f"[bold]{getattr(config.path, 'file', None) or 'keyframes'}[/]: the rig moves"
     console.print(
@@ -459,6 +460,8 @@ def _describe_steps(model: Model, counts: Mapping[str, int]) -> str:
     if model.path.attitude is not None:
         return "none: a motion is followed"
     vehicle, commands = model.config.vehicle, f"{counts['commands']:,} commands"
+    if not isinstance(vehicle, MultirotorVehicleConfig):
+        return f"{counts['steps']:,} of the vehicle {vehicle.title!r}, {commands}"
     if vehicle.integrator != "rkmk4":
         return f"adaptive, of {vehicle.integrator}; {commands}"
     redone = counts["redone intervals"]

@@ -329,6 +329,27 @@ class Image(Packet):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class PointCloud(Packet):
+    """One sweep of a LiDAR: the rays that came back, in the order of time; its stamp is that of the last."""
+
+    display: ClassVar[str] = "points"
+
+    points: Annotated[NDArray[np.float32], FieldSpec("n", 3, unit="m", frame="sensor")]
+    """Positions in S (x forward, y left, z up) [m], shape [n, 3]: of S when each ray was cast, or if
+    `deskewed`, at the stamp."""
+    intensity: Annotated[NDArray[np.float32], FieldSpec("n", unit="1/m^2")]
+    """albedo cos / r^2, shape [n]."""
+    ring: Annotated[NDArray[np.uint16], FieldSpec("n")]
+    """Which laser it was, shape [n]."""
+    t: Annotated[NDArray[np.uint32], FieldSpec("n", unit="ns")]
+    """When its ray was cast, since `start_ns` [ns], shape [n]."""
+    start_ns: int
+    """When the first ray was cast [ns]; before stamp 0 the vehicle stands where it begins."""
+    deskewed: Annotated[bool, FieldSpec(constant=True)]
+    """All points are seen from the pose at the stamp."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ImuSample(Packet):
     """What an inertial measurement unit reads at its stamp, in its own frame S."""
 

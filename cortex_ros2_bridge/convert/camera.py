@@ -15,7 +15,9 @@ from cortex_ros2_bridge.backend.base import Buffer
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
 
-_POINT_FLOAT32 = 7
+_FLOAT32 = ("<f4", 7)
+_POINT_TYPES = {"intensity": _FLOAT32, "ring": ("<u2", 4), "t": ("<u4", 6)}
+"""What fields of points are, in NumPy and in sensor_msgs/PointField."""
 _NAMED_PIXELS = {
     "mono8": ("u1", 1),
     "mono16": ("u2", 1),
@@ -69,30 +71,38 @@ def camera_info(message: messages.CameraInfo, context: Context) -> Buffer | None
 
 
 def point_cloud(message: messages.PointCloud, context: Context) -> Buffer:
-    """Convert to sensor_msgs/PointCloud2 with fields x, y, z and, where there are such, intensity and rgb."""
+    """Convert to sensor_msgs/PointCloud2 with fields x, y, z and, where they are, intensity, ring and t.
+
+    Its stamp is that of the first ray, from which `t` counts [ns], as drivers and odometry of LiDARs have it;
+    that of the last ray, if points are deskewed or have no `t`.
+    """
     count = len(message.points)
-    names = ["x", "y", "z"]
-    names += ["intensity"] if message.intensity is not None else []
-    names += ["rgb"] if message.color is not None else []
-    points = np.empty((count, len(names)), "<f4")
-    points[:, :3] = message.points
-    if message.intensity is not None:
-        points[:, 3] = _of_length("intensity", message.intensity, count)
-    if message.color is not None:
-        color = _of_length("color", message.color, count)
-        packed = points[:, -1:].view("u1")  # a float to PCL and RViz, whose bytes are blue, green, red, 0
-        packed[:, :3], packed[:, 3] = color[:, ::-1], 0
+    names = [name for name in _POINT_TYPES if getattr(message, name, None) is not None]
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), *((name, _POINT_TYPES[name][0]) for name in names)]
+    points = np.zeros(count, np.dtype(kinds, align=True))
+    for axis, name in enumerate("xyz"):
+        points[name] = message.points[:, axis]
+    for name in names:
+        points[name] = _of_length(name, getattr(message, name), count)
+    is_timed = message.t is not None and not message.deskewed
     describe = record("sensor_msgs/msg/PointField")
-    fields = [describe(name, 4 * index, _POINT_FLOAT32, 1) for index, name in enumerate(names)]
+    fields = [
+        describe(name, place[1], _POINT_TYPES.get(name, _FLOAT32)[1], 1)
+        for name, place in (points.dtype.fields or {}).items()
+    ]
     made = record("sensor_msgs/msg/PointCloud2")(
-        header(message.stamp_ns, message.frame_id or context.frame_id, context),
+        header(
+            message.start_ns if is_timed else message.stamp_ns,
+            message.frame_id or context.frame_id,
+            context,
+        ),
         1,
         count,
         fields,
         False,
-        4 * len(names),
+        points.itemsize,
         points.nbytes,
-        points.reshape(-1).view(np.uint8),
+        points.view(np.uint8),
         bool(np.isfinite(message.points).all()),
     )
     return cdr.encode(made)

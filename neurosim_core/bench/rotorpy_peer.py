@@ -31,7 +31,7 @@ def rotorpy_version() -> str | None:
     return importlib.metadata.version("rotorpy") if importlib.util.find_spec("rotorpy") else None
 
 
-def _vehicle(config: MultirotorConfig) -> Any:
+def make_rotorpy_vehicle(config: MultirotorConfig) -> Any:
     """Return a vehicle of RotorPy with our parameters under its names.
 
     Raises:
@@ -75,7 +75,7 @@ def fly_rotorpy(flight: Flight, step_s: float, *, cpu_max_s: float = np.inf) -> 
         States at the end of each hold, shape [K, 13 + R], NaN from where it gave up or failed; and the CPU
         time of the whole flight [s], scaled up from what was flown.
     """
-    vehicle = _vehicle(flight.config)
+    vehicle = make_rotorpy_vehicle(flight.config)
     state = {name: np.array(value) for name, value in zip(_NAMES, flight.start, strict=True)}
     state["wind"] = np.array(flight.config.wind_m_s)
     states = np.full((len(flight.commands), 13 + flight.config.rotor_count), np.nan)

@@ -117,7 +117,7 @@ def print_plan(console: Console, vehicles: Sequence[VehicleNode], config: Simula
     table.add_column(overflow="fold")
     for vehicle in vehicles:
         names = dict.fromkeys([*vehicle.config.sensors, "odometry", "rotor_speeds"])
-        table.add_row(vehicle.config.vehicle.preset, f"/{vehicle.name}/: {', '.join(names)}")
+        table.add_row(vehicle.config.vehicle.title, f"/{vehicle.name}/: {', '.join(names)}")
     console.print(table)
     commands = ", ".join(command_topic(vehicle.name, "*") for vehicle in vehicles)
     console.print(f"waiting for the first command on {commands}: `neurosim fly` sends them")

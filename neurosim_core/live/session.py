@@ -16,7 +16,7 @@ from cortex import messages as msg
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live import topics
 from neurosim_core.live.call import describe_status
-from neurosim_core.live.engine import load_scene, packet_type
+from neurosim_core.live.engine import packet_type
 from neurosim_core.live.messages import message_type, setpoint_of, to_packet
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
@@ -316,7 +316,7 @@ class LiveSession:
 def _load_scene(config: SimulationConfig, say: Callable[[str], None]) -> SceneShapes | None:
     """Return the scene; None if it cannot be loaded, which is said."""
     try:
-        return scene_shapes(load_scene(config.scene), make_bodies(config.bodies))
+        return scene_shapes(config.scene.load(), make_bodies(config.bodies))
     except (ValueError, OSError) as error:
         say(f"warning: shown without the scene: {error}")
         return None

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any, Literal, Protocol
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, ClassVar, Literal, Protocol
 
 import warp as wp
 
+from neurosim_core.registry import find, kinds, register
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
@@ -17,6 +18,7 @@ from neurosim_core.render.synthetic_renderer import SyntheticRenderer, Synthetic
 from neurosim_core.render.warp_renderer import ONE_WORLD, RenderWorlds, WarpRenderer
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
+from neurosim_core.settings import Settings
 
 __all__ = [
     "ONE_WORLD",
@@ -24,17 +26,10 @@ __all__ = [
     "RenderConfig",
     "RenderWorlds",
     "Renderer",
-    "RendererName",
-    "SceneOnDevice",
+    "RendererConfig",
     "make_renderer",
     "upload_scene",
 ]
-
-RendererName = Literal["warp", "pyrender", "synthetic"]
-"""Names of the renderers."""
-
-SceneOnDevice = SceneArrays | PyrenderScene | SyntheticScene
-"""A scene as one of the renderers keeps it, shared by all cameras."""
 
 
 class Renderer(Protocol):
@@ -79,40 +74,136 @@ class Renderer(Protocol):
         """
 
 
+class RendererConfig(Settings):
+    """Settings of a renderer. A kind adds its `kind`, what it needs, `scene_type`, `upload` and `make`."""
+
+    kind: str
+    """Under which name the class is registered."""
+
+    scene_type: ClassVar[type]
+    """Class of what `upload` returns."""
+
+    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
+        """Prepare a scene, for all cameras; see `upload_scene`."""
+        raise NotImplementedError
+
+    @staticmethod
+    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
+        """Return a renderer for one lens.
+
+        Args:
+            scene: What `upload` returned.
+            lens: The camera.
+            outputs: What is asked for.
+            shape: `instant_count`, `image_count`, `worlds` and `times` of `make_renderer`.
+
+        Raises:
+            ValueError: It cannot do what is asked for.
+        """
+        raise NotImplementedError
+
+
+@register("renderer", "warp")
+class WarpRendererConfig(RendererConfig):
+    """Ray casting on CPU and CUDA, for all cameras."""
+
+    kind: Literal["warp"] = "warp"
+    scene_type = SceneArrays
+
+    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
+        """Bring a scene to a device."""
+        return upload_warp_scene(scene, config, device=device, bodies=bodies)
+
+    @staticmethod
+    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
+        """Return a renderer for one lens."""
+        return WarpRenderer(scene, lens, outputs=outputs, **shape)
+
+
+@register("renderer", "pyrender")
+class PyrenderRendererConfig(RendererConfig):
+    """OpenGL, rgb and depth only."""
+
+    kind: Literal["pyrender"] = "pyrender"
+    scene_type = PyrenderScene
+
+    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
+        """Light a scene and hand it to pyrender."""
+        return upload_pyrender_scene(scene, config, device=device, bodies=bodies)
+
+    @staticmethod
+    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
+        """Return a renderer for one lens."""
+        refuse_worlds("pyrender", shape)
+        if not isinstance(lens, PinholeConfig):
+            kind = getattr(lens, "kind", type(lens).__name__)
+            raise ValueError(f"pyrender renders pinholes, not a lens of kind {kind}: use renderer: warp")
+        return PyrenderRenderer(scene, lens, outputs=outputs, image_count=shape["image_count"])
+
+
+@register("renderer", "synthetic")
+class SyntheticRendererConfig(RendererConfig):
+    """A test card that costs next to nothing, on CPU and CUDA; the scene is not seen."""
+
+    kind: Literal["synthetic"] = "synthetic"
+    scene_type = SyntheticScene
+
+    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
+        """Return what all test cards of a run share."""
+        if bodies:
+            names = ", ".join(body.name for body in bodies)
+            raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")
+        return SyntheticScene(scene=scene, config=config, device=device)
+
+    @staticmethod
+    def make(scene: Any, lens: Lens, *, outputs: Collection[str], **shape: Any) -> Renderer:
+        """Return a renderer for one lens."""
+        refuse_worlds("synthetic", shape)
+        counts = {name: shape[name] for name in ("instant_count", "image_count")}
+        return SyntheticRenderer(scene, lens, outputs=outputs, **counts)
+
+
+def refuse_worlds(kind: str, shape: Mapping[str, Any]) -> None:
+    """Raise if a renderer of one world and one time is asked for more.
+
+    Raises:
+        ValueError: There are several worlds, or rays have times of their own.
+    """
+    if shape["worlds"].count > 1:
+        raise ValueError(
+            f"{shape['worlds'].count} worlds are rendered by renderer 'warp' only, not by {kind!r}"
+        )
+    if shape["times"] is not None:
+        raise ValueError(f"rays with times of their own need renderer: warp, not {kind!r}")
+
+
 def upload_scene(
     scene: Scene,
     config: RenderConfig,
     *,
     device: str,
-    renderer: RendererName = "warp",
+    renderer: RendererConfig | str = "warp",
     bodies: Sequence[Body] = (),
-) -> SceneOnDevice:
+) -> Any:
     """Prepare a scene for a renderer.
 
     Args:
         scene: What to render.
         config: Light, exposure and the like.
         device: Where Warp renders, and where light is baked.
-        renderer: `warp`: ray casting on CPU and CUDA, all outputs. `pyrender`: OpenGL, rgb and depth only.
-            `synthetic`: a test card that costs next to nothing, on CPU and CUDA; the scene is not seen.
+        renderer: Its settings, or its kind alone: `warp`, `pyrender`, `synthetic`, or one of a plug-in.
         bodies: What moves in the scene.
 
     Raises:
         ValueError: The synthetic renderer is asked to show bodies.
         PyrenderError: pyrender cannot be used here.
     """
-    if renderer == "pyrender":
-        return upload_pyrender_scene(scene, config, device=device, bodies=bodies)
-    if renderer == "synthetic":
-        if bodies:
-            names = ", ".join(body.name for body in bodies)
-            raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")
-        return SyntheticScene(scene=scene, config=config, device=device)
-    return upload_warp_scene(scene, config, device=device, bodies=bodies)
+    chosen = renderer if isinstance(renderer, RendererConfig) else find("renderer", renderer)()
+    return chosen.upload(scene, config, device=device, bodies=bodies)
 
 
 def make_renderer(
-    scene: SceneOnDevice,
+    scene: Any,
     lens: Lens,
     *,
     outputs: Collection[str],
@@ -136,23 +227,17 @@ def make_renderer(
         ValueError: An output is unknown, or the renderer does not have it; it renders one world only, or only
             pinholes.
     """
-    if worlds.count > 1 and not isinstance(scene, SceneArrays):
-        raise ValueError(f"{worlds.count} worlds are rendered by renderer 'warp' only")
-    if isinstance(scene, PyrenderScene):
-        if not isinstance(lens, PinholeConfig):
-            kind = getattr(lens, "kind", type(lens).__name__)
-            raise ValueError(f"pyrender renders pinholes, not a lens of kind {kind}: use renderer: warp")
-        return PyrenderRenderer(scene, lens, outputs=outputs, image_count=image_count)
-    if isinstance(scene, SyntheticScene):
-        return SyntheticRenderer(
-            scene, lens, outputs=outputs, instant_count=instant_count, image_count=image_count
-        )
-    return WarpRenderer(
-        scene,
-        lens,
-        outputs=outputs,
-        instant_count=instant_count,
-        image_count=image_count,
-        worlds=worlds,
-        times=times,
-    )
+    kind: Any
+    for kind in kinds("renderer").values():
+        if isinstance(scene, kind.scene_type):
+            renderer: Renderer = kind.make(
+                scene,
+                lens,
+                outputs=outputs,
+                instant_count=instant_count,
+                image_count=image_count,
+                worlds=worlds,
+                times=times,
+            )
+            return renderer
+    raise ValueError(f"no renderer made {type(scene).__name__}, known: {sorted(kinds('renderer'))}")

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from neurosim_core.registry import register
+from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.gltf import read_gltf
 from neurosim_core.scene.lamps import hang_lamps, scaled_lights
 from neurosim_core.scene.normals import smooth_normals
@@ -23,7 +25,6 @@ from neurosim_core.scene.source import (
     linear_to_srgb8,
     rgb,
 )
-from neurosim_core.settings import Settings
 
 __all__ = ["MeshSceneConfig", "SceneError", "load_mesh_scene"]
 
@@ -41,7 +42,8 @@ _COLOR_WIDTH = 4096
 """Widest texture that vertex colours are packed into [px]."""
 
 
-class MeshSceneConfig(Settings):
+@register("scene", "mesh")
+class MeshSceneConfig(SceneConfig):
     """A scene that is read from a mesh file."""
 
     kind: Literal["mesh"] = "mesh"
@@ -67,6 +69,10 @@ class MeshSceneConfig(Settings):
     """Linear radiance that a white surface facing up reflects of the ambient light."""
     ambient_down: LinearRgb = (0.22, 0.21, 0.20)
     """Linear radiance that a white surface facing down reflects of the ambient light."""
+
+    def load(self, *, pictures: bool = True) -> Scene:
+        """Read the mesh file; see `load_mesh_scene`."""
+        return load_mesh_scene(self, pictures=pictures)
 
 
 def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:

@@ -10,7 +10,7 @@ it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -22,7 +22,7 @@ from neurosim_core.frames import Mount
 from neurosim_core.packets import Image, ImageEncoding, Packet
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import AnyLens
-from neurosim_core.render.ray_times import RayTiming, ShutterConfig
+from neurosim_core.render.ray_times import RayTimes, RayTiming, ShutterConfig
 from neurosim_core.settings import Settings
 from neurosim_core.vehicle import Multirotor
 
@@ -181,6 +181,54 @@ def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig
     return expanded
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureContext:
+    """What the processing of the pictures of one sensor is made for."""
+
+    name: str
+    """Its name in the settings; two sensors with different names have independent noise."""
+    source: Any
+    """What the renderer writes, device array, shape [M, H, W, ...]; M image slots."""
+    times: RayTimes | None
+    """When its rays are cast; None: all at the stamp."""
+    stride: int
+    """K, the most instants of a world in one batch."""
+    seeds: Any
+    """Seed of each world, device array of uint64, shape [N]."""
+
+
+class PictureViews(NamedTuple):
+    """From where and when the pictures of a batch were taken; device arrays, rows are [world, K] in order."""
+
+    instant_count: int
+    """How many of the K instants of each world were rendered."""
+    image_slot: Any
+    """Where the picture of an instant is, int32, shape [N K]; -1: there is none."""
+    p_WC: Any
+    """Position of the camera [m], vec3, shape [N K J], for the J times of its rays (1: the stamp)."""
+    q_WC: Any
+    """Orientation, likewise."""
+    stamps: Any
+    """Times [ns], int64, shape [N K J, 1]."""
+    active: Any
+    """0 where a world is not rendered, int32, shape [N]; None: all are."""
+
+
+class PictureProcess(Protocol):
+    """What makes of the pictures that are rendered those that a sensor takes: noise, and the like.
+
+    Its pictures are those of an output that has image slots. What it draws is addressed by the stamp.
+    """
+
+    terms: tuple[str, ...]
+    """What it computes."""
+    picture: Any
+    """What it makes, device array, shape [M, H, W, ...]."""
+
+    def launch(self, views: PictureViews) -> None:
+        """Process the pictures of a batch that was just rendered; launches only."""
+
+
 class PictureSensorConfig(RenderedConfig):
     """A sensor whose packet is made of one picture of one output of the renderer."""
 
@@ -203,9 +251,9 @@ class PictureSensorConfig(RenderedConfig):
         """
         raise NotImplementedError(f"{type(self).__name__} must say what its packets are")
 
-    def packet_maker(self, seed: int) -> Callable[..., Packet]:
-        """Return what makes its packets, called as `packet` is; noise comes from a seed."""
-        return self.packet
+    def make_process(self, context: PictureContext) -> PictureProcess | None:
+        """Return what its pictures go through on the device, before anyone has them; None: nothing."""
+        return None
 
 
 class ImageSensorConfig(CameraConfig, PictureSensorConfig):

@@ -1,7 +1,7 @@
 """The engine: what a run needs (`model`), what changes in it (`state`), and the data flow (`step`)."""
 
 from neurosim_core.sim.integrate import COLLISION, forget_controllers
-from neurosim_core.sim.model import Model, find_device, load_scene, make_fleet, make_model, plan_paths, refit
+from neurosim_core.sim.model import Model, find_device, make_fleet, make_model, plan_paths, refit
 from neurosim_core.sim.observation import Observation, Samples
 from neurosim_core.sim.rollout import (
     PendingStep,
@@ -46,7 +46,6 @@ __all__ = [
     "forget_controllers",
     "free_lanes",
     "integrate_period",
-    "load_scene",
     "make_fleet",
     "make_model",
     "make_state",

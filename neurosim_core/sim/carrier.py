@@ -22,7 +22,8 @@ import warp as wp
 
 from neurosim_core.frames import quaternion_exp
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
-from neurosim_core.vehicle import MultirotorArrays, MultirotorConfig, MultirotorState
+from neurosim_core.vehicle import MultirotorConfig, MultirotorState
+from neurosim_core.vehicle.host_vehicle import allocate_arrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -163,7 +164,7 @@ def _carry(
 class Carrier:
     """Bodies in place of vehicles, each at the pose that its path prescribes at its stamp.
 
-    It has those members of a `Multirotor` that a simulation uses. Rotors stand still.
+    It has what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still.
 
     Attributes:
         config: The parameters of the vehicle that is not there; of gravity, for IMUs.
@@ -196,19 +197,7 @@ class Carrier:
         """
         self.config, self.count = config, len(path_of_world)
         self.device, self.max_step_ns = wp.get_device(device), max_step_ns
-        vectors = {"position", "velocity", "body_rate", "acceleration", "angular_acceleration"}
-        dtypes = dict.fromkeys(vectors, wp.vec3d) | {"orientation": wp.quatd, "status": wp.int32}
-        rotors = {"rotor_speed", "rotor_speed_command"}
-        self.arrays = MultirotorArrays(
-            **{
-                name: wp.zeros(
-                    (self.count, config.rotor_count) if name in rotors else self.count,
-                    dtype=wp.float64 if name in rotors else dtypes.get(name, wp.int64),
-                    device=self.device,
-                )
-                for name in MultirotorArrays.__annotations__
-            }
-        )
+        self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
         self._body = _Carried()
         for name in _Carried.vars:
             setattr(self._body, name, getattr(self.arrays, name))

@@ -24,7 +24,8 @@ from neurosim_core.sim.reset import begin_batch, end_batch
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
-from neurosim_core.vehicle import DynamicsError, Multirotor
+from neurosim_core.vehicle import DynamicsError
+from neurosim_core.vehicle.host_vehicle import Vehicle
 from neurosim_core.vehicle.status import STATUS_COLLISION
 
 logger = logging.getLogger(__name__)
@@ -232,7 +233,7 @@ def _count_redone(state: State, redone_count: int) -> None:
     state.counts["redone intervals"] = redone_count
 
 
-def _failure(vehicle: Multirotor | Carrier) -> DynamicsError:
+def _failure(vehicle: Vehicle) -> DynamicsError:
     """Return why a vehicle is held."""
     try:
         vehicle.check()

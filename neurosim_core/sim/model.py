@@ -9,17 +9,16 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig
-from neurosim_core.render.renderer import SceneOnDevice, upload_scene
+from neurosim_core.render.renderer import upload_scene
 from neurosim_core.runtime.timing import timed
-from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.bodies import Body, make_bodies
 from neurosim_core.scene.freespace import FreeSpace, make_free_space
-from neurosim_core.scene.mesh import MeshSceneConfig, load_mesh_scene
 from neurosim_core.scene.scene import Scene
 from neurosim_core.sensors.base import StateSensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
@@ -49,7 +48,7 @@ class Model:
     schedule: Schedule
     samplers: tuple[str, ...]
     """Names of the sensors behind `schedule.samplers`."""
-    scene_on_device: SceneOnDevice | None
+    scene_on_device: Any
     """The scene as the renderer keeps it on the device; None without cameras."""
     setup_s: Mapping[str, float]
     """Wall-clock time that each part of the set-up took [s]."""
@@ -58,21 +57,6 @@ class Model:
     def duration_ns(self) -> int:
         """Length of the run [ns]."""
         return to_ns(self.config.duration_s)
-
-
-def load_scene(config: ApartmentConfig | MeshSceneConfig, *, pictures: bool = True) -> Scene:
-    """Generate or read a scene.
-
-    Args:
-        config: Which one.
-        pictures: Decode the textures of a file now, or when they are first looked at, if ever.
-
-    Raises:
-        SceneError: A file cannot be used.
-    """
-    if isinstance(config, ApartmentConfig):
-        return make_apartment(config)
-    return load_mesh_scene(config, pictures=pictures)
 
 
 def make_model(
@@ -139,7 +123,7 @@ def make_fleet(
     with phase("scene"):
         members = {name: config.of(name) for name in config.vehicles}
         seeing = any(plan_render_groups(member.sensors) for member in members.values())
-        scene = load_scene(config.scene, pictures=seeing) if scene is None else scene
+        scene = config.scene.load(pictures=seeing) if scene is None else scene
         bodies = make_bodies(config.bodies) if seeing else ()
     with phase("free space"):
         free_space = make_free_space(scene, config.free_space, device=device)
@@ -169,7 +153,7 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
         ValueError: The scene cannot be loaded, or no path exists.
     """
     members = {name: config.of(name) for name in (vehicles or config.vehicles)}
-    scene = load_scene(config.scene, pictures=False)
+    scene = config.scene.load(pictures=False)
     free_space = make_free_space(scene, config.free_space, device=find_device(config.device))
     return {name: _plan(member, free_space) for name, member in members.items()}
 
@@ -188,7 +172,7 @@ def _make_member(
     bodies: tuple[Body, ...],
     free_space: FreeSpace,
     path: Path,
-    scene_on_device: SceneOnDevice | None,
+    scene_on_device: Any,
     setup_s: Mapping[str, float],
 ) -> Model:
     """Return the model of one vehicle in a scene."""

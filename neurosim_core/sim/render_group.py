@@ -24,7 +24,6 @@ from neurosim_core.render.renderer import (
     ONE_WORLD,
     Renderer,
     RenderWorlds,
-    SceneOnDevice,
     make_renderer,
 )
 from neurosim_core.render.scene_arrays import SceneArrays
@@ -43,7 +42,10 @@ from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensor,
     FrameSensorConfig,
+    PictureContext,
+    PictureProcess,
     PictureSensorConfig,
+    PictureViews,
     SensorConfig,
     WorldFrameContext,
     WorldFrameSensor,
@@ -64,14 +66,14 @@ class ImageChannel:
     """An image sensor of a group."""
 
     config: PictureSensorConfig
-    packet: Callable[..., Packet]
-    """Makes a packet of a picture (`PictureSensorConfig.packet`)."""
     rate: Rate
+    source: str
+    """Its pictures are those of this output of the renderer, or those that its own processing makes."""
     sequence: int = 0
 
     @property
     def output(self) -> str:
-        """What the renderer calls its picture."""
+        """What is rendered for it."""
         return self.config.output
 
 
@@ -89,7 +91,9 @@ class RenderGroupState:
     renderers: list[Renderer]
     """One for each batch in flight."""
     picture_copies: list[dict[str, HostCopy]]
-    """Pictures on the host by output, for each batch in flight; empty: they stay on the device."""
+    """Pictures on the host by source, for each batch in flight; empty: they stay on the device."""
+    processes: Sequence[Mapping[str, PictureProcess]]
+    """What pictures go through on the device, by the name of the sensor, for each batch in flight."""
     frames: dict[str, FrameSensor]
     """The frame sensors, where packets go to the host."""
     images: dict[str, ImageChannel]
@@ -110,7 +114,7 @@ class RenderGroupState:
     `offsets_ns`."""
     q_WC: Sequence[wp.array[wp.quat]]
     stamps: Sequence[Any]
-    """Times of the instants [ns], shape [N K, 1]; empty without bodies."""
+    """Times of the instants [ns], shape [N K, 1]; [N K J, 1] with `offsets_ns`; empty if nobody asks."""
     instants: Any = None
     """0, 1, ... N K - 1: the instants in order."""
     motions: wp.array[Motion] | None = None
@@ -147,12 +151,13 @@ class Instants:
 def make_render_group(
     group: RenderGroup,
     sensors: Mapping[str, SensorConfig],
-    scene: SceneOnDevice,
+    scene: Any,
     *,
     capacity: int,
     in_flight: int,
     device: str,
     seed: int = 0,
+    seeds: Any = None,
     bodies: Mapping[str, BodyConfig] | None = None,
     worlds: RenderWorlds = ONE_WORLD,
     on_host: bool = True,
@@ -169,6 +174,7 @@ def make_render_group(
         in_flight: The most batches in flight.
         device: Where to compute.
         seed: Seed of the noise of frame sensors.
+        seeds: Of each world, for the noise of pictures, device array of uint64.
         bodies: What moves in the scene.
         worlds: Who is rendered together.
         on_host: Bring pictures and events to the host, as packets.
@@ -181,7 +187,7 @@ def make_render_group(
             for many worlds.
     """
     images = {
-        name: ImageChannel(config=sensor, packet=sensor.packet_maker(seed), rate=sensor.clock)
+        name: ImageChannel(config=sensor, rate=sensor.clock, source=sensor.output)
         for name in group.image_sensors
         if isinstance(sensor := sensors[name], PictureSensorConfig)
     }
@@ -207,6 +213,9 @@ def make_render_group(
         )
         for _ in range(in_flight)
     ]
+    processes = [_make_processes(images, renderer, times, capacity, seeds) for renderer in renderers]
+    for name in processes[0]:
+        images[name].source = f"{name}/processed"
     context = {
         name: FrameContext(
             name=name,
@@ -222,8 +231,8 @@ def make_render_group(
     p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
     offsets_ns: Any = None if times is None else wp.array(times.offsets_ns, dtype=wp.int64, device=device)
     rows = worlds.count * capacity * (1 if offsets_ns is None else offsets_ns.shape[0])
-    moving_rows = rows if bodies else 0
-    pictures, shared = ({}, {}) if on_host else _picture_arrays(images, renderers[0])
+    timed_rows = rows if bodies or processes[0] else 0
+    pictures, shared = ({}, {}) if on_host else _picture_arrays(images, renderers[0], processes[0])
     return RenderGroupState(
         device=device,
         world_count=worlds.count,
@@ -232,9 +241,16 @@ def make_render_group(
         rate=group.rate,
         renderers=renderers,
         picture_copies=[
-            {image.output: HostCopy(getattr(renderer, image.output)) for image in images.values() if on_host}
-            for renderer in renderers
+            {
+                image.source: HostCopy(
+                    made[name].picture if name in made else getattr(renderer, image.output)
+                )
+                for name, image in images.items()
+                if on_host
+            }
+            for renderer, made in zip(renderers, processes, strict=True)
         ],
+        processes=processes,
         frames={
             name: config.make(context[name])
             for name in context
@@ -253,8 +269,8 @@ def make_render_group(
         offsets_ns=offsets_ns,
         p_WC=[wp.zeros(rows, dtype=wp.vec3, device=device) for _ in renderers],
         q_WC=[wp.zeros(rows, dtype=wp.quat, device=device) for _ in renderers],
-        stamps=[wp.zeros((moving_rows, 1), dtype=wp.int64, device=device) for _ in renderers],
-        instants=wp.array(np.arange(moving_rows, dtype=np.int32), dtype=int, device=device),
+        stamps=[wp.zeros((timed_rows, 1), dtype=wp.int64, device=device) for _ in renderers],
+        instants=wp.array(np.arange(timed_rows, dtype=np.int32), dtype=int, device=device),
         motions=upload_motions(bodies, device) if bodies else None,
         body_poses=[make_body_poses(rows, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(group, scene, p_BC, q_BC),
@@ -265,7 +281,7 @@ def make_render_group(
     )
 
 
-def _ray_times(group: RenderGroup, scene: SceneOnDevice) -> RayTimes | None:
+def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
     """Return when the rays of a group are cast; None: all at the stamp."""
     if group.timing is None:
         return None
@@ -275,12 +291,26 @@ def _ray_times(group: RenderGroup, scene: SceneOnDevice) -> RayTimes | None:
     return ray_times_of(group.timing, group.lens, scene)
 
 
+def _make_processes(
+    images: Mapping[str, ImageChannel], renderer: Renderer, times: RayTimes | None, stride: int, seeds: Any
+) -> dict[str, PictureProcess]:
+    """Return what the pictures of a renderer go through, for the sensors that ask for it."""
+    made = {}
+    for name, image in images.items():
+        source = getattr(renderer, image.output)
+        context = PictureContext(name=name, source=source, times=times, stride=stride, seeds=seeds)
+        if (process := image.config.make_process(context)) is not None:
+            made[name] = process
+    return made
+
+
 def _picture_arrays(
-    images: Mapping[str, ImageChannel], renderer: Renderer
+    images: Mapping[str, ImageChannel], renderer: Renderer, processes: Mapping[str, PictureProcess]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return where the last picture of each image sensor is, and what has to be copied there from where."""
     fastest_hz = max((image.rate.rate_hz for image in images.values()), default=0.0)
     pictures = {name: getattr(renderer, image.output) for name, image in images.items()}
+    pictures |= {name: process.picture for name, process in processes.items()}
     shared = {n: pictures[n] for n, image in images.items() if image.rate.rate_hz < fastest_hz}
     return pictures | {name: wp.empty_like(array) for name, array in shared.items()}, shared
 
@@ -291,9 +321,7 @@ def _frames_of(renderer: Renderer, world_count: int, capacity: int) -> Any:
     return frames.reshape((world_count, capacity, frames.shape[1] * frames.shape[2]))
 
 
-def _make_rule(
-    group: RenderGroup, scene: SceneOnDevice, p_BC: wp.vec3d, q_BC: wp.quatd
-) -> DisplacementRule | None:
+def _make_rule(group: RenderGroup, scene: Any, p_BC: wp.vec3d, q_BC: wp.quatd) -> DisplacementRule | None:
     if group.max_displacement_px is None:
         return None
     if not isinstance(scene, SceneArrays):
@@ -317,10 +345,11 @@ def _make_rule(
 
 
 def render_terms(group: RenderGroupState) -> tuple[str, ...]:
-    """Return what the renderer of a group computes because of the scene, its settings, and the lens."""
+    """Return what a group computes beyond its outputs: for the scene, its settings, lens, pictures."""
     terms = getattr(group.renderers[0], "terms", None)  # only Warp's has a kernel made to measure
     present = {} if terms is None else terms._asdict()
-    return tuple(name for name, value in present.items() if value)
+    made = (term for process in group.processes[0].values() for term in process.terms)
+    return (*(name for name, value in present.items() if value), *made)
 
 
 def is_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> bool:
@@ -451,12 +480,15 @@ def plan_render(
         group.renderers[lane].render(
             p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses, active=active
         )
-        for _, _, name in pictures:
+        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active)
+        for name in {name: None for _, _, name in pictures}:
+            if name in group.processes[lane]:
+                group.processes[lane][name].launch(views)
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
         if group.make_room is None:
-            for output, copy in group.picture_copies[lane].items():
-                copy.fetch(0, len(slots) if output in INSTANT_OUTPUTS else used)
+            for source, copy in group.picture_copies[lane].items():
+                copy.fetch(0, len(slots) if source in INSTANT_OUTPUTS else used)
         else:
             _bring(group, instants)
         return from_slots, to_slots
@@ -477,7 +509,7 @@ def acquire_room(job: RenderJob) -> None:
         return
     for stamp_ns, slot, name in instants.pictures:
         if (name, stamp_ns) not in instants.rooms:
-            picture = group.picture_copies[instants.lane][group.images[name].output].view(slot, 1)[0]
+            picture = group.picture_copies[instants.lane][group.images[name].source].view(slot, 1)[0]
             room = group.make_room(name, stamp_ns, picture)
             if room is not None:
                 instants.rooms[name, stamp_ns] = room
@@ -529,7 +561,7 @@ def flush_frames(group: RenderGroupState, *, until_ns: int) -> list[Packet]:
 def _bring(group: RenderGroupState, instants: Instants) -> None:
     """Launch the copies of pictures to the host: to the room that there is, or as usual."""
     for stamp_ns, slot, name in instants.pictures:
-        copy = group.picture_copies[instants.lane][group.images[name].output]
+        copy = group.picture_copies[instants.lane][group.images[name].source]
         room = instants.rooms.get((name, stamp_ns))
         if room is None:
             copy.fetch(slot, 1)
@@ -552,10 +584,10 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
         room = instants.rooms.pop((name, stamp_ns), None)
         if room is not None:
             return room
-        picture: NDArray[Any] = group.picture_copies[instants.lane][image.output].view(slot, 1)[0]
+        picture: NDArray[Any] = group.picture_copies[instants.lane][image.source].view(slot, 1)[0]
         if borrow:
             return picture
-        key = (image.output, slot)  # cameras that take the same picture share the copy
+        key = (image.source, slot)  # cameras that take the same picture share the copy
         if key not in copies:
             copies[key] = np.array(picture)
         return copies[key]
@@ -564,7 +596,7 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
     for stamp_ns, slot, name in instants.pictures:
         image = group.images[name]
         picture = copy_of(image, slot, name, stamp_ns)
-        packets.append(image.packet(picture, stamp_ns=stamp_ns, sequence=image.sequence, sensor=name))
+        packets.append(image.config.packet(picture, stamp_ns=stamp_ns, sequence=image.sequence, sensor=name))
         image.sequence += 1
     return packets
 

@@ -82,8 +82,8 @@ def make_scene_table(
             move and there are several scenes; or models are on another device, have other bodies or were
             lit or packed by other settings of the renderer than `config` says.
     """
-    if config.renderer != "warp":
-        raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer!r}")
+    if config.renderer.kind != "warp":
+        raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer.kind!r}")
     if scenes is not None and models is not None:
         raise ValueError("give scenes or models, not both")
     if any(given is not None and len(given) == 0 for given in (scenes, models)):

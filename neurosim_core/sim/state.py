@@ -43,7 +43,9 @@ from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
 from neurosim_core.sim.scene_table import SceneTable, single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
 from neurosim_core.sim.trace import Fleet, Trace, make_surfaces
-from neurosim_core.vehicle import DynamicsError, Multirotor
+from neurosim_core.vehicle import DynamicsError
+from neurosim_core.vehicle.config import VehicleContext
+from neurosim_core.vehicle.host_vehicle import Vehicle
 
 _IN_FLIGHT_ON_CUDA = 3
 """With three, one batch is flown and one rendered while the host reads a third."""
@@ -112,7 +114,7 @@ class State:
     world_count: int
     on_host: bool
     """Packets go to the host; else results stay on the device."""
-    vehicle: Multirotor | Carrier
+    vehicle: Vehicle
     fleet: Any
     """The vehicles and the clocks of their worlds as kernels see them (`trace.Fleet`)."""
     surfaces: Any
@@ -247,7 +249,7 @@ def make_state(
             slot_count=boundary_count_max(model.schedule),
         )
     if in_flight is None:
-        in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer != "pyrender" else 1
+        in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer.kind != "pyrender" else 1
     count = len(worlds.seeds)
     flight_lane_count = max(in_flight, flight_lane_count or 0)
     slot_count = flight_lane_count * worlds.slot_count
@@ -299,7 +301,7 @@ def make_state(
             paths=paths[0] if all(path is paths[0] for path in paths) else paths,
         ),
         trace=trace,
-        groups=_make_groups(model, worlds, in_flight=in_flight, on_host=on_host, make_room=make_room),
+        groups=_make_groups(model, worlds, seeds, in_flight=in_flight, on_host=on_host, make_room=make_room),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -334,7 +336,7 @@ def _history_length(model: Model, slot_count: int) -> int:
     return boundary_count_within(model.schedule, window_ns) + slot_count + 1 if window_ns else 0
 
 
-def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Multirotor | Carrier:
+def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:
     """Return the vehicles of all worlds, or what carries the sensors along a motion that is prescribed."""
     max_step_ns = to_ns(model.config.vehicle.max_step_s)
     if model.path.attitude is not None:
@@ -345,19 +347,15 @@ def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Multirotor
             device=model.device,
             max_step_ns=max_step_ns,
         )
-    return Multirotor(
-        model.airframe,
-        count=len(worlds.seeds),
-        device=model.device,
-        max_step_ns=max_step_ns,
-        integrator=model.config.vehicle.integrator,
-        seeds=seeds,
+    return model.config.vehicle.make(
+        VehicleContext(count=len(worlds.seeds), device=model.device, max_step_ns=max_step_ns, seeds=seeds)
     )
 
 
 def _make_groups(
     model: Model,
     worlds: WorldSettings,
+    seeds: Any,
     *,
     in_flight: int,
     on_host: bool,
@@ -389,11 +387,12 @@ def _make_groups(
             make_render_group(
                 group,
                 config.sensors,
-                model.scene_on_device,  # type: ignore[arg-type]
+                model.scene_on_device,
                 capacity=model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count,
                 in_flight=in_flight,
                 device=model.device,
                 seed=worlds.seeds[0],
+                seeds=seeds,
                 bodies=config.bodies,
                 worlds=RenderWorlds(
                     count=len(worlds.seeds),
@@ -435,7 +434,7 @@ def _make_start(worlds: WorldSettings, chosen: StartState | None, device: str) -
     return start
 
 
-def _make_fleet(vehicle: Multirotor | Carrier) -> Any:
+def _make_fleet(vehicle: Vehicle) -> Any:
     fleet = Fleet()
     for name in _FLEET_ARRAYS:
         setattr(fleet, name, getattr(vehicle.arrays, name))

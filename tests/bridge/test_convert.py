@@ -353,10 +353,12 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
     "point_cloud": (
         convert.point_cloud,
         messages.PointCloud(
-            stamp_ns=STAMP_NS,
+            stamp_ns=STAMP_NS + 66_051,
             points=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], np.float32),
             intensity=np.array([0.5, 0.25], np.float32),
-            color=np.array([[1, 2, 3], [255, 254, 253]], U8),
+            ring=np.array([7, 258], np.uint16),
+            t=np.array([0, 66_051], np.uint32),
+            start_ns=STAMP_NS,
             frame_id="drone/lidar",
         ),
         context(),
@@ -367,16 +369,19 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
             1,
             2,
             [
-                record("sensor_msgs/PointField", name, offset, 7, 1)
-                for name, offset in (("x", 0), ("y", 4), ("z", 8), ("intensity", 12), ("rgb", 16))
+                record("sensor_msgs/PointField", name, offset, kind, 1)
+                for name, offset, kind in (
+                    *(("x", 0, 7), ("y", 4, 7), ("z", 8, 7)),
+                    *(("intensity", 12, 7), ("ring", 16, 4), ("t", 20, 6)),
+                )
             ],
             False,
-            20,
-            40,
+            24,
+            48,
             np.array(
                 [
-                    *(*float_bytes(1.0, 2.0, 3.0, 0.5), 3, 2, 1, 0),
-                    *(*float_bytes(4.0, 5.0, 6.0, 0.25), 253, 254, 255, 0),
+                    *(*float_bytes(1.0, 2.0, 3.0, 0.5), 7, 0, 0, 0, 0, 0, 0, 0),
+                    *(*float_bytes(4.0, 5.0, 6.0, 0.25), 2, 1, 0, 0, 3, 2, 1, 0),
                 ],
                 U8,
             ),
@@ -879,9 +884,11 @@ def test_clouds():
         "sensor_msgs/msg/PointCloud2",
     )
     assert (sent.is_dense, sent.point_step, [f.name for f in sent.fields]) == (False, 12, ["x", "y", "z"])
-    color = messages.PointCloud(0, points, color=np.array([[1, 2, 3]], U8))
-    sent = cdr.decode(convert.point_cloud(color, context()), "sensor_msgs/msg/PointCloud2")
-    assert np.array(sent.data, U8).view("<u4")[3] == 0x010203
+    t = np.array([5], np.uint32)
+    for deskewed, stamp_ns in ((False, 3), (True, 9)):
+        cloud = messages.PointCloud(9, points, t=t, start_ns=3, deskewed=deskewed)
+        sent = cdr.decode(convert.point_cloud(cloud, context()), "sensor_msgs/msg/PointCloud2")
+        assert sent.header.stamp.nanosec == stamp_ns
     with pytest.raises(ConvertError, match="1 points and 2 values of intensity"):
         convert.point_cloud(messages.PointCloud(0, points, np.zeros(2, np.float32)), context())
 

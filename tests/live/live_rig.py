@@ -12,12 +12,13 @@ from processes import SOON_S, wait_for
 
 from cortex import Node, Publisher, Subscriber, reliable
 from cortex.messages import Odometry, Parameters, SimulatorReply, SimulatorStatus
-from neurosim_core.config import SimulationConfig, VehicleConfig, load_config
+from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live.config import LiveConfig
 from neurosim_core.live.messages import command_of
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import COMMANDS, SERVICES, command_topic
 from neurosim_core.sim import Model, make_fleet
+from neurosim_core.vehicle.config import MultirotorVehicleConfig
 
 IMU = {"kind": "imu", "rate_hz": 400.0, "accelerometer_noise_density": 0.01}
 RGB = {"kind": "rgb", "rate_hz": 50.0, "lens": {"width": 64, "height": 48, "horizontal_fov_rad": 1.5}}
@@ -49,7 +50,13 @@ def make_config(*, sensors: Any = None, **overrides: Any) -> SimulationConfig:
 
 def models_of(config: SimulationConfig) -> dict[str, Model]:
     """The models of a configuration; what takes time to make is made once for all that share it."""
-    common = {"live": LiveConfig(), "links": {}, "seed": 0, "duration_s": 1.0, "vehicle": VehicleConfig()}
+    common = {
+        "live": LiveConfig(),
+        "links": {},
+        "seed": 0,
+        "duration_s": 1.0,
+        "vehicle": MultirotorVehicleConfig(),
+    }
     key = config.model_copy(update=common).model_dump_json()
     if key not in _models:
         _models[key] = make_fleet(config)

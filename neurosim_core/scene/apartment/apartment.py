@@ -10,19 +10,21 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from neurosim_core.registry import register
 from neurosim_core.scene.apartment.floorplan import make_floor_plan
 from neurosim_core.scene.apartment.looks import Palette, Surface
 from neurosim_core.scene.apartment.pieces import Piece
 from neurosim_core.scene.apartment.rooms import Furnisher
 from neurosim_core.scene.apartment.shell import make_shell
+from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.scene import Ambient, Material, Scene, Texture
 from neurosim_core.scene.solids import Part, merge
-from neurosim_core.settings import Settings
 
 _FLIGHT_HEIGHT_M = 1.4
 
 
-class ApartmentConfig(Settings):
+@register("scene", "apartment")
+class ApartmentConfig(SceneConfig):
     """A furnished flat that is generated from a seed."""
 
     kind: Literal["apartment"] = "apartment"
@@ -39,6 +41,10 @@ class ApartmentConfig(Settings):
     """Clear height of the doorways [m]."""
     furniture: float = Field(default=1.0, ge=0.0, le=1.0)
     """How much of the optional furniture is there; 0 leaves what each kind of room must have."""
+
+    def load(self, *, pictures: bool = True) -> Scene:
+        """Generate the flat; pictures are painted when they are looked at."""
+        return make_apartment(self)
 
 
 def make_apartment(config: ApartmentConfig) -> Scene:

@@ -1,0 +1,91 @@
+"""Fly another library's vehicle: the equations of RotorPy in place of ours, under the same sensors and path.
+
+It prints how far the two vehicles get from each other in a second of the same flight. A vehicle of an
+installed package registers through an entry point of the group `neurosim.plugins`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+import neurosim_core as ns
+from neurosim_core.bench.rotorpy_peer import make_rotorpy_vehicle
+from neurosim_core.vehicle import Acceleration, MultirotorConfig, MultirotorState
+from neurosim_core.vehicle.config import VehicleConfig, VehicleContext
+from neurosim_core.vehicle.host_vehicle import HostVehicle
+
+_NAMES = {
+    "position": "x",
+    "velocity": "v",
+    "orientation": "q",
+    "body_rate": "w",
+    "rotor_speed": "rotor_speeds",
+}
+
+
+@ns.register("vehicle", "rotorpy")
+class RotorPyVehicleConfig(VehicleConfig):
+    """RotorPy's multirotor, with the parameters of one of our airframes."""
+
+    kind: Literal["rotorpy"] = "rotorpy"
+    preset: str = "hummingbird"
+    """Name of the airframe."""
+
+    def airframe(self) -> MultirotorConfig:
+        """Return what controllers take it for."""
+        return ns.preset(self.preset)
+
+    def make(self, context: VehicleContext) -> RotorPyVehicle:
+        """Return the vehicles of all worlds."""
+        return RotorPyVehicle(self.airframe(), context)
+
+
+class RotorPyVehicle(HostVehicle):
+    """Integrates with RotorPy, one vehicle after the other."""
+
+    def __init__(self, config: MultirotorConfig, context: VehicleContext) -> None:
+        super().__init__(config, context)
+        self._vehicle = make_rotorpy_vehicle(config)
+
+    def move(
+        self, state: MultirotorState, command: NDArray[np.float64], duration_s: float
+    ) -> MultirotorState:
+        """Let RotorPy integrate."""
+        later = self._vehicle.step(self._told(state), {"cmd_motor_speeds": command}, duration_s)
+        return MultirotorState(*(later[_NAMES[name]] for name in MultirotorState._fields))
+
+    def acceleration(self, state: MultirotorState, command: NDArray[np.float64]) -> Acceleration:
+        """Ask RotorPy for the derivatives; IMUs need them."""
+        rates = self._vehicle.statedot(self._told(state), {"cmd_motor_speeds": command}, 0.0)
+        return Acceleration(linear=rates["vdot"], angular=rates["wdot"])
+
+    def _told(self, state: MultirotorState) -> dict[str, Any]:
+        return {_NAMES[name]: value for name, value in state._asdict().items()} | {"wind": np.zeros(3)}
+
+
+def fly(vehicle: str) -> NDArray[np.float64]:
+    """Return the positions of a flight through a generated flat, shape [200, 3]."""
+    config = ns.load_config(
+        {
+            "duration_s": 1.0,
+            "device": "cpu",
+            "scene": {"kind": "apartment", "rooms": 1},
+            "vehicle": {"kind": vehicle},
+            "sensors": {"imu": {"kind": "imu"}, "odometry": {"kind": "odometry"}},
+        }
+    )
+    return np.array([packet.position for packet in ns.run(config) if isinstance(packet, ns.Odometry)])
+
+
+def main() -> float:
+    """Fly both; return the largest distance between them [m]."""
+    apart = np.linalg.norm(fly("rotorpy") - fly("multirotor"), axis=1)
+    print(f"{len(apart)} positions, at most {1e6 * apart.max():.3f} um apart")
+    return float(apart.max())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+# mypy: disable-error-code="no-untyped-call,attr-defined"
+"""What the engine asks of a vehicle, and the base of those that are computed in Python on the host."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.vehicle.config import VehicleContext
+from neurosim_core.vehicle.multirotor import (
+    Acceleration,
+    DynamicsError,
+    MultirotorArrays,
+    MultirotorConfig,
+    MultirotorState,
+)
+from neurosim_core.vehicle.status import STATUS_BODY_RATE, STATUS_TERMS, STATUS_VELOCITY
+
+_VECTORS = ("position", "velocity", "body_rate", "acceleration", "angular_acceleration")
+_ROTORS = ("rotor_speed", "rotor_speed_command")
+_OTHERS = {"orientation": wp.quatd, "status": wp.int32}
+
+
+class Vehicle(Protocol):
+    """The vehicles of all worlds. Everything but `check` and `state` only launches, on a device."""
+
+    config: MultirotorConfig
+    """What planners, controllers and IMUs take it for."""
+    count: int
+    """Number of worlds, N."""
+    device: Any
+    """Where `arrays` are."""
+    max_step_ns: int
+    """Longest integration step [ns]."""
+    arrays: MultirotorArrays
+    """The state; `rotor_speed_command` is written by others."""
+    terms: tuple[str, ...]
+    """What was compiled in."""
+
+    def advance(self, duration_ns: int) -> None:
+        """Move all vehicles on by a duration [ns] under the commands that hold."""
+
+    def begin(self, mask: Any) -> None:
+        """Take up the state that `arrays` have, where the mask, int32 of shape [N], is not 0."""
+
+    def accelerate(self) -> None:
+        """Compute the accelerations at the present state."""
+
+    def check(self) -> None:
+        """Raise `DynamicsError` for the first vehicle that is held."""
+
+    @property
+    def state(self) -> MultirotorState:
+        """A copy of the state on the host, with a leading axis of worlds."""
+
+
+def allocate_arrays(count: int, rotor_count: int, device: Any) -> MultirotorArrays:
+    """Return the state of vehicles, all zero."""
+    dtypes = dict.fromkeys(_VECTORS, wp.vec3d) | _OTHERS
+    arrays: dict[str, Any] = {
+        name: wp.zeros(
+            (count, rotor_count) if name in _ROTORS else count,
+            dtype=wp.float64 if name in _ROTORS else dtypes.get(name, wp.int64),
+            device=device,
+        )
+        for name in MultirotorArrays.__annotations__
+    }
+    return MultirotorArrays(**arrays)
+
+
+class HostVehicle:
+    """Base of a vehicle whose motion is computed in Python: define `move` and `acceleration`.
+
+    It flies on the CPU, one world after the other. What `move` returns for a world that is not finite holds
+    that world at its last good state, and ends a run with `DynamicsError`, as in all vehicles.
+    """
+
+    terms: tuple[str, ...] = ()
+
+    def __init__(self, config: MultirotorConfig, context: VehicleContext) -> None:
+        """Allocate the state.
+
+        Args:
+            config: What planners, controllers and IMUs take it for.
+            context: What it is made for.
+
+        Raises:
+            ValueError: The device is not the CPU.
+        """
+        self.config, self.count, self.max_step_ns = config, context.count, context.max_step_ns
+        self.device = wp.get_device(context.device)
+        if self.device.is_cuda:
+            raise ValueError(f"{type(self).__name__} is computed in Python: it needs device: cpu")
+        self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
+        self._views = {name: getattr(self.arrays, name).numpy() for name in MultirotorArrays.__annotations__}
+
+    def move(
+        self, state: MultirotorState, command: NDArray[np.float64], duration_s: float
+    ) -> MultirotorState:
+        """Return the state of one world a while later.
+
+        Args:
+            state: Of the vehicle, without the leading axis.
+            command: Rotor speeds that are commanded [rad/s], shape [R].
+            duration_s: How long they hold [s].
+        """
+        raise NotImplementedError
+
+    def acceleration(self, state: MultirotorState, command: NDArray[np.float64]) -> Acceleration:
+        """Return dv/dt in W [m/s^2] and dw/dt in B [rad/s^2] of one world, each of shape [3]."""
+        raise NotImplementedError
+
+    def advance(self, duration_ns: int) -> None:
+        """Move all vehicles on that are not held."""
+        views = self._views
+        for world in np.flatnonzero(views["status"] == 0).tolist():
+            now = self._row(world)
+            later = self.move(now, views["rotor_speed_command"][world], 1e-9 * duration_ns)
+            turned = [*later.orientation, *later.body_rate, *later.rotor_speed]
+            if not np.all(np.isfinite([*later.position, *later.velocity])):
+                views["status"][world] = int(STATUS_VELOCITY)
+            elif not np.all(np.isfinite(turned)):
+                views["status"][world] = int(STATUS_BODY_RATE)
+            else:
+                views["stamp_ns"][world] += duration_ns
+                for name, value in later._asdict().items():
+                    views[name][world] = value
+
+    def begin(self, mask: Any) -> None:
+        """Nothing is kept beside the state."""
+
+    def accelerate(self) -> None:
+        """Compute the accelerations at the present state."""
+        for world in range(self.count):
+            found = self.acceleration(self._row(world), self._views["rotor_speed_command"][world])
+            self._views["acceleration"][world] = found.linear
+            self._views["angular_acceleration"][world] = found.angular
+
+    def check(self) -> None:
+        """Raise `DynamicsError` for the first vehicle that is held."""
+        for world in np.flatnonzero(self._views["status"] > 0).tolist():
+            term = STATUS_TERMS[self._views["status"][world]]
+            raise DynamicsError(int(self._views["stamp_ns"][world]), world, term, self._row(world))
+
+    @property
+    def state(self) -> MultirotorState:
+        """A copy of the state on the host, with a leading axis of worlds."""
+        return MultirotorState(*(self._views[name].copy() for name in MultirotorState._fields))
+
+    def _row(self, world: int) -> MultirotorState:
+        return MultirotorState(*(self._views[name][world].copy() for name in MultirotorState._fields))
