@@ -23,7 +23,7 @@ from neurosim_core.bench.dynamics_oracle import (
 )
 from neurosim_core.bench.engine import Multirotor, preset
 
-STEPS_S = (5e-3, 2e-3, 1e-3)
+STEPS_S = (1e-2, 5e-3, 2e-3)
 
 
 @pytest.fixture(scope="module")
