@@ -21,6 +21,7 @@ from pydantic import (
 
 from neurosim_core.control import Se3Config
 from neurosim_core.live.config import LinkConfig, LiveConfig
+from neurosim_core.live.remote_renderer import RemoteRendererConfig  # noqa: F401  registers a kind
 from neurosim_core.mistakes import explain, suggestion
 from neurosim_core.registry import kinds, on_change
 from neurosim_core.render.renderer import RenderConfig, RendererConfig, WarpRendererConfig
@@ -304,9 +305,13 @@ def load_config(
         patches.insert(0, {"sensors": raw[_ADDED]})
         raw = {key: value for key, value in raw.items() if key != _ADDED}
     if "sensors" not in raw and any("sensors" in patch for patch in patches):
-        # pixels are ideal where nothing is said of them, which leaves a preset free to say it
-        sensors = _default_sensors()
-        raw["sensors"] = {name: sensor.model_dump(exclude={"pixel"}) for name, sensor in sensors.items()}
+        # of what a preset may say, nothing is said: errors and pixels are ideal anyway
+        raw["sensors"] = {
+            name: {"kind": sensor.kind}
+            if "preset" in type(sensor).model_fields
+            else sensor.model_dump(exclude={"pixel"})
+            for name, sensor in _default_sensors().items()
+        }
     given = raw
     for patch in patches:
         raw = _merge(raw, patch)

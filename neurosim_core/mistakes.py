@@ -162,7 +162,7 @@ def _wanted(annotation: Any) -> str:
     choices = [choice for choice in _alternatives(annotation) if choice is not type(None)]
     kinds = [_tag(choice) for choice in choices if _is_model(choice)]
     if len(kinds) > 1:
-        return "keys with values, such as {kind: " + " or ".join(str(kind) for kind in kinds) + "}"
+        return "keys with values, such as {kind: " + " or ".join(sorted(str(kind) for kind in kinds)) + "}"
     texts = dict.fromkeys(_described(choice) for choice in choices)
     null = ["null"] if type(None) in _alternatives(annotation) else []
     return ", or ".join([*texts, *null])

@@ -220,15 +220,19 @@ class _Column:
     ) -> None:
         # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
         filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
+        room = [max(1, length) for length in shape]  # an axis may be empty
         self._dataset = group.create_dataset(
-            name, shape=(0, *shape), maxshape=(None, *shape), dtype=dtype, chunks=(chunk, *shape), **filters
+            name, shape=(0, *shape), maxshape=(None, *room), dtype=dtype, chunks=(chunk, *room), **filters
         )
         self._shape = shape
         self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
         self._rows: list[NDArray[Any]] = []
 
     def append(self, rows: Any) -> int:
-        block = np.asarray(rows).astype(self._dtype, casting="same_kind").reshape(-1, *self._shape)  # a copy
+        count = len(rows) if 0 in self._shape else -1
+        block = (
+            np.asarray(rows).astype(self._dtype, casting="same_kind").reshape(count, *self._shape)
+        )  # a copy
         self._rows.append(block)
         return block.nbytes
 

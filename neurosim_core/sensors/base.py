@@ -79,6 +79,8 @@ class SamplerContext:
     """Seed of each world, device array of uint64, shape [world]."""
     active: Any
     """0 where a world is not measured, device array of int32, shape [world]."""
+    surfaces: Any = None
+    """What vehicles can touch (`sim.trace.Surfaces`)."""
 
 
 class Sampler(ABC):
@@ -97,8 +99,8 @@ class Sampler(ABC):
         """Measure all vehicles at their present state into a slot of the arrays; launches only."""
 
     @abstractmethod
-    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet:
-        """Return one sample of one world as a packet.
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
+        """Return one sample of one world as a packet; None: it is lost, and the sequence shows the gap.
 
         Args:
             rows: The sample's element of each array, on the host.

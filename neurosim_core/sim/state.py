@@ -259,10 +259,23 @@ def make_state(
     if carried and start is not None:
         raise ValueError("path.kind poses says where an episode starts: give no start")
     fleet = _make_fleet(vehicle)
+    ground = model.airframe.ground
+    surfaces = make_surfaces(
+        worlds.scenes.fields,
+        worlds.scenes.scene,
+        radius_m=-math.inf if carried else config.vehicle.collision_radius_m,  # it touches nothing
+        ground_height_m=None if ground is None else ground.height_m,
+        holds=config.vehicle.on_collision == "end",
+    )
     samplers = {
         name: sensor.make(
             SamplerContext(
-                name=name, vehicle=vehicle, slot_count=slot_count, seeds=seeds, active=fleet.active
+                name=name,
+                vehicle=vehicle,
+                slot_count=slot_count,
+                seeds=seeds,
+                active=fleet.active,
+                surfaces=surfaces,
             )
         )
         for name, sensor in config.sensors.items()
@@ -277,20 +290,13 @@ def make_state(
     )
     if on_host:
         trace.bring_to_host()
-    ground = model.airframe.ground
     paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
     state = State(
         world_count=count,
         on_host=on_host,
         vehicle=vehicle,
         fleet=fleet,
-        surfaces=make_surfaces(
-            worlds.scenes.fields,
-            worlds.scenes.scene,
-            radius_m=-math.inf if carried else config.vehicle.collision_radius_m,  # it touches nothing
-            ground_height_m=None if ground is None else ground.height_m,
-            holds=config.vehicle.on_collision == "end",
-        ),
+        surfaces=surfaces,
         start=_make_start(worlds, start, device),
         path_controller=make_controller(
             "path",
