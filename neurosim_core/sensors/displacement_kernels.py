@@ -67,7 +67,7 @@ def load_poses(
     # Out:
     poses_out: Poses,
 ) -> None:
-    """Write the poses of the camera at the ticks of a block and one tick after each; threads are the ticks."""
+    """Write the poses of the camera at the ticks of a block and one tick later; threads are the ticks."""
     tick = wp.tid()
     slot = slots[tick]
     p_WB = wp.vec3d(states[slot, vehicle, 0], states[slot, vehicle, 1], states[slot, vehicle, 2])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from neurosim_core.mistakes import explain
+from neurosim_core.config_errors import explain
 from neurosim_core.registry import register
 from neurosim_core.settings import Settings
 from neurosim_core.vehicle.airframe import MultirotorConfig
