@@ -19,7 +19,7 @@ import warp as wp
 
 import neurosim_core
 from neurosim_core import run
-from neurosim_core.control import MODES, make_controller
+from neurosim_core.control import MODES, make_controller, mode_kernel
 from neurosim_core.render.antialias import sampling_kernels
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
@@ -35,6 +35,7 @@ from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.trajectory import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS
 from neurosim_core.vehicle.integrator import make_kernels as make_flight
 
 ARCHITECTURES = (80, 90)
@@ -91,6 +92,7 @@ def make_kernels() -> None:
         make_imu(frozenset(errors), own_seeds=True)
     for adaptive in (False, True):
         make_flight(frozenset(VEHICLE_TERMS), adaptive=adaptive)
+    mode_kernel("path", frozenset(AIR_TERMS))
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
         for mode in MODES:

@@ -73,6 +73,7 @@ class Node:
         domain: Nodes of one domain see each other; None takes `CORTEX_DOMAIN`, else 0.
         registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port".
         listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None: this host only.
+            Without `keys` also "127.0.0.1" lets every user of this host read and call this node.
         peers: Control addresses of nodes to talk to without a registry.
         keys: CURVE keys for tcp, from `cortex.security.load_keys`.
         insecure: Allow plain tcp beyond this host.

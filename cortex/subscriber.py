@@ -573,6 +573,9 @@ class Subscriber(Generic[T]):
             for link in self._links:
                 if link.source == source and link not in self._leaving:
                     self._leaving[link] = monotonic_ns() + LEAVING_NS
+                    link.leave()
+                    self._inlet.exhausted = False
+                    self.wakeup.set()
 
     def complain(self, problem: TypeMismatch) -> None:
         """A publisher cannot be connected; the user hears of it at the next `recv`."""

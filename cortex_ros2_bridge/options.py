@@ -57,6 +57,9 @@ OPTIONS: Mapping[str, Option] = MappingProxyType(
             "base_footprint", lambda v: isinstance(v, str) and bool(v), "the name of a frame, such as map"
         ),
         "depth_max_m": _not_negative(None),
+        "compression": _one_of("jpeg", "png"),
+        "stick_speed_m_s": _not_negative(2.0),
+        "stick_rate_rad_s": _not_negative(1.0),
     }
 )
 """All options, by name; README.md says what they do. A conversion knows some of them: `convert.OPTIONS`."""

@@ -153,7 +153,7 @@ def _add_view(commands: _Commands) -> None:
         "flight",
         nargs="?",
         type=Path,
-        help="folder that `neurosim run` left, or a flight.h5; default: what runs now",
+        help="folder that `neurosim run` left, a flight.h5, or a file of events; default: what runs now",
     )
     view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(

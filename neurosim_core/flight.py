@@ -23,6 +23,8 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.flight_report import FlightReport, print_plan, print_report
 from neurosim_core.install import install_hint
+from neurosim_core.io import is_event_file
+from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
@@ -150,7 +152,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     """Return the Rerun file of a flight; write it from the recording if there is none, or to `save` if given.
 
     Args:
-        flight: The folder that `fly` left, or its flight.h5 or flight.rrd.
+        flight: The folder that `fly` left, its flight.h5 or flight.rrd, or any file of events.
         save: Write here.
 
     Raises:
@@ -161,9 +163,9 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     made = recorded.with_suffix(".rrd")
     if save is None and made.exists():
         return made
-    if not recorded.exists() or recorded.suffix != ".h5":
+    if not recorded.exists() or not is_event_file(recorded):
         raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {flight}` makes one")
-    with Recording(recorded) as source:
+    with as_recording(recorded) as file, Recording(file) as source:
         header = source.header
         settings = yaml.safe_load(header.config_yaml)
         vehicle, scene = "video", None  # a conversion of a video has neither vehicle nor scene

@@ -267,6 +267,15 @@ class EventArrays(NamedTuple):
     polarity: NDArray[np.uint8]
     """1: brighter, 0: darker."""
 
+    def rows(self, index: slice | NDArray[Any]) -> EventArrays:
+        """Return some of the events: of a slice, a mask, or an array of indices."""
+        return EventArrays(self.t[index], self.x[index], self.y[index], self.polarity[index])
+
+
+NO_EVENTS = EventArrays(
+    np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Events(Packet):

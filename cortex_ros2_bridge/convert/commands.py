@@ -12,6 +12,7 @@ from cortex import messages
 from cortex_ros2_bridge import cdr, frames
 from cortex_ros2_bridge.backend.base import Buffer
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
+from cortex_ros2_bridge.convert.records import record, vector
 
 DEFAULT_MAX_THRUST_N = 50.13
 """Thrust of an AttitudeTarget with thrust 1 [N], if neither an option nor the simulator says otherwise.
@@ -112,6 +113,23 @@ def twist(data: Buffer, context: Context) -> messages.VelocityCommand:
     """Convert geometry_msgs/Twist, in the frame that the option `frame` names, by default base_footprint."""
     message = cdr.decode_record(data, "geometry_msgs/msg/Twist")
     return _velocity(message, context.option("frame"), context.now_ns, context)
+
+
+def joy(data: Buffer, context: Context) -> messages.VelocityCommand:
+    """Convert sensor_msgs/Joy, a gamepad of two sticks: left up and yaw, right forward and left.
+
+    Axes are those of the driver `joy` for gamepads: 1 up, 0 yaw, 4 forward, 3 left, each -1 to 1; full sticks
+    are the options `stick_speed_m_s` and `stick_rate_rad_s`, in base_footprint.
+    """
+    message = cdr.decode_record(data, "sensor_msgs/msg/Joy")
+    axes = np.array(message.axes, np.float64)
+    if len(axes) < 5 or not (np.abs(axes) <= 1.0).all():
+        raise ConvertError(f"Joy.axes must be 5 or more from -1 to 1, got {axes.tolist()}")
+    linear = context.option("stick_speed_m_s") * axes[[4, 3, 1]]
+    turn = record("geometry_msgs/msg/Twist")(
+        vector(linear), vector((0.0, 0.0, context.option("stick_rate_rad_s") * axes[0]))
+    )
+    return _velocity(turn, "base_footprint", _stamp_ns(message, context), context)
 
 
 def pose(data: Buffer, context: Context) -> messages.PoseCommand:

@@ -28,10 +28,13 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from cortex import messages
 from cortex.schema import schema_of
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer, Qos
+from cortex_ros2_bridge.convert.camera import image
 from cortex_ros2_bridge.convert.context import Context, ConvertError, In, Out
+from cortex_ros2_bridge.convert.measurements import MEASUREMENTS
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.typestore import define, typestore
 
@@ -137,17 +140,51 @@ def adopt(schema: str, fingerprint: int) -> str:
     """Let messages go out whose type is known by its schema only; returns why not, empty if they do."""
     plain = json.loads(schema)
     name = plain["name"]
+    if name not in ADDED and _is_picture(plain):
+        ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=tuple(_picture_rules(plain)))
     if name in ADDED:
         return "" if ADDED[name].fingerprint == fingerprint else f"another {name} is known already"
-    try:
-        ros_type = _define(plain, None)
-    except ValueError as error:
-        return str(error)
-    OUT[name, ros_type] = _writer(plain, ros_type)
+    standard = MEASUREMENTS.get(name)
+    if standard is not None and standard.fields <= {field["name"] for field in plain["fields"]}:
+        ros_type, OUT[name, standard.ros_type] = standard.ros_type, standard.convert
+    else:
+        try:
+            ros_type = _define(plain, None)
+        except ValueError as error:
+            return str(error)
+        OUT[name, ros_type] = _writer(plain, ros_type)
     ADDED[name] = Added(
         kind=None, fingerprint=fingerprint, rules=(Rule(name, ros_type, "out", "{topic}", PACKETS),)
     )
     return ""
+
+
+def _is_picture(plain: Any) -> bool:
+    """Return whether messages are pictures: `data` of [H, W] or [H, W, C], and `encoding`."""
+    types = {field["name"]: field["type"] for field in plain["fields"]}
+    data = types.get("data")
+    ranks = len(data["shape"]) if isinstance(data, dict) and "array" in data else 0
+    return "stamp_ns" in types and types.get("encoding") == "str" and ranks in (2, 3)
+
+
+def _picture_rules(plain: Any) -> Iterable[Rule]:
+    """Register conversions of pictures: `data`, and what labels mean."""
+    name, pictures = plain["name"], "sensor_msgs/msg/Image"
+    OUT[name, pictures] = lambda message, context: _send_picture(
+        message, message.data, message.encoding, context
+    )
+    yield Rule(name, pictures, "out", "{topic}/image_raw", PACKETS)
+    if any(field["name"] == "labels" and field["type"] == "str" for field in plain["fields"]):
+        make = record("std_msgs/msg/String")
+        OUT[name, "std_msgs/msg/String"] = lambda message, _: cdr.encode(make(message.labels))
+        yield Rule(
+            name, "std_msgs/msg/String", "out", "{topic}/labels", Qos(durability="transient_local", depth=1)
+        )
+
+
+def _send_picture(message: Any, data: Any, encoding: str, context: Context) -> Buffer:
+    picture = data if data.ndim == 3 else data[:, :, None]
+    return image(messages.Image(message.stamp_ns, picture, encoding, message.frame_id), context)
 
 
 def load_converters(modules: Iterable[str]) -> list[str]:

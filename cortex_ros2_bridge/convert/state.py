@@ -77,6 +77,14 @@ def odometry(message: messages.Odometry, context: Context) -> Buffer:
     )
 
 
+def pose_stamped(message: messages.Odometry, context: Context) -> Buffer:
+    """Convert to geometry_msgs/PoseStamped, in the odom frame."""
+    _check_pose(message)
+    head = record("std_msgs/msg/Header")(time_of(message.stamp_ns), context.frames.odom_of(context.vehicle))
+    pose = pose_of(message.position, message.orientation)
+    return cdr.encode(record("geometry_msgs/msg/PoseStamped")(head, pose))
+
+
 def odometry_transform(message: messages.Odometry, context: Context) -> Buffer:
     """Convert to tf2_msgs/TFMessage: from the odom frame to the body frame."""
     _check_pose(message)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="operator,arg-type"
+# mypy: disable-error-code="operator,arg-type,no-any-return"
 """Bodies that move through the scene on prescribed paths: their poses are pure functions of time.
 
 A body is rigid and has a frame O. With t the time since the start of the episode [s], and what is not given
@@ -203,6 +203,20 @@ def make_body_poses(instant_count: int, body_count: int, device: str) -> BodyPos
     return BodyPoses(
         p_WO=wp.zeros(shape, dtype=wp.vec3d, device=device),
         q_WO=wp.zeros(shape, dtype=wp.quatd, device=device),
+    )
+
+
+@wp.func
+def body_velocity(motion: Motion, stamp_ns: wp.int64) -> wp.vec3d:
+    """Return the velocity of the origin of a body in W [m/s]; `spin` is its angular velocity in O."""
+    time_s = wp.float64(stamp_ns) * _S_PER_NS
+    sway_rate, orbit_rate = _TWO_PI * motion.sway_hz, _TWO_PI * motion.orbit_hz
+    sway = sway_rate * time_s + motion.sway_rad
+    orbit = orbit_rate * time_s + motion.orbit_rad
+    return (
+        motion.velocity
+        + sway_rate * wp.cos(sway) * motion.sway
+        + orbit_rate * (wp.cos(orbit) * motion.orbit_e2 - wp.sin(orbit) * motion.orbit_e1)
     )
 
 

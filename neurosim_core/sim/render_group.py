@@ -42,7 +42,6 @@ from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensor,
     FrameSensorConfig,
-    PictureContext,
     PictureProcess,
     PictureSensorConfig,
     PictureViews,
@@ -52,6 +51,7 @@ from neurosim_core.sensors.base import (
 )
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.render_plan import RenderGroup
+from neurosim_core.sim.picture_views import Further, look_further, make_further, make_picture_context
 from neurosim_core.sim.trace import Trace
 
 _SLOT_LISTS_MAX = 256
@@ -69,6 +69,8 @@ class ImageChannel:
     rate: Rate
     source: str
     """Its pictures are those of this output of the renderer, or those that its own processing makes."""
+    constants: Mapping[str, Any] = field(default_factory=dict)
+    """Fields that all its packets have."""
     sequence: int = 0
 
     @property
@@ -94,6 +96,8 @@ class RenderGroupState:
     """Pictures on the host by source, for each batch in flight; empty: they stay on the device."""
     processes: Sequence[Mapping[str, PictureProcess]]
     """What pictures go through on the device, by the name of the sensor, for each batch in flight."""
+    further: Sequence[Mapping[str, Further]]
+    """What their processing needs besides, likewise."""
     frames: dict[str, FrameSensor]
     """The frame sensors, where packets go to the host."""
     images: dict[str, ImageChannel]
@@ -213,9 +217,39 @@ def make_render_group(
         )
         for _ in range(in_flight)
     ]
-    processes = [_make_processes(images, renderer, times, capacity, seeds) for renderer in renderers]
+    motions: Any = upload_motions(bodies, device) if bodies else None
+    contexts = [
+        {
+            name: make_picture_context(
+                name,
+                image.config,
+                renderer,
+                lens=group.lens,
+                scene=scene,
+                worlds=worlds,
+                times=times,
+                motions=motions,
+                stride=capacity,
+                seeds=seeds,
+                device=device,
+            )
+            for name, image in images.items()
+        }
+        for renderer in renderers
+    ]
+    made = [{n: images[n].config.make_process(c) for n, c in by_name.items()} for by_name in contexts]
+    processes = [{n: process for n, process in by_name.items() if process is not None} for by_name in made]
+    for name, image in images.items():
+        image.constants = image.config.constants(contexts[0][name])
     for name in processes[0]:
         images[name].source = f"{name}/processed"
+    further = [
+        {
+            name: make_further(images[name].config, worlds.count * capacity, len(bodies or ()), device)
+            for name in each
+        }
+        for each in processes
+    ]
     context = {
         name: FrameContext(
             name=name,
@@ -251,6 +285,7 @@ def make_render_group(
             for renderer, made in zip(renderers, processes, strict=True)
         ],
         processes=processes,
+        further=further,
         frames={
             name: config.make(context[name])
             for name in context
@@ -271,7 +306,7 @@ def make_render_group(
         q_WC=[wp.zeros(rows, dtype=wp.quat, device=device) for _ in renderers],
         stamps=[wp.zeros((timed_rows, 1), dtype=wp.int64, device=device) for _ in renderers],
         instants=wp.array(np.arange(timed_rows, dtype=np.int32), dtype=int, device=device),
-        motions=upload_motions(bodies, device) if bodies else None,
+        motions=motions,
         body_poses=[make_body_poses(rows, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(group, scene, p_BC, q_BC),
         make_room=make_room,
@@ -289,19 +324,6 @@ def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
         names = ", ".join(group.names)
         raise ValueError(f"{names}: rays with times of their own need renderer: warp")
     return ray_times_of(group.timing, group.lens, scene)
-
-
-def _make_processes(
-    images: Mapping[str, ImageChannel], renderer: Renderer, times: RayTimes | None, stride: int, seeds: Any
-) -> dict[str, PictureProcess]:
-    """Return what the pictures of a renderer go through, for the sensors that ask for it."""
-    made = {}
-    for name, image in images.items():
-        source = getattr(renderer, image.output)
-        context = PictureContext(name=name, source=source, times=times, stride=stride, seeds=seeds)
-        if (process := image.config.make_process(context)) is not None:
-            made[name] = process
-    return made
 
 
 def _picture_arrays(
@@ -480,10 +502,20 @@ def plan_render(
         group.renderers[lane].render(
             p_WC, q_WC, to_slots, instant_count=len(slots), bodies=body_poses, active=active
         )
-        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active)
+        views = PictureViews(len(slots), to_slots, p_WC, q_WC, stamps, active, body_poses)
         for name in {name: None for _, _, name in pictures}:
             if name in group.processes[lane]:
-                group.processes[lane][name].launch(views)
+                seen = look_further(
+                    group.further[lane][name],
+                    views,
+                    trace,
+                    from_slots,
+                    count=len(posed),
+                    **mount,
+                    motions=group.motions,
+                    instants=group.instants,
+                )
+                group.processes[lane][name].launch(seen)
             if name in group.shared_pictures:
                 wp.copy(group.pictures[name], group.shared_pictures[name])
         if group.make_room is None:
@@ -596,7 +628,8 @@ def read_images(group: RenderGroupState, instants: Instants, *, borrow: bool = F
     for stamp_ns, slot, name in instants.pictures:
         image = group.images[name]
         picture = copy_of(image, slot, name, stamp_ns)
-        packets.append(image.config.packet(picture, stamp_ns=stamp_ns, sequence=image.sequence, sensor=name))
+        header = {"stamp_ns": stamp_ns, "sequence": image.sequence, "sensor": name}
+        packets.append(image.config.packet(picture, **image.constants, **header))
         image.sequence += 1
     return packets
 

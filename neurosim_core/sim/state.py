@@ -406,6 +406,7 @@ def _make_groups(
                     lens_of_world=lens_of_world,
                     scenes=scenes.data,
                     scene_of_world=scenes.scene,
+                    arrays=[each.scene_on_device for each in scenes.models],
                     terms=scenes.terms,
                 ),
                 on_host=on_host,

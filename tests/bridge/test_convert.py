@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 from cortex import messages
+from cortex.evt3 import Evt3Decoder
 from cortex_ros2_bridge import cdr, convert, frames
 from cortex_ros2_bridge.convert import IN, OPTIONS, OUT, Context, ConvertError, static_transforms
-from cortex_ros2_bridge.event_codec import Evt3Decoder, decode_mono
+from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
     Actuators,
@@ -248,6 +249,17 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
         context(),
         "tf2_msgs/TFMessage",
         record("tf2_msgs/TFMessage", [transform("drone/odom", "drone/base_link", (1.0, -2.0, 3.0), TURN)]),
+    ),
+    "pose_stamped": (
+        convert.pose_stamped,
+        ODOMETRY,
+        context(),
+        "geometry_msgs/PoseStamped",
+        record(
+            "geometry_msgs/PoseStamped",
+            header("drone/odom"),
+            record("geometry_msgs/Pose", point(1.0, -2.0, 3.0), quaternion(*TURN)),
+        ),
     ),
     "transform": (
         convert.transform,
@@ -601,7 +613,11 @@ def test_out_is_what_rosbags_writes_and_what_it_was_before(name):
 
 def test_every_way_out_is_tested():
     tested = {(type(message), kind.replace("/", "/msg/")) for _, message, _, kind, _ in EXPECTED.values()}
-    below = {(messages.Events, "sensor_msgs/msg/Image"), (messages.Image, "sensor_msgs/msg/PointCloud2")}
+    below = {
+        (messages.Events, "sensor_msgs/msg/Image"),
+        (messages.Image, "sensor_msgs/msg/PointCloud2"),
+        (messages.Image, "sensor_msgs/msg/CompressedImage"),
+    }
     assert OUT.keys() - tested == below
     for (_, message, _, kind, _), name in zip(EXPECTED.values(), EXPECTED, strict=True):
         assert OUT[type(message), kind.replace("/", "/msg/")] is EXPECTED[name][0]

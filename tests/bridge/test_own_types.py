@@ -59,6 +59,16 @@ class Gripper:
     frame_id: str = ""
 
 
+@message(name="my_robot/Labels")
+class Labels:
+    stamp_ns: int
+    data: Array["int32", "H", "W"]
+    labels: str
+    encoding: str
+    sequence: int
+    frame_id: str
+
+
 @message(name="my_robot/Wave")
 class Wave:
     spectrum: Array["complex64", "n"]
@@ -107,6 +117,23 @@ def test_an_unknown_type_goes_out_field_by_field() -> None:
     assert (got.pose.tolist(), list(got.flags)) == ([1.0, 2.0, 3.0], [True, False])
     fields = [name for name, _ in typestore("humble").fielddefs["my_robot/msg/Arm"][1]]
     assert fields[:2] == ["header", "joints"]
+
+
+def test_a_picture_of_any_type_goes_out_as_an_image_with_what_its_labels_mean() -> None:
+    picture = Labels(
+        3_000_000_007, np.arange(6, dtype=np.int32).reshape(2, 3), '{"classes":[]}', "32SC1", 0, "c"
+    )
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/labels", Labels)
+        images, texts = rig.opens("/drone/labels/image_raw", "/drone/labels/labels")
+        assert (images.type_name, texts.type_name) == ("sensor_msgs/msg/Image", "std_msgs/msg/String")
+        with rig.listening(sent, "/drone/labels/image_raw", "/drone/labels/labels"):
+            sent.publish(picture)
+            wait_for(lambda: images.sent and texts.sent)
+        image, text = images.messages()[0], texts.messages()[0]
+    assert (image.height, image.width, image.encoding, image.step) == (2, 3, "32SC1", 12)
+    np.testing.assert_array_equal(np.asarray(image.data).view(np.int32), np.arange(6))
+    assert (image.header.stamp.sec, image.header.frame_id, text.data) == (3, "c", picture.labels)
 
 
 def test_a_type_without_counterparts_has_no_route() -> None:
