@@ -95,10 +95,10 @@ Flights of {config.vehicle.title!r} simulated by Neurosim {__version__}. Made by
     for batch in ns.data.Stream("{plan.folder.name}", window_s=0.05, batch=32, shuffle=True):
         batch.events.voxel(5), batch.stamp_ns
 
-`flights/NNNNN.h5` are recordings: HDF5 with events as in DSEC (`/events/x`, `y`, `t`, `p`, `/ms_to_idx`), and
-one group for each sensor. `NNNNN.json` has the statistics of a flight. `dataset.yaml` has all settings. Flight
-k has the seeds `seed + k` and `path.seed + k`; {plan.flights_per_scene} flights share a generated scene, and
-the next ones have the next seed. `sha256sum --check SHA256SUMS` checks the files.
+`flights/NNNNN.h5` are recordings: HDF5 with events as in DSEC (`/events/x`, `y`, `t`, `p`, `/ms_to_idx`),
+and one group for each sensor. `NNNNN.json` has the statistics of a flight. `dataset.yaml` has all settings.
+Flight k has the seeds `seed + k` and `path.seed + k`; {plan.flights_per_scene} flights share a generated
+scene, and the next ones have the next seed. `sha256sum --check SHA256SUMS` checks the files.
 
 ## Licence
 
