@@ -234,15 +234,25 @@ def _show_sums(
 def _forget(
     # In:
     mask: wp.array[wp.int32],
+    stride: int,
     # Out:
     last_us: wp.array4d[wp.int64],
     surface: wp.array4d[wp.float32],
 ) -> None:
-    world, channel, row, column = wp.tid()
-    if mask[world] != 0:
+    world, lane = wp.tid()
+    if mask[world] == 0:
+        return
+    columns = surface.shape[3]
+    size = surface.shape[2] * columns
+    place = lane
+    while place < surface.shape[1] * size:
+        channel = place / size
+        row = place % size / columns
+        column = place % columns
         surface[world, channel, row, column] = 0.0
         if channel < last_us.shape[1]:
             last_us[world, channel, row, column] = _NEVER_US
+        place += stride
 
 
 class EventSurface:
@@ -306,7 +316,8 @@ class EventSurface:
 
     def forget(self, mask: Any) -> None:
         """Clear the surfaces of worlds that begin anew; `mask` is a device array of int32, shape [N]."""
-        self._launch(_forget, self.array.shape, [mask], [self._last, self.array])
+        dim = (self.array.shape[0], self._lanes)
+        self._launch(_forget, dim, [mask, self._lanes], [self._last, self.array])
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)
