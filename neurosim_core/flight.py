@@ -185,6 +185,26 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     return save or made
 
 
+def header_of(model: Model, config: SimulationConfig | None = None) -> RecordingHeader:
+    """Return what goes with the packets of a flight.
+
+    Args:
+        model: What is flown.
+        config: Settings that hold in place of those of the model.
+    """
+    config = model.config if config is None else config
+    stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
+    return RecordingHeader(
+        config_yaml=to_yaml(config),
+        seed=config.seed,
+        version=__version__,
+        scene=model.scene.name,
+        sensors=describe_sensors(config.sensors),
+        path_stamp_ns=stamps,
+        path_position=model.path.evaluate(stamps).position,
+    )
+
+
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[None]:
     """Make a folder and try to write in it; remove it again if the block fails."""
@@ -212,27 +232,16 @@ class _Files:
         self._recording: RecordingWriter | None = None
         self._rerun: RerunLogger | None = None
         self._checked_s = time.monotonic()
-        stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
-        path_position = model.path.evaluate(stamps).position
-        sensors = describe_sensors(config.sensors)
+        header = header_of(model)
         if _has("h5py", console, "flight.h5"):
-            header = RecordingHeader(
-                config_yaml=to_yaml(config),
-                seed=config.seed,
-                version=__version__,
-                scene=model.scene.name,
-                sensors=sensors,
-                path_stamp_ns=stamps,
-                path_position=path_position,
-            )
             self._recording = RecordingWriter(folder / "flight.h5", header)
         if rerun and _has("rerun", console, "flight.rrd"):
             self._rerun = RerunLogger(
                 open_rerun(folder / "flight.rrd"),
-                vehicles={next(iter(config.vehicles)): sensors},
+                vehicles={next(iter(config.vehicles)): header.sensors},
                 scene=scene_shapes(model.scene, model.bodies),
             )
-            self._rerun.log_path(path_position)
+            self._rerun.log_path(header.path_position)
 
     @property
     def kept_ns(self) -> int:
