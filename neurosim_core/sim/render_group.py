@@ -167,6 +167,7 @@ def make_render_group(
     on_host: bool = True,
     make_room: MakeRoom | None = None,
     world_context: Callable[[str, Any], WorldFrameContext] | None = None,
+    history: Any = None,
 ) -> RenderGroupState:
     """Allocate the buffers of a group.
 
@@ -184,6 +185,7 @@ def make_render_group(
         on_host: Bring pictures and events to the host, as packets.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; `acquire_room` asks
             for it before pictures are rendered.
+        history: The flight, for sensors that look back.
         world_context: Without `on_host`: what the frame sensor of a name is made for, given its frames.
 
     Raises:
@@ -250,6 +252,7 @@ def make_render_group(
         }
         for each in processes
     ]
+    p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
     context = {
         name: FrameContext(
             name=name,
@@ -258,11 +261,16 @@ def make_render_group(
             device=device,
             in_flight=in_flight,
             seed=seed,
+            lens=group.lens,
+            scene=scene,
+            motions=motions,
+            history=history,
+            p_BC=p_BC,
+            q_BC=q_BC,
         )
         for name in group.frame_sensors
         if on_host
     }
-    p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
     offsets_ns: Any = None if times is None else wp.array(times.offsets_ns, dtype=wp.int64, device=device)
     rows = worlds.count * capacity * (1 if offsets_ns is None else offsets_ns.shape[0])
     timed_rows = rows if bodies or processes[0] else 0
