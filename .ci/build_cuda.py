@@ -26,7 +26,7 @@ from neurosim_core.render.frustum_search import frustum_search_kernel
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.sensors.displacement import rule_kernels
+from neurosim_core.sensors.displacement_kernels import rule_kernels
 from neurosim_core.sensors.event_noise import make_scan
 from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_worlds_scan import make_noisy_scan

@@ -1,4 +1,4 @@
-"""The command `neurosim`: run | serve | fly | view | up | call | scene | convert | bench."""
+"""The command `neurosim`: run | serve | fly | view | up | call | scene | convert | dataset | bench."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
+from neurosim_core.data import command as dataset
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
@@ -62,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
-    for add in (*parsers, convert.add_parser, bench.add_parser):
+    for add in (*parsers, convert.add_parser, dataset.add_parser, bench.add_parser):
         add(commands)
     return parser
 

@@ -197,8 +197,8 @@ def read_config(arguments: argparse.Namespace) -> ConversionConfig:
     """
     from pydantic import ValidationError
 
+    from neurosim_core.config_errors import explain
     from neurosim_core.convert.convert import ConversionConfig
-    from neurosim_core.mistakes import explain
 
     given = {option.setting: getattr(arguments, option.setting) for option in _OPTIONS.values()}
     settings = {key: value for key, value in given.items() if value is not None}

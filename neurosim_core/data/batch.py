@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.packets import EventArrays
+from neurosim_core.packets import EventArrays, join_events
 
 FIELDS = ("events", "depth", "flow", "rgb", "imu", "pose")
 """What a sample may have."""
@@ -230,18 +230,6 @@ def collate(samples: Sequence[Sample]) -> Batch:
         dropped_count=np.array([sample.dropped_count for sample in samples], np.int64),
         lost_count=np.array([sample.lost_count for sample in samples], np.int64),
         **stacked,
-    )
-
-
-def join_events(parts: Sequence[EventArrays]) -> EventArrays:
-    """Return several lots of events as one; at least one."""
-    if len(parts) == 1:
-        return parts[0]
-    return EventArrays(
-        np.concatenate([part.t for part in parts]),
-        np.concatenate([part.x for part in parts]),
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([part.polarity for part in parts]),
     )
 
 

@@ -15,8 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from neurosim_core.data.batch import FIELDS, Sample, join_events
-from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.data.batch import FIELDS, Sample
+from neurosim_core.packets import (
+    EventArrays,
+    Events,
+    Image,
+    ImuSample,
+    Odometry,
+    Packet,
+    join_events,
+)
 
 _ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
 _US_NS = 1000
@@ -198,7 +206,7 @@ def cut_events(parts: Iterable[EventArrays], start_us: int, end_us: int) -> Even
         begin, end = np.searchsorted(part.t, [start_us, end_us], side="right")
         if begin < end:
             cut.append(part.rows(slice(int(begin), int(end))))
-    return join_events(cut) if cut else NO_EVENTS
+    return join_events(cut)
 
 
 def choose_sensors(found: Mapping[str, str | None], config: WindowConfig, *, source: str) -> dict[str, str]:

@@ -6,10 +6,8 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError
-from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet
+from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet, join_events
 
 
 class LogReader:
@@ -78,10 +76,10 @@ class LogReader:
             if isinstance(packet, Events) and packet.sensor == name:
                 pending.append(packet.numpy())
                 if sum(len(part.t) for part in pending) >= BLOCK_EVENTS:
-                    yield checker.check(_joined(pending))
+                    yield checker.check(join_events(pending))
                     pending = []
         if pending:
-            yield checker.check(_joined(pending))
+            yield checker.check(join_events(pending))
 
     def close(self) -> None:
         """Close the file."""
@@ -99,7 +97,3 @@ def _message_types() -> dict[str, type]:
             kind = message_type(packet)
             types[schema_of(kind).name] = kind
     return types
-
-
-def _joined(parts: list[EventArrays]) -> EventArrays:
-    return EventArrays(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

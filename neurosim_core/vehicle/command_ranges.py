@@ -13,7 +13,7 @@ from pydantic import Field
 from neurosim_core.settings import Settings
 
 if TYPE_CHECKING:
-    from neurosim_core.vehicle.multirotor import MultirotorConfig
+    from neurosim_core.vehicle.airframe import MultirotorConfig
 
 SPEED_CEILING_M_S = 100.0
 """Highest default of `speed_max_m_s`: a model without drag has no top speed of its own [m/s]."""
