@@ -303,7 +303,7 @@ def _image_channels(
 def _frame_sensors(
     group: RenderGroup, sensors: Mapping[str, SensorConfig], **context: Any
 ) -> dict[str, FrameSensor]:
-    """Return the frame sensors of a group at work in one world, by name; `context` is as of `FrameContext`."""
+    """Return the frame sensors of a group at work in one world, by name; `context`: as `FrameContext`."""
     width, height = group.lens.width, group.lens.height
     return {
         name: config.make(FrameContext(name=name, width=width, height=height, lens=group.lens, **context))
