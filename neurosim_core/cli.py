@@ -1,4 +1,4 @@
-"""The command `neurosim`: run | serve | fly | view | up | call | scene | convert | dataset | bench."""
+"""The command `neurosim`: one module or function for each of its commands."""
 
 from __future__ import annotations
 
@@ -63,7 +63,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
-    for add in (*parsers, convert.add_parser, dataset.add_parser, bench.add_parser):
+    for add in (
+        *parsers,
+        convert.add_parser,
+        dataset.add_parser,
+        dataset.add_compare_parser,
+        bench.add_parser,
+    ):
         add(commands)
     return parser
 
