@@ -31,14 +31,8 @@ from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import Rig, lens_tables
-from neurosim_core.sim.render_group import (
-    Choice,
-    Instants,
-    MakeRoom,
-    RenderGroupState,
-    RenderJob,
-    make_render_group,
-)
+from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_group
+from neurosim_core.sim.render_job import Choice, Instants, RenderJob
 from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
 from neurosim_core.sim.scene_table import SceneTable, single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
