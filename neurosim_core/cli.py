@@ -1,4 +1,4 @@
-"""The command `neurosim`: one module or function for each of its commands."""
+"""The command `neurosim`; `neurosim --help` lists what it does."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
+from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
@@ -63,13 +64,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
-    for add in (
-        *parsers,
+    others = (
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
         bench.add_parser,
-    ):
+        learn.add_parsers,
+    )
+    for add in (*parsers, *others):
         add(commands)
     return parser
 
@@ -107,6 +109,11 @@ def _add_fly(commands: _Commands) -> None:
     )
     fly.add_argument(
         "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
+    )
+    fly.add_argument(
+        "--policy",
+        metavar="NAME",
+        help="let a trained policy fly a throw in this process, without a simulator: hover, or a .onnx file",
     )
     fly.set_defaults(command=_fly)
 
@@ -272,6 +279,8 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 
 def _fly(arguments: argparse.Namespace) -> int:
+    if arguments.policy is not None:
+        return learn.fly_policy(arguments, _overrides(arguments))
     from neurosim_core.config import load_config
     from neurosim_core.live.controller import fly
 

@@ -10,7 +10,7 @@ it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -378,8 +378,8 @@ class WorldFrameSensor(Protocol):
             parity: Which of the two states is the present one.
         """
 
-    def seed(self, seeds: Sequence[int]) -> None:
-        """Draw what stays in the pixels anew; waits for the device."""
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
+        """Draw what stays in the pixels of some worlds (None: of all) anew; waits for the device."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -159,6 +159,16 @@ class MultirotorConfig(Settings):
         speed = np.sqrt(self.mass_kg * self.gravity_m_s2 / thrust) if thrust > 0.0 else 0.0
         return float(np.clip(speed, self.rotor_speed_min_rad_s, self.rotor_speed_max_rad_s))
 
+    @property
+    def hover_thrust_n(self) -> float:
+        """The weight [N]."""
+        return self.mass_kg * self.gravity_m_s2
+
+    @property
+    def thrust_max_n(self) -> float:
+        """Thrust of all rotors at their highest speed [N]."""
+        return float(self.thrust_coefficients_n_s2.sum() * self.rotor_speed_max_rad_s**2)
+
     def _of_each(self, common: float, scale: tuple[float, ...]) -> NDArray[np.float64]:
         return common * np.array(scale or self.rotor_count * (1.0,))
 
