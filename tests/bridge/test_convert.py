@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 from cortex import messages
+from cortex.evt3 import Evt3Decoder
 from cortex_ros2_bridge import cdr, convert, frames
 from cortex_ros2_bridge.convert import IN, OPTIONS, OUT, Context, ConvertError, static_transforms
-from cortex_ros2_bridge.event_codec import Evt3Decoder, decode_mono
+from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
     Actuators,
