@@ -301,7 +301,15 @@ def make_state(
             paths=paths[0] if all(path is paths[0] for path in paths) else paths,
         ),
         trace=trace,
-        groups=_make_groups(model, worlds, seeds, in_flight=in_flight, on_host=on_host, make_room=make_room),
+        groups=_make_groups(
+            model,
+            worlds,
+            seeds,
+            trace.history,
+            in_flight=in_flight,
+            on_host=on_host,
+            make_room=make_room,
+        ),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -356,6 +364,7 @@ def _make_groups(
     model: Model,
     worlds: WorldSettings,
     seeds: Any,
+    history: Any,
     *,
     in_flight: int,
     on_host: bool,
@@ -406,6 +415,7 @@ def _make_groups(
                 on_host=on_host,
                 make_room=make_room,
                 world_context=None if on_host else world_context,
+                history=history,
             )
         )
     return groups
