@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from event_decoder import Evt3Decoder, decode_mono
 
 from cortex import messages
 from cortex_ros2_bridge import cdr, convert, frames
 from cortex_ros2_bridge.convert import IN, OPTIONS, OUT, Context, ConvertError, static_transforms
-from cortex_ros2_bridge.event_codec import Evt3Decoder, decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
     Actuators,

@@ -7,15 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from event_decoder import Evt3Decoder, decode_mono
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.event_codec import (
     EventCodecError,
     EventColumns,
     EventPicture,
-    Evt3Decoder,
     Evt3Encoder,
-    decode_mono,
     dvs_size,
     encode_mono,
     write_dvs,
