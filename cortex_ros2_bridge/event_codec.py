@@ -75,7 +75,7 @@ class Evt3Encoder:
         """Return a packet, in which time is written before the first event.
 
         Args:
-            events: What to write, with times in microseconds.
+            events: With times in microseconds.
             width: Of the sensor [px].
             height: Of the sensor [px].
             end_us: Time of a packet without events [us].
@@ -207,7 +207,7 @@ def encode_mono(
     """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
 
     Args:
-        events: What to write, with times in microseconds.
+        events: With times in microseconds.
         width: Of the sensor [px].
         height: Of the sensor [px].
         base_us: Time not after that of the first event [us].
@@ -266,7 +266,7 @@ def write_dvs(
 
     Args:
         out: Bytes to write to, `dvs_size` of them and 3 more, from a multiple of 4 on in the message.
-        events: What to write, with times in microseconds.
+        events: With times in microseconds.
         width: Of the sensor [px].
         height: Of the sensor [px].
 
