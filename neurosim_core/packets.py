@@ -19,7 +19,7 @@ import inspect
 import json
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -266,6 +266,27 @@ class EventArrays(NamedTuple):
     """Row [px]."""
     polarity: NDArray[np.uint8]
     """1: brighter, 0: darker."""
+
+    def rows(self, index: slice | NDArray[Any]) -> EventArrays:
+        """Return some of the events: of a slice, a mask, or an array of indices."""
+        return EventArrays(self.t[index], self.x[index], self.y[index], self.polarity[index])
+
+
+NO_EVENTS = EventArrays(
+    np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+)
+
+
+def join_events(parts: Sequence[EventArrays]) -> EventArrays:
+    """Return the events of all parts, one after the other, as new arrays."""
+    if not parts:
+        return NO_EVENTS
+    return EventArrays(
+        np.concatenate([part.t for part in parts]),
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.polarity for part in parts]),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,22 +7,14 @@ from typing import Any
 import numpy as np
 
 from cortex import messages
+from cortex.evt3 import Bytes, EventCodecError, EventColumns, Evt3Encoder
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.convert.camera import calibration
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.convert.registry import FRAMES, PACKETS, standard
-from cortex_ros2_bridge.event_codec import (
-    Bytes,
-    EventCodecError,
-    EventColumns,
-    EventPicture,
-    Evt3Encoder,
-    dvs_size,
-    encode_mono,
-    write_dvs,
-)
+from cortex_ros2_bridge.event_codec import EventPicture, dvs_size, encode_mono, write_dvs
 
 _NO_BYTES: Bytes = np.empty(0, np.uint8)
 

@@ -23,12 +23,13 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from cortex import messages
 from cortex.schema import schema_of
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer, Qos
@@ -47,6 +48,9 @@ NEWEST = Qos(depth=1)
 LATCHED = Qos(durability="transient_local", depth=1)
 Direction = Literal["out", "in", "call"]
 """out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+_EVENT_PACKET = "event_camera_msgs/msg/EventPacket"
+_EVENT_FIELDS = frozenset(field.name for field in fields(messages.Events))
+"""What events with more than that, such as their truth, have too."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -205,19 +209,60 @@ def adopt(schema: str, fingerprint: int) -> str:
     name = plain["name"]
     if name in ADDED:
         return "" if ADDED[name].fingerprint == fingerprint else f"another {name} is known already"
-    known = MEASUREMENTS.get(name)
-    convert: Any
-    if known is not None and known.fields <= {field["name"] for field in plain["fields"]}:
-        ros_type, convert = known.ros_type, known.convert
-    else:
-        try:
-            ros_type = _define(plain, None)
-        except ValueError as error:
-            return str(error)
-        convert = _writer(plain, ros_type)
-    rule = Rule(name, ros_type, "out", "{topic}", PACKETS, convert)
-    ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=(rule,))
+    try:
+        ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=tuple(_rules_of(plain)))
+    except ValueError as error:
+        return str(error)
     return ""
+
+
+def _rules_of(plain: Any) -> Iterable[Rule]:
+    """Yield the rules of a type that is known by its schema only.
+
+    Raises:
+        ValueError: A field has no counterpart.
+    """
+    name, fields_of = plain["name"], {field["name"] for field in plain["fields"]}
+    known = MEASUREMENTS.get(name)
+    if fields_of >= _EVENT_FIELDS:
+        yield Rule(
+            name, _EVENT_PACKET, "out", "{topic}", PACKETS, _conversion_of("cortex/Events", _EVENT_PACKET)
+        )
+    elif _is_picture(plain):
+        yield from _picture_rules(plain)
+    elif known is not None and known.fields <= fields_of:
+        yield Rule(name, known.ros_type, "out", "{topic}", PACKETS, known.convert)
+    else:
+        ros_type = _define(plain, None)
+        yield Rule(name, ros_type, "out", "{topic}", PACKETS, _writer(plain, ros_type))
+
+
+def _conversion_of(cortex_type: str, ros_type: str) -> Any:
+    """Return the bridge's own conversion of a standard type."""
+    return next(rule.convert for rule in RULES if rule[:3] == (cortex_type, ros_type, "out"))
+
+
+def _is_picture(plain: Any) -> bool:
+    """Return whether messages are pictures: `data` of [H, W] or [H, W, C], and `encoding`."""
+    types = {field["name"]: field["type"] for field in plain["fields"]}
+    data = types.get("data")
+    ranks = len(data["shape"]) if isinstance(data, dict) and "array" in data else 0
+    return "stamp_ns" in types and types.get("encoding") == "str" and ranks in (2, 3)
+
+
+def _picture_rules(plain: Any) -> Iterable[Rule]:
+    """Yield the rules of pictures: `data`, and what labels mean."""
+    name, pictures, texts = plain["name"], "sensor_msgs/msg/Image", "std_msgs/msg/String"
+    image = _conversion_of("cortex/Image", pictures)
+
+    def send(message: Any, context: Context) -> Any:
+        data = message.data if message.data.ndim == 3 else message.data[:, :, None]
+        return image(messages.Image(message.stamp_ns, data, message.encoding, message.frame_id), context)
+
+    yield Rule(name, pictures, "out", "{topic}/image_raw", PACKETS, send)
+    if any(field["name"] == "labels" and field["type"] == "str" for field in plain["fields"]):
+        labels = _encoded(lambda message, _: record(texts)(message.labels))
+        yield Rule(name, texts, "out", "{topic}/labels", LATCHED, labels)
 
 
 def load_converters(modules: Iterable[str]) -> list[str]:

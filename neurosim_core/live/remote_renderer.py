@@ -262,7 +262,7 @@ class RemoteRenderer:
         log_radiance: float32 [K, H, W], or None.
         rgb: uint8 [M, H, W, 3], or None.
         depth: float32 [M, H, W], or None.
-        normal: None; so are instance and returns.
+        normal: None; so are range, instance and returns.
     """
 
     def __init__(
@@ -284,7 +284,7 @@ class RemoteRenderer:
         self.log_radiance = array("log_radiance", instant_count)
         self.rgb = array("rgb", image_count, 3, dtype=wp.uint8)
         self.depth = array("depth", image_count)
-        self.normal = self.instance = self.returns = None
+        self.normal = self.range = self.instance = self.returns = None
         self._outputs = {"depth"} & set(outputs)
         if {"rgb", "log_radiance"} & set(outputs):
             self._outputs.add("radiance")

@@ -51,6 +51,8 @@ def _darken_pixels(
             out.rgb[slot, row, col, channel] = wp.uint8(0)
     if out.depth.shape[0] > 0:
         out.depth[slot, row, col] = wp.inf
+    if out.range.shape[0] > 0:
+        out.range[slot, row, col] = wp.inf
     if out.normal.shape[0] > 0:
         out.normal[slot, row, col] = wp.vec3(0.0)
     if out.instance.shape[0] > 0:

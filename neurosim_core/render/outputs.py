@@ -16,11 +16,12 @@ from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import albedo_reader
 
-OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance", "returns")
+OUTPUTS = ("log_radiance", "rgb", "depth", "range", "normal", "instance", "returns")
 """The outputs of the ray caster."""
 
 INSTANT_OUTPUTS = frozenset({"log_radiance"})
 """Those that all instants have, whether they have an image slot or not."""
+_GEOMETRY = ("depth", "range", "normal", "instance", "returns")
 
 
 class RequestedOutputs(NamedTuple):
@@ -33,7 +34,7 @@ class RequestedOutputs(NamedTuple):
     radiance: bool
     """Log radiance or RGB is requested."""
     geometry: bool
-    """Depth, normal, instance or returns are requested."""
+    """Depth, range, normal, instance or returns are requested."""
 
 
 def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
@@ -42,7 +43,7 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
         log="log_radiance" in outputs,
         images=any(name != "log_radiance" for name in outputs),
         radiance="log_radiance" in outputs or "rgb" in outputs,
-        geometry=any(name in outputs for name in ("depth", "normal", "instance", "returns")),
+        geometry=any(name in outputs for name in _GEOMETRY),
     )
 
 
@@ -56,6 +57,8 @@ class RenderOutputs:
     """sRGB of exposure times radiance, shape [M, H, W, 3]."""
     depth: wp.array3d[float]
     """Planar z [m], inf where nothing is hit, shape [M, H, W]."""
+    range: wp.array3d[float]
+    """Length of the ray [m], inf where nothing is hit, shape [M, H, W]."""
     normal: wp.array3d[wp.vec3]
     """Of the triangle, in W, towards the camera, zero where nothing is hit, shape [M, H, W]."""
     instance: wp.array3d[int]
@@ -100,6 +103,8 @@ def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function
     ) -> None:
         if wp.static("depth" in outputs):
             out.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
+        if wp.static("range" in outputs):
+            out.range[slot, row, col] = wp.where(hit.face >= 0, hit.t, wp.inf)
         if wp.static("normal" in outputs):
             normal = wp.vec3(0.0)
             if hit.face >= 0:

@@ -49,6 +49,8 @@ class RenderWorlds:
     """All scenes, device array of `SceneData`; None: every world is in the scene of the renderer."""
     scene_of_world: Any = None
     """Index into `scenes` of each world, device array of int32, shape [N]."""
+    arrays: Sequence[SceneArrays] = ()
+    """The scenes that `scene_of_world` counts; empty: that of the renderer."""
     terms: RenderTerms | None = None
     """What some scene needs in the kernel; None: as the scene of the renderer says."""
 
@@ -78,6 +80,7 @@ class WarpRenderer:
         log_radiance: float32, shape [N K, H, W].
         rgb: uint8, shape [M, H, W, 3].
         depth: float32, shape [M, H, W].
+        range: float32, shape [M, H, W].
         normal: vec3, shape [M, H, W].
         instance: int32, shape [M, H, W].
         returns: vec3, shape [M, H, W].
@@ -166,6 +169,7 @@ class WarpRenderer:
         self.log_radiance = log_radiance if "log_radiance" in outputs else None
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
         self.depth = allocate("depth", images, float)
+        self.range = allocate("range", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
         self.returns = allocate("returns", images, wp.vec3)

@@ -10,7 +10,7 @@ it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -142,6 +142,11 @@ class RenderedConfig(SensorConfig):
         """When its rays are cast; None: all at the stamp."""
         return None
 
+    @property
+    def look_back_ns(self) -> int:
+        """How long before the end of a batch it needs the motion of the vehicle [ns]."""
+        return 0
+
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
         raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
@@ -191,6 +196,18 @@ class PictureContext:
     """Its name in the settings; two sensors with different names have independent noise."""
     source: Any
     """What the renderer writes, device array, shape [M, H, W, ...]; M image slots."""
+    sources: Mapping[str, Any]
+    """The same for all outputs that the sensor asks for, by name."""
+    lenses: Sequence[Lens]
+    """The lenses there are, all of one size."""
+    lens_of_world: Sequence[int]
+    """Index into them of each world, shape [N]."""
+    scenes: Sequence[Any]
+    """The scenes as the renderer has them."""
+    scene_of_world: Any
+    """Index into them of each world, device array of int32, shape [N]."""
+    motions: Any
+    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
     times: RayTimes | None
     """When its rays are cast; None: all at the stamp."""
     stride: int
@@ -214,6 +231,13 @@ class PictureViews(NamedTuple):
     """Times [ns], int64, shape [N K J, 1]."""
     active: Any
     """0 where a world is not rendered, int32, shape [N]; None: all are."""
+    bodies: Any
+    """Where bodies are at these times, `scene.bodies.BodyPoses`; None: there are none."""
+    then: PictureViews | None = None
+    """The same at the further time that the sensor asks for (`PictureSensorConfig.pose_offset_ns`)."""
+    twist: Any = None
+    """Velocity of the camera in W [m/s] and its angular velocity in C [rad/s] at the stamps, spatial_vectord,
+    shape [N K], where the sensor asks for it (`PictureSensorConfig.needs_twist`)."""
 
 
 class PictureProcess(Protocol):
@@ -240,9 +264,33 @@ class PictureSensorConfig(RenderedConfig):
     output: ClassVar[str]
     """What it takes pictures of, one of `render.outputs.OUTPUTS`."""
 
+    @property
+    def outputs(self) -> frozenset[str]:
+        """All outputs that its pictures are made of."""
+        return frozenset([self.output])
+
+    @property
+    def pose_offset_ns(self) -> int | None:
+        """From the stamp to a further time at which its processing needs poses [ns], <= 0; None: none."""
+        return None
+
+    @property
+    def look_back_ns(self) -> int:
+        """To that time."""
+        return -(self.pose_offset_ns or 0)
+
+    @property
+    def needs_twist(self) -> bool:
+        """Whether its processing needs the velocity of the camera."""
+        return False
+
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
-        return RenderRequest(outputs=frozenset([self.output]), rate_hz=self.rate_hz)
+        return RenderRequest(outputs=self.outputs, rate_hz=self.rate_hz)
+
+    def constants(self, context: PictureContext) -> Mapping[str, Any]:
+        """Return fields that all its packets have, such as names of what is in the scene."""
+        return {}
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
         """Return a picture as a packet.
@@ -310,6 +358,17 @@ class FrameContext:
     """The most batches that it has seen and that were not read."""
     seed: int
     """Of the episode."""
+    lens: Lens
+    scene: Any
+    """As the renderer has it."""
+    motions: Any
+    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
+    history: Any
+    """The flight, as far back as `look_back_ns` says (`vehicle.history.History`)."""
+    p_BC: Any
+    """Position of the camera on the body [m], vec3d."""
+    q_BC: Any
+    """Orientation of the camera against the body, quatd."""
 
 
 class WorldFrameSensor(Protocol):
@@ -340,8 +399,8 @@ class WorldFrameSensor(Protocol):
             parity: Which of the two states is the present one.
         """
 
-    def seed(self, seeds: Sequence[int]) -> None:
-        """Draw what stays in the pixels anew; waits for the device."""
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
+        """Draw what stays in the pixels of some worlds (None: of all) anew; waits for the device."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

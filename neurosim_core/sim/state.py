@@ -31,14 +31,8 @@ from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import Rig, lens_tables
-from neurosim_core.sim.render_group import (
-    Choice,
-    Instants,
-    MakeRoom,
-    RenderGroupState,
-    RenderJob,
-    make_render_group,
-)
+from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_group
+from neurosim_core.sim.render_job import Choice, Instants, RenderJob
 from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
 from neurosim_core.sim.scene_table import SceneTable, single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
@@ -307,7 +301,15 @@ def make_state(
             paths=paths[0] if all(path is paths[0] for path in paths) else paths,
         ),
         trace=trace,
-        groups=_make_groups(model, worlds, seeds, in_flight=in_flight, on_host=on_host, make_room=make_room),
+        groups=_make_groups(
+            model,
+            worlds,
+            seeds,
+            trace.history,
+            in_flight=in_flight,
+            on_host=on_host,
+            make_room=make_room,
+        ),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -362,6 +364,7 @@ def _make_groups(
     model: Model,
     worlds: WorldSettings,
     seeds: Any,
+    history: Any,
     *,
     in_flight: int,
     on_host: bool,
@@ -406,11 +409,13 @@ def _make_groups(
                     lens_of_world=lens_of_world,
                     scenes=scenes.data,
                     scene_of_world=scenes.scene,
+                    arrays=[each.scene_on_device for each in scenes.models],
                     terms=scenes.terms,
                 ),
                 on_host=on_host,
                 make_room=make_room,
                 world_context=None if on_host else world_context,
+                history=history,
             )
         )
     return groups

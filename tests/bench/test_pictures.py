@@ -124,8 +124,7 @@ def test_throughput_study():
     assert all(row["slowest"] <= row["whole steps/s"] <= row["fastest"] for row in steps)
     assert [row["triangles"] for row in steps[-2:]] == [steps[0]["triangles"], 4 * steps[0]["triangles"]]
     assert all(row["us per frame"] > 0.0 for row in parts)
-    claims = {claim.text: claim.met for claim in chapter.claims}
-    assert claims["the same flight again gives the same bytes"]
+    assert chapter.claims[0].met is None  # it is of a CUDA device
 
 
 def test_worlds_study():

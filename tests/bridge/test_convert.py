@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from event_decoder import Evt3Decoder, decode_mono
 
 from cortex import messages
+from cortex.evt3 import Evt3Decoder
 from cortex_ros2_bridge import cdr, frames
 from cortex_ros2_bridge.convert import RULES, Context, ConvertError, check_transform, static_transforms
+from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
     Actuators,
