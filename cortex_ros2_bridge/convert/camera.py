@@ -28,6 +28,8 @@ _NAMED_PIXELS = {
     "bgra8": ("u1", 4),
     "rgb16": ("u2", 3),
     "bgr16": ("u2", 3),
+    **{f"bayer_{order}8": ("u1", 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{order}16": ("u2", 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
 _PIXEL = re.compile(r"(8|16|32|64)([USF])C([1-9][0-9]*)")
 

@@ -22,7 +22,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -34,6 +34,7 @@ from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer, Qos
 from cortex_ros2_bridge.convert.camera import image
 from cortex_ros2_bridge.convert.context import Context, ConvertError, In, Out
+from cortex_ros2_bridge.convert.events import event_packet
 from cortex_ros2_bridge.convert.measurements import MEASUREMENTS
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.typestore import define, typestore
@@ -42,6 +43,9 @@ GROUP = "cortex_ros2_bridge.converters"
 PACKETS = Qos(depth=100)
 Direction = Literal["out", "in", "call"]
 """out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+_EVENT_PACKET = "event_camera_msgs/msg/EventPacket"
+_EVENT_FIELDS = frozenset(field.name for field in fields(messages.Events))
+"""What events with more than that, such as their truth, have too."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -140,6 +144,10 @@ def adopt(schema: str, fingerprint: int) -> str:
     """Let messages go out whose type is known by its schema only; returns why not, empty if they do."""
     plain = json.loads(schema)
     name = plain["name"]
+    if name not in ADDED and {field["name"] for field in plain["fields"]} >= _EVENT_FIELDS:
+        OUT[name, _EVENT_PACKET] = event_packet
+        rule = Rule(name, _EVENT_PACKET, "out", "{topic}", PACKETS)
+        ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=(rule,))
     if name not in ADDED and _is_picture(plain):
         ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=tuple(_picture_rules(plain)))
     if name in ADDED:
