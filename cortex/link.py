@@ -427,6 +427,14 @@ class Link:
             self.socket.subscribe(head)
 
     @property
+    def carrier(self) -> str:
+        """How messages come: the transport, and what carries them on this host."""
+        parts = [self.address.partition("://")[0]]
+        parts += ["pipe"] if self._pipe is not None else []
+        parts += ["shared memory"] if self._column is not None else []
+        return ", ".join(parts)
+
+    @property
     def fds(self) -> tuple[int, ...]:
         """Descriptors that become readable when something may have come."""
         return (self._socket_fd,) if self._offer is None else (self._socket_fd, self._offer.fd)

@@ -64,7 +64,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
-    others = (convert.add_parser, dataset.add_parser, bench.add_parser, learn.add_parsers)
+    others = (
+        convert.add_parser,
+        dataset.add_parser,
+        dataset.add_compare_parser,
+        bench.add_parser,
+        learn.add_parsers,
+    )
     for add in (*parsers, *others):
         add(commands)
     return parser

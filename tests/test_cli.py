@@ -178,7 +178,8 @@ def test_a_folder_that_cannot_be_written_is_said_before_anything_is_prepared(tmp
 
 
 def test_a_run_without_sensors_is_a_run(tmp_path):
-    done = neurosim("run", "--duration", "0.1", "--set", "sensors={}", "--out", "none", cwd=tmp_path)
+    scene = ("--set", "scene.rooms=1", "--set", "render.lighting.mode=unshadowed")
+    done = neurosim("run", "--duration", "0.1", "--set", "sensors={}", *scene, "--out", "none", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "0.000 s" not in done.stdout
 

@@ -1,4 +1,4 @@
-"""The command `neurosim dataset`."""
+"""The commands `neurosim dataset` and `neurosim compare`."""
 
 from __future__ import annotations
 
@@ -83,3 +83,57 @@ def _without_workers(words: list[str]) -> list[str]:
         elif not word.startswith("--workers="):
             kept.append(word)
     return kept
+
+
+def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `compare` to the commands of `neurosim`."""
+    parser = commands.add_parser(
+        "compare",
+        help="compare the statistics of event files, such as a simulated and a real one",
+        description="Event rate, intervals, polarity and spatial spectrum of files of any format, as a table "
+        "and on one page of plots.",
+    )
+    parser.add_argument("files", nargs="+", type=Path, help="files of events")
+    parser.add_argument("--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write")
+    parser.add_argument("--size", metavar="WxH", help="resolution, of files that do not say it")
+    parser.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
+    parser.set_defaults(command=_compare)
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from neurosim_core.convert.geometry import read_size
+    from neurosim_core.data.compare import draw_comparison, measure_events
+
+    size = None if arguments.size is None else read_size(arguments.size)
+    console = Console(soft_wrap=not sys.stdout.isatty())
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "c/px")
+    for name in columns:
+        table.add_column(name, justify="left" if name == "file" else "right")
+    stats = []
+    with console.status("reading") as status:
+        for path in arguments.files:
+            status.update(f"reading {path}")
+            one = measure_events(path, size=size, sensor=arguments.sensor)
+            stats.append(one)
+            table.add_row(
+                one.name,
+                f"{one.width}x{one.height}",
+                f"{one.event_count:,}",
+                f"{one.duration_s:.3f}",
+                f"{one.mean_rate_hz / 1e6:.3f}",
+                f"{one.on_share:.1%}",
+                f"{one.median_interval_us / 1000.0:.3g} ms",
+                f"{one.silent_share:.1%}",
+                f"{one.centroid:.3f}",
+            )
+        status.update("drawing")
+        draw_comparison(stats, arguments.out)
+    console.print(table)
+    for note in (note for one in stats for note in one.notes):
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    console.print(f"{arguments.out}", markup=False, highlight=False)
+    return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import yaml
@@ -29,6 +29,7 @@ class LiveSource:
         vehicles: Whose sensors; None: all.
         timeout_s: Give up after so long without a message, once a flight has begun; end there [s].
         start_s: Give up after so long without a simulator [s].
+        on_join: Called once all sensors are subscribed to: the time to start controllers.
     """
 
     def __init__(
@@ -38,7 +39,9 @@ class LiveSource:
         vehicles: Sequence[str] | None = None,
         timeout_s: float = 2.0,
         start_s: float = 120.0,
+        on_join: Callable[[], object] | None = None,
     ) -> None:
+        self._on_join = on_join
         self._namespaces, self._vehicles = namespaces, vehicles
         self._timeout_s, self._start_s = timeout_s, start_s
         self.skipped_count = 0
@@ -54,6 +57,8 @@ class LiveSource:
 
         with Node("data") as node:
             flights = [flight for space in self._namespaces for flight in self._join(node, space, config)]
+            if self._on_join is not None:
+                self._on_join()
             last_s, started = time.monotonic(), False
             while True:
                 before = last_s

@@ -142,6 +142,11 @@ class RenderedConfig(SensorConfig):
         """When its rays are cast; None: all at the stamp."""
         return None
 
+    @property
+    def look_back_ns(self) -> int:
+        """How long before the end of a batch it needs the motion of the vehicle [ns]."""
+        return 0
+
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
         raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
@@ -270,6 +275,11 @@ class PictureSensorConfig(RenderedConfig):
         return None
 
     @property
+    def look_back_ns(self) -> int:
+        """To that time."""
+        return -(self.pose_offset_ns or 0)
+
+    @property
     def needs_twist(self) -> bool:
         """Whether its processing needs the velocity of the camera."""
         return False
@@ -277,6 +287,11 @@ class PictureSensorConfig(RenderedConfig):
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
         return RenderRequest(outputs=self.outputs, rate_hz=self.rate_hz)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a picture depends on those before: then one batch is rendered after the other."""
+        return False
 
     def constants(self, context: PictureContext) -> Mapping[str, Any]:
         """Return fields that all its packets have, such as names of what is in the scene."""
@@ -348,6 +363,17 @@ class FrameContext:
     """The most batches that it has seen and that were not read."""
     seed: int
     """Of the episode."""
+    lens: Lens
+    scene: Any
+    """As the renderer has it."""
+    motions: Any
+    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
+    history: Any
+    """The flight, as far back as `look_back_ns` says (`vehicle.history.History`)."""
+    p_BC: Any
+    """Position of the camera on the body [m], vec3d."""
+    q_BC: Any
+    """Orientation of the camera against the body, quatd."""
 
 
 class WorldFrameSensor(Protocol):

@@ -27,7 +27,7 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_input import are_ends, as_frames, as_stamps, check_stack, invalid_message
 from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise_model import terms_of
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_pixels import Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
@@ -74,7 +74,7 @@ class EventCamera:
         on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
         terms: What is compiled in beyond ideal pixels, some of `event_noise_model.TERMS`; by default what the
-            configuration asks for.
+            configuration asks for. With `CAUSE` besides, x is eight times the column plus the cause.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise_model.TERMS`, and "readout".
@@ -107,6 +107,8 @@ class EventCamera:
         self.sensor = sensor
         self.device = wp.get_device(device)
         self._row_shift = SUB_BITS + (width - 1).bit_length()
+        if CAUSE in (terms or ()):
+            self._row_shift += CAUSE_BITS
         self._time_shift = self._row_shift + (height - 1).bit_length() + 1
 
         # scans under way begin with a state each, and the last of them needs room for the state after it

@@ -26,7 +26,7 @@ from neurosim_core.packets import FieldSpec, Packet
 from neurosim_core.registry import register
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.projection import LensData, make_lens_data, projector
+from neurosim_core.render.projection import LensData, make_lens_data, projector, velocity_projector
 from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.scene.bodies import Motion, body_velocity, make_body_poses
 from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
@@ -36,7 +36,6 @@ VISIBLE, HIDDEN, OUTSIDE = 0, 1, 2
 _FAR_M = wp.constant(1.0e9)
 _NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
 """What hides a point is nearer than it by this ratio: rays and points are float32."""
-_STEP = wp.constant(wp.float64(1.0e-4))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -191,19 +190,8 @@ def _is_hidden(
 @functools.cache
 def _make_kernel(lens_kind: str, terms: tuple[str, ...]) -> Any:
     project = projector(lens_kind)
+    project_velocity = velocity_projector(lens_kind)
     name = "_".join((lens_kind, *terms)).replace(" ", "_")
-
-    @wp.func
-    def flow_velocity(lens: LensData, p_C: wp.vec3d, v_C: wp.vec3d):
-        """Return the velocity in the picture of a point in C, by central differences over a small step."""
-        speed = wp.length(v_C)
-        flow = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-        if speed > wp.float64(0.0):
-            step_s = _STEP * wp.length(p_C) / speed
-            a, b = project(lens, p_C - step_s * v_C), project(lens, p_C + step_s * v_C)
-            flow = (b - a) / (wp.float64(2.0) * step_s)
-            flow = wp.vec3d(flow[0], flow[1], a[2] * b[2])
-        return flow
 
     @wp.kernel(module=wp.get_module("neurosim_core.sensors.optical_flow." + name), enable_backward=False)
     def measure_flow(
@@ -260,7 +248,7 @@ def _make_kernel(lens_kind: str, terms: tuple[str, ...]) -> Any:
                         turning = wp.quat_rotate(q_WO, wp.cross(model.motions[body].spin, p_O))
                         v_W += body_velocity(model.motions[body], here.stamps[view, 0]) + turning
                 v_C = wp.quat_rotate_inv(q_WC, v_W) - wp.cross(w_C, p_C)
-            rate = flow_velocity(lens, p_C, v_C)
+            rate = project_velocity(lens, p_C, v_C)
             flow_out[slot, row, col] = wp.vec3(float(rate[0]), float(rate[1]), 0.0)
             if rate[2] == wp.float64(0.0):
                 flow_out[slot, row, col] = wp.vec3(wp.nan, wp.nan, 2.0)

@@ -30,7 +30,7 @@ class RenderGroup:
     timing: RayTiming | None = None
     """When rays are cast; None: all at the stamp."""
     look_back_ns: int = 0
-    """How long before the stamp a camera needs further poses [ns]."""
+    """How long before the end of a batch a camera needs poses besides those of its rays [ns]."""
     max_displacement_px: float | None = None
     """Rays are cast only at the instants that this asks for (`sensors.displacement`); None: at all."""
 
@@ -102,13 +102,12 @@ class _Plan(NamedTuple):
 def _group(
     plan: _Plan, requests: Mapping[str, RenderRequest], cameras: Mapping[str, RenderedConfig]
 ) -> RenderGroup:
-    offsets = (getattr(cameras[name], "pose_offset_ns", None) for name in plan.members)
     frames = tuple(name for name in plan.members if requests[name].every_instant)
     return RenderGroup(
         lens=plan.lens,
         mount=plan.mount,
         timing=plan.timing,
-        look_back_ns=max(-(offset or 0) for offset in offsets),
+        look_back_ns=max(cameras[name].look_back_ns for name in plan.members),
         rate=Rate(plan.clock.rate_hz),
         frame_sensors=frames,
         image_sensors=tuple(name for name in plan.members if name not in frames),

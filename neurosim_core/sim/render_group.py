@@ -144,6 +144,7 @@ def make_render_group(
     on_host: bool = True,
     make_room: MakeRoom | None = None,
     world_context: Callable[[str, Any], WorldFrameContext] | None = None,
+    history: Any = None,
 ) -> RenderGroupState:
     """Allocate the buffers of a group.
 
@@ -161,6 +162,7 @@ def make_render_group(
         on_host: Bring pictures and events to the host, as packets.
         make_room: Gives memory to copy a picture to, where the caller has a place for it; `acquire_room` asks
             for it before pictures are rendered.
+        history: The flight, for sensors that look back.
         world_context: Without `on_host`: what the frame sensor of a name is made for, given its frames.
 
     Raises:
@@ -241,7 +243,18 @@ def make_render_group(
         ],
         processes=processes,
         further=further,
-        frames=_frame_sensors(group, sensors, device=device, in_flight=in_flight, seed=seed)
+        frames=_frame_sensors(
+            group,
+            sensors,
+            device=device,
+            in_flight=in_flight,
+            seed=seed,
+            scene=scene,
+            motions=motions,
+            history=history,
+            p_BC=p_BC,
+            q_BC=q_BC,
+        )
         if on_host
         else {},
         images=images,
@@ -288,14 +301,12 @@ def _image_channels(
 
 
 def _frame_sensors(
-    group: RenderGroup, sensors: Mapping[str, SensorConfig], *, device: str, in_flight: int, seed: int
+    group: RenderGroup, sensors: Mapping[str, SensorConfig], **context: Any
 ) -> dict[str, FrameSensor]:
-    """Return the frame sensors of a group whose packets go to the host, by name."""
+    """Return the frame sensors of a group at work in one world, by name; `context`: as `FrameContext`."""
     width, height = group.lens.width, group.lens.height
     return {
-        name: config.make(
-            FrameContext(name=name, width=width, height=height, device=device, in_flight=in_flight, seed=seed)
-        )
+        name: config.make(FrameContext(name=name, width=width, height=height, lens=group.lens, **context))
         for name in group.frame_sensors
         if isinstance(config := sensors[name], FrameSensorConfig)
     }

@@ -244,6 +244,8 @@ def make_state(
         )
     if in_flight is None:
         in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer.kind != "pyrender" else 1
+    if any(getattr(sensor, "remembers", False) for sensor in config.sensors.values()):
+        in_flight = 1
     count = len(worlds.seeds)
     flight_lane_count = max(in_flight, flight_lane_count or 0)
     slot_count = flight_lane_count * worlds.slot_count
@@ -301,7 +303,15 @@ def make_state(
             paths=paths[0] if all(path is paths[0] for path in paths) else paths,
         ),
         trace=trace,
-        groups=_make_groups(model, worlds, seeds, in_flight=in_flight, on_host=on_host, make_room=make_room),
+        groups=_make_groups(
+            model,
+            worlds,
+            seeds,
+            trace.history,
+            in_flight=in_flight,
+            on_host=on_host,
+            make_room=make_room,
+        ),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -356,6 +366,7 @@ def _make_groups(
     model: Model,
     worlds: WorldSettings,
     seeds: Any,
+    history: Any,
     *,
     in_flight: int,
     on_host: bool,
@@ -406,6 +417,7 @@ def _make_groups(
                 on_host=on_host,
                 make_room=make_room,
                 world_context=None if on_host else world_context,
+                history=history,
             )
         )
     return groups

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy
 from neurosim_core.scene.freespace import DistanceField, room_around
-from neurosim_core.sim.ray_poses import History, append_history, make_history, write_ray_poses
+from neurosim_core.sim.ray_poses import write_ray_poses
+from neurosim_core.vehicle.history import History, append_history, make_history
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
@@ -334,6 +335,11 @@ class Trace:
             outputs=[twist],
             device=self.states.device,
         )
+
+    @property
+    def history(self) -> Any:
+        """The states at all boundaries, as far back as somebody needs (`vehicle.history`)."""
+        return self._rows.history
 
     def bring_to_host(self) -> None:
         """Allocate the copies on the host that `fetch` writes to."""

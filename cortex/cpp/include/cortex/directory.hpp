@@ -59,11 +59,12 @@ inline ControlFrame parse_control(Span<const std::uint8_t> frame) {
   return result;
 }
 
-inline bool is_topic(const std::string& topic) noexcept {
+inline bool is_topic(const std::string& topic, bool or_pattern = false) noexcept {
   if (topic.empty() || topic.size() > 200 || topic.front() != '/' || topic.back() == '/') return false;
   char before = ' ';
   for (const char c : topic) {
-    const bool word = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_';
+    const bool word = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_' ||
+                      (or_pattern && c == '*');
     if (!word && (c != '/' || before == '/')) return false;
     before = c;
   }
@@ -225,7 +226,7 @@ class Directory {
   static void check(const records::NodeRecord& record) {
     bool good = record.node != 0 && record.revision != 0;
     for (const auto& publisher : record.publishers) good = good && publisher.source != 0 && is_topic(publisher.topic);
-    for (const auto& subscriber : record.subscribers) good = good && is_topic(subscriber.topic);
+    for (const auto& subscriber : record.subscribers) good = good && is_topic(subscriber.topic, true);
     for (const auto& service : record.services) good = good && is_topic(service.name);
     for (const auto& endpoint : record.endpoints) {
       for (const auto* address : {&endpoint.lossy, &endpoint.strict, &endpoint.control}) {
