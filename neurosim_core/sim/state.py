@@ -239,6 +239,8 @@ def make_state(
         worlds = _single_world(model, seed)
     if in_flight is None:
         in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer.kind != "pyrender" else 1
+    if any(getattr(sensor, "remembers", False) for sensor in config.sensors.values()):
+        in_flight = 1
     count = len(worlds.seeds)
     flight_lane_count = max(in_flight, flight_lane_count or 0)
     slot_count = flight_lane_count * worlds.slot_count
