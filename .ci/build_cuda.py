@@ -125,7 +125,8 @@ def main() -> int:
     modules = {k.module.name: k.module for k in kernels if k.func.__module__.startswith("neurosim_core")}
     failed = 0
     with ThreadPoolExecutor(2) as pool:
-        jobs = {name: pool.submit(build, module) for name, module in sorted(modules.items())}
+        longest_first = sorted(modules, key=lambda name: (".integrator." not in name, name))
+        jobs = {name: pool.submit(build, modules[name]) for name in longest_first}
     for name, job in jobs.items():
         error = job.exception()
         failed += error is not None

@@ -54,7 +54,8 @@ def main(iterations: int) -> float:
     """Train, and return the mean error of the height at the end of an episode [m]."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    env = ns.learn.make_env("climb", worlds=128, device="cpu", observe=["state"])
+    scene = {"kind": "apartment", "rooms": 1}
+    env = ns.learn.make_env("climb", worlds=128, device="cpu", observe=["state"], scenes=[scene])
     ppo = Ppo(env, PpoConfig(worlds=128, iterations=iterations), torch.Generator().manual_seed(0))
     ppo.begin(seed=1)
     for iteration in range(iterations):

@@ -326,7 +326,11 @@ class Events(Packet):
         return EventArrays(*(as_numpy(values) for values in (self.t, self.x, self.y, self.polarity)))
 
 
-ImageEncoding = Literal["rgb8", "mono8", "32FC1", "32FC2", "32FC3", "32SC1"]
+ImageEncoding = Literal[
+    "rgb8", "mono8", "rgb16", "mono16", "32FC1", "32FC2", "32FC3", "32SC1",
+    "bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8",
+    "bayer_rggb16", "bayer_bggr16", "bayer_gbrg16", "bayer_grbg16",
+]  # fmt: skip
 """Names of ROS image encodings; `Image` says what they hold."""
 
 
@@ -337,6 +341,8 @@ class Image(Packet):
     | encoding | data | content |
     | --- | --- | --- |
     | rgb8, mono8 | uint8 [H, W, 3], [H, W] | colour or grey in sRGB |
+    | rgb16, mono16 | uint16 [H, W, 3], [H, W] | the same in 16 bits, or as the camera says |
+    | bayer_rggb8, ..., bayer_grbg16 | uint8, uint16 [H, W] | one colour at each pixel |
     | 32FC1 | float32 [H, W] | depth: planar z [m], inf where nothing was hit |
     | 32FC2 | float32 [H, W, 2] | optical flow (x, y) [px] |
     | 32FC3 | float32 [H, W, 3] | surface normals, unit vectors, 0 where nothing was hit |

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex import messages
-from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.backend.base import Buffer
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
+from cortex_ros2_bridge.convert.registry import FRAMES, LATCHED, standard
 
 _FLOAT32 = ("<f4", 7)
 _POINT_TYPES = {"intensity": _FLOAT32, "ring": ("<u2", 4), "t": ("<u4", 6)}
@@ -28,11 +27,14 @@ _NAMED_PIXELS = {
     "bgra8": ("u1", 4),
     "rgb16": ("u2", 3),
     "bgr16": ("u2", 3),
+    **{f"bayer_{order}8": ("u1", 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{order}16": ("u2", 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
 _PIXEL = re.compile(r"(8|16|32|64)([USF])C([1-9][0-9]*)")
 
 
-def image(message: messages.Image, context: Context) -> Buffer:
+@standard(messages.Image, "sensor_msgs/Image", "{topic}/image_raw", FRAMES)
+def image(message: messages.Image, context: Context) -> Any:
     """Convert to sensor_msgs/Image; encodings are called the same."""
     data = np.ascontiguousarray(message.data)
     if data.ndim != 3:
@@ -43,7 +45,7 @@ def image(message: messages.Image, context: Context) -> Buffer:
         raise ConvertError(
             f"{message.encoding} means {expected} channels of {dtype}, got {channels} of {data.dtype}"
         )
-    made = record("sensor_msgs/msg/Image")(
+    return record("sensor_msgs/msg/Image")(
         header(message.stamp_ns, message.frame_id or context.frame_id, context),
         height,
         width,
@@ -52,10 +54,17 @@ def image(message: messages.Image, context: Context) -> Buffer:
         width * channels * data.itemsize,
         data.reshape(-1).view(np.uint8),
     )
-    return cdr.encode(made)
 
 
-def compressed_image(message: messages.Image, context: Context) -> Buffer:
+@standard(
+    messages.Image,
+    "sensor_msgs/CompressedImage",
+    "{topic}/image_raw/compressed",
+    FRAMES,
+    "compression",
+    default=False,
+)
+def compressed_image(message: messages.Image, context: Context) -> Any:
     """Convert to sensor_msgs/CompressedImage: png if the option `compression` says so, else jpeg.
 
     Raises:
@@ -69,15 +78,15 @@ def compressed_image(message: messages.Image, context: Context) -> Buffer:
     kind, data = context.option("compression"), np.asarray(message.data)
     out = io.BytesIO()
     Picture.fromarray(data[:, :, 0] if data.shape[2] == 1 else data).save(out, kind, quality=90)
-    made = record("sensor_msgs/msg/CompressedImage")(
+    return record("sensor_msgs/msg/CompressedImage")(
         header(message.stamp_ns, message.frame_id or context.frame_id, context),
         f"{message.encoding}; {kind} compressed {'bgr8' if data.shape[2] == 3 else 'mono8'}",
         np.frombuffer(out.getbuffer(), np.uint8),
     )
-    return cdr.encode(made)
 
 
-def image_camera_info(message: messages.Image, context: Context) -> Buffer | None:
+@standard(messages.Image, "sensor_msgs/CameraInfo", "{topic}/camera_info")
+def image_camera_info(message: messages.Image, context: Context) -> Any:
     """Return the calibration of the camera, as sensor_msgs/CameraInfo with the stamp of a picture.
 
     None, as long as the calibration is not known.
@@ -85,7 +94,8 @@ def image_camera_info(message: messages.Image, context: Context) -> Buffer | Non
     return calibration(message.stamp_ns, context.camera_info, context)
 
 
-def camera_info(message: messages.CameraInfo, context: Context) -> Buffer | None:
+@standard(messages.CameraInfo, "sensor_msgs/CameraInfo", "{parent}/camera_info", LATCHED)
+def camera_info(message: messages.CameraInfo, context: Context) -> Any:
     """Convert to sensor_msgs/CameraInfo.
 
     In ROS the centre of the first pixel is at 0, in Cortex at 0.5: the principal point moves by half a pixel.
@@ -93,7 +103,8 @@ def camera_info(message: messages.CameraInfo, context: Context) -> Buffer | None
     return calibration(message.stamp_ns, message, context)
 
 
-def point_cloud(message: messages.PointCloud, context: Context) -> Buffer:
+@standard(messages.PointCloud, "sensor_msgs/PointCloud2", "{topic}", FRAMES)
+def point_cloud(message: messages.PointCloud, context: Context) -> Any:
     """Convert to sensor_msgs/PointCloud2 with fields x, y, z and, where they are, intensity, ring and t.
 
     Its stamp is that of the first ray, from which `t` counts [ns], as drivers and odometry of LiDARs have it;
@@ -113,7 +124,7 @@ def point_cloud(message: messages.PointCloud, context: Context) -> Buffer:
         describe(name, place[1], _POINT_TYPES.get(name, _FLOAT32)[1], 1)
         for name, place in (points.dtype.fields or {}).items()
     ]
-    made = record("sensor_msgs/msg/PointCloud2")(
+    return record("sensor_msgs/msg/PointCloud2")(
         header(
             message.start_ns if is_timed else message.stamp_ns,
             message.frame_id or context.frame_id,
@@ -128,10 +139,10 @@ def point_cloud(message: messages.PointCloud, context: Context) -> Buffer:
         points.view(np.uint8),
         bool(np.isfinite(message.points).all()),
     )
-    return cdr.encode(made)
 
 
-def point_cloud_of_depth(message: messages.Image, context: Context) -> Buffer | None:
+@standard(messages.Image, "sensor_msgs/PointCloud2", "{topic}/points", FRAMES, "depth_max_m", default=False)
+def point_cloud_of_depth(message: messages.Image, context: Context) -> Any:
     """Convert a picture of depths [m] (32FC1) to sensor_msgs/PointCloud2, in its optical frame.
 
     Depth is measured along the axis. Pixels without a finite depth, and beyond the option `depth_max_m`, have
@@ -157,7 +168,7 @@ def point_cloud_of_depth(message: messages.Image, context: Context) -> Buffer | 
     return point_cloud(cloud, context)
 
 
-def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Context) -> Buffer | None:
+def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Context) -> Any:
     """Return a calibration as sensor_msgs/CameraInfo, with another stamp [ns]; None of none."""
     if message is None:
         return None
@@ -169,7 +180,7 @@ def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Con
     distortion = np.array(message.distortion, np.float64)
     if not message.distortion_model:
         distortion = np.zeros(5)
-    made = record("sensor_msgs/msg/CameraInfo")(
+    return record("sensor_msgs/msg/CameraInfo")(
         header(stamp_ns, message.frame_id or context.frame_id, context),
         message.height,
         message.width,
@@ -182,7 +193,6 @@ def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Con
         0,
         record("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False),
     )
-    return cdr.encode(made)
 
 
 @functools.cache

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.data.batch import FIELDS, Sample
-from neurosim_core.data.windows import AT_STAMP, WindowConfig, choose_sensors
+from neurosim_core.data.windows import AT_STAMP, ENCODINGS, WindowConfig, choose_sensors
 from neurosim_core.packets import NO_EVENTS, EventArrays, PacketSchema
 from neurosim_core.record.hdf5 import DSEC_NAMES, FORMAT, import_h5py
 
-_ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
 _BATCH_WINDOWS_MAX = 64
 
 
@@ -200,6 +199,5 @@ def no_ground_truth(source: str, field: str, config: WindowConfig) -> str:
 
 def _field(group: Any) -> str | None:
     kind = PacketSchema.from_json(group.attrs["schema"]).name
-    if kind == "Image":
-        return _ENCODINGS.get(str(group.attrs["encoding"]))
-    return {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
+    named = {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
+    return named or ENCODINGS.get(str(group.attrs.get("encoding", "")))

@@ -19,14 +19,13 @@ from neurosim_core.data.batch import FIELDS, Sample
 from neurosim_core.packets import (
     EventArrays,
     Events,
-    Image,
     ImuSample,
     Odometry,
     Packet,
     join_events,
 )
 
-_ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
+ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
 _US_NS = 1000
 AT_STAMP = ("depth", "flow", "rgb", "pose")
 """Fields that need a packet at exactly the end of a window."""
@@ -76,11 +75,11 @@ def field_of(packet: Packet) -> str | None:
     """Return the field that a packet gives."""
     if isinstance(packet, Events):
         return "events"
-    if isinstance(packet, Image):
-        return _ENCODINGS.get(packet.encoding)
     if isinstance(packet, ImuSample):
         return "imu"
-    return "pose" if isinstance(packet, Odometry) else None
+    if isinstance(packet, Odometry):
+        return "pose"
+    return ENCODINGS.get(getattr(packet, "encoding", ""))
 
 
 def value_of(packet: Packet) -> Any:
@@ -89,7 +88,7 @@ def value_of(packet: Packet) -> Any:
         return np.concatenate([[packet.stamp_ns * 1e-9], packet.specific_force, packet.angular_rate])
     if isinstance(packet, Odometry):
         return np.concatenate([packet.position, packet.orientation])
-    return np.asarray(packet.data) if isinstance(packet, Image) else None
+    return np.asarray(getattr(packet, "data"))  # noqa: B009 (any class that has an encoding)
 
 
 class PacketWindows:

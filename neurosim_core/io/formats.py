@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neurosim_core.io.event_file import EventFileError, EventReader, EventWriter
-from neurosim_core.io.hdf5_events import open_hdf5
+from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 
 
 class Format(NamedTuple):
@@ -94,7 +94,7 @@ def open_events(
         raise FileNotFoundError(f"no file {path}")
     name = format_of(path, format)
     if format is None and name in ("mvsec", "recording"):
-        with open_hdf5(path) as file:
+        with open_hdf5(path) as file, damage_of(path):
             name = "mvsec" if "davis" in file else "recording"
     known = FORMATS[name]
     more = {"sensor": sensor} if name in ("recording", "mcap") else {}

@@ -202,14 +202,13 @@ def _row(packet: Packet) -> tuple[str, NDArray[Any] | None]:
         pose[:3, :3] = Rotation.from_quat(packet.orientation).as_matrix()
         pose[:3, 3] = packet.position
         return "pose", pose
-    if isinstance(packet, Image):
-        data = np.asarray(packet.data)
-        if packet.encoding == "32FC1":
-            return "depth", np.where(np.isinf(data), np.float32(np.nan), data)
-        if packet.encoding == "32FC2":
-            return "flow", np.moveaxis(data, -1, 0).astype(np.float64)
-        if packet.encoding == "mono8":
-            return "image", data
-        if packet.encoding == "rgb8":
-            return "image", np.rint(data @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
+    encoding, data = getattr(packet, "encoding", ""), np.asarray(getattr(packet, "data", None))
+    if encoding == "32FC1":
+        return "depth", np.where(np.isinf(data), np.float32(np.nan), data)
+    if encoding == "32FC2":
+        return "flow", np.moveaxis(data, -1, 0).astype(np.float64)
+    if encoding == "mono8":
+        return "image", data
+    if encoding == "rgb8":
+        return "image", np.rint(data @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
     return "", None

@@ -39,10 +39,12 @@ class NpzReader:
         """
         self._path = path
         self.notes: list[str] = []
+        with open(path, "rb"):
+            pass  # an OSError from here on comes of what is in it
         try:
             self._zip = zipfile.ZipFile(path)
             damaged = self._zip.testzip()
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
+        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError) as error:
             raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         if damaged:
             raise EventFileError(f"{path} is damaged: the checksum of {damaged} is wrong")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neurosim_core.io.formats import create_events, format_of, open_events
-from neurosim_core.io.hdf5_events import open_hdf5
+from neurosim_core.io.hdf5_events import damage_of, open_hdf5
 from neurosim_core.packets import Events
 from neurosim_core.record.hdf5 import FORMAT
 
@@ -123,5 +123,5 @@ def is_recording(path: Path) -> bool:
     """
     if path.suffix.lower() not in (".h5", ".hdf5"):
         return False
-    with open_hdf5(path) as file:
+    with open_hdf5(path) as file, damage_of(path):
         return bool(file.attrs.get("format") == FORMAT)

@@ -155,6 +155,7 @@ class Env:
         self._seed = seed
         self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
         self._status: torch.Tensor | None = None
+        self._last_surface: torch.Tensor | None = None
         self._started = False
 
     @property
@@ -200,9 +201,8 @@ class Env:
 
         Returns:
             Observations (of worlds whose episode ended: of their new one), rewards, terminated, truncated,
-            and a dictionary: `final_obs` (the last observations of all worlds before any began anew),
-            `metrics` of all worlds, which count where an episode ended, and `seed`, from which each episode
-            can be played again.
+            and a dictionary: `final_obs` (what was seen last where an episode ended), `metrics` of all
+            worlds, which count there, and `seed`, from which each episode can be played again.
         """
         view = self.view
         view.last_action.copy_(view.action)
@@ -224,7 +224,7 @@ class Env:
         if self.device.type == "cpu" and not self._mask.any():
             return final, reward, terminated, truncated, info
         if "events" in final:
-            final["events"] = final["events"].clone()
+            final["events"] = self._keep(final["events"])
         self._begin(everywhere=False)
         return self._observations(), reward, terminated, truncated, info
 
@@ -260,6 +260,17 @@ class Env:
             self._surface.forget(wp.from_torch(self._mask_int))
         self._look(observation)
         self.task.begin(view, self._mask)
+
+    def _keep(self, surface: torch.Tensor) -> torch.Tensor:
+        """Return the surfaces where episodes have ended, in memory that the next such step overwrites."""
+        if self._last_surface is None:
+            self._last_surface = torch.zeros_like(surface)
+        if self.device.type == "cpu":
+            self._last_surface[self._mask] = surface[self._mask]
+        else:  # which rows they are is known to the device only
+            mask = self._mask[:, None, None, None]
+            torch.where(mask, surface, self._last_surface, out=self._last_surface)
+        return self._last_surface
 
     def _delayed(self, command: torch.Tensor) -> torch.Tensor:
         """Return the commands that take effect now: each episode has a latency and a factor of thrust."""

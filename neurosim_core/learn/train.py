@@ -69,13 +69,8 @@ class Training:
         say: Say = print,
         models: Sequence[Model] | None = None,
     ) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
         self.folder, self._say = folder, say
-        if config is None:
-            config = read_config(folder)
-        else:
-            (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
-        self.config = config
+        self.config = config = read_config(folder) if config is None else config
         self.trained_s: dict[str, float] = {}
         torch.manual_seed(config.seed)  # of the first weights
         self._env = make_env(
@@ -95,6 +90,8 @@ class Training:
         self._teacher = Ppo(teacher_env, config.teacher, self._generator)
         self._student = Dagger(self._env, self._teacher.policy, config.student, self._generator)
         self._done = {"teacher": 0, "student": 0}
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
 
     @property
     def teacher(self) -> ActorCritic:

@@ -284,7 +284,7 @@ class RemoteRenderer:
         self.log_radiance = array("log_radiance", instant_count)
         self.rgb = array("rgb", image_count, 3, dtype=wp.uint8)
         self.depth = array("depth", image_count)
-        self.normal = self.range = self.instance = self.returns = None
+        self.radiance = self.normal = self.range = self.instance = self.returns = None
         self._outputs = {"depth"} & set(outputs)
         if {"rgb", "log_radiance"} & set(outputs):
             self._outputs.add("radiance")

@@ -32,7 +32,7 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import spread_order
-from neurosim_core.render.outputs import RenderOutputs, radiance_writer
+from neurosim_core.render.outputs import RADIANCE, RenderOutputs, radiance_writer
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS, mark_pixel, turn_count
@@ -317,7 +317,7 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool)
                 mark_pixel(varies, index, samples.pixels, samples.pixel_count)
             if leads:
                 slot = int(-1)
-                if wp.static("rgb" in outputs):
+                if wp.static(len(outputs) > 1):
                     slot = view.image_slot[instant]
                 write_radiance(scene, total, group + 1, instant, slot, row, col, out)
 
@@ -391,7 +391,7 @@ def _packet_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, coarse: bool
             index = samples.pixels[entry]
         instant, row, col, world = find_pixel(index, view, worlds)
         slot = int(-1)
-        if wp.static("rgb" in outputs):
+        if wp.static(len(outputs) > 1):
             slot = view.image_slot[instant]
         if wp.static(bool(terms.embree)):
             if wp.static(terms.world_scenes):
@@ -450,7 +450,7 @@ def sampling_kernels(
         terms: Terms of the first pass.
         is_cpu: Whether the device is a CPU.
     """
-    written = tuple(name for name in ("log_radiance", "rgb") if name in ("log_radiance", *outputs))
+    written = tuple(name for name in RADIANCE if name in ("log_radiance", *outputs))
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=True)
     make_kernel = _packet_kernel if is_cpu else _block_kernel
     coarse, fine = (make_kernel(written, plain, coarse=coarse) for coarse in (True, False))

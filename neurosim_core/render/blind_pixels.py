@@ -49,6 +49,8 @@ def _darken_pixels(
     if out.rgb.shape[0] > 0:
         for channel in range(3):
             out.rgb[slot, row, col, channel] = wp.uint8(0)
+    if out.radiance.shape[0] > 0:
+        out.radiance[slot, row, col] = wp.vec3(0.0)
     if out.depth.shape[0] > 0:
         out.depth[slot, row, col] = wp.inf
     if out.range.shape[0] > 0:

@@ -42,6 +42,8 @@ class Renderer(Protocol):
     """Logarithm of linear luma plus the dark floor, float32 [N K, H, W]."""
     rgb: Any
     """8-bit sRGB, uint8 [M, H, W, 3]."""
+    radiance: Any
+    """Exposure times linear radiance, of which 1 is white, vec3 [M, H, W]."""
     depth: Any
     """Planar z [m], inf where nothing is hit, float32 [M, H, W]."""
     range: Any

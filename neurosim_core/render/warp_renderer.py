@@ -79,6 +79,7 @@ class WarpRenderer:
     Attributes:
         log_radiance: float32, shape [N K, H, W].
         rgb: uint8, shape [M, H, W, 3].
+        radiance: vec3, shape [M, H, W].
         depth: float32, shape [M, H, W].
         range: float32, shape [M, H, W].
         normal: vec3, shape [M, H, W].
@@ -168,6 +169,7 @@ class WarpRenderer:
         log_radiance = allocate("log_radiance", (worlds.count * instant_count, *images[1:]), float)
         self.log_radiance = log_radiance if "log_radiance" in outputs else None
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
+        self.radiance = allocate("radiance", images, wp.vec3)
         self.depth = allocate("depth", images, float)
         self.range = allocate("range", images, float)
         self.normal = allocate("normal", images, wp.vec3)

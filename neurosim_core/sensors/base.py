@@ -288,6 +288,11 @@ class PictureSensorConfig(RenderedConfig):
         """Return what it asks of the renderer."""
         return RenderRequest(outputs=self.outputs, rate_hz=self.rate_hz)
 
+    @property
+    def remembers(self) -> bool:
+        """Whether a picture depends on those before: then one batch is rendered after the other."""
+        return False
+
     def constants(self, context: PictureContext) -> Mapping[str, Any]:
         """Return fields that all its packets have, such as names of what is in the scene."""
         return {}

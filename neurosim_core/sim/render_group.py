@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -170,9 +171,7 @@ def make_render_group(
             for many worlds.
     """
     images = _image_channels(group, sensors, on_host=on_host)
-    # of n consecutive ticks of the group, every m-th is at most floor((n - 1) / m) + 1; cameras may alternate
-    most = sum(int(capacity * i.rate.rate_hz / group.rate.rate_hz) + 1 for i in images.values())
-    picture_count = max(1, min(capacity, most)) if on_host else 1
+    picture_count = _picture_count(group, images, capacity) if on_host else 1
     times = _ray_times(group, scene)
     renderers = [
         make_renderer(
@@ -187,38 +186,22 @@ def make_render_group(
         for _ in range(in_flight)
     ]
     motions: Any = upload_motions(bodies, device) if bodies else None
-    contexts = [
-        {
-            name: make_picture_context(
-                name,
-                image.config,
-                renderer,
-                lens=group.lens,
-                scene=scene,
-                worlds=worlds,
-                times=times,
-                motions=motions,
-                stride=capacity,
-                seeds=seeds,
-                device=device,
-            )
-            for name, image in images.items()
-        }
-        for renderer in renderers
-    ]
-    made = [{n: images[n].config.make_process(c) for n, c in by_name.items()} for by_name in contexts]
-    processes = [{n: process for n, process in by_name.items() if process is not None} for by_name in made]
-    for name, image in images.items():
-        image.constants = image.config.constants(contexts[0][name])
-    for name in processes[0]:
-        images[name].source = f"{name}/processed"
-    further = [
-        {
-            name: make_further(images[name].config, worlds.count * capacity, len(bodies or ()), device)
-            for name in each
-        }
-        for each in processes
-    ]
+    processes, further = _picture_processes(
+        images,
+        renderers,
+        partial(
+            make_picture_context,
+            lens=group.lens,
+            scene=scene,
+            worlds=worlds,
+            times=times,
+            motions=motions,
+            stride=capacity,
+            seeds=seeds,
+            device=device,
+        ),
+        partial(make_further, rows=worlds.count * capacity, body_count=len(bodies or ()), device=device),
+    )
     p_BC, q_BC = wp.vec3d(*group.mount.position_m), wp.quatd(*group.mount.optical_quaternion())
     offsets_ns: Any = None if times is None else wp.array(times.offsets_ns, dtype=wp.int64, device=device)
     rows = worlds.count * capacity * (1 if offsets_ns is None else offsets_ns.shape[0])
@@ -232,20 +215,15 @@ def make_render_group(
         rate=group.rate,
         renderers=renderers,
         picture_copies=[
-            {
-                image.source: HostCopy(
-                    made[name].picture if name in made else getattr(renderer, image.output)
-                )
-                for name, image in images.items()
-                if on_host
-            }
-            for renderer, made in zip(renderers, processes, strict=True)
+            _picture_copies(images if on_host else {}, *each)
+            for each in zip(renderers, processes, strict=True)
         ],
         processes=processes,
         further=further,
         frames=_frame_sensors(
-            group,
+            group.frame_sensors if on_host else (),
             sensors,
+            lens=group.lens,
             device=device,
             in_flight=in_flight,
             seed=seed,
@@ -254,15 +232,9 @@ def make_render_group(
             history=history,
             p_BC=p_BC,
             q_BC=q_BC,
-        )
-        if on_host
-        else {},
+        ),
         images=images,
-        world_frames={
-            name: config.make_worlds(world_context(name, _frames_of(renderers[0], worlds.count, capacity)))
-            for name in group.frame_sensors
-            if world_context is not None and isinstance(config := sensors[name], FrameSensorConfig)
-        },
+        world_frames=_world_frames(group, sensors, renderers[0], world_context, worlds.count, capacity),
         pictures=pictures,
         shared_pictures=shared,
         p_BC=p_BC,
@@ -276,9 +248,7 @@ def make_render_group(
         body_poses=[make_body_poses(rows, len(bodies), device) if bodies else None for _ in renderers],
         rule=_make_rule(group, scene, p_BC, q_BC),
         make_room=make_room,
-        chosen_slots=[HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(in_flight)]
-        if group.max_displacement_px is not None
-        else (),
+        chosen_slots=_chosen_slots(group, in_flight, capacity, device),
     )
 
 
@@ -300,16 +270,58 @@ def _image_channels(
     return images
 
 
-def _frame_sensors(
-    group: RenderGroup, sensors: Mapping[str, SensorConfig], **context: Any
-) -> dict[str, FrameSensor]:
-    """Return the frame sensors of a group at work in one world, by name; `context`: as `FrameContext`."""
-    width, height = group.lens.width, group.lens.height
+def _picture_processes(
+    images: Mapping[str, ImageChannel],
+    renderers: Sequence[Renderer],
+    make_context: Callable[..., Any],
+    make_more: Callable[..., Any],
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return what makes pictures of what a renderer wrote, and what it reads besides, for each renderer.
+
+    Args:
+        images: Their constants and sources are set.
+        renderers: One for each batch in flight.
+        make_context: Returns what a process is made for, of name, settings and renderer.
+        make_more: Returns what the process of a sensor with some settings reads besides.
+    """
+    contexts = [{n: make_context(n, image.config, r) for n, image in images.items()} for r in renderers]
+    made = [{n: images[n].config.make_process(c) for n, c in by_name.items()} for by_name in contexts]
+    processes = [{n: process for n, process in by_name.items() if process is not None} for by_name in made]
+    for name, image in images.items():
+        image.constants = image.config.constants(contexts[0][name])
+    for name in processes[0]:
+        images[name].source = f"{name}/processed"
+    return processes, [{name: make_more(images[name].config) for name in each} for each in processes]
+
+
+def _picture_copies(
+    images: Mapping[str, ImageChannel], renderer: Renderer, processes: Mapping[str, Any]
+) -> dict[str, HostCopy]:
+    """Return the pictures of a renderer on the host, by their sources."""
     return {
-        name: config.make(FrameContext(name=name, width=width, height=height, lens=group.lens, **context))
-        for name in group.frame_sensors
+        image.source: HostCopy(
+            processes[name].picture if name in processes else getattr(renderer, image.output)
+        )
+        for name, image in images.items()
+    }
+
+
+def _frame_sensors(
+    names: Sequence[str], sensors: Mapping[str, SensorConfig], *, lens: Any, **context: Any
+) -> dict[str, FrameSensor]:
+    """Return frame sensors at work in one world, by name; `context`: as `FrameContext`."""
+    return {
+        name: config.make(FrameContext(name=name, width=lens.width, height=lens.height, lens=lens, **context))
+        for name in names
         if isinstance(config := sensors[name], FrameSensorConfig)
     }
+
+
+def _chosen_slots(group: RenderGroup, in_flight: int, capacity: int, device: str) -> Sequence[HostInput]:
+    """Return where the slots of chosen ticks go, for each batch in flight; none if all ticks are rendered."""
+    if group.max_displacement_px is None:
+        return ()
+    return [HostInput(wp.zeros(capacity, dtype=int, device=device)) for _ in range(in_flight)]
 
 
 def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
@@ -333,10 +345,33 @@ def _picture_arrays(
     return pictures | {name: wp.empty_like(array) for name, array in shared.items()}, shared
 
 
-def _frames_of(renderer: Renderer, world_count: int, capacity: int) -> Any:
-    """Return the log radiance of all worlds, shape [N, K, H W]."""
-    frames = renderer.log_radiance
-    return frames.reshape((world_count, capacity, frames.shape[1] * frames.shape[2]))
+def _picture_count(group: RenderGroup, images: Mapping[str, ImageChannel], capacity: int) -> int:
+    """Return the most pictures of a batch; cameras may alternate.
+
+    Of n consecutive ticks of the group, every m-th is at most floor((n - 1) / m) + 1.
+    """
+    most = sum(int(capacity * i.rate.rate_hz / group.rate.rate_hz) + 1 for i in images.values())
+    return max(1, min(capacity, most))
+
+
+def _world_frames(
+    group: RenderGroup,
+    sensors: Mapping[str, SensorConfig],
+    renderer: Renderer,
+    context: Callable[[str, Any], WorldFrameContext] | None,
+    world_count: int,
+    capacity: int,
+) -> dict[str, WorldFrameSensor]:
+    """Return the frame sensors whose results stay on the device; they read log radiance [N, K, H W]."""
+    if context is None:
+        return {}
+    found = {}
+    for name in group.frame_sensors:
+        if isinstance(config := sensors[name], FrameSensorConfig):
+            frames = renderer.log_radiance
+            shape = (world_count, capacity, frames.shape[1] * frames.shape[2])
+            found[name] = config.make_worlds(context(name, frames.reshape(shape)))
+    return found
 
 
 def _make_rule(group: RenderGroup, scene: Any, p_BC: wp.vec3d, q_BC: wp.quatd) -> DisplacementRule | None:

@@ -7,6 +7,7 @@ import math
 from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -235,15 +236,11 @@ def make_state(
     is_cuda = wp.get_device(device).is_cuda
     on_host = worlds is None
     if worlds is None:
-        worlds = WorldSettings(
-            scenes=single_scene(model),
-            seeds=[config.seed if seed is None else seed],
-            rigs=[config.sensors],
-            instant_count=0,
-            slot_count=boundary_count_max(model.schedule),
-        )
+        worlds = _single_world(model, seed)
     if in_flight is None:
         in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer.kind != "pyrender" else 1
+    if any(getattr(sensor, "remembers", False) for sensor in config.sensors.values()):
+        in_flight = 1
     count = len(worlds.seeds)
     flight_lane_count = max(in_flight, flight_lane_count or 0)
     slot_count = flight_lane_count * worlds.slot_count
@@ -261,17 +258,16 @@ def make_state(
         ground_height_m=None if ground is None else ground.height_m,
         holds=config.vehicle.on_collision == "end",
     )
+    context = partial(
+        SamplerContext,
+        vehicle=vehicle,
+        slot_count=slot_count,
+        seeds=seeds,
+        active=fleet.active,
+        surfaces=surfaces,
+    )
     samplers = {
-        name: sensor.make(
-            SamplerContext(
-                name=name,
-                vehicle=vehicle,
-                slot_count=slot_count,
-                seeds=seeds,
-                active=fleet.active,
-                surfaces=surfaces,
-            )
-        )
+        name: sensor.make(context(name=name))
         for name, sensor in config.sensors.items()
         if isinstance(sensor, StateSensorConfig)
     }
@@ -284,7 +280,6 @@ def make_state(
     )
     if on_host:
         trace.bring_to_host()
-    paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
     state = State(
         world_count=count,
         on_host=on_host,
@@ -292,14 +287,7 @@ def make_state(
         fleet=fleet,
         surfaces=surfaces,
         start=_make_start(worlds, start, device),
-        path_controller=make_controller(
-            "path",
-            model.airframe,
-            config.control.gains,
-            count=count,
-            device=device,
-            paths=paths[0] if all(path is paths[0] for path in paths) else paths,
-        ),
+        path_controller=_path_controller(model, worlds),
         trace=trace,
         groups=_make_groups(
             model,
@@ -336,6 +324,30 @@ def make_state(
     )
     reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
     return state
+
+
+def _path_controller(model: Model, worlds: WorldSettings) -> Controller:
+    """Return what follows the paths of all worlds, which may share one."""
+    paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
+    return make_controller(
+        "path",
+        model.airframe,
+        model.config.control.gains,
+        count=len(worlds.seeds),
+        device=model.device,
+        paths=paths[0] if all(path is paths[0] for path in paths) else paths,
+    )
+
+
+def _single_world(model: Model, seed: int | None) -> WorldSettings:
+    """Return the settings of the one world of a single run."""
+    return WorldSettings(
+        scenes=single_scene(model),
+        seeds=[model.config.seed if seed is None else seed],
+        rigs=[model.config.sensors],
+        instant_count=0,
+        slot_count=boundary_count_max(model.schedule),
+    )
 
 
 def _history_length(model: Model, slot_count: int) -> int:

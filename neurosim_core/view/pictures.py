@@ -19,6 +19,9 @@ PictureKind = Literal["colour", "values", "depth", "segmentation", "normals", "f
 _KINDS: dict[str, PictureKind] = {
     "rgb8": "colour",
     "mono8": "colour",
+    "rgb16": "colour",
+    "mono16": "colour",
+    **{f"bayer_{order}{bits}": "colour" for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)},
     "32FC1": "depth",
     "32FC2": "flow",
     "32FC3": "normals",
@@ -64,6 +67,8 @@ def picture_of(packet: Packet) -> tuple[PictureKind, NDArray[Any]]:
         encoding = getattr(packet, "encoding", None)
         if encoding is not None and encoding not in _KINDS:
             raise ValueError(f"cannot show a picture of encoding {encoding!r}, known: {', '.join(_KINDS)}")
+        if data.dtype == np.uint16:
+            data = (data >> 8).astype(np.uint8)
         kind = _KINDS[encoding] if encoding else "colour" if data.dtype == np.uint8 else "values"
     return kind, data
 

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,8 @@ import pytest
 
 from cortex import messages
 from cortex.evt3 import Evt3Decoder
-from cortex_ros2_bridge import cdr, convert, frames
-from cortex_ros2_bridge.convert import IN, OPTIONS, OUT, Context, ConvertError, static_transforms
+from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge.convert import RULES, Context, ConvertError, check_transform, static_transforms
 from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
@@ -41,6 +42,13 @@ from cortex_ros2_bridge.options import OPTIONS as OPTIONS_OF_ROUTES
 from cortex_ros2_bridge.options import check_option
 from cortex_ros2_bridge.typestore import typestore
 
+OUT = {(r.cortex_type, r.ros_type): r for r in RULES if r.direction == "out"}
+IN = {(r.ros_type, r.cortex_type): r for r in RULES if r.direction != "out"}
+convert = SimpleNamespace(
+    **{rule.convert.__name__: rule.convert for rule in RULES},
+    static_transforms=static_transforms,
+    check_transform=check_transform,
+)
 GOLDEN = Path(__file__).with_name("golden")
 TURN = np.array([0.5, 0.5, 0.5, 0.5])
 """Takes x to y, y to z and z to x: so v_W = (c, a, b) for v_B = (a, b, c), exactly."""
@@ -612,15 +620,18 @@ def test_out_is_what_rosbags_writes_and_what_it_was_before(name):
 
 
 def test_every_way_out_is_tested():
-    tested = {(type(message), kind.replace("/", "/msg/")) for _, message, _, kind, _ in EXPECTED.values()}
-    below = {
-        (messages.Events, "sensor_msgs/msg/Image"),
-        (messages.Image, "sensor_msgs/msg/PointCloud2"),
-        (messages.Image, "sensor_msgs/msg/CompressedImage"),
+    tested = {
+        (f"cortex/{type(message).__name__}", kind.replace("/", "/msg/")): function
+        for function, message, _, kind, _ in EXPECTED.values()
     }
-    assert OUT.keys() - tested == below
-    for (_, message, _, kind, _), name in zip(EXPECTED.values(), EXPECTED, strict=True):
-        assert OUT[type(message), kind.replace("/", "/msg/")] is EXPECTED[name][0]
+    below = {
+        ("cortex/Events", "sensor_msgs/msg/Image"),
+        ("cortex/Image", "sensor_msgs/msg/PointCloud2"),
+        ("cortex/Image", "sensor_msgs/msg/CompressedImage"),
+    }
+    assert OUT.keys() - tested.keys() == below
+    assert all(OUT[key].convert is function for key, function in tested.items() if key in OUT)
+    assert len(OUT) + len(IN) == len(RULES)
 
 
 def test_event_image_is_drawn_until_its_period_is_over():
@@ -1014,8 +1025,7 @@ def test_a_picture_of_depths_becomes_a_cloud():
 
 
 def test_options_belong_to_conversions():
-    assert OPTIONS.keys() <= {*OUT.values(), *IN.values()}
-    known = {"queue", "stale_s", "stamp"}.union(*OPTIONS.values())
+    known = {"queue", "stale_s", "stamp"}.union(*(rule.options for rule in RULES))
     assert known == OPTIONS_OF_ROUTES.keys()
 
 
@@ -1335,7 +1345,7 @@ def test_everything_that_comes_in_is_checked_for_its_length(ros_type, kind):
     whole = cdr.encode(cdr.decode(cdr.encode(_default(ros_type)), ros_type))
     for data in (whole[:-4], bytes(whole) + bytes(8), b"\0\1\0\0", b""):
         with pytest.raises(cdr.CdrError):
-            IN[ros_type, kind](data, context())
+            IN[ros_type, kind].convert(data, context())
 
 
 def _default(ros_type: str) -> Any:

@@ -11,11 +11,11 @@ from PIL import Image as Picture
 
 from cortex import messages
 from cortex.schema import schema_of
-from cortex_ros2_bridge import cdr, convert
+from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.config import BridgeConfig
-from cortex_ros2_bridge.convert import Context, ConvertError, registry
+from cortex_ros2_bridge.convert import Context, ConvertError, camera, commands, registry
 from cortex_ros2_bridge.msgs import Joy
-from cortex_ros2_bridge.routes import Seen, SeenTopic, make_routes, out_of
+from cortex_ros2_bridge.routes import Seen, SeenTopic, make_routes, rule_of
 from neurosim_core.live.messages import message_type, to_message
 from neurosim_core.sensors.barometer import Pressure
 from neurosim_core.sensors.gps import GpsFix
@@ -41,8 +41,7 @@ PACKETS = {
 @pytest.fixture(autouse=True)
 def nothing_added():
     yield
-    for table in (registry.ADDED, registry.OUT, registry.IN):
-        table.clear()
+    registry.ADDED.clear()
 
 
 def sent(packet):
@@ -52,7 +51,7 @@ def sent(packet):
     (route,), problems = make_routes(Seen((topic,)), BridgeConfig())
     assert not problems
     message = to_message(packet, frame_id="drone/s")
-    data = out_of(route)(message, Context(vehicle="drone"))
+    data = rule_of(route).convert(message, Context(vehicle="drone"))
     decoded = cdr.decode(data, route.ros_type)
     assert (decoded.header.stamp.sec, decoded.header.stamp.nanosec) == (3, 7)
     assert decoded.header.frame_id == "drone/s"
@@ -99,16 +98,13 @@ def test_compressed_pictures_are_what_they_were(kind, error, channels):
     data = np.stack([8 * rows, 4 * columns, 255 - 4 * rows], axis=-1)[:, :, :channels].astype(np.uint8)
     encoding = {1: "mono8", 3: "rgb8"}[channels]
     picture = messages.Image(5, data, encoding, "drone/rgb_optical_frame")
-    got = cdr.decode(
-        convert.compressed_image(picture, Context(options={"compression": kind})),
-        "sensor_msgs/msg/CompressedImage",
-    )
+    got = camera.compressed_image(picture, Context(options={"compression": kind}))
     assert got.format == f"{encoding}; {kind} compressed {'mono8' if channels == 1 else 'bgr8'}"
     back = np.asarray(Picture.open(io.BytesIO(bytes(got.data)))).reshape(data.shape)
     assert np.abs(back.astype(int) - data).max() <= error
     depth = messages.Image(5, np.zeros((2, 2, 1), np.float32), "32FC1")
     with pytest.raises(ConvertError, match="only rgb8 and mono8 are compressed, not 32FC1"):
-        convert.compressed_image(depth, Context())
+        camera.compressed_image(depth, Context())
 
 
 def test_a_gamepad_flies():
@@ -118,8 +114,8 @@ def test_a_gamepad_flies():
     joy = Joy(axes=[-1.0, -1.0, 0.0, 0.25, 0.5, 0.0], buttons=[])
     joy.header.stamp.sec = 2
     given = Context(vehicle="drone", odometry=state, options={"stick_speed_m_s": 4.0})
-    command = convert.joy(cdr.encode(joy), given)
+    command = commands.joy(joy, given)
     np.testing.assert_allclose(command.velocity, [-1.0, 2.0, -4.0], atol=1e-12)
     assert (command.yaw_rate_rad_s, command.stamp_ns) == (-1.0, 2_000_000_000)
     with pytest.raises(ConvertError, match=r"Joy\.axes must be 5 or more from -1 to 1"):
-        convert.joy(cdr.encode(Joy(axes=[0.0, 0.0])), Context(odometry=state))
+        commands.joy(Joy(axes=[0.0, 0.0]), Context(odometry=state))

@@ -37,12 +37,16 @@ from cortex.messages import (
 from cortex.schema import schema_of
 from cortex_ros2_bridge import config
 from cortex_ros2_bridge.config import ConfigError, load
-from cortex_ros2_bridge.routes import Seen, SeenTopic, default_routes, look, make_routes, unfit, vehicle_of
+from cortex_ros2_bridge.routes import Seen, SeenTopic, look, make_routes, unfit, vehicle_of
 
 
 def topic(name, kind, *, published=True, fingerprint=None):
     schema = schema_of(kind)
     return SeenTopic(name, schema.name, fingerprint or schema.fingerprint, published)
+
+
+def default_routes(seen):
+    return make_routes(seen, config.BridgeConfig())[0]
 
 
 DRONE = Seen(

@@ -149,7 +149,8 @@ def same(one: data.Sample, two: data.Sample) -> None:
 
 
 def test_a_run_and_its_recording_give_the_same(tmp_path):
-    config = ns.load_config(CONFIG)
+    flow = {"kind": "optical_flow", "rate_hz": 20.0, "lens": LENS}
+    config = ns.load_config({**CONFIG, "sensors": {**CONFIG["sensors"], "flow": flow}})
     with RecordingWriter(tmp_path / "a.h5", RecordingHeader(config_yaml="", seed=0, version="0")) as out:
         for packet in ns.run(config):
             out.write(packet)
@@ -159,6 +160,8 @@ def test_a_run_and_its_recording_give_the_same(tmp_path):
     assert len(samples) == 4
     for one, two in zip(samples, recorded, strict=True):
         same(one, two)
+        assert one.flow.shape == (24, 32, 2)
+        assert np.array_equal(one.flow, two.flow, equal_nan=True)
 
 
 def test_batches_of_worlds():

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from processes import ROOT
 
 import neurosim_core as ns
 from neurosim_core.registry import register
@@ -131,3 +132,12 @@ def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
     assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
     assert "% success" in str(first)
     del training
+
+
+def test_a_task_of_ones_own_is_learnt(monkeypatch):
+    """The example ends nearer to its height after a third of its training than without any."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import custom_task
+
+    errors = [custom_task.main(iterations) for iterations in (0, 30)]
+    assert errors[1] < 0.8 * errors[0]
