@@ -280,7 +280,7 @@ class Directory:
             else:
                 reply = Alive(self._own.node, 0, known.revision if known else 0)
         elif isinstance(message, Leave):
-            known_record = self.nodes.get(message.node)
+            known_record = self.nodes.get(message.node) if message.node in self._inbound else None
             if known_record is not None and self._may_change(known_record, sender):
                 self._forget_inbound(message.node)
                 for link in self._links:

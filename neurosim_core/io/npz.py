@@ -44,7 +44,7 @@ class NpzReader:
         try:
             self._zip = zipfile.ZipFile(path)
             damaged = self._zip.testzip()
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, OSError) as error:
+        except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError) as error:
             raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         if damaged:
             raise EventFileError(f"{path} is damaged: the checksum of {damaged} is wrong")

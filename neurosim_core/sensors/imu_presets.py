@@ -1,4 +1,7 @@
-"""Settings of inertial measurement units named after sensors, with the source of each number.
+"""Settings of inertial measurement units named after sensors, with the document of each number.
+
+Compared with the document itself were the accelerometer of the ICM-20948, and ranges and steps of the BMI088.
+The other numbers were not: compare them with the data sheet of your sensor before you rely on them.
 
 Data sheets give the least Allan deviation as the bias stability: B of `ImuConfig` is that over 0.664. They do
 not give random walks of the bias, which stay 0.

@@ -91,7 +91,9 @@ class _Model:
 def make_kernel(terms: tuple[tuple[str, ...], ...]) -> Any:
     """Return the kernel with the given errors, of each group."""
     to_position, to_attitude, to_yaw, to_velocity, to_rate = (error_adder(each) for each in terms)
-    name = "_and_".join("_".join(each) for each in terms)
+    name = "_and_".join(
+        "".join(term[:2] for term in each) for each in terms
+    )  # a file cannot have 255 letters
 
     @wp.kernel(module=wp.get_module(f"neurosim_core.sensors.state_estimate.{name}"), enable_backward=False)
     def measure(

@@ -384,7 +384,7 @@ class Node {
         const auto control = detail::parse_control(net::bytes(frame));
         std::optional<zmq::message_t> reply = control.is<records::StatsRequest>()
                                                   ? detail::control_frame(stats(), control.header.sequence)
-                                                  : directory_->answer(control);
+                                                  : directory_->answer(control, net::sender_of(frame));
         if (!reply) continue;
         router_.send(identity, zmq::send_flags::sndmore | zmq::send_flags::dontwait);
         router_.send(*reply, zmq::send_flags::dontwait);
