@@ -21,7 +21,7 @@ BROKEN_PIPE = 141
 _HELP_WIDTH = 78
 
 _EXAMPLES = """examples:
-  cortex doctor                                does it work here, and if not, why
+  cortex doctor                                whether all works here
   cortex top                                   topics: rate, bandwidth, losses
   cortex topics                                what is published and subscribed
   cortex info /scan                            counters, live, and the type
