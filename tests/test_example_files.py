@@ -52,7 +52,7 @@ def test_an_unknown_seam_or_kind_is_said():
 
     with pytest.raises(ValueError, match="unknown seam 'sensors', known: sensor, vehicle"):
         registry.kinds("sensors")
-    with pytest.raises(ValueError, match=r"unknown sensor kind 'sonar', known: \['depth', 'event_camera'"):
+    with pytest.raises(ValueError, match=r"unknown sensor kind 'sonar', known: .*'depth'"):
         registry.find("sensor", "sonar")
 
 
