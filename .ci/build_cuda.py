@@ -19,14 +19,14 @@ import warp as wp
 
 import neurosim_core
 from neurosim_core import run
-from neurosim_core.control import MODES, make_controller
+from neurosim_core.control import MODES, make_controller, mode_kernel
 from neurosim_core.render.antialias import antialiasing_kernel
 from neurosim_core.render.candidate_data import BLOCK
 from neurosim_core.render.frustum_search import frustum_search_kernel
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms
-from neurosim_core.sensors.displacement import rule_kernels
+from neurosim_core.sensors.displacement_kernels import rule_kernels
 from neurosim_core.sensors.event_noise import make_scan
 from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
@@ -35,6 +35,7 @@ from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.trajectory import HoverConfig, hover
 from neurosim_core.vehicle import TERMS as VEHICLE_TERMS
 from neurosim_core.vehicle import Multirotor, preset
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS
 from neurosim_core.vehicle.integrator import make_kernels as make_flight
 
 ARCHITECTURES = (80, 90)
@@ -53,13 +54,19 @@ SENSORS = {
         "accelerometer_resolution_m_s2": 1e-3,
     },
 }
+LEARN = {"torch", "gymnasium", "rsl_rl", "tensordict"}
+"""Libraries of which the CUDA build needs none."""
 
 
 def make_kernels() -> None:
     """Ask for the kernels that are made to measure."""
     for found in pkgutil.walk_packages(neurosim_core.__path__, "neurosim_core."):
         if not found.name.endswith("__main__"):
-            importlib.import_module(found.name)
+            try:
+                importlib.import_module(found.name)
+            except ModuleNotFoundError as error:  # those of the extra `learn` have no kernels
+                if (error.name or "").split(".")[0] not in LEARN:
+                    raise
     scene = {"kind": "apartment", "rooms": 1}
     for lighting in ("baked", "unshadowed"):
         for _ in run({"duration_s": 0.02, "device": "cpu", "scene": scene, "sensors": SENSORS,
@@ -91,6 +98,7 @@ def make_kernels() -> None:
         make_imu(frozenset(errors), own_seeds=True)
     for adaptive in (False, True):
         make_flight(frozenset(VEHICLE_TERMS), adaptive=adaptive)
+    mode_kernel("path", frozenset(AIR_TERMS))
     for name in ("crazyflie", "hummingbird", "racer"):
         vehicle = Multirotor(preset(name), device="cpu")
         for mode in MODES:
@@ -117,7 +125,8 @@ def main() -> int:
     modules = {k.module.name: k.module for k in kernels if k.func.__module__.startswith("neurosim_core")}
     failed = 0
     with ThreadPoolExecutor(2) as pool:
-        jobs = {name: pool.submit(build, module) for name, module in sorted(modules.items())}
+        longest_first = sorted(modules, key=lambda name: (".integrator." not in name, name))
+        jobs = {name: pool.submit(build, modules[name]) for name in longest_first}
     for name, job in jobs.items():
         error = job.exception()
         failed += error is not None

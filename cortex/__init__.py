@@ -14,6 +14,7 @@ from cortex.message import message
 if TYPE_CHECKING:
     from cortex.codec import MalformedMessage
     from cortex.context import Closed
+    from cortex.liveliness import Liveliness
     from cortex.loan import Loan
     from cortex.message import (
         Array,
@@ -47,6 +48,7 @@ _HOME = {
     "Int16": "message",
     "Int32": "message",
     "Int64": "message",
+    "Liveliness": "liveliness",
     "MalformedMessage": "codec",
     "Node": "node",
     "Policy": "policy",
@@ -78,6 +80,7 @@ __all__ = [
     "Int16",
     "Int32",
     "Int64",
+    "Liveliness",
     "Loan",
     "MalformedMessage",
     "Node",

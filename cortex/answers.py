@@ -11,7 +11,7 @@ from functools import partial
 import zmq
 
 from cortex.codec import MalformedMessage
-from cortex.control import control_types
+from cortex.control import control_types, sender_of
 from cortex.records import StatsReply, StatsRequest
 from cortex.schema import schema_of
 from cortex.service import Server
@@ -26,7 +26,7 @@ class Answers:
     Args:
         name: The node's, for what is logged.
         server: Handles requests of services.
-        registry: Answers what nodes ask a registry; None: there is no answer.
+        registry: Answers what nodes ask a registry, given a frame and its sender; None: there is no answer.
         stats: Says what the node has counted.
         wake: Called when there is a reply to be sent.
     """
@@ -36,7 +36,7 @@ class Answers:
         name: str,
         server: Server,
         *,
-        registry: Callable[[bytes], bytes | None],
+        registry: Callable[[bytes, str], bytes | None],
         stats: Callable[[], StatsReply],
         wake: Callable[[], None],
     ) -> None:
@@ -53,19 +53,19 @@ class Answers:
         """Take in what has come to a ROUTER."""
         for _ in range(256):
             try:
-                parts = router.recv_multipart(zmq.DONTWAIT)
+                parts = router.recv_multipart(zmq.DONTWAIT, copy=False)
             except zmq.Again:
                 return
             try:
                 if len(parts) != 2:
                     raise MalformedMessage(f"a control message of {len(parts)} frames")
-                self._answer(router, *parts)
+                self._answer(router, parts[0].bytes, parts[1].bytes, sender_of(parts[1]))
             except MalformedMessage as error:
                 self.rejected += 1
                 if self.rejected == 1:
                     logger.warning("%s: rejected a control frame: %s", self._name, error)
 
-    def _answer(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes) -> None:
+    def _answer(self, router: zmq.Socket[bytes], identity: bytes, frame: bytes, sender: str) -> None:
         header = unpack_header(frame)
         if header.kind == REQUEST:
             self._server.handle(frame, partial(self._reply, router, identity))
@@ -73,7 +73,7 @@ class Answers:
             parse_control(frame, control_types(StatsRequest))
             self._reply(router, identity, control_frame(self._stats(), header.sequence))
         else:
-            answer = self._registry(frame)
+            answer = self._registry(frame, sender)
             if answer is not None:
                 self._reply(router, identity, answer)
 

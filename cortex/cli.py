@@ -21,6 +21,8 @@ BROKEN_PIPE = 141
 _HELP_WIDTH = 78
 
 _EXAMPLES = """examples:
+  cortex doctor                                whether all works here
+  cortex top                                   topics: rate, bandwidth, losses
   cortex topics                                what is published and subscribed
   cortex info /scan                            counters, live, and the type
   cortex echo /scan                            messages as they come
@@ -181,6 +183,14 @@ def _add_looking(commands: Any) -> None:
         ("look", "show_topics"),
     )
     _add(commands, "nodes", "list the nodes", ("look", "show_nodes"))
+    top = _add(
+        commands,
+        "top",
+        "show all topics live: rate, bandwidth, losses, delay",
+        ("look", "show_top"),
+        details="Losses are counted since each subscriber began.",
+    )
+    top.add_argument("--once", action="store_true", help="print once and end, instead of every second")
     info = _add(
         commands,
         "info",
@@ -325,6 +335,23 @@ def _add_tools(commands: Any) -> None:
     keys.add_argument(
         "--dir", type=_directory, metavar="DIR", help="where to (cortex in XDG_CONFIG_HOME or ~/.config)"
     )
+    _add(
+        commands,
+        "doctor",
+        "check what Cortex needs on this host, and say how to mend what is wrong",
+        ("doctor", "examine"),
+        network=False,
+    ).add_argument("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
+    schema = _add(
+        commands,
+        "schema",
+        "say what sets two message types apart, and whether one may read the other",
+        ("tools", "compare"),
+        examples=["cortex schema diff robot:Scan /scan", "cortex schema diff run.mcap:/scan robot:Scan"],
+    )
+    schema.add_argument("action", choices=("diff",))
+    for which in ("old", "new"):
+        schema.add_argument(which, help="module:Type, a topic that is published, or FILE.mcap:/topic")
     cpp = _add(
         commands,
         "cpp",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from typing import Any
 
 import zmq
@@ -42,6 +44,26 @@ def make_control_socket(context: zmq.Context[Any], kind: int, *, tcp: bool) -> z
         socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
         socket.setsockopt(zmq.CONNECT_TIMEOUT, 3000)
     return socket
+
+
+def sender_of(frame: zmq.Frame) -> str:
+    """Who sent a frame: its CURVE key; else `localhost:UID:GID:PID`, or the address of another host."""
+    for name in ("User-Id", "Peer-Address"):
+        with contextlib.suppress(zmq.ZMQError):
+            found = frame.get(name)
+            if found:
+                return str(found)
+    return ""
+
+
+def watch_process(sender: str) -> int:
+    """A descriptor that becomes readable when the process of a sender ends; -1 where there is none."""
+    kind, _, rest = sender.partition(":")
+    pid = rest.rpartition(":")[2]
+    if kind == "localhost" and pid.isdigit() and int(pid):
+        with contextlib.suppress(OSError, AttributeError):  # no descriptors left; not Linux
+            return os.pidfd_open(int(pid))
+    return -1
 
 
 def try_send(socket: zmq.Socket[Any], frame: bytes) -> bool:

@@ -38,7 +38,7 @@ from cortex.records import (
     check_record,
 )
 from cortex.registry import Registry, ensure_registry, main
-from cortex.security import Keys, apply_client, check_address, host_of
+from cortex.security import Keys, apply_client, check_address, host_of, keeps_keys
 from cortex.wire import control_frame, parse_control
 
 __all__ = ["Directory", "Registry", "ensure_registry", "main"]
@@ -138,6 +138,7 @@ class Directory:
         self._own = self._next_record()
         self._known: dict[int, dict[Hashable, NodeRecord]] = {}
         self._inbound: dict[int, int] = {}
+        self._senders: dict[int, str] = {}
         self._changed: set[int] = set()
         self._logged: set[str] = set()
         self._tick_ns = time.monotonic_ns()
@@ -233,15 +234,19 @@ class Directory:
                 self._beat(link, now_ns)
             self._expire(link, now_ns)
         for node in [n for n, seen_ns in self._inbound.items() if now_ns - seen_ns > LEASE_NS]:
-            del self._inbound[node]
-            self._drop(_INBOUND, node)
+            self._forget_inbound(node)
         self._flush()
 
-    def answer(self, frame: bytes) -> bytes | None:
+    def answer(self, frame: bytes, sender: str = "") -> bytes | None:
         """Answer a control frame that came to this node's own ROUTER.
 
         It is for `Describe`, and for the `Hello`, `Heartbeat` and `Leave` of nodes that have this one as
-        static peer: they become known here too, for as long as they send heartbeats.
+        static peer: they become known here too, for as long as they send heartbeats. A node belongs to who
+        came with it first.
+
+        Args:
+            frame: What has come.
+            sender: Whence it came; see `sender_of`.
 
         Returns:
             The frame to send back; None if there is nothing to say.
@@ -257,8 +262,11 @@ class Directory:
             node = message.record.node
             if len(frame) > RECORD_BYTES_MAX:
                 reply = Refused(node, f"a record of {len(frame)} bytes, allowed are {RECORD_BYTES_MAX}")
+            elif not self._may_change(message.record, sender):
+                reply = Refused(node, "it is the node of another process or key")
             elif node in self._inbound or len(self._inbound) < NODES_MAX:
                 self._inbound[node] = now_ns
+                self._senders[node] = sender
                 self._put(_INBOUND, message.record)
                 reply = Changed(0, self._own)
             else:
@@ -272,15 +280,22 @@ class Directory:
             else:
                 reply = Alive(self._own.node, 0, known.revision if known else 0)
         elif isinstance(message, Leave):
-            self._inbound.pop(message.node, None)
-            self._drop(_INBOUND, message.node)
-            for link in self._links:
-                if not link.is_registry and message.node in link.nodes:
-                    self._drop(link, message.node)
+            known_record = self.nodes.get(message.node) if message.node in self._inbound else None
+            if known_record is not None and self._may_change(known_record, sender):
+                self._forget_inbound(message.node)
+                for link in self._links:
+                    if not link.is_registry and message.node in link.nodes:
+                        self._drop(link, message.node)
         else:
             reply = Changed(0, self._own)
         self._flush()
         return None if reply is None else control_frame(reply, header.sequence)
+
+    def _may_change(self, record: NodeRecord, sender: str) -> bool:
+        """Whether a sender may speak for a node: it did so first, and its keys are those that are known."""
+        known = self.nodes.get(record.node, record)
+        is_first = self._senders.get(record.node, sender) == sender
+        return is_first and keeps_keys(record, sender) and keeps_keys(known, sender)
 
     def close(self) -> None:
         """Take leave, and close the sockets."""
@@ -460,6 +475,11 @@ class Directory:
             if isinstance(holder, _Link):
                 holder.nodes.add(record.node)
             self._choose(record.node)
+
+    def _forget_inbound(self, node: int) -> None:
+        self._inbound.pop(node, None)
+        self._senders.pop(node, None)
+        self._drop(_INBOUND, node)
 
     def _drop(self, holder: Hashable, node: int) -> None:
         if isinstance(holder, _Link):

@@ -121,8 +121,11 @@ class Fanout:
                 self.route()
                 return
 
-    def resume(self, outlet: Outlet, sequence: int) -> None:
-        """A reader that was too late has caught up to a sequence."""
+    def resume(self, outlet: Outlet, reader: int, sequence: int) -> None:
+        """A reliable reader has accounted for all below a sequence."""
+        for each in self.readers.values():
+            if each.request.reader == reader:
+                each.confirmed = max(each.confirmed, sequence)
         if sequence >= self.late.get(outlet, 0):  # else it was too late once more since
             self.late.pop(outlet, None)
             self.route()
@@ -245,9 +248,14 @@ class Fanout:
         if waited_s >= self._tell_again_s:
             self._tell_again_s = waited_s + TELL_AGAIN_S
             self._untold = [each for each in self._untold if not each.try_send(last) or each in self.late]
-        timeouts_s = [r.timeout_s for r in self.readers.values() if r.outlet in self._untold]
-        told = not self._untold or waited_s >= max([linger_s, *timeouts_s])
+        behind = [r for r in self.readers.values() if r.outlet in self._untold or self._owes(r)]
+        told = not (self._untold or behind) or waited_s >= max([linger_s, *(r.timeout_s for r in behind)])
         return written and told
+
+    def _owes(self, reader: Reader) -> bool:
+        """Whether a reader has yet to say that it has everything: a socket may lose what it has taken."""
+        confirms = reader.request.confirms and reader.outlet.strict and reader.pipe is None
+        return confirms and reader.confirmed < self._gate.sequence
 
     def give_up(self) -> None:
         """Let readers that had too little time count what they lost."""
@@ -258,7 +266,8 @@ class Fanout:
         for reader in unfinished:  # their pipes are full, their sockets are not
             answer = AttachAnswer(sequence, reader.column, (), b"")
             reader.outlet.try_send(answer_frame(reader.key, answer))
-        count = sum(reader.request.strict for reader in unfinished)
+        unconfirmed = sum(map(self._owes, self.readers.values()))
+        count = unconfirmed + sum(reader.request.strict for reader in unfinished)
         if count:
             self._outlets.note(
                 f"{self._topic}: {count} reliable subscribers had no time to read everything at the end"

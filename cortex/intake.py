@@ -86,11 +86,11 @@ class Intake:
                 try:
                     frame = receive(DONTWAIT)
                 except zmq.Again:
-                    if link.receive is not receive:  # what came has told it to read elsewhere
-                        unread.append(link)
                     break
                 self.accept(link, frame, timed=count & 7 == 0)
-                if not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns:
+                moved = link.receive is not receive  # what came has told it to read elsewhere: that first
+                overtaken = not reliable and queue and queue[-1].publish_ns + link.clock_offset_ns > begin_ns
+                if moved or overtaken:
                     unread.append(link)
                     break
             else:

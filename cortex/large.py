@@ -72,6 +72,8 @@ class Reader:
     """Its pipe was full for too long: it holds up nothing until it has room again."""
     has_last: bool = False
     """The last frame of all was given to its pipe."""
+    confirmed: int = 0
+    """It has accounted for all messages below this."""
 
     @property
     def timeout_s(self) -> float:

@@ -124,6 +124,8 @@ class Link:
         """The publisher writes to no ring of a lower number any more."""
         self._reached = 0
         """The highest sequence that the publisher is known to have reached."""
+        self._told = -1
+        """The sequence that the publisher last said would come next."""
         self._column: int | None = None
         self._large_subscribed = True
         self._complained: set[str] = set()
@@ -159,6 +161,8 @@ class Link:
     def _ask(self, *, shared_memory: bool) -> None:
         policy = self._policy
         self._reader = secrets.randbits(64) or 1
+        # What is in our own process cannot get lost on its way.
+        self._confirms = policy.reliable and not self.address.startswith("inproc:")
         if shared_memory and self._directory is not None:
             try:
                 self._offer = Offer(self._directory, self._reader)
@@ -171,6 +175,7 @@ class Link:
             policy.reliable,
             min(policy.depth + 2, 255),
             min(int(policy.timeout_s * 1000.0), 2**32 - 1),
+            self._confirms,
         )
         self._key = attach_key(key, stamped=self._stamped)
         self.socket.subscribe(self._key)
@@ -223,11 +228,22 @@ class Link:
             for ring in self._rings.values():
                 ring.heal(sequence)
             if self._policy.reliable:
-                key = resume_key(self.source, self._reader, sequence, stamped=self._stamped)
-                self.socket.subscribe(key)
-                self.socket.unsubscribe(key)
+                self._confirm(sequence)
         self.expected = sequence + count
         return True
+
+    def _confirm(self, sequence: int) -> None:
+        """Tell the publisher that all below a sequence is accounted for."""
+        key = resume_key(self.source, self._reader, sequence, stamped=self._stamped)
+        self.socket.subscribe(key)
+        self.socket.unsubscribe(key)
+
+    def _count_to(self, sequence: int) -> None:
+        """The publisher says which sequence comes next."""
+        if self.advance(sequence, 0):
+            self._told = sequence
+            if self._confirms and self._pipe is None:
+                self._confirm(sequence)
 
     def _check(self, fingerprint: int, size: int) -> None:
         if fingerprint != self.codec.fingerprint:
@@ -269,7 +285,8 @@ class Link:
         leased = self._column is not None and bool(mask >> self._column & 1)
         if view is None or not leased:
             if self._large_subscribed or sequence < self.expected:
-                return []  # it comes, or came, as a large message
+                self._reached = max(self._reached, sequence + 1)
+                return []  # it comes, or came, as a large message; lost if the publisher ends before
             if view is None or self._policy.reliable:
                 if self.advance(sequence):  # left out on purpose: the publisher held us to our share
                     self.counters.lost += 1
@@ -294,7 +311,7 @@ class Link:
         if size != len(frame) - HEADER_SIZE or (count == 0) != (size == 0):
             raise MalformedMessage(f"a batch of {len(frame)} bytes that says its records have {size}")
         if not count:
-            self.advance(first, 0)
+            self._count_to(first)
             return []
         fixed = self.codec.fixed_size
         if self.whole_batches and fixed is not None:
@@ -334,7 +351,9 @@ class Link:
         except MalformedMessage as error:
             self.reject(str(error))
             return
-        if self.advance(first, count):
+        if not count:
+            self._count_to(first)
+        elif self.advance(first, count):
             messages.extend(decoded)
 
     def _records(self, frame: bytes, first: int, count: int) -> list[Item]:
@@ -370,6 +389,7 @@ class Link:
         first = not self.attached
         self.attached = True
         self._reached = max(self._reached, answer.sequence)
+        self._told = max(self._told, answer.sequence)
         self._column = answer.column
         if answer.column is None and not self._large_subscribed:
             self.socket.subscribe(self._large_head)
@@ -405,6 +425,14 @@ class Link:
             self._offer.silence()
         for head in (self._message_prefix, self.batch_head, self._slot_head):
             self.socket.subscribe(head)
+
+    @property
+    def carrier(self) -> str:
+        """How messages come: the transport, and what carries them on this host."""
+        parts = [self.address.partition("://")[0]]
+        parts += ["pipe"] if self._pipe is not None else []
+        parts += ["shared memory"] if self._column is not None else []
+        return ", ".join(parts)
 
     @property
     def fds(self) -> tuple[int, ...]:
@@ -494,10 +522,19 @@ class Link:
         self._column = None
         self._ask(shared_memory=False)
 
+    def leave(self) -> None:
+        """The publisher has left: what it wrote into our pipe counts, also if its answer never came."""
+        if not self.attached and self._offer is not None and self._offer.taken():
+            self.attached = True
+            self._use_pipe(self._offer)
+
     def end(self) -> None:
         """The publisher has left, and all that came of it was read: what it has published besides is lost."""
         if 0 <= self.expected < self._reached:
             self.advance(self._reached, 0)
+        if self._policy.reliable and self.expected > max(self._told, 0):
+            self.counters.cut_off += 1
+            logger.warning("%s: a publisher ended without saying how much it had sent", self.record.topic)
 
     def close(self) -> None:
         """Disconnect. Messages that the user still holds stay valid.

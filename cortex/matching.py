@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 import zmq
 
-from cortex.codec import codec_of
+from cortex.codec import Codec, codec_of
+from cortex.evolution import EvolvedCodec, is_evolved
 from cortex.link import Link
 from cortex.places import Reach, reach
 from cortex.records import NodeRecord, PublisherRecord
@@ -16,6 +17,7 @@ from cortex.schema import Schema, SchemaError, TypeMismatch, type_from_schema
 from cortex.security import Keys
 from cortex.service import Place
 from cortex.subscriber import Subscriber
+from cortex.topic import is_pattern, matches
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +48,7 @@ class Matcher:
             publisher.source: (node, publisher)
             for node in (own, *peers)
             for publisher in node.publishers
-            if publisher.topic == subscriber.topic
+            if matches(subscriber.topic, publisher.topic)
         }
         subscriber.refused &= wanted.keys()
         present = subscriber.sources()
@@ -66,12 +68,16 @@ class Matcher:
             if schema.fingerprint != publisher.fingerprint:
                 raise SchemaError("its fingerprint is another")
             codec = subscriber.codec or codec_of(type_from_schema(schema))
+            if codec.fingerprint != schema.fingerprint and is_evolved(codec.schema, schema):
+                codec = cast(Codec, EvolvedCodec(schema, codec.type))
         except (SchemaError, ValueError, TypeError) as error:
             subscriber.refused.add(publisher.source)
             logger.warning("%s of %s: unreadable schema: %s", publisher.topic, node.name, error)
             return
         if codec.fingerprint != publisher.fingerprint:
             subscriber.refused.add(publisher.source)
+            if is_pattern(subscriber.topic):
+                return  # it asks for topics of its type
             what = (
                 f"{publisher.topic}: node {node.name!r} publishes another type than this subscriber expects"
             )

@@ -26,6 +26,7 @@ from cortex.control import control_types
 from cortex.discovery import Directory
 from cortex.flusher import Flusher
 from cortex.host import domain_id, host_id
+from cortex.liveliness import Liveliness, Watch
 from cortex.matching import Matcher
 from cortex.outlet import Outlets
 from cortex.overview import (
@@ -46,7 +47,7 @@ from cortex.schema import Schema, schema_of
 from cortex.security import Keys
 from cortex.service import Client, Place, Server, Service, service_number
 from cortex.subscriber import Subscriber
-from cortex.topic import check_topic
+from cortex.topic import check_pattern, check_topic, matches
 from cortex.wakeup import Wakeup
 from cortex.wire import control_frame, parse_control
 
@@ -73,6 +74,7 @@ class Node:
         domain: Nodes of one domain see each other; None takes `CORTEX_DOMAIN`, else 0.
         registry: "auto" (the one of this host, started if there is none), "off", or "tcp://host:port".
         listen: Address to be reached at over tcp, such as "192.168.1.5" or "0.0.0.0"; None: this host only.
+            Without `keys` also "127.0.0.1" lets every user of this host read and call this node.
         peers: Control addresses of nodes to talk to without a registry.
         keys: CURVE keys for tcp, from `cortex.security.load_keys`.
         insecure: Allow plain tcp beyond this host.
@@ -103,6 +105,7 @@ class Node:
         self._outlets = Outlets()
         self._publishers: list[Publisher[Any]] = []
         self._subscribers: list[Subscriber[Any]] = []
+        self._watches: list[Watch] = []
         self._clients: weakref.WeakSet[Client[Any, Any]] = weakref.WeakSet()
         self._callbacks = CallbackThread(name)
         self._flusher = Flusher(name)
@@ -212,8 +215,11 @@ class Node:
         """Subscribe to a topic.
 
         Args:
-            topic: Like "/front/image"; exact, there are no wildcards.
-            message_type: A class made by `@message`; None takes whatever type each publisher has.
+            topic: Like "/front/image". In a pattern `*` stands for one part of a name, `**` for any number:
+                "/*/imu", "/drone/**". `recv_with_info` says which topic a message is of. A pattern passes
+                over topics of other types.
+            message_type: A class made by `@message`; None takes whatever type each publisher has. A publisher
+                may have further optional fields at the end, or lack ours, which are None then.
             callback: Called with every message on the node's callback thread; None: use `recv` or iterate.
             policy: What to do when messages come faster than they are taken; None: `keep_last(64)`.
         """
@@ -223,7 +229,7 @@ class Node:
         if callback is not None and not callable(callback):
             raise TypeError(f"callback must be a function of one message, got {callback!r:.80}")
         subscriber: Subscriber[T] = Subscriber(
-            check_topic(topic),
+            check_pattern(topic),
             None if message_type is None else codec_of(message_type),
             keep_last() if policy is None else policy,
             callback=callback,
@@ -274,6 +280,34 @@ class Node:
         client = Client(name, request_type, reply_type, partial(self._find_service, name, number, expected))
         self._clients.add(client)
         return client
+
+    def watch(self, pattern: str, callback: Callable[[Liveliness], object]) -> Callable[[], None]:
+        """Be told, on the callback thread, of each publisher that comes, leaves or dies.
+
+        Those that are there already come first. A process that dies on this host is known within
+        milliseconds, one on another host after a second.
+
+        Args:
+            pattern: A topic, or a pattern of topics as for `subscriber`.
+            callback: Called with each change.
+
+        Returns:
+            A function that ends it.
+        """
+        self._check_open()
+        watch = Watch(pattern, callback)
+        with self._lock:
+            self._watches.append(watch)
+        self._callbacks.serve()
+        self._tell_watches()
+
+        def stop() -> None:
+            watch.stopped = True
+            with self._lock:
+                if watch in self._watches:
+                    self._watches.remove(watch)
+
+        return stop
 
     @property
     def rejected(self) -> int:
@@ -380,7 +414,7 @@ class Node:
         with self._lock:
             self._publishers.append(publisher)
             for subscriber in self._subscribers:
-                if subscriber.topic == publisher.topic:
+                if matches(subscriber.topic, publisher.topic):
                     self._match(subscriber)
         if coalesce:
             self._flusher.add(publisher)
@@ -393,7 +427,7 @@ class Node:
             if publisher in self._publishers:
                 self._publishers.remove(publisher)
             for subscriber in self._subscribers:
-                if subscriber.topic == publisher.topic:
+                if matches(subscriber.topic, publisher.topic):
                     self._match(subscriber)
         self._announce()
 
@@ -408,6 +442,15 @@ class Node:
         if not self._closed:
             self._directory.announce()
             self._hurry()
+            self._tell_watches()
+
+    def _tell_watches(self) -> None:
+        with self._lock:
+            if self._watches and not self._closed:
+                records = list(self._known().values())
+                for watch in self._watches:
+                    for change in watch.changes(records):
+                        self._callbacks.submit(partial(watch.tell, change))
 
     def _wake(self) -> None:
         """Have the control thread look at once, unless it is that which calls."""
@@ -446,6 +489,7 @@ class Node:
                     self._match(subscriber)
                 except Exception:  # one that cannot be connected must not take the others along
                     logger.exception("%s: cannot connect the subscriber of %s", self.name, subscriber.topic)
+        self._tell_watches()
         self._busy_until_ns = time.monotonic_ns() + BUSY_NS
 
     def _match(self, subscriber: Subscriber[Any]) -> None:

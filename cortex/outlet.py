@@ -36,8 +36,8 @@ class Attachable(Protocol):
         """A reader has left or died."""
         ...
 
-    def resume(self, outlet: Outlet, sequence: int) -> None:
-        """A reliable reader that was too late has seen what it lost, and reads from this sequence on."""
+    def resume(self, outlet: Outlet, reader: int, sequence: int) -> None:
+        """A reliable reader has accounted for all below a sequence."""
         ...
 
 
@@ -185,7 +185,7 @@ class Outlets:
         if request is None:
             resumed = parse_resume_key(key)
             if resumed is not None and event[0] == 1 and resumed[0] in self._publishers:
-                self._publishers[resumed[0]].resume(outlet, resumed[1])
+                self._publishers[resumed[0]].resume(outlet, *resumed[1:])
             return
         publisher = self._publishers.get(request.source)
         if publisher is None:

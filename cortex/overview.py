@@ -18,6 +18,7 @@ from cortex.schema import schema_of
 from cortex.service import Service
 from cortex.stats import array_of
 from cortex.subscriber import Subscriber
+from cortex.topic import matches
 
 
 class TopicInfo(NamedTuple):
@@ -44,7 +45,7 @@ def topics_of(records: Iterable[NodeRecord]) -> list[TopicInfo]:
             found[pub.topic, pub.fingerprint] = info._replace(publishers=(*info.publishers, node.name))
     for node in records:
         for sub in node.subscribers:
-            keys = [k for k in found if k[0] == sub.topic and sub.fingerprint in (0, k[1])]
+            keys = [k for k in found if matches(sub.topic, k[0]) and sub.fingerprint in (0, k[1])]
             for key in keys or [(sub.topic, sub.fingerprint)]:
                 info = found.get(key) or TopicInfo(sub.topic, sub.type_name, sub.fingerprint, "", (), ())
                 found[key] = info._replace(subscribers=(*info.subscribers, node.name))

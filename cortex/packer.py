@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 from cortex.codec import Codec, MalformedMessage
 from cortex.native import make_coder
 from cortex.outlet import DONTWAIT
-from cortex.raw import RawMessage
 from cortex.stats import note_latency
 from cortex.wire import HEAD_SIZE, HEADER_SIZE, REST
 
@@ -35,7 +34,7 @@ class Reader(NamedTuple):
 
 def coder_of(codec: Codec, head: bytes) -> Any:
     """Return what packs and reads one publisher's messages in C; None: Python does."""
-    return None if codec.type is RawMessage else make_coder(codec.schema, codec.type, head)
+    return make_coder(codec.schema, codec.type, head) if isinstance(codec, Codec) else None
 
 
 def make_reader(codec: Codec, head: bytes) -> Reader:

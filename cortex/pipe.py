@@ -335,9 +335,10 @@ class Offer:
         return reader
 
     def silence(self) -> None:
-        """Read no more: the descriptor stays valid, as others may wait for it, but nothing comes there."""
+        """Read no more: the descriptor stays valid, as others may wait for it or read it, but is silent."""
         self._unlink()
         for fd, quiet in zip(self._fds, os.pipe(), strict=True):
+            os.set_blocking(quiet, False)
             os.dup2(quiet, fd, inheritable=False)
             os.close(quiet)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cortex.codec import MalformedMessage
 from cortex.message import Array, Int64, UInt32, UInt64, message
-from cortex.topic import check_topic
+from cortex.topic import check_pattern, check_topic
 
 
 @message(name="cortex/PublisherRecord")
@@ -230,12 +230,13 @@ def check_record(record: NodeRecord) -> None:
         raise MalformedMessage("a node, its revision and its sources must not be 0")
     if abs(record.clock_offset_ns) >= CLOCK_OFFSET_MAX_NS:
         raise MalformedMessage(f"a clock offset of {record.clock_offset_ns} ns is not one")
-    topics = [p.topic for p in record.publishers] + [s.topic for s in record.subscribers]
-    for topic in topics + [s.name for s in record.services]:
-        try:
-            check_topic(topic)
-        except ValueError as error:
-            raise MalformedMessage(f"{topic[:200]!r} is not a topic") from error
+    names = [p.topic for p in record.publishers] + [s.name for s in record.services]
+    for check, given in (check_topic, names), (check_pattern, [s.topic for s in record.subscribers]):
+        for topic in given:
+            try:
+                check(topic)
+            except ValueError as error:
+                raise MalformedMessage(f"{topic[:200]!r} is not a topic") from error
     for endpoint in record.endpoints:
         for address in (endpoint.lossy, endpoint.strict, endpoint.control):
             if address and not address.startswith(f"{endpoint.transport}://"):

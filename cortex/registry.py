@@ -8,7 +8,8 @@ registry that was killed is whole again after one heartbeat of each node. Nodes 
 other directly when there is no registry (`Directory.answer`).
 
 A node whose process on this host lives is given more time than a lease, so that a long call in C, which stops
-its heartbeats, cuts no stream. A process that is dead is known by its lock, and gone after one lease.
+its heartbeats, cuts no stream. That a process of this host has ended the kernel tells at once (a pidfd), else
+its lock after one lease. Only the process, or the CURVE key, that a node came with can change its record.
 
 A registry that vanishes takes nobody with it: nodes keep what they know, and drop what a new registry has not
 confirmed within one lease.
@@ -25,7 +26,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ from cortex.control import (
     TOTAL_BYTES_MAX,
     control_types,
     make_control_socket,
+    sender_of,
+    watch_process,
 )
 from cortex.host import (
     REGISTRY_LOCK,
@@ -64,7 +67,7 @@ from cortex.records import (
     Welcome,
     check_record,
 )
-from cortex.security import Authenticator, Keys, apply_server, check_address, load_keys
+from cortex.security import Authenticator, Keys, apply_server, check_address, keeps_keys, load_keys
 from cortex.wire import control_frame, parse_control
 
 logger = logging.getLogger(__name__)
@@ -96,6 +99,10 @@ class _Entry:
     frame: bytes
     route: Route
     seen_ns: int
+    sender: str
+    """Whose node it is; see `sender_of`."""
+    process: int
+    """Readable when its process has ended; -1: not known."""
 
 
 def _differs(record: NodeRecord, entry: _Entry, route: Route) -> bool:
@@ -154,6 +161,8 @@ class Registry:
         self._bytes = 0
         self._logged: set[object] = set()
         self._sequence = 0
+        self._sender = ""
+        self._poller = zmq.Poller()
         self._stopping = False
         path = self._directory / REGISTRY_LOCK
         taken = lock or FileLock.acquire(path)
@@ -203,12 +212,11 @@ class Registry:
     def run(self) -> None:
         """Serve until `stop`, or until the last node has been gone for `linger_s`."""
         sweep(self._directory)
-        poller = zmq.Poller()
         for socket in self._sockets:
-            poller.register(socket, zmq.POLLIN)
+            self._poller.register(socket, zmq.POLLIN)
         turn_ns = busy_ns = time.monotonic_ns()
         while not self._stopping:
-            ready = poller.poll(_POLL_MS)
+            ready = dict(self._poller.poll(_POLL_MS))
             before_ns, turn_ns = turn_ns, time.monotonic_ns()
             if turn_ns - before_ns > STALL_NS:
                 for entry in self._entries.values():
@@ -217,9 +225,10 @@ class Registry:
             if not self._lock.intact:
                 logger.warning("%s was removed: another registry takes over", self._lock.path)
                 break
-            for socket, _ in ready:
-                self._drain(socket, turn_ns)
-            self._expire(turn_ns)
+            for socket in self._sockets:
+                if socket in ready:
+                    self._drain(socket, turn_ns)
+            self._expire(turn_ns, ready)
             if self._entries:
                 busy_ns = turn_ns
             elif self._linger_ns is not None and turn_ns - busy_ns > self._linger_ns:
@@ -228,6 +237,8 @@ class Registry:
 
     def close(self) -> None:
         """Release everything. A registry that starts afterwards finds nothing of this one."""
+        for entry in list(self._entries.values()):
+            self._forget(entry)
         for socket in self._sockets:
             socket.close()
         if self._authenticator is not None:
@@ -241,15 +252,15 @@ class Registry:
     def _drain(self, socket: zmq.Socket[Any], now_ns: int) -> None:
         for _ in range(_FRAMES_PER_TURN):
             try:
-                identity, *frames = socket.recv_multipart(zmq.NOBLOCK)
+                identity, *frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
-            route = (socket, identity)
+            route = (socket, identity.bytes)
             try:
                 if len(frames) != 1:
                     raise MalformedMessage(f"{len(frames)} frames where one was expected")
-                message, header = parse_control(frames[0], self._types)
-                self._sequence = header.sequence
+                message, header = parse_control(frames[0].bytes, self._types)
+                self._sequence, self._sender = header.sequence, sender_of(frames[0])
                 self._handlers[type(message)](message, len(frames[0]), route, now_ns)
             except MalformedMessage as error:
                 self.rejected += 1
@@ -291,6 +302,10 @@ class Registry:
             return f"its record has {size} bytes, {record_bytes_max} are allowed"
         if self._routes.get(route, record.node) != record.node:
             return "another node speaks on this connection"
+        if entry is not None and entry.sender != self._sender:
+            return "it is the node of another process or key"
+        if not keeps_keys(record, self._sender):
+            return "its addresses have another key than it came with"
         if entry is None and len(self._entries) >= nodes_max:
             return f"there are {nodes_max} nodes already"
         if self._bytes - (len(entry.frame) if entry else 0) + size > TOTAL_BYTES_MAX:
@@ -298,6 +313,9 @@ class Registry:
         return ""
 
     def _store(self, record: NodeRecord, route: Route, now_ns: int, old: _Entry | None) -> None:
+        process = watch_process(self._sender)
+        if process >= 0:
+            self._poller.register(process, zmq.POLLIN)
         if old is not None:
             self._forget(old)
         else:
@@ -305,7 +323,9 @@ class Registry:
         self.version += 1
         frame = control_frame(Changed(self.version, record))
         name = record.name[:200]
-        self._entries[record.node] = _Entry(record.node, record.revision, name, frame, route, now_ns)
+        self._entries[record.node] = _Entry(
+            record.node, record.revision, name, frame, route, now_ns, self._sender, process
+        )
         self._routes[route] = record.node
         self._bytes += len(frame)
         self._tell(frame, except_node=record.node)
@@ -322,16 +342,20 @@ class Registry:
         if entry is not None and entry.route == route:
             self._remove(entry, "left")
 
-    def _expire(self, now_ns: int) -> None:
+    def _expire(self, now_ns: int, ready: Mapping[Any, int]) -> None:
+        ended = [entry for entry in self._entries.values() if entry.process in ready]
         expired = [
             entry
             for entry in self._entries.values()
-            if (silent_ns := now_ns - entry.seen_ns) > LEASE_NS
+            if entry.process not in ready
+            and (silent_ns := now_ns - entry.seen_ns) > LEASE_NS
             and (silent_ns > self._stalled_ns or not node_lives(self._directory, entry.node))
         ]
+        for entry in ended:
+            self._remove(entry, "its process has ended")
         for entry in expired:
             self._remove(entry, "its lease has run out")
-        if expired:
+        if ended or expired:
             sweep(self._directory)
 
     def _remove(self, entry: _Entry, reason: str) -> None:
@@ -341,6 +365,9 @@ class Registry:
         self._tell(control_frame(Gone(self.version, entry.node, reason)), except_node=entry.node)
 
     def _forget(self, entry: _Entry) -> None:
+        if entry.process >= 0:
+            self._poller.unregister(entry.process)
+            os.close(entry.process)
         del self._entries[entry.node]
         self._routes.pop(entry.route, None)
         self._bytes -= len(entry.frame)

@@ -282,12 +282,17 @@ def describe(schema: Schema) -> str:
     return "\n".join([f"{schema.name} ({schema.fingerprint:016x})", *_describe_fields(schema, "  ")])
 
 
+def describe_field(field: Field, width: int = 0) -> str:
+    """Return the name of a field, padded, its type, unit and frame."""
+    unit = f" [{field.unit}]" if field.unit else ""
+    frame = f" in {field.frame}" if field.frame else ""
+    return f"{field.name:<{width}}  {_describe_type(field.type)}{unit}{frame}"
+
+
 def _describe_fields(schema: Schema, indent: str) -> Iterator[str]:
     names = max((len(field.name) for field in schema.fields), default=0)
     for field in schema.fields:
-        unit = f" [{field.unit}]" if field.unit else ""
-        frame = f" in {field.frame}" if field.frame else ""
-        yield f"{indent}{field.name:<{names}}  {_describe_type(field.type)}{unit}{frame}"
+        yield indent + describe_field(field, names)
         inner: FieldType = field.type
         while isinstance(inner, (OptionalType, ListType)):
             inner = inner.item

@@ -16,10 +16,13 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import zmq
 from zmq.utils import z85
+
+if TYPE_CHECKING:
+    from cortex.records import NodeRecord
 
 logger = logging.getLogger(__name__)
 
@@ -142,6 +145,11 @@ def _read_authorized(directory: Path) -> dict[str, tuple[str, ...]]:
         elif words and not line.lstrip().startswith("#"):
             raise ValueError(f"{path}:{number} must be a key of 40 characters or a comment, got {words[0]!r}")
     return known
+
+
+def keeps_keys(record: NodeRecord, sender: str) -> bool:
+    """Tell whether who has a CURVE key announces addresses with that key only."""
+    return not is_key(sender) or all(e.server_key in ("", sender) for e in record.endpoints)
 
 
 def check_address(address: str, *, keys: Keys | None, insecure: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import secrets
 import threading
@@ -236,6 +237,13 @@ class Client(Generic[Request, Reply]):
             return self._exchange(place, pack_header(header) + body, deadline_s, timeout_s)
         finally:
             self._lock.release()
+
+    async def call_async(self, request: Request, timeout_s: float = 1.0) -> Reply:
+        """Do `call` without blocking the running loop, in a thread.
+
+        A task that is cancelled meanwhile does not end the call, which goes on until its time is over.
+        """
+        return await asyncio.to_thread(self.call, request, timeout_s)
 
     def available(self) -> bool:
         """Whether somebody offers the service now."""

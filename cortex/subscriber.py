@@ -374,7 +374,7 @@ class Subscriber(Generic[T]):
     def _info(self, item: Item) -> Info:
         publish_ns = item.publish_ns + item.link.clock_offset_ns
         return Info(
-            self.topic,
+            item.link.record.topic,
             item.link.source,
             item.sequence,
             item.stamp_ns if item.link.codec.stamp_of is not None else None,
@@ -385,8 +385,8 @@ class Subscriber(Generic[T]):
 
     def _join(self, item: Item) -> np.ndarray:
         """The records of one batch, or of all single messages that wait, as one array."""
-        codec = item.link.codec
-        fixed, dtype = codec.fixed_size, codec.record_dtype
+        assert self.codec is not None
+        fixed, dtype = self.codec.fixed_size, self.codec.record_dtype
         assert fixed is not None
         assert dtype is not None
         if item.offset == WHOLE_BATCH:
@@ -395,16 +395,24 @@ class Subscriber(Generic[T]):
                 self.counters.received += item.size - 1
             records: np.ndarray = np.ndarray((item.size,), dtype, item.buffer, RECORD.size, (stride,))
             return records
-        bodies: list[Any] = [self._buffer(item)[item.offset : item.offset + item.size]]
+        bodies: list[Any] = [self._record(item, self._buffer(item))]
         with self._turn:
             while self._queue and self._queue[0].offset != WHOLE_BATCH and self._queue[0].buffer is not None:
                 more = self._queue.popleft()
                 assert more.buffer is not None
-                bodies.append(more.buffer[more.offset : more.offset + more.size])
+                bodies.append(self._record(more, more.buffer))
                 self.counters.received += 1
         if any(len(body) != fixed for body in bodies):
             raise MalformedMessage(f"a body that has not the {fixed} bytes of its type")
         return np.frombuffer(b"".join(bodies), dtype)
+
+    def _record(self, item: Item, buffer: bytes | np.ndarray) -> Any:
+        """The body of a message, in our type."""
+        if item.link.codec is self.codec or self.codec is None:
+            return buffer[item.offset : item.offset + item.size]
+        return self.codec.encode(
+            item.link.codec.decode(buffer, item.offset, item.size), self.codec.fixed_size or 0
+        )
 
     def _wait(self, timeout_s: float) -> None:
         """Sleep until a socket may have something, or `wakeup` is called."""
@@ -539,6 +547,12 @@ class Subscriber(Generic[T]):
         with self._turn:
             return sum(link.attached for link in self._links if link not in self._leaving)
 
+    @property
+    def carriers(self) -> list[str]:
+        """How the messages of each publisher come, such as "ipc, pipe, shared memory" or "tcp"."""
+        with self._turn:
+            return [link.carrier for link in self._links if link.attached]
+
     def connect(self, link: Link) -> None:
         """Add a publisher; for the node."""
         with self._turn:
@@ -573,6 +587,9 @@ class Subscriber(Generic[T]):
             for link in self._links:
                 if link.source == source and link not in self._leaving:
                     self._leaving[link] = monotonic_ns() + LEAVING_NS
+                    link.leave()
+                    self._inlet.exhausted = False
+                    self.wakeup.set()
 
     def complain(self, problem: TypeMismatch) -> None:
         """A publisher cannot be connected; the user hears of it at the next `recv`."""

@@ -185,6 +185,8 @@ class AttachKey(NamedTuple):
     strict: bool
     quota: int
     timeout_ms: int
+    confirms: bool = False
+    """It says how far it has read, when it is told how many messages there have been."""
 
 
 class RingPlace(NamedTuple):
@@ -214,6 +216,7 @@ def attach_key(key: AttachKey, *, stamped: bool) -> bytes:
     options = (
         int(key.shared_memory)
         | int(key.strict) << 1
+        | int(key.confirms) << 2
         | min(key.quota, 255) << 8
         | min(key.timeout_ms, 2**32 - 1) << 32
     )
@@ -227,20 +230,26 @@ def parse_attach_key(data: bytes) -> AttachKey | None:
     source = int.from_bytes(data[8:16], "little")
     reader, options = _KEY.unpack_from(data, PREFIX_SIZE)
     return AttachKey(
-        source, reader, bool(options & 1), bool(options & 2), (options >> 8) & 0xFF, options >> 32
+        source,
+        reader,
+        bool(options & 1),
+        bool(options & 2),
+        (options >> 8) & 0xFF,
+        options >> 32,
+        bool(options & 4),
     )
 
 
 def resume_key(source: int, reader: int, sequence: int, *, stamped: bool) -> bytes:
-    """What a reliable reader subscribes to for a moment when it has seen a gap that ended with a sequence."""
+    """What a reliable reader subscribes to for a moment: it has accounted for all below a sequence."""
     return prefix(RESUME, source, stamped=stamped) + _KEY.pack(reader, sequence)
 
 
-def parse_resume_key(data: bytes) -> tuple[int, int] | None:
-    """Source and sequence of a resume key; None if the subscription is something else."""
+def parse_resume_key(data: bytes) -> tuple[int, int, int] | None:
+    """Source, reader and sequence of a resume key; None if the subscription is something else."""
     if len(data) != KEY_SIZE or data[:4] != b"CTX" + RESUME:
         return None
-    return int.from_bytes(data[8:16], "little"), int.from_bytes(data[24:32], "little")
+    return int.from_bytes(data[8:16], "little"), *_KEY.unpack_from(data, PREFIX_SIZE)
 
 
 def pack_place(place: RingPlace) -> bytes:

@@ -27,12 +27,11 @@ from cortex_ros2_bridge.routes import (
     INFO,
     Route,
     Seen,
-    in_of,
     kind_of,
     look,
     make_routes,
     odometry_of,
-    out_of,
+    rule_of,
     shared_topics,
     unfit,
     vehicle_of,
@@ -315,7 +314,7 @@ class Bridge:
         output = Outgoing(
             route,
             publisher,
-            out_of(route),
+            rule_of(route).convert,
             self._context(route),
             latched=any(t.topic == route.cortex_topic and t.latched for t in seen.topics),
         )
@@ -336,7 +335,7 @@ class Bridge:
             (route.cortex_topic, route.cortex_type),
             lambda: self._node.publisher(route.cortex_topic, kind),
         )
-        target = Target(route, publisher, in_of(route), self._context(route))
+        target = Target(route, publisher, rule_of(route).convert, self._context(route))
         whereabouts = self._whereabouts_of(vehicle_of(route.cortex_topic))
 
         def subscribe() -> Incoming:
@@ -354,7 +353,7 @@ class Bridge:
     def _open_call(
         self, route: Route, seen: Seen, stack: contextlib.ExitStack
     ) -> tuple[Tally, Callable[[], int]]:
-        caller = Caller(route, self._node, in_of(route), self._context(route))
+        caller = Caller(route, self._node, rule_of(route).convert, self._context(route))
         stack.callback(caller.close)
         subscription = self._backend.subscription(route.ros_topic, route.ros_type, route.qos, caller.take)
         stack.callback(subscription.close)

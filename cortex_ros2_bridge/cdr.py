@@ -78,21 +78,12 @@ def decode(data: Buffer, type_name: str | type[Any]) -> Any:
 
 
 def decode_record(data: Buffer, type_name: str) -> Any:
-    """Return the message in a buffer as a plain record, which is faster; its arrays are views of the data.
-
-    Raises:
-        CdrError: As `decode`.
-        UnknownTypeError: There is no such type.
-    """
+    """Return what `decode` does as a plain record, which is faster; its arrays are views of the data."""
     return _deserialise(data, type_name, typestore())
 
 
 def record_class(type_name: str) -> Any:
-    """Return the class of plain records of a type: a dataclass without defaults; sequences are NumPy arrays.
-
-    Raises:
-        UnknownTypeError: There is no such type.
-    """
+    """Return the class of plain records of a type: a dataclass without defaults; sequences are arrays."""
     check_type(type_name)
     return typestore().types[type_name]
 

@@ -13,13 +13,12 @@ from typing import Any
 import yaml
 
 from cortex_ros2_bridge.backend.base import Qos
-from cortex_ros2_bridge.backend.names import check_node_name
+from cortex_ros2_bridge.backend.names import NAME, check_node_name
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.options import OPTIONS, check_option
 from cortex_ros2_bridge.ros_args import RosArguments, nest
 from cortex_ros2_bridge.typestore import DISTROS
 
-_ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS_TYPE = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
 _SHORT_TYPE = re.compile(r"([a-z][a-z0-9_]*)/([A-Z][A-Za-z0-9]*)")
 
@@ -36,7 +35,10 @@ ROOTED = frozenset({"/clock", "/tf", "/tf_static", "/diagnostics"})
 
 
 class ConfigError(ValueError):
-    """The settings are wrong; the message names the key, its value and what is allowed."""
+    """The settings are wrong; the message names the key, its value and what is allowed.
+
+    All that takes a key and its value here raises it.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,9 +115,6 @@ def load(
         source: A YAML file, a mapping with the same keys, or None for the defaults.
         parameters: ROS parameters by their dotted names, such as {"frames.map": "world"}; they win. Entries
             of `routes` have labels here: {"routes.imu.cortex": "/drone/imu", "routes.imu.qos": "latched"}.
-
-    Raises:
-        ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is not what it must be.
     """
     if isinstance(source, str | Path):
         try:
@@ -134,11 +133,7 @@ def load(
 
 
 def check_namespace(key: str, value: object) -> str:
-    """Return a namespace with a slash in front and none behind; "" for none.
-
-    Raises:
-        ConfigError: ROS allows no such name.
-    """
+    """Return a namespace with a slash in front and none behind; "" for none."""
     if not isinstance(value, str):
         raise ConfigError(f"{key} must be a text, got {value!r:.80}")
     text = value.strip("/")
@@ -147,15 +142,11 @@ def check_namespace(key: str, value: object) -> str:
 
 def is_ros_name(name: str) -> bool:
     """Return whether ROS allows an absolute topic of this name."""
-    return _ROS_NAME.fullmatch(name) is not None and "__" not in name and not name.endswith("_")
+    return NAME.fullmatch(name) is not None and "__" not in name and not name.endswith("_")
 
 
 def to_ros_type(key: str, value: object) -> str:
-    """Return a type as ROS 2 writes it: sensor_msgs/msg/Imu, also for sensor_msgs/Imu.
-
-    Raises:
-        ConfigError: It is not the name of a message type.
-    """
+    """Return a type as ROS 2 writes it: sensor_msgs/msg/Imu, also for sensor_msgs/Imu."""
     text = _SHORT_TYPE.sub(r"\1/msg/\2", _text(key, value)) if str(value).count("/") == 1 else value
     if not isinstance(text, str) or not _ROS_TYPE.fullmatch(text):
         raise ConfigError(f"{key} must be a ROS type such as sensor_msgs/msg/Imu, got {value!r}")
@@ -163,11 +154,7 @@ def to_ros_type(key: str, value: object) -> str:
 
 
 def qos_changes(key: str, value: object) -> dict[str, Any]:
-    """Return the elements of a quality of service that YAML sets: a name of `QOS`, or a mapping.
-
-    Raises:
-        ConfigError: It is neither, or an element is not what it must be.
-    """
+    """Return the elements of a quality of service that YAML sets: a name of `QOS`, or a mapping."""
     if isinstance(value, str):
         if value not in QOS:
             raise ConfigError(f"{key}: unknown quality of service {value!r}, known: {', '.join(QOS)}")
@@ -226,11 +213,7 @@ def _bridge_config(raw: object) -> BridgeConfig:
 
 
 def check_distro(key: str, value: object) -> str:
-    """Return the name of a distribution.
-
-    Raises:
-        ConfigError: It is not known.
-    """
+    """Return the name of a distribution."""
     text = _text(key, value)
     if text not in DISTROS:
         raise ConfigError(f"{key} must be one of {', '.join(DISTROS)}, got {text!r}")
@@ -238,11 +221,7 @@ def check_distro(key: str, value: object) -> str:
 
 
 def check_cortex_domain(key: str, value: object) -> int:
-    """Return a domain of Cortex.
-
-    Raises:
-        ConfigError: It is no integer >= 0.
-    """
+    """Return a domain of Cortex."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise ConfigError(f"{key} must be an integer >= 0, got {value!r}")
     return value

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer
-from cortex_ros2_bridge.msgs import message_class
+from cortex_ros2_bridge.convert.records import record, status_record, time_of
 from cortex_ros2_bridge.tally import Totals
 
 TOPIC = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
+_SAID = {"dropped": "events dropped by the sensor"}
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels, as in diagnostic_msgs/DiagnosticStatus."""
 
@@ -41,33 +42,20 @@ def route_status(
         reason: Why the last message was lost or refused.
         types: Which become which.
     """
-    gone = {
-        "lost": now.lost - before.lost,
-        "refused": now.refused - before.refused,
-        "clamped": now.clamped - before.clamped,
-        "events dropped by the sensor": now.dropped - before.dropped,
-    }
-    rate_hz = (now.sent - before.sent) / elapsed_s if elapsed_s > 0.0 else 0.0
+    counts = asdict(now)
+    grown = {name: count - getattr(before, name) for name, count in counts.items()}
+    gone = {_SAID.get(name, name): grown[name] for name in ("lost", "refused", "clamped", "dropped")}
+    rate_hz = grown["sent"] / elapsed_s if elapsed_s > 0.0 else 0.0
+    message = f"{rate_hz:.1f} Hz" if rate_hz else "idle"
     if any(gone.values()):
         parts = [f"{count} {what}" for what, count in gone.items() if count]
         message = f"{' and '.join(parts)} in {elapsed_s:.1f} s ({reason})"
-    else:
-        message = f"{rate_hz:.1f} Hz" if rate_hz else "idle"
+    values = {**counts, "rate_hz": f"{rate_hz:.1f}", "listeners": listeners, "types": types}
     return Status(
         name=name,
         level=WARN if any(gone.values()) else OK,
         message=message,
-        values=(
-            ("received", str(now.received)),
-            ("sent", str(now.sent)),
-            ("lost", str(now.lost)),
-            ("refused", str(now.refused)),
-            ("clamped", str(now.clamped)),
-            ("dropped", str(now.dropped)),
-            ("rate_hz", f"{rate_hz:.1f}"),
-            ("listeners", str(listeners)),
-            ("types", types),
-        ),
+        values=tuple((key, str(value)) for key, value in values.items()),
     )
 
 
@@ -79,18 +67,11 @@ def diagnostic_array(statuses: Iterable[Status], *, stamp_ns: int, node: str) ->
         stamp_ns: Time of the statuses [ns].
         node: Name of the node that says it.
     """
-    status_class = message_class("diagnostic_msgs/msg/DiagnosticStatus")
-    pair_class = message_class("diagnostic_msgs/msg/KeyValue")
-    array = message_class(TYPE)()
-    array.header.stamp.sec, array.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-    array.status = [
-        status_class(
-            level=bytes([status.level]),
-            name=f"{node}: {status.name}",
-            message=status.message,
-            hardware_id="cortex",
-            values=[pair_class(key=key, value=value) for key, value in status.values],
-        )
-        for status in statuses
-    ]
+    array = record(TYPE)(
+        record("std_msgs/msg/Header")(time_of(stamp_ns), ""),
+        [
+            status_record(each.level, f"{node}: {each.name}", each.message, "cortex", each.values)
+            for each in statuses
+        ],
+    )
     return cdr.encode(array)

@@ -82,15 +82,7 @@ class FrameNames:
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Vector:
-    """Return R(q) v.
-
-    Args:
-        q: Unit quaternion q_AB, xyzw, shape [4].
-        v: Vector in B, shape [3].
-
-    Returns:
-        The vector in A, shape [3].
-    """
+    """Return R(q) v: in A, of a unit quaternion q_AB (xyzw) and a vector in B."""
     x, y, z, w = np.asarray(q, np.float64).tolist()
     a, b, c = np.asarray(v, np.float64).tolist()
     # v + 2 u x (u x v + w v) with u = (x, y, z), written out: np.cross takes ten times as long.
@@ -99,15 +91,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Vector:
 
 
 def rotate_back(q: ArrayLike, v: ArrayLike) -> Vector:
-    """Return R(q)^T v.
-
-    Args:
-        q: Unit quaternion q_AB, xyzw, shape [4].
-        v: Vector in A, shape [3].
-
-    Returns:
-        The vector in B, shape [3].
-    """
+    """Return R(q)^T v: in B, of a unit quaternion q_AB (xyzw) and a vector in A."""
     x, y, z, w = np.asarray(q, np.float64).tolist()
     return rotate((-x, -y, -z, w), v)
 

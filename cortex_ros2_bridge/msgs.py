@@ -114,6 +114,7 @@ class Message:
         return f"{package}.{kind}.{name}({', '.join(texts)})"
 
 
+@functools.cache
 def message_class(type_name: str) -> Any:
     """Return the class of a message type: that of ROS if it can be imported, else a stand-in.
 
@@ -123,11 +124,6 @@ def message_class(type_name: str) -> Any:
     Raises:
         UnknownTypeError: There is no such type.
     """
-    return _message_class(type_name)
-
-
-@functools.cache
-def _message_class(type_name: str) -> Any:
     real = _ros_class(type_name)
     if real is not None:
         return real

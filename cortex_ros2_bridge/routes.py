@@ -17,13 +17,10 @@ import cortex.messages
 from cortex import Node
 from cortex.schema import schema_of
 from cortex.service import service_number
-from cortex_ros2_bridge import convert
 from cortex_ros2_bridge.backend.base import Qos
-from cortex_ros2_bridge.config import QOS, BridgeConfig, RouteChange, is_ros_name
-from cortex_ros2_bridge.convert.context import In, Out
-from cortex_ros2_bridge.convert.registry import ADDED, PACKETS, Direction, Rule, adopt
-from cortex_ros2_bridge.convert.registry import IN as ADDED_IN
-from cortex_ros2_bridge.convert.registry import OUT as ADDED_OUT
+from cortex_ros2_bridge.config import BridgeConfig, RouteChange, is_ros_name
+from cortex_ros2_bridge.convert import RULES
+from cortex_ros2_bridge.convert.registry import ADDED, Direction, Rule, adopt
 
 CORTEX_TYPES: Mapping[str, type[Any]] = {
     schema_of(kind).name: kind
@@ -65,59 +62,8 @@ class Route:
         return f"{self.cortex_topic} {arrow} {self.ros_topic}"
 
 
-STREAM = Qos(depth=1000)
-"""Many small messages: at 1 kHz a subscriber may sleep for a second."""
-FRAMES = Qos(depth=10)
-"""Few large messages."""
-NEWEST = Qos(depth=1)
-
-RULES: tuple[Rule, ...] = (
-    Rule("cortex/Clock", "rosgraph_msgs/msg/Clock", "out", "{topic}"),
-    Rule("cortex/Imu", "sensor_msgs/msg/Imu", "out", "{topic}", STREAM),
-    Rule("cortex/Odometry", "nav_msgs/msg/Odometry", "out", "{topic}", STREAM),
-    Rule("cortex/Odometry", "tf2_msgs/msg/TFMessage", "out", "/tf", STREAM),
-    Rule("cortex/Transform", "tf2_msgs/msg/TFMessage", "out", "/tf_static", QOS["latched"]),
-    Rule("cortex/Image", "sensor_msgs/msg/Image", "out", "{topic}/image_raw", FRAMES),
-    Rule("cortex/Image", "sensor_msgs/msg/CameraInfo", "out", "{topic}/camera_info"),
-    Rule("cortex/Image", "sensor_msgs/msg/PointCloud2", "out", "{topic}/points", FRAMES, default=False),
-    Rule("cortex/Events", "event_camera_msgs/msg/EventPacket", "out", "{topic}", PACKETS),
-    Rule("cortex/Events", "sensor_msgs/msg/Image", "out", "{topic}/image", FRAMES),
-    Rule("cortex/Events", "sensor_msgs/msg/CameraInfo", "out", "{topic}/camera_info"),
-    Rule("cortex/Events", "dvs_msgs/msg/EventArray", "out", "{topic}/event_array", PACKETS, default=False),
-    Rule("cortex/CameraInfo", "sensor_msgs/msg/CameraInfo", "out", "{parent}/camera_info", QOS["latched"]),
-    Rule("cortex/PointCloud", "sensor_msgs/msg/PointCloud2", "out", "{topic}", FRAMES),
-    Rule("cortex/RotorSpeeds", "actuator_msgs/msg/Actuators", "out", "{topic}", STREAM),
-    Rule("cortex/Path", "nav_msgs/msg/Path", "out", "{topic}", QOS["latched"]),
-    Rule("cortex/Text", "std_msgs/msg/String", "out", "{topic}"),
-    Rule("cortex/Collision", "neurosim/msg/Collision", "out", "{topic}"),
-    Rule("cortex/Simulation", "std_msgs/msg/String", "out", "{topic}", QOS["latched"]),
-    Rule("cortex/SimulatorStatus", "neurosim/msg/SimulatorStatus", "out", "{topic}"),
-    Rule("cortex/SimulatorStatus", "diagnostic_msgs/msg/DiagnosticArray", "out", "/diagnostics"),
-    Rule("cortex/MotorCommand", "actuator_msgs/msg/Actuators", "in", "{base}/actuators", NEWEST),
-    Rule(
-        "cortex/RateThrustCommand", "mavros_msgs/msg/AttitudeTarget", "in", "{base}/attitude_target", NEWEST
-    ),
-    Rule("cortex/AttitudeCommand", "mavros_msgs/msg/AttitudeTarget", "in", "{base}/attitude_target", NEWEST),
-    Rule("cortex/VelocityCommand", "geometry_msgs/msg/Twist", "in", "{base}/cmd_vel", NEWEST),
-    Rule("cortex/VelocityCommand", "geometry_msgs/msg/TwistStamped", "in", "{base}/command_velocity", NEWEST),
-    Rule("cortex/PoseCommand", "geometry_msgs/msg/PoseStamped", "in", "{base}/command_pose", NEWEST),
-    Rule(
-        "cortex/PoseCommand",
-        "trajectory_msgs/msg/MultiDOFJointTrajectory",
-        "in",
-        "{base}/command_trajectory",
-        NEWEST,
-    ),
-    Rule("cortex/Reset", "std_msgs/msg/Empty", "call", "{topic}"),
-    Rule("cortex/Reset", "neurosim/msg/Reset", "call", "{topic}_to"),
-    Rule("cortex/Step", "std_msgs/msg/UInt32", "call", "{topic}"),
-    Rule("cortex/Trigger", "std_msgs/msg/Empty", "call", "{topic}"),
-)
-"""The table. A row for a service has the type of its request."""
-
-
 def rules() -> tuple[Rule, ...]:
-    """Return all rules: those of the table, and those of types that were added."""
+    """Return all rules: those of the bridge, and those of types that were added."""
     return (*RULES, *(rule for added in ADDED.values() for rule in added.rules))
 
 
@@ -126,18 +72,11 @@ def kind_of(type_name: str) -> type[Any] | None:
     return CORTEX_TYPES[type_name] if type_name in CORTEX_TYPES else ADDED[type_name].kind
 
 
-def out_of(route: Route) -> Out:
-    """Return the conversion of a route to ROS."""
-    key = route.cortex_type, route.ros_type
-    return (
-        ADDED_OUT[key] if key in ADDED_OUT else convert.OUT[CORTEX_TYPES[route.cortex_type], route.ros_type]
-    )
-
-
-def in_of(route: Route) -> In:
-    """Return the conversion of a route from ROS."""
-    key = route.ros_type, route.cortex_type
-    return ADDED_IN[key] if key in ADDED_IN else convert.IN[route.ros_type, CORTEX_TYPES[route.cortex_type]]
+def rule_of(route: Route) -> Rule:
+    """Return the rule of a route: of several, that which was added last."""
+    key = route.cortex_type, route.ros_type, route.direction
+    found: Rule = next(rule for rule in reversed(rules()) if rule[:3] == key)
+    return found
 
 
 _TF_SOURCES = ("odometry", "odom")
@@ -190,11 +129,6 @@ def look(node: Node) -> Seen:
     return Seen(tuple(topics[key] for key in sorted(topics)), tuple(sorted(services)))
 
 
-def default_routes(seen: Seen) -> list[Route]:
-    """Return the routes of the standard topics, without what settings change."""
-    return [route for route, rule in _candidates(seen) if rule.default]
-
-
 def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str]]:
     """Return the routes that there are now, and what is wrong with others.
 
@@ -205,7 +139,7 @@ def make_routes(seen: Seen, config: BridgeConfig) -> tuple[list[Route], list[str
     Returns:
         Routes in the order of their topics, and a sentence for each topic or setting that has none.
     """
-    problems = _adopt(seen, config) + _unknown_types(seen, config)
+    problems = _adopt(seen, config)
     routes: list[Route] = []
     images: dict[str, str] = {}
     unused = {(n, name): set[str]() for n, change in enumerate(config.routes) for name in change.options}
@@ -229,10 +163,8 @@ def shared_topics(config: BridgeConfig) -> frozenset[str]:
 
 def known_options(route: Route) -> frozenset[str]:
     """Return the names of the options that a route has."""
-    if route.direction == "out":
-        return convert.OPTIONS.get(out_of(route), frozenset()) | {"queue"}
-    known = convert.OPTIONS.get(in_of(route), frozenset())
-    return known | {"stale_s", "stamp"} if route.direction == "in" else known
+    more = {"out": {"queue"}, "in": {"stale_s", "stamp"}, "call": set[str]()}
+    return rule_of(route).options | more[route.direction]
 
 
 def unfit(seen: Seen, config: BridgeConfig) -> list[str]:
@@ -428,30 +360,20 @@ def _without_conflicts(routes: Iterable[Route], problems: list[str], shared: fro
 
 
 def _adopt(seen: Seen, config: BridgeConfig) -> list[str]:
-    """Let published types cross that nothing is registered for; say which cannot."""
+    """Let published types cross that nothing is registered for; say which topics cannot be converted."""
     problems = []
     for topic in seen.topics:
-        known = topic.type_name in CORTEX_TYPES or topic.type_name in ADDED
-        if topic.schema and not known and _wanted(topic.topic, config):
-            reason = adopt(topic.schema, topic.fingerprint)
-            if reason:
-                problems.append(f"no route for {topic.topic} of type {topic.type_name}: {reason}")
-    return problems
-
-
-def _unknown_types(seen: Seen, config: BridgeConfig) -> list[str]:
-    """Say which published topics cannot be converted."""
-    problems = []
-    for topic in seen.topics:
-        if not topic.published or _is_known(topic) or not _wanted(topic.topic, config):
+        if not topic.published or not _wanted(topic.topic, config):
             continue
-        if topic.schema and topic.type_name not in (*CORTEX_TYPES, *ADDED):
-            continue  # `_adopt` says why
-        if topic.type_name in (*CORTEX_TYPES, *ADDED):
-            what = f"its {topic.type_name} is of another version ({topic.fingerprint:016x}) than ours"
-        else:
-            what = f"nothing converts its type {topic.type_name}"
-        problems.append(f"no route for {topic.topic}: {what}")
+        name = topic.type_name
+        if name in CORTEX_TYPES or name in ADDED:
+            if not _is_known(topic):
+                what = f"its {name} is of another version ({topic.fingerprint:016x}) than ours"
+                problems.append(f"no route for {topic.topic}: {what}")
+        elif not topic.schema:
+            problems.append(f"no route for {topic.topic}: nothing converts its type {name}")
+        elif reason := adopt(topic.schema, topic.fingerprint):
+            problems.append(f"no route for {topic.topic} of type {name}: {reason}")
     return problems
 
 

@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurosim_core import packets, registry, scene, sensors
+    from neurosim_core import data, learn, packets, registry, scene, sensors
     from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
     from neurosim_core.control.setpoints import AttitudeThrust, BodyRates, MotorSpeeds, Position, Velocity
     from neurosim_core.frames import Mount
@@ -51,7 +51,7 @@ _HOMES = {
     "neurosim_core.sim.state": ("State", "make_state"),
     "neurosim_core.vehicle": ("DynamicsError", "Multirotor", "MultirotorConfig", "preset"),
 }
-_MODULES = ("packets", "registry", "scene", "sensors")
+_MODULES = ("data", "learn", "packets", "registry", "scene", "sensors")
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
@@ -79,6 +79,8 @@ __all__ = [
     "SimulationConfig",
     "State",
     "Velocity",
+    "data",
+    "learn",
     "load_config",
     "make_model",
     "make_renderer",

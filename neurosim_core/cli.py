@@ -1,4 +1,4 @@
-"""The command `neurosim`: run | serve | fly | view | up | call | scene | convert | bench."""
+"""The command `neurosim`; `neurosim --help` lists what it does."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from neurosim_core import __version__
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
+from neurosim_core.data import command as dataset
+from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
 
@@ -62,7 +64,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
-    for add in (*parsers, convert.add_parser, bench.add_parser):
+    others = (
+        convert.add_parser,
+        dataset.add_parser,
+        dataset.add_compare_parser,
+        bench.add_parser,
+        learn.add_parsers,
+    )
+    for add in (*parsers, *others):
         add(commands)
     return parser
 
@@ -100,6 +109,11 @@ def _add_fly(commands: _Commands) -> None:
     )
     fly.add_argument(
         "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
+    )
+    fly.add_argument(
+        "--policy",
+        metavar="NAME",
+        help="let a trained policy fly a throw in this process, without a simulator: hover, or a .onnx file",
     )
     fly.set_defaults(command=_fly)
 
@@ -153,7 +167,7 @@ def _add_view(commands: _Commands) -> None:
         "flight",
         nargs="?",
         type=Path,
-        help="folder that `neurosim run` left, or a flight.h5; default: what runs now",
+        help="folder that `neurosim run` left, a flight.h5, or a file of events; default: what runs now",
     )
     view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(
@@ -265,6 +279,8 @@ def _serve(arguments: argparse.Namespace) -> int:
 
 
 def _fly(arguments: argparse.Namespace) -> int:
+    if arguments.policy is not None:
+        return learn.fly_policy(arguments, _overrides(arguments))
     from neurosim_core.config import load_config
     from neurosim_core.live.controller import fly
 

@@ -19,9 +19,10 @@ from pydantic import (
     model_validator,
 )
 
+from neurosim_core.config_errors import describe_errors, explain, suggestion
 from neurosim_core.control import Se3Config
 from neurosim_core.live.config import LinkConfig, LiveConfig
-from neurosim_core.mistakes import explain, suggestion
+from neurosim_core.live.remote_renderer import RemoteRendererConfig  # noqa: F401  registers a kind
 from neurosim_core.registry import kinds, on_change
 from neurosim_core.render.renderer import RenderConfig, RendererConfig, WarpRendererConfig
 from neurosim_core.scene.apartment import ApartmentConfig
@@ -283,7 +284,7 @@ def load_config(
         overrides: Keys that win over the source. Nested mappings are merged, unless they say that they are of
             another kind; a key may be dotted ("scene.seed"). Where the source has no `sensors`, those of
             the default set are changed, and new ones added to it.
-        options: What the user calls a key of `overrides`, such as {"duration_s": "--duration"}: a mistake
+        options: What the user calls a key of `overrides`, such as {"duration_s": "--duration"}: an error
             there is said of it, and so is what lacks or is unknown in a group that only it has made.
 
     A group that comes in several kinds and does not say which (`scene`, `path`) is of the default kind.
@@ -292,7 +293,7 @@ def load_config(
 
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
-            out of range. The message has one line for each mistake.
+            out of range. The message has one line for each error.
     """
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = _read(Path(source)) if isinstance(source, str | Path) else dict(source or {})
@@ -304,9 +305,13 @@ def load_config(
         patches.insert(0, {"sensors": raw[_ADDED]})
         raw = {key: value for key, value in raw.items() if key != _ADDED}
     if "sensors" not in raw and any("sensors" in patch for patch in patches):
-        # pixels are ideal where nothing is said of them, which leaves a preset free to say it
-        sensors = _default_sensors()
-        raw["sensors"] = {name: sensor.model_dump(exclude={"pixel"}) for name, sensor in sensors.items()}
+        # of what a preset may say, nothing is said: errors and pixels are ideal anyway
+        raw["sensors"] = {
+            name: {"kind": sensor.kind}
+            if "preset" in type(sensor).model_fields
+            else sensor.model_dump(exclude={"pixel"})
+            for name, sensor in _default_sensors().items()
+        }
     given = raw
     for patch in patches:
         raw = _merge(raw, patch)
@@ -316,7 +321,7 @@ def load_config(
     try:
         return SimulationConfig.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(_say(origin, list(_explain(error, raw)), options or {}, given)) from None
+        raise ConfigError(describe_errors(origin, list(_explain(error, raw)), options or {}, given)) from None
 
 
 def absent_sensors(config: SimulationConfig) -> str:
@@ -417,7 +422,7 @@ def _without_nulls(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
-    """Say of each mistake what is wrong; also where a key belongs, and which sensor may have been meant."""
+    """Say of each error what is wrong; also where a key belongs, and which sensor may have been meant."""
     for line in explain(SimulationConfig, error):
         path, _, reason = line.partition(": ")
         group, _, name = path.rpartition(".")
@@ -432,48 +437,6 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
             yield f"{path}: must be auto, cpu, cuda, or cuda:0 and so on, got {raw['device']!r}"
         else:
             yield line
-
-
-def _say(origin: str, mistakes: list[str], options: Mapping[str, str], given: Mapping[str, Any]) -> str:
-    """Return the text of an error: each mistake by the name that the user gave its key.
-
-    Args:
-        origin: What the settings are from.
-        mistakes: Lines that begin with a dotted key.
-        options: Names of keys that were given otherwise.
-        given: What is in the settings without these.
-    """
-    lines = dict.fromkeys(_by_option(line, options, given) for line in mistakes)
-    elsewhere = any(line in mistakes for line in lines)
-    if not elsewhere and len(lines) == 1:
-        return next(iter(lines))
-    head = f"{origin} is not a valid configuration:" if elsewhere else "wrong options:"
-    return "\n".join([head, *(f"  {line}" for line in lines)])
-
-
-def _by_option(line: str, options: Mapping[str, str], given: Mapping[str, Any]) -> str:
-    """Name the option in place of its key; a key within it, or in a group that it made, is said as well."""
-    key, separator, reason = line.partition(": ")
-    for place in sorted(options, key=len, reverse=True):
-        if key == place:
-            return f"{options[place]}{separator}{reason}"
-        if key.startswith(f"{place}."):
-            return f"{options[place]}: {line}"
-    for group in (key, key.rpartition(".")[0]):
-        makers = [place for place in options if group and place.startswith(f"{group}.")]
-        if makers and not _holds(given, key) and (f"{group}.kind" in makers or not _holds(given, group)):
-            return f"{options[makers[0]]}: {line}"
-    return line
-
-
-def _holds(raw: Mapping[str, Any], key: str) -> bool:
-    """Return whether settings have a value at a dotted key."""
-    value: Any = raw
-    for part in key.split("."):
-        if not isinstance(value, Mapping) or part not in value:
-            return False
-        value = value[part]
-    return True
 
 
 def _yaml_lines(model: BaseModel, *, indent: int, comments: bool) -> Iterator[str]:

@@ -19,7 +19,7 @@ import inspect
 import json
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -267,6 +267,27 @@ class EventArrays(NamedTuple):
     polarity: NDArray[np.uint8]
     """1: brighter, 0: darker."""
 
+    def rows(self, index: slice | NDArray[Any]) -> EventArrays:
+        """Return some of the events: of a slice, a mask, or an array of indices."""
+        return EventArrays(self.t[index], self.x[index], self.y[index], self.polarity[index])
+
+
+NO_EVENTS = EventArrays(
+    np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.uint8)
+)
+
+
+def join_events(parts: Sequence[EventArrays]) -> EventArrays:
+    """Return the events of all parts, one after the other, as new arrays."""
+    if not parts:
+        return NO_EVENTS
+    return EventArrays(
+        np.concatenate([part.t for part in parts]),
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.polarity for part in parts]),
+    )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Events(Packet):
@@ -305,7 +326,11 @@ class Events(Packet):
         return EventArrays(*(as_numpy(values) for values in (self.t, self.x, self.y, self.polarity)))
 
 
-ImageEncoding = Literal["rgb8", "mono8", "32FC1", "32FC2", "32FC3", "32SC1"]
+ImageEncoding = Literal[
+    "rgb8", "mono8", "rgb16", "mono16", "32FC1", "32FC2", "32FC3", "32SC1",
+    "bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8",
+    "bayer_rggb16", "bayer_bggr16", "bayer_gbrg16", "bayer_grbg16",
+]  # fmt: skip
 """Names of ROS image encodings; `Image` says what they hold."""
 
 
@@ -316,6 +341,8 @@ class Image(Packet):
     | encoding | data | content |
     | --- | --- | --- |
     | rgb8, mono8 | uint8 [H, W, 3], [H, W] | colour or grey in sRGB |
+    | rgb16, mono16 | uint16 [H, W, 3], [H, W] | the same in 16 bits, or as the camera says |
+    | bayer_rggb8, ..., bayer_grbg16 | uint8, uint16 [H, W] | one colour at each pixel |
     | 32FC1 | float32 [H, W] | depth: planar z [m], inf where nothing was hit |
     | 32FC2 | float32 [H, W, 2] | optical flow (x, y) [px] |
     | 32FC3 | float32 [H, W, 3] | surface normals, unit vectors, 0 where nothing was hit |
@@ -326,6 +353,27 @@ class Image(Packet):
     """Pixels, row-major, shape [H, W] or [H, W, C]."""
     encoding: Annotated[ImageEncoding, FieldSpec(constant=True)]
     """What a pixel is."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointCloud(Packet):
+    """One sweep of a LiDAR: the rays that came back, in the order of time; its stamp is that of the last."""
+
+    display: ClassVar[str] = "points"
+
+    points: Annotated[NDArray[np.float32], FieldSpec("n", 3, unit="m", frame="sensor")]
+    """Positions in S (x forward, y left, z up) [m], shape [n, 3]: of S when each ray was cast, or if
+    `deskewed`, at the stamp."""
+    intensity: Annotated[NDArray[np.float32], FieldSpec("n", unit="1/m^2")]
+    """albedo cos / r^2, shape [n]."""
+    ring: Annotated[NDArray[np.uint16], FieldSpec("n")]
+    """Which laser it was, shape [n]."""
+    t: Annotated[NDArray[np.uint32], FieldSpec("n", unit="ns")]
+    """When its ray was cast, since `start_ns` [ns], shape [n]."""
+    start_ns: int
+    """When the first ray was cast [ns]; before stamp 0 the vehicle stands where it begins."""
+    deskewed: Annotated[bool, FieldSpec(constant=True)]
+    """All points are seen from the pose at the stamp."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

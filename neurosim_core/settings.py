@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from pydantic import BaseModel, ConfigDict
 
 
@@ -20,3 +23,26 @@ class Settings(BaseModel):
         validate_default=True,
         use_attribute_docstrings=True,
     )
+
+
+def fill_from_preset(given: Any, presets: Mapping[str, Mapping[str, Any]]) -> Any:
+    """Return settings with those of the preset that they name below them; for validators of mode "before".
+
+    Single keys win. Groups of keys are merged, unless they are of another `kind`.
+
+    Raises:
+        ValueError: There is no such preset.
+    """
+    if not isinstance(given, Mapping) or not isinstance(given.get("preset"), str):
+        return given
+    name = given["preset"]
+    if name not in presets:
+        raise ValueError(f"unknown preset {name!r}, known: {', '.join(presets)}")
+    filled = dict(presets[name])
+    for key, value in given.items():
+        old = filled.get(key)
+        filled[key] = value
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            same = value.get("kind", old.get("kind")) == old.get("kind")
+            filled[key] = {**old, **value} if same else value
+    return filled

@@ -18,11 +18,28 @@ wp.config.log_level = wp.LOG_WARNING
 hypothesis.settings.register_profile("any machine", deadline=None)
 hypothesis.settings.load_profile("any machine")
 
-# Shells start background jobs with SIGINT ignored, and processes that a test starts would inherit that.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# Shells start background jobs with SIGINT ignored, `nohup` any with SIGHUP, and processes that a test starts
+# would inherit that.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
+
+LONGEST = [Path(__file__).parent / name for name in (
+    "live/test_restart.py", "cortex/test_cpp.py", "test_readme.py", "live/test_browser.py", "test_cli.py",
+)]  # fmt: skip
+"""Files that come first: a long one at the end would be waited for by all processes but its own."""
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep the order of the files; pytest-xdist would begin with those of the most tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONGEST.index(item.path) if item.path in LONGEST else len(LONGEST))
 
 
 def _devices() -> list[str]:

@@ -178,7 +178,8 @@ def test_a_folder_that_cannot_be_written_is_said_before_anything_is_prepared(tmp
 
 
 def test_a_run_without_sensors_is_a_run(tmp_path):
-    done = neurosim("run", "--duration", "0.1", "--set", "sensors={}", "--out", "none", cwd=tmp_path)
+    scene = ("--set", "scene.rooms=1", "--set", "render.lighting.mode=unshadowed")
+    done = neurosim("run", "--duration", "0.1", "--set", "sensors={}", *scene, "--out", "none", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "0.000 s" not in done.stdout
 
@@ -254,11 +255,10 @@ def test_printed_settings_are_settings(tmp_path):
         (["run", "--out", sys.executable], "--out must name a folder"),
     ],
 )
-def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path):
-    done = neurosim(*arguments, cwd=tmp_path)
-    assert done.returncode == 1
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
+def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 1
+    assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -159,7 +159,7 @@ def test_parameters_are_explained_as_they_are_written(vehicle: dict[str, Any], s
             "path.points_m: must be a list of lists of 3 numbers, got 3",
         ),
         ("scene: {kind: mesh, file: 3}", "scene.file: must be the name of a file, got 3"),
-        ("sensors: {imu: 3}", "sensors.imu: must be keys with values, such as {kind: depth or event_camera"),
+        ("sensors: {imu: 3}", "sensors.imu: must be keys with values, such as {kind: barometer or contact"),
         ("no: 3", "a key is off, no or false, which YAML reads as false; known: bodies,"),
         ("3: 3", "keys must be text, got 3; known: bodies,"),
     ],

@@ -18,7 +18,7 @@ FORBIDDEN = {
     "cortex_ros2_bridge": {"neurosim_core", "warp", "zmq"},
 }
 LAZY = {"torch", "rerun", "h5py", "matplotlib", "pyrender", "OpenGL", "gymnasium"}
-LAZY |= {"cyclonedds", "rclpy", "mcap", "zenoh", "iceoryx2", "lcm", "rotorpy", "av"}
+LAZY |= {"cyclonedds", "rclpy", "mcap", "zenoh", "iceoryx2", "lcm", "rotorpy", "av", "faery"}
 """Heavy or optional: imported where they are used, never when a module is imported."""
 SPEAKS_DDS = {f"cortex_ros2_bridge.backend.{name}" for name in ("cyclone", "dds", "graph", "idl")}
 SPEAKS_DDS |= {"neurosim_core.bench.bridge_controller"}
@@ -62,7 +62,8 @@ def imports(tree: ast.AST, *, top_level: bool, modules: Collection[str] = ()) ->
 def test_package_imports_only_what_it_may(package):
     for name, tree in modules(package).items():
         used = {n.split(".")[0] for n in imports(tree, top_level=False)}
-        allowed = {"cortex"} if name.startswith("neurosim_core.live") else set()
+        streams = name.startswith(tuple(f"neurosim_core.{part}" for part in ("live", "data", "io", "learn")))
+        allowed = {"cortex"} if streams else set()
         allowed |= {"rotorpy"} if name == "neurosim_core.bench.rotorpy_peer" else set()
         forbidden = FORBIDDEN[package] | ({"cortex"} if package == "neurosim_core" else set())
         assert not (used & forbidden) - allowed, name
@@ -73,6 +74,8 @@ def test_heavy_libraries_are_imported_where_they_are_used(package):
     for name, tree in modules(package).items():
         used = imports(tree, top_level=True, modules=SPEAKS_DDS)
         heavy = {n.split(".")[0] for n in used} & LAZY | used & SPEAKS_DDS
+        if name.startswith("neurosim_core.learn."):  # what is there is imported on use
+            heavy -= {"torch", "gymnasium"}
         assert not heavy - (SPEAKS_DDS | {"cyclonedds"} if name in SPEAKS_DDS else set()), name
 
 

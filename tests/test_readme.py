@@ -83,7 +83,7 @@ def test_the_run_command(tmp_path):
 
 
 EXAMPLES = named("example", "python")
-for page in ("simulator.md", "worlds.md"):
+for page in ("simulator.md", "worlds.md", "data.md"):
     EXAMPLES |= named("example", "python", (ROOT / "docs" / page).read_text(encoding="utf-8"))
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 from cortex.bench.tally import Floats
 
-PATIENCE_S = 5.0
+PATIENCE_S = 30.0
 """Longest wait for one message, before the other side counts as dead [s]."""
 PONG_FLOATS = 10
 """Items of the answer in a round trip: 40 bytes."""

@@ -26,7 +26,7 @@ from cortex.bench.spread import Spread
 from cortex.bench.transports import missing
 
 _SHM = Path("/dev/shm")
-_GRACE_S = 30.0
+_GRACE_S = 120.0
 _SLOWEST_HZ = 2_000.0
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""

@@ -1,4 +1,4 @@
-"""`cortex topics`, `nodes` and `info`: who is there, and what they have counted."""
+"""`cortex topics`, `nodes`, `top` and `info`: who is there, and what they have counted."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import argparse
 import math
 import time
 from collections.abc import Iterator
+
+import numpy as np
 
 from cortex.commands.session import CommandError, hint, look_around, say_empty
 from cortex.commands.text import bytes_of, entries, is_terminal, number_of, plain, rate, seconds, table
@@ -107,25 +109,89 @@ def show_info(options: argparse.Namespace) -> int:
             time.sleep(_PERIOD_S)
 
 
-class _Counts:
-    """What the nodes of a topic have counted at one moment."""
+def show_top(options: argparse.Namespace) -> int:
+    """`cortex top`."""
+    node = look_around(options)
+    if node is None:
+        return 0
+    with node:
+        before = _Counts(node)
+        while True:
+            time.sleep(_PERIOD_S)
+            counts = _Counts(node)
+            live = not options.once and is_terminal()
+            print((_CLEAR if live else "") + "\n".join(_top_lines(counts, before)), flush=True)
+            if options.once:
+                return 0
+            before = counts
 
-    def __init__(self, node: Node, topic: str) -> None:
+
+def _top_lines(counts: _Counts, before: _Counts) -> Iterator[str]:
+    elapsed_s = counts.at_s - before.at_s
+    earlier = {stats.source: stats for _, stats in before.publishers}
+    last = {(record.node, index): stats for record, index, stats in before.subscribers}
+    by_topic: dict[str, dict[str, int]] = {}
+    delays: dict[str, np.ndarray] = {}
+    names = ("publishers", "published", "bytes", "subscribers", "lost", "overtaken", "rejected", "timeouts")
+
+    def add(topic: str, **values: int) -> None:
+        row = by_topic.setdefault(topic, dict.fromkeys(names, 0))
+        for name, value in values.items():
+            row[name] += value
+
+    for _, pub in counts.publishers:
+        was = earlier.get(pub.source)
+        published, size = (pub.published - was.published, pub.bytes - was.bytes) if was else (0, 0)
+        add(pub.topic, publishers=1, published=published, bytes=size, timeouts=pub.timeouts)
+    for record, index, sub in counts.subscribers:
+        add(sub.topic, subscribers=1, lost=sub.lost, overtaken=sub.overtaken, rejected=sub.rejected)
+        old = last.get((record.node, index))
+        if old is not None and old.topic == sub.topic:
+            delays[sub.topic] = delays.get(sub.topic, 0) + (sub.latency_counts - old.latency_counts)
+    rows = []
+    for topic, row in sorted(by_topic.items()):
+        latency = delays[topic].tolist() if topic in delays else [0]
+        rows.append(
+            (
+                plain(topic),
+                str(row["publishers"]),
+                rate(row["published"] / elapsed_s),
+                f"{bytes_of(row['bytes'] / elapsed_s)}/s",
+                str(row["subscribers"]),
+                *(f"{row[name]:,}" for name in ("lost", "overtaken", "rejected", "timeouts")),
+                seconds(quantile_ns(latency, 0.5) * 1e-9),
+                seconds(quantile_ns(latency, 0.99) * 1e-9),
+            )
+        )
+    head = ("topic", "publishers", "rate", "bandwidth", "subscribers", *names[4:], "delay p50", "p99")
+    yield from table(head, rows) if rows else ("nothing is published or subscribed",)
+    for name in counts.silent:
+        yield f"node {plain(name)} did not answer"
+
+
+class _Counts:
+    """What the nodes of a topic, or of all, have counted at one moment."""
+
+    def __init__(self, node: Node, topic: str | None = None) -> None:
         from concurrent.futures import ThreadPoolExecutor
 
         self.at_s = time.monotonic()
         self.silent: list[str] = []
         self.publishers: list[tuple[NodeRecord, PublisherStats]] = []
         self.subscribers: list[tuple[NodeRecord, int, SubscriberStats]] = []
-        concerned = [record for record in node.nodes() if record.node != node.id and _is_on(record, topic)]
+        others = [record for record in node.nodes() if record.node != node.id]
+        concerned = [record for record in others if topic is None or _is_on(record, topic)]
         with ThreadPoolExecutor(_ASKED_AT_ONCE) as pool:
             replies = list(pool.map(lambda record: _ask(node, record), concerned))
         for record, reply in zip(concerned, replies, strict=True):
             if reply is None:
                 self.silent.append(record.name)
                 continue
-            self.publishers += [(record, stats) for stats in reply.publishers if stats.topic == topic]
-            own = [stats for stats in reply.subscribers if stats.topic == topic]
+            every = topic is None
+            self.publishers += [
+                (record, stats) for stats in reply.publishers if every or stats.topic == topic
+            ]
+            own = [stats for stats in reply.subscribers if every or stats.topic == topic]
             self.subscribers += [(record, index, stats) for index, stats in enumerate(own)]
 
 

@@ -1,4 +1,4 @@
-"""`cortex keys` and `cortex cpp`."""
+"""`cortex keys`, `cortex schema` and `cortex cpp`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 
-from cortex.commands.session import CommandError, UsageError, hint
+from cortex.commands.session import CommandError, UsageError, hint, look_around
 from cortex.cppgen import generate
+from cortex.evolution import differences, is_evolved
 from cortex.message import is_message
 from cortex.schema import EnumType, FieldType, ListType, OptionalType, Schema, schema_of
 from cortex.security import AUTHORIZED_FILE, default_directory, new_keys
@@ -32,6 +33,42 @@ def make_keys(options: argparse.Namespace) -> int:
         f"3. Use --keys {directory}."
     )
     return 0
+
+
+def compare(options: argparse.Namespace) -> int:
+    """`cortex schema diff`: 0 if the two are the same or can read each other, else 1."""
+    old, new = (_find_schema(name, options) for name in (options.old, options.new))
+    for line in differences(old, new):
+        print(line)
+    if old == new:
+        print(f"the same: {old.name} ({old.fingerprint:016x})")
+    elif is_evolved(old, new):
+        print("compatible: a Python subscriber of either reads the other; what is absent is None")
+    else:
+        print("incompatible: only fields that are optional may be added, and only at the end")
+    return int(old != new and not is_evolved(old, new))
+
+
+def _find_schema(name: str, options: argparse.Namespace) -> Schema:
+    path, _, topic = name.rpartition(":")
+    if topic.startswith("/") and path:
+        from cortex.log import open_log
+
+        with open_log(path) as log:
+            found = {entry.topic: entry.schema for entry in log.topics}
+    elif topic.startswith("/"):
+        node = look_around(options)
+        if node is None:
+            raise CommandError(f"{name} is not published")
+        with node:
+            infos = [info for info in node.topics() if info.schema]
+        found = {info.topic: Schema.from_json(info.schema) for info in infos}
+    else:
+        sys.path.insert(0, os.getcwd())
+        return schema_of(_find_type(name))
+    if topic not in found:
+        raise CommandError(f"there is no type of {topic}; there are {', '.join(sorted(found)) or 'none'}")
+    return found[topic]
 
 
 def write_cpp(options: argparse.Namespace) -> int:

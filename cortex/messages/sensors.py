@@ -102,13 +102,19 @@ class PointCloud:
     """Points in the frame of a sensor."""
 
     stamp_ns: Annotated[int, Unit("ns")]
-    """Time of the measurement [ns]."""
+    """Time of the last point [ns]."""
     points: Annotated[Array["float32", "n", 3], Unit("m", frame="sensor")]
     """Positions [m], shape [n, 3]."""
     intensity: Array["float32", "n"] | None = None
     """Strength of each return, shape [n]."""
-    color: Array["uint8", "n", 3] | None = None
-    """Red, green and blue in sRGB, shape [n, 3]."""
+    ring: Array["uint16", "n"] | None = None
+    """Which laser of the sensor measured each point, shape [n]."""
+    t: Annotated[Array["uint32", "n"], Unit("ns")] | None = None
+    """When each point was measured, since `start_ns` [ns], shape [n]."""
+    start_ns: Annotated[int, Unit("ns")] = 0
+    """When the first ray was cast [ns]."""
+    deskewed: bool = False
+    """Points are seen from the sensor's pose at `stamp_ns`; else each from that at its own time."""
     frame_id: str = ""
     """Name of the sensor's frame."""
     sequence: UInt64 = 0

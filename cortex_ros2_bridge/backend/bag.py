@@ -19,7 +19,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys.store import Typestore
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, check_type, typestore
@@ -146,8 +146,7 @@ class BagPublisher:
         """Record a message."""
         if not self._open:
             raise BackendError(f"the publisher of {self._connection.topic} is closed")
-        if bytes(message[:2]) != b"\0\1" or len(message) < 5:
-            raise BackendError(f"a message for {self._connection.topic} is not little-endian CDR")
+        check_message(message, self._connection.topic)
         self._bag.write(self._connection, self._read_stamp(message), message)
 
     def close(self) -> None:
@@ -160,7 +159,6 @@ class BagSubscription:
 
     publisher_count = 0
     lost_count = 0
-    error_count = 0
 
     def close(self) -> None:
         """Receive nothing any more either."""

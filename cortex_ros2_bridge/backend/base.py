@@ -71,10 +71,6 @@ class RosSubscription(Protocol):
         What a newer one has overtaken is not counted.
         """
 
-    @property
-    def error_count(self) -> int:
-        """Messages with which the callback raised; each is logged, and the subscription goes on."""
-
     def close(self) -> None:
         """Withdraw the subscription; its callback is not called any more once this returns.
 
@@ -83,11 +79,7 @@ class RosSubscription(Protocol):
 
 
 class RosService(Protocol):
-    """Answers the requests to one service."""
-
-    @property
-    def error_count(self) -> int:
-        """Requests with which the callback raised; each is logged, and answered with an empty response."""
+    """Answers the requests to one service; one with which the callback raises with an empty response."""
 
     def close(self) -> None:
         """Withdraw the service."""
@@ -148,3 +140,9 @@ class Backend(Protocol):
 
 class BackendError(RuntimeError):
     """ROS 2 cannot be reached, or refused a message."""
+
+
+def check_message(message: Buffer, topic: str) -> None:
+    """Raise `BackendError` unless a message is little-endian CDR."""
+    if len(message) <= 4 or bytes(message[:2]) != b"\0\1":
+        raise BackendError(f"a message for {topic} is not little-endian CDR")

@@ -13,15 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-from cyclonedds.core import (
-    DDSException,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds.core import DDSException, GuardCondition
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy
@@ -32,14 +24,7 @@ from cyclonedds.util import duration
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
-from cortex_ros2_bridge.backend.cyclone import (
-    ENTITIES,
-    NO_TYPE_HASH,
-    Choice,
-    Refused,
-    Transport,
-    choose_transport,
-)
+from cortex_ros2_bridge.backend.cyclone import ENTITIES, NO_TYPE_HASH, Refused, take, wait_set, write
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro, cyclone_config, domain_id
 from cortex_ros2_bridge.backend.graph import (
@@ -117,7 +102,6 @@ class DdsBackend:
         namespace: str = "",
         distro: str | None = None,
         domain: int | None = None,
-        transport: Choice = "auto",
     ) -> None:
         """Join a domain.
 
@@ -126,7 +110,6 @@ class DdsBackend:
             namespace: Its namespace; "" or "/" for none.
             distro: Distribution of the other nodes; None: ROS_DISTRO, else as the first node that is seen.
             domain: DDS domain; None: ROS_DOMAIN_ID, else 0.
-            transport: How messages get in and out of Cyclone DDS; "auto": fast if that works.
 
         Raises:
             ValueError: A name is not valid, or the environment asks for what ROS does not know.
@@ -144,19 +127,11 @@ class DdsBackend:
                 self._participant: Any = DomainParticipant(
                     self._domain, DdsQos(Policy.Userdata(ENCLAVE), Policy.EntityName(PARTICIPANT_NAME))
                 )
-                self._transport = choose_transport(self._participant, transport)
-            self._graph = Graph(
-                self._participant, self._transport, node_name=node_name, namespace=namespace, distro=known
-            )
+            self._graph = Graph(self._participant, node_name=node_name, namespace=namespace, distro=known)
         except (DDSException, Refused) as error:
             self._participant = None
             _domains.leave(self._domain)
             raise BackendError(f"DDS does not start in domain {self._domain}: {error}") from error
-
-    @property
-    def transport(self) -> str:
-        """How messages get in and out of Cyclone DDS: "fast" or "public"."""
-        return self._transport.name
 
     @property
     def layout(self) -> str | None:
@@ -202,7 +177,7 @@ class DdsBackend:
     def _site(self) -> _Site:
         if self._participant is None:
             raise BackendError("this node is closed")
-        return _Site(self._participant, self._transport, self._graph, self.distro, self._forget)
+        return _Site(self._participant, self._graph, self.distro, self._forget)
 
     def _keep(self, part: _Part) -> _Part:
         self._parts[part] = None
@@ -217,7 +192,6 @@ class _Site(NamedTuple):
     """Where publishers and subscriptions are made."""
 
     participant: Any
-    transport: Transport
     graph: Graph
     distro: str
     forget: Callable[[Any], None]
@@ -275,7 +249,6 @@ class DdsPublisher:
         self._name = f"{topic} ({type_name})"
         kind = idl_struct(type_name, site.distro)
         self._writer = site.writer(TOPIC_PREFIX + topic, kind, qos, user_data_of_type(type_name, site.distro))
-        self._transport = site.transport
         self._guid = self._writer.guid.bytes
 
     @property
@@ -290,7 +263,7 @@ class DdsPublisher:
         if writer is None:
             raise BackendError(f"the publisher of {self._name} is closed")
         try:
-            self._transport.write(writer, message)
+            write(writer, message)
         except Refused as error:
             raise BackendError(f"a message for {self._name} cannot be sent: {error}") from error
 
@@ -327,12 +300,10 @@ class _Receiver:
     def _run(self, site: _Site, reader: Any, limit: int, name: str) -> None:
         try:
             with ENTITIES:
-                waitset = WaitSet(site.participant)
-                waitset.attach(self._guard)
-                waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
+                waitset = wait_set(site.participant, self._guard, [reader])
             while not self._closed.is_set():
                 waitset.wait(duration(infinite=True))
-                for message in site.transport.take(reader, limit):
+                for message in take(reader, limit):
                     self._deliver(message)
         except (DDSException, Refused):
             if not self._closed.is_set():
@@ -366,11 +337,6 @@ class DdsSubscription:
         if reader is not None:
             self._lost_count = int(reader.get_sample_lost_status().total_count)
         return self._lost_count
-
-    @property
-    def error_count(self) -> int:
-        """Messages with which the callback raised."""
-        return self._deliver.error_count
 
     def close(self) -> None:
         """Withdraw the subscription."""
@@ -406,11 +372,6 @@ class DdsService:
         self._deliver = Delivery(self._answer, name)
         self._receiver = _Receiver(site, self._reader, qos.depth, self._deliver, name)
 
-    @property
-    def error_count(self) -> int:
-        """Requests with which the callback raised."""
-        return self._deliver.error_count
-
     def close(self) -> None:
         """Withdraw the service."""
         if self._reader is not None:
@@ -443,4 +404,4 @@ class DdsService:
             and time.monotonic() < deadline_s
         ):
             time.sleep(1e-3)
-        self._site.transport.write(writer, message[:4] + client + message[4:])
+        write(writer, message[:4] + client + message[4:])

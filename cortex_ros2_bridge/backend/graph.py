@@ -21,15 +21,7 @@ from cyclonedds.builtin import (
     BuiltinTopicDcpsPublication,
     BuiltinTopicDcpsSubscription,
 )
-from cyclonedds.core import (
-    DDSException,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds.core import DDSException, GuardCondition, InstanceState
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
@@ -37,7 +29,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from cortex_ros2_bridge.backend.base import TopicInfo
-from cortex_ros2_bridge.backend.cyclone import ENTITIES, Refused, Transport
+from cortex_ros2_bridge.backend.cyclone import ENTITIES, Refused, wait_set, write
 from cortex_ros2_bridge.backend.idl import idl_struct
 from cortex_ros2_bridge.backend.names import TOPIC_PREFIX, ros_topic, ros_type
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, DISTROS, type_hash, typestore
@@ -82,7 +74,6 @@ class Graph:
     def __init__(
         self,
         participant: DomainParticipant,
-        transport: Transport,
         *,
         node_name: str,
         namespace: str,
@@ -92,14 +83,12 @@ class Graph:
 
         Args:
             participant: Participant whose endpoints are announced.
-            transport: How announcements are written.
             node_name: Name of the node.
             namespace: Its namespace, "/" for none.
             distro: Distribution whose layout is announced; None: that of the first node of ROS that is seen.
         """
         self._participant = participant
         self._key: bytes = participant.guid.bytes
-        self._transport = transport
         self._node = node_name, namespace
         self._lock = threading.Lock()
         self._own: dict[bytes, Endpoint] = {}
@@ -174,12 +163,8 @@ class Graph:
         """Return what wakes the thread up, and readers of participants, writers and readers of others."""
         kinds = BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
         with ENTITIES:
-            waitset = WaitSet(self._participant)
-            waitset.attach(self._guard)
             readers = [BuiltinDataReader(self._participant, kind) for kind in kinds]
-            for reader in readers:
-                waitset.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
-        return waitset, readers
+            return wait_set(self._participant, self._guard, readers), readers
 
     def _take_participants(self, reader: Any) -> None:
         for sample, alive in _samples(reader):
@@ -300,7 +285,7 @@ class Graph:
                 )
             ],
         )
-        self._transport.write(self._writer, store.serialize_cdr(message, DISCOVERY_TYPE))
+        write(self._writer, store.serialize_cdr(message, DISCOVERY_TYPE))
 
 
 def _samples(reader: Any) -> Iterator[tuple[Any, bool]]:

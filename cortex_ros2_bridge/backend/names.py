@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(msg|srv)/([A-Za-z][A-Za-z0-9_]*)")
 _DDS_TYPE = re.compile(r"([A-Za-z0-9_]+)::(msg|srv)::dds_::([A-Za-z0-9_]+)_")
 
@@ -19,7 +19,7 @@ def check_name(name: str) -> str:
     Raises:
         ValueError: ROS does not allow it.
     """
-    if not _NAME.fullmatch(name) or "__" in name:
+    if not NAME.fullmatch(name) or "__" in name:
         raise ValueError(
             f"invalid ROS name {name!r}: it must look like '/drone/imu', of letters, digits and single '_', "
             "and no part may begin with a digit"

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo
+from cortex_ros2_bridge.backend.base import BackendError, Buffer, Qos, Serve, TopicInfo, check_message
 from cortex_ros2_bridge.backend.delivery import Delivery
 from cortex_ros2_bridge.backend.environment import chosen_distro
 from cortex_ros2_bridge.backend.names import check_name, check_node_name, split_type
@@ -334,6 +334,8 @@ class _Endpoint:
 
     is_waited_for = True
     """Whether the executor waits for it."""
+    destroyer = ""
+    """What the node destroys a handle with."""
 
     def __init__(self, loop: _Loop, topic: str, make: Callable[[Any], Any]) -> None:
         self.topic = topic
@@ -343,7 +345,7 @@ class _Endpoint:
 
     def destroy(self, node: Any, handle: Any) -> None:
         """Destroy the handle."""
-        raise NotImplementedError
+        getattr(node, self.destroyer)(handle)
 
     def close(self) -> None:
         """Withdraw it."""
@@ -355,6 +357,7 @@ class RclpyPublisher(_Endpoint):
     """Publishes on one topic."""
 
     is_waited_for = False
+    destroyer = "destroy_publisher"
 
     @property
     def subscriber_count(self) -> int:
@@ -367,21 +370,17 @@ class RclpyPublisher(_Endpoint):
         handle = self.handle
         if handle is None:
             raise BackendError(f"the publisher of {self.topic} is closed")
-        if len(message) <= 4 or bytes(message[:2]) != b"\0\1":
-            raise BackendError(f"a message for {self.topic} is not little-endian CDR")
+        check_message(message, self.topic)
         try:
             handle.publish(message if isinstance(message, bytes) else bytes(message))
         except Exception as error:  # errors of rclpy have no public base
             raise BackendError(f"a message for {self.topic} cannot be sent: {error}") from error
 
-    def destroy(self, node: Any, handle: Any) -> None:
-        """Destroy the handle."""
-        node.destroy_publisher(handle)
-
 
 class RclpySubscription(_Endpoint):
     """Receives from one topic."""
 
+    destroyer = "destroy_subscription"
     lost_count = 0
     """rclpy does not tell."""
     deliver: Delivery
@@ -390,15 +389,6 @@ class RclpySubscription(_Endpoint):
     def publisher_count(self) -> int:
         """Publishers of the topic now, the own included."""
         return 0 if self.handle is None else int(self._loop.node.count_publishers(self.topic))
-
-    @property
-    def error_count(self) -> int:
-        """Messages with which the callback raised."""
-        return self.deliver.error_count
-
-    def destroy(self, node: Any, handle: Any) -> None:
-        """Destroy the handle."""
-        node.destroy_subscription(handle)
 
     def close(self) -> None:
         """Withdraw the subscription."""
@@ -409,20 +399,14 @@ class RclpySubscription(_Endpoint):
 class RclpyService(_Endpoint):
     """Answers the requests to one service."""
 
-    error_count = 0
-    """Requests with which the callback raised."""
+    destroyer = "destroy_service"
     callback: Serve
-
-    def destroy(self, node: Any, handle: Any) -> None:
-        """Destroy the handle."""
-        node.destroy_service(handle)
 
     def answer(self, request: Any, response: Any) -> Any:
         """Answer a request; an empty response where the callback raises."""
         try:
             return self.callback(request, response)
         except Exception:  # whatever it raises: the client gets an answer, and the node goes on
-            self.error_count += 1
             _log.exception("the service %s failed", self.topic)
             return type(response)()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import re
 from typing import Any
 
@@ -10,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex import messages
-from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.backend.base import Buffer
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
+from cortex_ros2_bridge.convert.registry import FRAMES, LATCHED, standard
 
-_POINT_FLOAT32 = 7
+_FLOAT32 = ("<f4", 7)
+_POINT_TYPES = {"intensity": _FLOAT32, "ring": ("<u2", 4), "t": ("<u4", 6)}
+"""What fields of points are, in NumPy and in sensor_msgs/PointField."""
 _NAMED_PIXELS = {
     "mono8": ("u1", 1),
     "mono16": ("u2", 1),
@@ -25,11 +27,14 @@ _NAMED_PIXELS = {
     "bgra8": ("u1", 4),
     "rgb16": ("u2", 3),
     "bgr16": ("u2", 3),
+    **{f"bayer_{order}8": ("u1", 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
+    **{f"bayer_{order}16": ("u2", 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
 _PIXEL = re.compile(r"(8|16|32|64)([USF])C([1-9][0-9]*)")
 
 
-def image(message: messages.Image, context: Context) -> Buffer:
+@standard(messages.Image, "sensor_msgs/Image", "{topic}/image_raw", FRAMES)
+def image(message: messages.Image, context: Context) -> Any:
     """Convert to sensor_msgs/Image; encodings are called the same."""
     data = np.ascontiguousarray(message.data)
     if data.ndim != 3:
@@ -40,7 +45,7 @@ def image(message: messages.Image, context: Context) -> Buffer:
         raise ConvertError(
             f"{message.encoding} means {expected} channels of {dtype}, got {channels} of {data.dtype}"
         )
-    made = record("sensor_msgs/msg/Image")(
+    return record("sensor_msgs/msg/Image")(
         header(message.stamp_ns, message.frame_id or context.frame_id, context),
         height,
         width,
@@ -49,10 +54,39 @@ def image(message: messages.Image, context: Context) -> Buffer:
         width * channels * data.itemsize,
         data.reshape(-1).view(np.uint8),
     )
-    return cdr.encode(made)
 
 
-def image_camera_info(message: messages.Image, context: Context) -> Buffer | None:
+@standard(
+    messages.Image,
+    "sensor_msgs/CompressedImage",
+    "{topic}/image_raw/compressed",
+    FRAMES,
+    "compression",
+    default=False,
+)
+def compressed_image(message: messages.Image, context: Context) -> Any:
+    """Convert to sensor_msgs/CompressedImage: png if the option `compression` says so, else jpeg.
+
+    Raises:
+        ConvertError: It is neither rgb8 nor mono8.
+        ImportError: Pillow is not installed.
+    """
+    from PIL import Image as Picture  # it takes 50 ms to import
+
+    if message.encoding not in ("rgb8", "mono8") or np.ndim(message.data) != 3:
+        raise ConvertError(f"only rgb8 and mono8 are compressed, not {message.encoding}")
+    kind, data = context.option("compression"), np.asarray(message.data)
+    out = io.BytesIO()
+    Picture.fromarray(data[:, :, 0] if data.shape[2] == 1 else data).save(out, kind, quality=90)
+    return record("sensor_msgs/msg/CompressedImage")(
+        header(message.stamp_ns, message.frame_id or context.frame_id, context),
+        f"{message.encoding}; {kind} compressed {'bgr8' if data.shape[2] == 3 else 'mono8'}",
+        np.frombuffer(out.getbuffer(), np.uint8),
+    )
+
+
+@standard(messages.Image, "sensor_msgs/CameraInfo", "{topic}/camera_info")
+def image_camera_info(message: messages.Image, context: Context) -> Any:
     """Return the calibration of the camera, as sensor_msgs/CameraInfo with the stamp of a picture.
 
     None, as long as the calibration is not known.
@@ -60,7 +94,8 @@ def image_camera_info(message: messages.Image, context: Context) -> Buffer | Non
     return calibration(message.stamp_ns, context.camera_info, context)
 
 
-def camera_info(message: messages.CameraInfo, context: Context) -> Buffer | None:
+@standard(messages.CameraInfo, "sensor_msgs/CameraInfo", "{parent}/camera_info", LATCHED)
+def camera_info(message: messages.CameraInfo, context: Context) -> Any:
     """Convert to sensor_msgs/CameraInfo.
 
     In ROS the centre of the first pixel is at 0, in Cortex at 0.5: the principal point moves by half a pixel.
@@ -68,37 +103,46 @@ def camera_info(message: messages.CameraInfo, context: Context) -> Buffer | None
     return calibration(message.stamp_ns, message, context)
 
 
-def point_cloud(message: messages.PointCloud, context: Context) -> Buffer:
-    """Convert to sensor_msgs/PointCloud2 with fields x, y, z and, where there are such, intensity and rgb."""
+@standard(messages.PointCloud, "sensor_msgs/PointCloud2", "{topic}", FRAMES)
+def point_cloud(message: messages.PointCloud, context: Context) -> Any:
+    """Convert to sensor_msgs/PointCloud2 with fields x, y, z and, where they are, intensity, ring and t.
+
+    Its stamp is that of the first ray, from which `t` counts [ns], as drivers and odometry of LiDARs have it;
+    that of the last ray, if points are deskewed or have no `t`.
+    """
     count = len(message.points)
-    names = ["x", "y", "z"]
-    names += ["intensity"] if message.intensity is not None else []
-    names += ["rgb"] if message.color is not None else []
-    points = np.empty((count, len(names)), "<f4")
-    points[:, :3] = message.points
-    if message.intensity is not None:
-        points[:, 3] = _of_length("intensity", message.intensity, count)
-    if message.color is not None:
-        color = _of_length("color", message.color, count)
-        packed = points[:, -1:].view("u1")  # a float to PCL and RViz, whose bytes are blue, green, red, 0
-        packed[:, :3], packed[:, 3] = color[:, ::-1], 0
+    names = [name for name in _POINT_TYPES if getattr(message, name, None) is not None]
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), *((name, _POINT_TYPES[name][0]) for name in names)]
+    points = np.zeros(count, np.dtype(kinds, align=True))
+    for axis, name in enumerate("xyz"):
+        points[name] = message.points[:, axis]
+    for name in names:
+        points[name] = _of_length(name, getattr(message, name), count)
+    is_timed = message.t is not None and not message.deskewed
     describe = record("sensor_msgs/msg/PointField")
-    fields = [describe(name, 4 * index, _POINT_FLOAT32, 1) for index, name in enumerate(names)]
-    made = record("sensor_msgs/msg/PointCloud2")(
-        header(message.stamp_ns, message.frame_id or context.frame_id, context),
+    fields = [
+        describe(name, place[1], _POINT_TYPES.get(name, _FLOAT32)[1], 1)
+        for name, place in (points.dtype.fields or {}).items()
+    ]
+    return record("sensor_msgs/msg/PointCloud2")(
+        header(
+            message.start_ns if is_timed else message.stamp_ns,
+            message.frame_id or context.frame_id,
+            context,
+        ),
         1,
         count,
         fields,
         False,
-        4 * len(names),
+        points.itemsize,
         points.nbytes,
-        points.reshape(-1).view(np.uint8),
+        points.view(np.uint8),
         bool(np.isfinite(message.points).all()),
     )
-    return cdr.encode(made)
 
 
-def point_cloud_of_depth(message: messages.Image, context: Context) -> Buffer | None:
+@standard(messages.Image, "sensor_msgs/PointCloud2", "{topic}/points", FRAMES, "depth_max_m", default=False)
+def point_cloud_of_depth(message: messages.Image, context: Context) -> Any:
     """Convert a picture of depths [m] (32FC1) to sensor_msgs/PointCloud2, in its optical frame.
 
     Depth is measured along the axis. Pixels without a finite depth, and beyond the option `depth_max_m`, have
@@ -124,7 +168,7 @@ def point_cloud_of_depth(message: messages.Image, context: Context) -> Buffer | 
     return point_cloud(cloud, context)
 
 
-def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Context) -> Buffer | None:
+def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Context) -> Any:
     """Return a calibration as sensor_msgs/CameraInfo, with another stamp [ns]; None of none."""
     if message is None:
         return None
@@ -136,7 +180,7 @@ def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Con
     distortion = np.array(message.distortion, np.float64)
     if not message.distortion_model:
         distortion = np.zeros(5)
-    made = record("sensor_msgs/msg/CameraInfo")(
+    return record("sensor_msgs/msg/CameraInfo")(
         header(stamp_ns, message.frame_id or context.frame_id, context),
         message.height,
         message.width,
@@ -149,7 +193,6 @@ def calibration(stamp_ns: int, message: messages.CameraInfo | None, context: Con
         0,
         record("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False),
     )
-    return cdr.encode(made)
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Commands and requests of ROS, to those of Cortex. All of these also raise `cdr.CdrError`."""
+"""Commands and requests of ROS, to those of Cortex; what comes is a plain record of its type."""
 
 from __future__ import annotations
 
@@ -9,25 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortex import messages
-from cortex_ros2_bridge import cdr, frames
-from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.convert.context import Context, ConvertError, check_finite
+from cortex_ros2_bridge.convert.records import record, vector
+from cortex_ros2_bridge.convert.registry import command, request
 
 DEFAULT_MAX_THRUST_N = 50.13
 """Thrust of an AttitudeTarget with thrust 1 [N], if neither an option nor the simulator says otherwise.
 
 It is that of the airframe that Neurosim flies by default: four rotors at 1500 rad/s with 5.57e-6 N s^2."""
+_VELOCITY = ("frame", "max_speed_m_s", "max_rate_rad_s", "beyond")
+_POSITION = ("max_position_m", "beyond")
 _IGNORE_RATES = (1, 2, 4)
 _IGNORE_THRUST, _IGNORE_ATTITUDE = 64, 128
 _KNOWN_BITS = sum(_IGNORE_RATES) | _IGNORE_THRUST | _IGNORE_ATTITUDE
 
 
-def actuators(data: Buffer, context: Context) -> messages.MotorCommand:
+@command(messages.MotorCommand, "actuator_msgs/Actuators", "actuators", "max_speed_rad_s", "beyond")
+def actuators(message: Any, context: Context) -> messages.MotorCommand:
     """Convert actuator_msgs/Actuators: rotor speeds [rad/s] from `velocity`.
 
     With the option `max_speed_rad_s`, also from `normalized`, 0 to 1.
     """
-    message = cdr.decode_record(data, "actuator_msgs/msg/Actuators")
     speed = np.array(message.velocity, np.float64)
     if not len(speed) and len(message.normalized):
         largest = context.option("max_speed_rad_s")
@@ -48,7 +51,8 @@ def actuators(data: Buffer, context: Context) -> messages.MotorCommand:
     return messages.MotorCommand(stamp_ns=_stamp_ns(message, context), speed=speed, sequence=context.sequence)
 
 
-def attitude(data: Buffer, context: Context) -> messages.AttitudeCommand | None:
+@command(messages.AttitudeCommand, "mavros_msgs/AttitudeTarget", "attitude_target", "max_thrust_n")
+def attitude(message: Any, context: Context) -> messages.AttitudeCommand | None:
     """Convert a mavros_msgs/AttitudeTarget whose type_mask does not ignore the attitude.
 
     Body rates that it does not ignore either must be finite, and are not used: the attitude decides.
@@ -56,7 +60,6 @@ def attitude(data: Buffer, context: Context) -> messages.AttitudeCommand | None:
     Returns:
         None if it ignores the attitude.
     """
-    message = cdr.decode_record(data, "mavros_msgs/msg/AttitudeTarget")
     if message.type_mask & _IGNORE_ATTITUDE:
         return None
     _check_mask(message.type_mask)
@@ -71,13 +74,20 @@ def attitude(data: Buffer, context: Context) -> messages.AttitudeCommand | None:
     )
 
 
-def rates(data: Buffer, context: Context) -> messages.RateThrustCommand | None:
+@command(
+    messages.RateThrustCommand,
+    "mavros_msgs/AttitudeTarget",
+    "attitude_target",
+    "max_thrust_n",
+    "max_rate_rad_s",
+    "beyond",
+)
+def rates(message: Any, context: Context) -> messages.RateThrustCommand | None:
     """Convert a mavros_msgs/AttitudeTarget whose type_mask ignores the attitude, and no rate.
 
     Returns:
         None if it does not ignore the attitude.
     """
-    message = cdr.decode_record(data, "mavros_msgs/msg/AttitudeTarget")
     if not message.type_mask & _IGNORE_ATTITUDE:
         return None
     _check_mask(message.type_mask)
@@ -96,33 +106,58 @@ def rates(data: Buffer, context: Context) -> messages.RateThrustCommand | None:
     )
 
 
-def twist_stamped(data: Buffer, context: Context) -> messages.VelocityCommand:
+@command(messages.VelocityCommand, "geometry_msgs/Twist", "cmd_vel", *_VELOCITY)
+def twist(message: Any, context: Context) -> messages.VelocityCommand:
+    """Convert geometry_msgs/Twist, in the frame that the option `frame` names, by default base_footprint."""
+    return _velocity(message, context.option("frame"), context.now_ns, context)
+
+
+@command(messages.VelocityCommand, "geometry_msgs/TwistStamped", "command_velocity", *_VELOCITY)
+def twist_stamped(message: Any, context: Context) -> messages.VelocityCommand:
     """Convert geometry_msgs/TwistStamped; its frame says what the velocity is relative to.
 
     base_link: the vehicle as it is tilted now (REP 147); base_footprint: level, x where its nose points; map
     or odom: the ground. For an empty frame the option `frame` decides, as for a Twist. The yaw rate is always
     that of the heading, about the vertical.
     """
-    message = cdr.decode_record(data, "geometry_msgs/msg/TwistStamped")
     frame = message.header.frame_id or context.option("frame")
     return _velocity(message.twist, frame, _stamp_ns(message, context), context)
 
 
-def twist(data: Buffer, context: Context) -> messages.VelocityCommand:
-    """Convert geometry_msgs/Twist, in the frame that the option `frame` names, by default base_footprint."""
-    message = cdr.decode_record(data, "geometry_msgs/msg/Twist")
-    return _velocity(message, context.option("frame"), context.now_ns, context)
+@command(
+    messages.VelocityCommand,
+    "sensor_msgs/Joy",
+    "joy",
+    "stick_speed_m_s",
+    "stick_rate_rad_s",
+    *_VELOCITY[1:],
+    default=False,
+)
+def joy(message: Any, context: Context) -> messages.VelocityCommand:
+    """Convert sensor_msgs/Joy, a gamepad of two sticks: left up and yaw, right forward and left.
+
+    Axes are those of the driver `joy` for gamepads: 1 up, 0 yaw, 4 forward, 3 left, each -1 to 1; full sticks
+    are the options `stick_speed_m_s` and `stick_rate_rad_s`, in base_footprint.
+    """
+    axes = np.array(message.axes, np.float64)
+    if len(axes) < 5 or not (np.abs(axes) <= 1.0).all():
+        raise ConvertError(f"Joy.axes must be 5 or more from -1 to 1, got {axes.tolist()}")
+    linear = context.option("stick_speed_m_s") * axes[[4, 3, 1]]
+    turn = record("geometry_msgs/msg/Twist")(
+        vector(linear), vector((0.0, 0.0, context.option("stick_rate_rad_s") * axes[0]))
+    )
+    return _velocity(turn, "base_footprint", _stamp_ns(message, context), context)
 
 
-def pose(data: Buffer, context: Context) -> messages.PoseCommand:
+@command(messages.PoseCommand, "geometry_msgs/PoseStamped", "command_pose", *_POSITION)
+def pose(message: Any, context: Context) -> messages.PoseCommand:
     """Convert geometry_msgs/PoseStamped in the map or odom frame: position and heading; tilt is not used."""
-    message = cdr.decode_record(data, "geometry_msgs/msg/PoseStamped")
     return _pose_command(message, message.pose.position, message.pose.orientation, context)
 
 
-def trajectory(data: Buffer, context: Context) -> messages.PoseCommand:
+@command(messages.PoseCommand, "trajectory_msgs/MultiDOFJointTrajectory", "command_trajectory", *_POSITION)
+def trajectory(message: Any, context: Context) -> messages.PoseCommand:
     """Convert the first point of a trajectory_msgs/MultiDOFJointTrajectory in the map or odom frame."""
-    message = cdr.decode_record(data, "trajectory_msgs/msg/MultiDOFJointTrajectory")
     if not message.points:
         raise ConvertError("a trajectory without points")
     if not message.points[0].transforms:
@@ -131,9 +166,15 @@ def trajectory(data: Buffer, context: Context) -> messages.PoseCommand:
     return _pose_command(message, first.translation, first.rotation, context)
 
 
-def reset(data: Buffer, context: Context) -> messages.Reset:
+@request(messages.Reset, "std_msgs/Empty")
+def reset_empty(message: Any, context: Context) -> messages.Reset:
+    """Convert std_msgs/Empty to a reset to what is configured."""
+    return messages.Reset()
+
+
+@request(messages.Reset, "neurosim/Reset", "{topic}_to")
+def reset(message: Any, context: Context) -> messages.Reset:
     """Convert neurosim/Reset."""
-    message = cdr.decode_record(data, "neurosim/msg/Reset")
     chosen: dict[str, Any] = {}
     if message.use_seed:
         chosen["seed"] = int(message.seed)
@@ -148,21 +189,16 @@ def reset(data: Buffer, context: Context) -> messages.Reset:
     return messages.Reset(vehicle=message.vehicle, **chosen)
 
 
-def reset_empty(data: Buffer, context: Context) -> messages.Reset:
-    """Convert std_msgs/Empty to a reset to what is configured."""
-    cdr.decode_record(data, "std_msgs/msg/Empty")
-    return messages.Reset()
-
-
-def trigger(data: Buffer, context: Context) -> messages.Trigger:
+@request(messages.Trigger, "std_msgs/Empty")
+def trigger(message: Any, context: Context) -> messages.Trigger:
     """Convert std_msgs/Empty to a request without arguments."""
-    cdr.decode_record(data, "std_msgs/msg/Empty")
     return messages.Trigger(context.sequence)
 
 
-def steps(data: Buffer, context: Context) -> messages.Step:
+@request(messages.Step, "std_msgs/UInt32")
+def steps(message: Any, context: Context) -> messages.Step:
     """Convert std_msgs/UInt32: control periods to go on for."""
-    count = cdr.decode_record(data, "std_msgs/msg/UInt32").data
+    count = message.data
     if count < 1:
         raise ConvertError("a step of 0 control periods")
     return messages.Step(count)

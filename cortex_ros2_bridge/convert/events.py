@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from cortex import messages
+from cortex.evt3 import Bytes, EventCodecError, EventColumns, Evt3Encoder
 from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge.backend.base import Qos
 from cortex_ros2_bridge.convert.camera import calibration
 from cortex_ros2_bridge.convert.context import Context, ConvertError
 from cortex_ros2_bridge.convert.records import header, record
-from cortex_ros2_bridge.event_codec import (
-    Bytes,
-    EventCodecError,
-    EventColumns,
-    EventPicture,
-    Evt3Encoder,
-    dvs_size,
-    encode_mono,
-    write_dvs,
-)
+from cortex_ros2_bridge.convert.registry import FRAMES, PACKETS, standard
+from cortex_ros2_bridge.event_codec import EventPicture, dvs_size, encode_mono, write_dvs
 
 _NO_BYTES: Bytes = np.empty(0, np.uint8)
 
 
-def event_packet(message: messages.Events, context: Context) -> Buffer:
+@standard(messages.Events, "event_camera_msgs/EventPacket", "{topic}", PACKETS, "encoding")
+def event_packet(message: messages.Events, context: Context) -> Any:
     """Convert to event_camera_msgs/EventPacket; the option `encoding` is evt3 (default) or mono.
 
     As drivers do it, its stamp is the time of the first event; of a packet without events, the end of its
@@ -64,7 +60,8 @@ def event_packet(message: messages.Events, context: Context) -> Buffer:
     return room.message()
 
 
-def event_array(message: messages.Events, context: Context) -> Buffer:
+@standard(messages.Events, "dvs_msgs/EventArray", "{topic}/event_array", PACKETS, default=False)
+def event_array(message: messages.Events, context: Context) -> Any:
     """Convert to dvs_msgs/EventArray, which older programs use; stamped as an event packet is."""
     prefix = cdr.encode(
         record("dvs_msgs/msg/EventArray")(
@@ -88,7 +85,8 @@ def event_array(message: messages.Events, context: Context) -> Buffer:
     return room.message()
 
 
-def event_image(message: messages.Events, context: Context) -> Buffer | None:
+@standard(messages.Events, "sensor_msgs/Image", "{topic}/image", FRAMES, "period_s")
+def event_image(message: messages.Events, context: Context) -> Any:
     """Draw events, and return a sensor_msgs/Image (rgb8) each time that the option `period_s` has passed.
 
     White where there was no event, else the last one: blue is brighter, red is darker. The default is 1/30 s
@@ -110,7 +108,7 @@ def event_image(message: messages.Events, context: Context) -> Buffer | None:
     if not ends:
         return None
     data = picture.take()
-    made = record("sensor_msgs/msg/Image")(
+    return record("sensor_msgs/msg/Image")(
         header(message.stamp_ns, message.frame_id or context.frame_id, context),
         size[1],
         size[0],
@@ -119,10 +117,10 @@ def event_image(message: messages.Events, context: Context) -> Buffer | None:
         3 * size[0],
         data.reshape(-1),
     )
-    return cdr.encode(made)
 
 
-def events_camera_info(message: messages.Events, context: Context) -> Buffer | None:
+@standard(messages.Events, "sensor_msgs/CameraInfo", "{topic}/camera_info", Qos(), "period_s")
+def events_camera_info(message: messages.Events, context: Context) -> Any:
     """Return the calibration of an event camera with the stamp of a picture of `event_image`.
 
     None between these pictures, and as long as the calibration is not known. The option `period_s` must be

@@ -33,20 +33,17 @@ def header(stamp_ns: int, frame: str, context: Context) -> Any:
 
 def vector(v: Iterable[float]) -> Any:
     """Return a geometry_msgs/Vector3."""
-    x, y, z = v
-    return record("geometry_msgs/msg/Vector3")(x, y, z)
+    return record("geometry_msgs/msg/Vector3")(*v)
 
 
 def point(p: Iterable[float]) -> Any:
     """Return a geometry_msgs/Point."""
-    x, y, z = p
-    return record("geometry_msgs/msg/Point")(x, y, z)
+    return record("geometry_msgs/msg/Point")(*p)
 
 
 def quaternion(q: Iterable[float]) -> Any:
     """Return a geometry_msgs/Quaternion of xyzw."""
-    x, y, z, w = q
-    return record("geometry_msgs/msg/Quaternion")(x, y, z, w)
+    return record("geometry_msgs/msg/Quaternion")(*q)
 
 
 def pose_of(position: Iterable[float], orientation: Iterable[float]) -> Any:
@@ -63,3 +60,11 @@ def transform_record(
         child,
         record("geometry_msgs/msg/Transform")(vector(translation), quaternion(rotation)),
     )
+
+
+def status_record(
+    level: int, name: str, message: str, hardware: str, values: Iterable[tuple[str, str]]
+) -> Any:
+    """Return a diagnostic_msgs/DiagnosticStatus."""
+    pairs = [record("diagnostic_msgs/msg/KeyValue")(*value) for value in values]
+    return record("diagnostic_msgs/msg/DiagnosticStatus")(level, name, message, hardware, pairs)

@@ -15,6 +15,7 @@ fields all have a counterpart in ROS, goes out field by field without any regist
 
 from __future__ import annotations
 
+import functools
 import importlib
 import importlib.metadata
 import importlib.util
@@ -22,23 +23,34 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from cortex import messages
 from cortex.schema import schema_of
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import Buffer, Qos
-from cortex_ros2_bridge.convert.context import Context, ConvertError, In, Out
+from cortex_ros2_bridge.convert.context import Context, ConvertError, Out
+from cortex_ros2_bridge.convert.measurements import MEASUREMENTS
 from cortex_ros2_bridge.convert.records import header, record
 from cortex_ros2_bridge.typestore import define, typestore
 
 GROUP = "cortex_ros2_bridge.converters"
+STREAM = Qos(depth=1000)
+"""Many small messages: at 1 kHz a subscriber may sleep for a second."""
 PACKETS = Qos(depth=100)
+FRAMES = Qos(depth=10)
+"""Few large messages."""
+NEWEST = Qos(depth=1)
+LATCHED = Qos(durability="transient_local", depth=1)
 Direction = Literal["out", "in", "call"]
 """out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service."""
+_EVENT_PACKET = "event_camera_msgs/msg/EventPacket"
+_EVENT_FIELDS = frozenset(field.name for field in fields(messages.Events))
+"""What events with more than that, such as their truth, have too."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -46,12 +58,80 @@ class Rule(NamedTuple):
     """What happens by default to a topic of a type; `{topic}`, `{parent}` and `{base}` as in `routes`."""
 
     cortex_type: str
+    """Of a service, that of its request."""
     ros_type: str
     direction: Direction
     name: str
-    qos: Qos = Qos()
+    qos: Qos
+    convert: Any
+    """`context.Out`, or `context.In`, which also raises `cdr.CdrError`."""
     default: bool = True
     """False: only where the settings ask for it."""
+    options: frozenset[str] = frozenset()
+    """Names of the options that the conversion knows."""
+
+
+RULES: list[Rule] = []
+"""What the bridge converts by itself; of one type in Cortex, the main one first."""
+
+
+def standard(
+    kind: type[Any],
+    ros_type: str,
+    name: str = "{topic}",
+    qos: Qos = Qos(),  # noqa: B008  (frozen)
+    *options: str,
+    default: bool = True,
+) -> Callable[[F], F]:
+    """Register a conversion of the bridge's own, which makes a record or CDR; see `Rule`."""
+
+    def register(function: F) -> F:
+        _add_rule(kind, ros_type, "out", name, qos, _encoded(function), default, options)
+        return function
+
+    return register
+
+
+def command(
+    kind: type[Any], ros_type: str, name: str, *options: str, default: bool = True
+) -> Callable[[F], F]:
+    """Register a conversion of commands, which takes plain records; `name` is below {base}."""
+    return _incoming(kind, ros_type, "in", f"{{base}}/{name}", default, options)
+
+
+def request(kind: type[Any], ros_type: str, name: str = "{topic}") -> Callable[[F], F]:
+    """Register a conversion of requests, likewise."""
+    return _incoming(kind, ros_type, "call", name, True, ())
+
+
+def _encoded(function: Callable[..., Any]) -> Out:
+    @functools.wraps(function)
+    def convert(message: Any, context: Context) -> Buffer | None:
+        made = function(message, context)
+        return made if made is None or isinstance(made, Buffer) else cdr.encode(made)
+
+    return convert
+
+
+def _incoming(kind: type[Any], ros_type: str, direction: Direction, *rest: Any) -> Callable[[F], F]:
+    name, default, options = rest
+
+    def register(function: F) -> F:
+        def convert(data: Buffer, context: Context) -> Any:
+            return function(cdr.decode_record(data, ros_type.replace("/", "/msg/")), context)
+
+        functools.update_wrapper(convert, function)
+        qos = NEWEST if direction == "in" else Qos()
+        _add_rule(kind, ros_type, direction, name, qos, convert, default, options)
+        return function
+
+    return register
+
+
+def _add_rule(kind: type[Any], ros_type: str, *rest: Any) -> None:
+    direction, name, qos, convert, default, options = rest
+    to = ros_type.replace("/", "/msg/")
+    RULES.append(Rule(schema_of(kind).name, to, direction, name, qos, convert, default, frozenset(options)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,10 +146,6 @@ class Added:
 
 ADDED: dict[str, Added] = {}
 """By the name of the type in Cortex."""
-OUT: dict[tuple[str, str], Out] = {}
-"""Conversions to ROS, by the types in Cortex and in ROS."""
-IN: dict[tuple[str, str], In] = {}
-"""Conversions from ROS, likewise."""
 
 
 def to_ros(kind: type[Any], ros_type: str, *, name: str = "{topic}", qos: Qos = PACKETS) -> Callable[[F], F]:
@@ -86,12 +162,7 @@ def to_ros(kind: type[Any], ros_type: str, *, name: str = "{topic}", qos: Qos = 
     """
 
     def register(function: F) -> F:
-        def convert(message: Any, context: Context) -> Buffer | None:
-            made = function(message, context)
-            return made if made is None or isinstance(made, Buffer) else cdr.encode(made)
-
-        type_name = _add(kind, Rule(schema_of(kind).name, ros_type, "out", name, qos))
-        OUT[type_name, ros_type] = convert
+        _add(kind, Rule(schema_of(kind).name, ros_type, "out", name, qos, _encoded(function)))
         return function
 
     return register
@@ -109,8 +180,7 @@ def from_ros(
         def convert(data: Buffer, context: Context) -> Any:
             return function(cdr.decode(data, ros_type), context)
 
-        type_name = _add(kind, Rule(schema_of(kind).name, ros_type, "in", name, qos))
-        IN[ros_type, type_name] = convert
+        _add(kind, Rule(schema_of(kind).name, ros_type, "in", name, qos, convert))
         return function
 
     return register
@@ -140,14 +210,59 @@ def adopt(schema: str, fingerprint: int) -> str:
     if name in ADDED:
         return "" if ADDED[name].fingerprint == fingerprint else f"another {name} is known already"
     try:
-        ros_type = _define(plain, None)
+        ADDED[name] = Added(kind=None, fingerprint=fingerprint, rules=tuple(_rules_of(plain)))
     except ValueError as error:
         return str(error)
-    OUT[name, ros_type] = _writer(plain, ros_type)
-    ADDED[name] = Added(
-        kind=None, fingerprint=fingerprint, rules=(Rule(name, ros_type, "out", "{topic}", PACKETS),)
-    )
     return ""
+
+
+def _rules_of(plain: Any) -> Iterable[Rule]:
+    """Yield the rules of a type that is known by its schema only.
+
+    Raises:
+        ValueError: A field has no counterpart.
+    """
+    name, fields_of = plain["name"], {field["name"] for field in plain["fields"]}
+    known = MEASUREMENTS.get(name)
+    if fields_of >= _EVENT_FIELDS:
+        yield Rule(
+            name, _EVENT_PACKET, "out", "{topic}", PACKETS, _conversion_of("cortex/Events", _EVENT_PACKET)
+        )
+    elif _is_picture(plain):
+        yield from _picture_rules(plain)
+    elif known is not None and known.fields <= fields_of:
+        yield Rule(name, known.ros_type, "out", "{topic}", PACKETS, known.convert)
+    else:
+        ros_type = _define(plain, None)
+        yield Rule(name, ros_type, "out", "{topic}", PACKETS, _writer(plain, ros_type))
+
+
+def _conversion_of(cortex_type: str, ros_type: str) -> Any:
+    """Return the bridge's own conversion of a standard type."""
+    return next(rule.convert for rule in RULES if rule[:3] == (cortex_type, ros_type, "out"))
+
+
+def _is_picture(plain: Any) -> bool:
+    """Return whether messages are pictures: `data` of [H, W] or [H, W, C], and `encoding`."""
+    types = {field["name"]: field["type"] for field in plain["fields"]}
+    data = types.get("data")
+    ranks = len(data["shape"]) if isinstance(data, dict) and "array" in data else 0
+    return "stamp_ns" in types and types.get("encoding") == "str" and ranks in (2, 3)
+
+
+def _picture_rules(plain: Any) -> Iterable[Rule]:
+    """Yield the rules of pictures: `data`, and what labels mean."""
+    name, pictures, texts = plain["name"], "sensor_msgs/msg/Image", "std_msgs/msg/String"
+    image = _conversion_of("cortex/Image", pictures)
+
+    def send(message: Any, context: Context) -> Any:
+        data = message.data if message.data.ndim == 3 else message.data[:, :, None]
+        return image(messages.Image(message.stamp_ns, data, message.encoding, message.frame_id), context)
+
+    yield Rule(name, pictures, "out", "{topic}/image_raw", PACKETS, send)
+    if any(field["name"] == "labels" and field["type"] == "str" for field in plain["fields"]):
+        labels = _encoded(lambda message, _: record(texts)(message.labels))
+        yield Rule(name, texts, "out", "{topic}/labels", LATCHED, labels)
 
 
 def load_converters(modules: Iterable[str]) -> list[str]:
@@ -178,14 +293,13 @@ def _import(module: str) -> None:
     spec.loader.exec_module(loaded)
 
 
-def _add(kind: type[Any], rule: Rule) -> str:
+def _add(kind: type[Any], rule: Rule) -> None:
     schema = schema_of(kind)
     before = ADDED.get(schema.name)
     rules = before.rules if before is not None and before.kind is not None else ()
     ADDED[schema.name] = Added(
         kind=kind, fingerprint=schema.fingerprint, rules=(*(r for r in rules if r[:3] != rule[:3]), rule)
     )
-    return schema.name
 
 
 # Field by field

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from cortex import messages
-from cortex_ros2_bridge import cdr, frames
-from cortex_ros2_bridge.backend.base import Buffer
+from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.convert.context import Context
-from cortex_ros2_bridge.convert.records import header, point, record
+from cortex_ros2_bridge.convert.records import header, point, record, status_record
+from cortex_ros2_bridge.convert.registry import LATCHED, standard
 
 DIAGNOSTICS_INTERVAL_NS = 900_000_000
 """Shortest wall-clock time between two arrays of one phase [ns]: about one a second, as others send them."""
@@ -30,28 +30,31 @@ _VEHICLE_VALUES = (
 )
 
 
-def text(message: messages.Text, context: Context) -> Buffer:
+@standard(messages.Text, "std_msgs/String")
+def text(message: messages.Text, context: Context) -> Any:
     """Convert to std_msgs/String."""
-    return cdr.encode(record("std_msgs/msg/String")(message.text))
+    return record("std_msgs/msg/String")(message.text)
 
 
-def simulation(message: messages.Simulation, context: Context) -> Buffer:
+@standard(messages.Simulation, "std_msgs/String", "{topic}", LATCHED)
+def simulation(message: messages.Simulation, context: Context) -> Any:
     """Convert to std_msgs/String: the settings, as YAML."""
-    return cdr.encode(record("std_msgs/msg/String")(message.config))
+    return record("std_msgs/msg/String")(message.config)
 
 
-def collision(message: messages.Collision, context: Context) -> Buffer:
+@standard(messages.Collision, "neurosim/Collision")
+def collision(message: messages.Collision, context: Context) -> Any:
     """Convert to neurosim/Collision, in the map frame."""
-    made = record("neurosim/msg/Collision")(
+    return record("neurosim/msg/Collision")(
         header(message.stamp_ns, frames.WORLD, context), point(message.position), float(message.clearance_m)
     )
-    return cdr.encode(made)
 
 
-def simulator_status(message: messages.SimulatorStatus, context: Context) -> Buffer:
+@standard(messages.SimulatorStatus, "neurosim/SimulatorStatus")
+def simulator_status(message: messages.SimulatorStatus, context: Context) -> Any:
     """Convert to neurosim/SimulatorStatus; counts are sums over sensors and vehicles."""
     second, nanosecond = divmod(message.slipped_ns, 1_000_000_000)
-    made = record("neurosim/msg/SimulatorStatus")(
+    return record("neurosim/msg/SimulatorStatus")(
         header(message.stamp_ns, "", context),
         message.phase,
         message.reason,
@@ -66,10 +69,10 @@ def simulator_status(message: messages.SimulatorStatus, context: Context) -> Buf
         sum(vehicle.collision_count for vehicle in message.vehicles),
         any(vehicle.fail_safe for vehicle in message.vehicles),
     )
-    return cdr.encode(made)
 
 
-def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -> Buffer | None:
+@standard(messages.SimulatorStatus, "diagnostic_msgs/DiagnosticArray", "/diagnostics")
+def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -> Any:
     """Convert to diagnostic_msgs/DiagnosticArray: of the simulator, of each sensor and vehicle.
 
     What is counted is judged over the time since the array before, and said in `message`; `values` are sums.
@@ -86,7 +89,7 @@ def simulator_diagnostics(message: messages.SimulatorStatus, context: Context) -
     statuses += [_of_sensor(sensor, judged) for sensor in message.sensors]
     statuses += [_of_vehicle(vehicle, judged) for vehicle in message.vehicles]
     array = record("diagnostic_msgs/msg/DiagnosticArray")
-    return cdr.encode(array(header(message.stamp_ns, "", context), statuses))
+    return array(header(message.stamp_ns, "", context), statuses)
 
 
 def _is_due(message: messages.SimulatorStatus, before: messages.SimulatorStatus) -> bool:
@@ -120,7 +123,7 @@ def _of_simulator(message: messages.SimulatorStatus, judged: _Judged) -> Any:
     if late or slipped_ns:
         said += f"; {late} steps were late, and {slipped_ns / 1e9:.3f} s slipped {judged.period}"
     level = _ERROR if message.phase == "ended" else _WARN if late or slipped_ns else _OK
-    return _status(level, "simulator", said, "simulator", message, _SIMULATOR_VALUES)
+    return status_record(level, "simulator", said, "simulator", _pairs(message, _SIMULATOR_VALUES))
 
 
 def _of_sensor(sensor: messages.SensorStatus, judged: _Judged) -> Any:
@@ -134,32 +137,25 @@ def _of_sensor(sensor: messages.SensorStatus, judged: _Judged) -> Any:
     if undelivered:
         said = f"{'' if said == 'ok' else f'{said}; '}{undelivered} lost by reliable readers {judged.period}"
     level = _WARN if unwanted or undelivered else _OK
-    return _status(level, f"sensor {name}", said, sensor.vehicle, sensor, _SENSOR_VALUES)
+    return status_record(level, f"sensor {name}", said, sensor.vehicle, _pairs(sensor, _SENSOR_VALUES))
 
 
 def _of_vehicle(vehicle: messages.VehicleStatus, judged: _Judged) -> Any:
     trouble = ["no command has come in time: the fail-safe flies"] if vehicle.fail_safe else []
-    refused = judged.more(vehicle, "refused_count", vehicle.name)
-    if refused:
-        reason = f" ({vehicle.refused_reason})" if vehicle.refused_reason else ""
-        trouble.append(f"{refused} commands refused {judged.period}{reason}")
-    clamped = judged.more(vehicle, "clamped_count", vehicle.name)
-    if clamped:
-        trouble.append(f"{clamped} commands clamped {judged.period} ({vehicle.clamped_reason})")
-    collisions = judged.more(vehicle, "collision_count", vehicle.name)
-    if collisions:
-        trouble.append(f"{collisions} collisions {judged.period}")
-    undelivered = judged.more(vehicle, "undelivered_count", vehicle.name)
-    if undelivered:
-        trouble.append(f"{undelivered} messages lost by reliable readers {judged.period}")
+    counts = (
+        ("refused_count", "commands refused", vehicle.refused_reason),
+        ("clamped_count", "commands clamped", vehicle.clamped_reason),
+        ("collision_count", "collisions", ""),
+        ("undelivered_count", "messages lost by reliable readers", ""),
+    )
+    for name, what, reason in counts:
+        if count := judged.more(vehicle, name, vehicle.name):
+            trouble.append(f"{count} {what} {judged.period}" + (f" ({reason})" if reason else ""))
     mode = f"commands: {vehicle.command_mode}" if vehicle.command_mode else "no command yet"
     said = "; ".join([*trouble, mode])
-    return _status(
-        _WARN if trouble else _OK, f"vehicle {vehicle.name}", said, vehicle.name, vehicle, _VEHICLE_VALUES
-    )
+    level, values = _WARN if trouble else _OK, _pairs(vehicle, _VEHICLE_VALUES)
+    return status_record(level, f"vehicle {vehicle.name}", said, vehicle.name, values)
 
 
-def _status(level: int, name: str, said: str, hardware: str, source: Any, values: Sequence[str]) -> Any:
-    pair = record("diagnostic_msgs/msg/KeyValue")
-    pairs = [pair(key, str(getattr(source, key))) for key in values]
-    return record("diagnostic_msgs/msg/DiagnosticStatus")(level, name, said, hardware, pairs)
+def _pairs(source: Any, names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(name, str(getattr(source, name))) for name in names]

@@ -21,17 +21,27 @@ from cortex_ros2_bridge.convert.records import (
     transform_record,
     vector,
 )
+from cortex_ros2_bridge.convert.registry import LATCHED, STREAM, standard
 from cortex_ros2_bridge.frames import FrameNames
 
 _NO_FLOATS: NDArray[np.float64] = np.empty(0)
 
 
-def clock(message: messages.Clock, context: Context) -> Buffer:
+@standard(messages.Clock, "rosgraph_msgs/Clock")
+def clock(message: messages.Clock, context: Context) -> Any:
     """Convert to rosgraph_msgs/Clock."""
-    return cdr.encode(record("rosgraph_msgs/msg/Clock")(time_of(message.stamp_ns)))
+    return record("rosgraph_msgs/msg/Clock")(time_of(message.stamp_ns))
 
 
-def imu(message: messages.Imu, context: Context) -> Buffer:
+@standard(
+    messages.Imu,
+    "sensor_msgs/Imu",
+    "{topic}",
+    STREAM,
+    "angular_velocity_std_rad_s",
+    "linear_acceleration_std_m_s2",
+)
+def imu(message: messages.Imu, context: Context) -> Any:
     """Convert to sensor_msgs/Imu, without an orientation (its covariance begins with -1); at rest z is 9.81.
 
     The options `angular_velocity_std_rad_s` and `linear_acceleration_std_m_s2` give standard deviations of
@@ -40,7 +50,7 @@ def imu(message: messages.Imu, context: Context) -> Buffer:
     check_finite("imu", message.angular_rate, message.specific_force)
     unknown = np.zeros(9)
     unknown[0] = -1.0
-    made = record("sensor_msgs/msg/Imu")(
+    return record("sensor_msgs/msg/Imu")(
         header(message.stamp_ns, context.frame_id, context),
         quaternion((0.0, 0.0, 0.0, 1.0)),
         unknown,
@@ -49,10 +59,19 @@ def imu(message: messages.Imu, context: Context) -> Buffer:
         vector(message.specific_force),
         _diagonal([context.option("linear_acceleration_std_m_s2")] * 3),
     )
-    return cdr.encode(made)
 
 
-def odometry(message: messages.Odometry, context: Context) -> Buffer:
+@standard(
+    messages.Odometry,
+    "nav_msgs/Odometry",
+    "{topic}",
+    STREAM,
+    "position_std_m",
+    "orientation_std_rad",
+    "velocity_std_m_s",
+    "angular_velocity_std_rad_s",
+)
+def odometry(message: messages.Odometry, context: Context) -> Any:
     """Convert to nav_msgs/Odometry: the pose in the odom frame, the velocity turned into the body frame.
 
     The options `position_std_m`, `orientation_std_rad`, `velocity_std_m_s` and `angular_velocity_std_rad_s`
@@ -72,12 +91,20 @@ def odometry(message: messages.Odometry, context: Context) -> Buffer:
         ),
     )
     head = record("std_msgs/msg/Header")(time_of(message.stamp_ns), context.frames.odom_of(context.vehicle))
-    return cdr.encode(
-        record("nav_msgs/msg/Odometry")(head, context.frames.body_of(context.vehicle), pose, twist)
-    )
+    return record("nav_msgs/msg/Odometry")(head, context.frames.body_of(context.vehicle), pose, twist)
 
 
-def odometry_transform(message: messages.Odometry, context: Context) -> Buffer:
+@standard(messages.Odometry, "geometry_msgs/PoseStamped", "{topic}/pose", STREAM, default=False)
+def pose_stamped(message: messages.Odometry, context: Context) -> Any:
+    """Convert to geometry_msgs/PoseStamped, in the odom frame."""
+    _check_pose(message)
+    head = record("std_msgs/msg/Header")(time_of(message.stamp_ns), context.frames.odom_of(context.vehicle))
+    pose = pose_of(message.position, message.orientation)
+    return record("geometry_msgs/msg/PoseStamped")(head, pose)
+
+
+@standard(messages.Odometry, "tf2_msgs/TFMessage", "/tf", STREAM)
+def odometry_transform(message: messages.Odometry, context: Context) -> Any:
     """Convert to tf2_msgs/TFMessage: from the odom frame to the body frame."""
     _check_pose(message)
     names = context.frames
@@ -94,7 +121,8 @@ def odometry_transform(message: messages.Odometry, context: Context) -> Buffer:
     )
 
 
-def transform(message: messages.Transform, context: Context) -> Buffer:
+@standard(messages.Transform, "tf2_msgs/TFMessage", "/tf_static", LATCHED)
+def transform(message: messages.Transform, context: Context) -> Any:
     """Convert to tf2_msgs/TFMessage."""
     return _transforms([_transform_of(message, context.frames)])
 
@@ -118,7 +146,7 @@ def static_transforms(
         )
         for vehicle in vehicles
     ]
-    return _transforms(roots + [_transform_of(each, names) for each in transforms])
+    return cdr.encode(_transforms(roots + [_transform_of(each, names) for each in transforms]))
 
 
 def check_transform(message: messages.Transform, names: FrameNames) -> None:
@@ -126,14 +154,16 @@ def check_transform(message: messages.Transform, names: FrameNames) -> None:
     _transform_of(message, names)
 
 
-def rotor_speeds(message: messages.RotorSpeeds, context: Context) -> Buffer:
+@standard(messages.RotorSpeeds, "actuator_msgs/Actuators", "{topic}", STREAM)
+def rotor_speeds(message: messages.RotorSpeeds, context: Context) -> Any:
     """Convert to actuator_msgs/Actuators, velocities in the order of the rotors."""
     speed = np.ascontiguousarray(message.speed, dtype=np.float64)
     head = record("std_msgs/msg/Header")(time_of(message.stamp_ns), context.frames.body_of(context.vehicle))
-    return cdr.encode(record("actuator_msgs/msg/Actuators")(head, _NO_FLOATS, speed, _NO_FLOATS))
+    return record("actuator_msgs/msg/Actuators")(head, _NO_FLOATS, speed, _NO_FLOATS)
 
 
-def path(message: messages.Path, context: Context) -> Buffer:
+@standard(messages.Path, "nav_msgs/Path", "{topic}", LATCHED)
+def path(message: messages.Path, context: Context) -> Any:
     """Convert to nav_msgs/Path; each pose is stamped with its time, and not turned."""
     check_finite("path", message.position)
     if len(message.time_ns) != len(message.position):
@@ -145,7 +175,7 @@ def path(message: messages.Path, context: Context) -> Buffer:
         stamped(header(time_ns, frame, context), pose_of(position, level))
         for time_ns, position in zip(message.time_ns.tolist(), message.position, strict=True)
     ]
-    return cdr.encode(record("nav_msgs/msg/Path")(header(message.stamp_ns, frame, context), poses))
+    return record("nav_msgs/msg/Path")(header(message.stamp_ns, frame, context), poses)
 
 
 def _check_pose(message: messages.Odometry) -> None:
@@ -180,5 +210,5 @@ def _transform_of(message: messages.Transform, names: FrameNames) -> Any:
     )
 
 
-def _transforms(records: list[Any]) -> Buffer:
-    return cdr.encode(record("tf2_msgs/msg/TFMessage")(records))
+def _transforms(records: list[Any]) -> Any:
+    return record("tf2_msgs/msg/TFMessage")(records)

@@ -1,6 +1,6 @@
 """Closed loop through DDS: how well a foreign controller flies through the ROS 2 bridge, against one without.
 
-`cortex-ros2-bridge bench` runs this module in a process of its own; it prints a line of JSON for each flight.
+`python -m neurosim_core.bench.bridge_flight` prints a line of JSON for each flight.
 A simulator, the bridge and a controller that only speaks DDS are three processes. The controller in the
 simulator's process has the same law and the same rate.
 """

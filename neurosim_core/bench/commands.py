@@ -83,6 +83,10 @@ QUESTIONS: Sequence[Question] = (
         options=(*_VIEW, "worlds", "seconds"),
     ),
     Question(
+        name="data",
+        help="windows a second from a recording, and event files of all formats there and back",
+    ),
+    Question(
         name="leave-out",
         help="what a scene does not need is not computed: kernels, memory, libraries, time",
     ),

@@ -173,13 +173,12 @@ def _sweep(
         rows += [
             _ours(flight, flight.name, method, value, known, 3 if quick else 5) for method, value in settings
         ]
-    batch = [(flight, step_s) for flight in flights for step_s in STEPS_S[:5]]
     for tableau in TABLEAUX:
         progress(f"all flights with {tableau.name}")
-        flown = integrate([flight for flight, _ in batch], [step_s for _, step_s in batch], tableau)
         rows += [
-            _row(flight.name, tableau.name, step_s, states, references[flight.name])
-            for (flight, step_s), states in zip(batch, flown, strict=True)
+            _row(f.name, tableau.name, step_s, integrate(f, step_s, tableau), references[f.name])
+            for f in flights
+            for step_s in STEPS_S[:5]
         ]
     return sorted(rows, key=lambda row: list(FLIGHTS).index(row["flight"]))
 
@@ -219,14 +218,13 @@ def _hard(
         except ValueError as error:
             why = next(line for line in str(error).splitlines() if "Value error" in line)
             rows.append({"flight": name, "method": RKMK4, "outcome": f"refused: {why.strip()}"})
-    flown = {t.name: integrate(list(flights.values()), [1e-3] * len(flights), t) for t in TABLEAUX}
-    for number, (name, flight) in enumerate(flights.items()):
+    for name, flight in flights.items():
         progress(name)
         known = make_reference(flight, stiff=cases[name][1])
         rows += [
             _ours(flight, name, m, value, known, 1) for m, value in ((RKMK4, 1e-3), (DORMAND_PRINCE, 1e-6))
         ]
-        rows += [_row(name, method, 1e-3, states[number], known) for method, states in flown.items()]
+        rows += [_row(name, t.name, 1e-3, integrate(flight, 1e-3, t), known) for t in TABLEAUX]
         if rotorpy_peer.rotorpy_version() and flight.config.motor_time_constant_s > 0.0 and not quick:
             states, cpu_s = rotorpy_peer.fly_rotorpy(flight, 1e-3, cpu_max_s=5.0)
             outcome = "too slow" if cpu_s > 5.0 and not np.isfinite(states).all() else "flown"

@@ -1,7 +1,7 @@
 """What the integrators of the vehicle are judged by: SciPy on equations of its own.
 
-`Equations` states the equations of motion a second time, in NumPy and for batches, independently of the
-kernels of the vehicle. SciPy solves them to rounding; small fixed-step methods integrate them for comparison.
+`Equations` states the equations of motion a second time, in NumPy, independently of the kernels of the
+vehicle. SciPy solves them to rounding; small fixed-step methods integrate them for comparison.
 
 Reference: Svacha, Mohta, Kumar (2017), Improving quadrotor trajectory tracking by compensating for
 aerodynamic effects (the equations); Hairer, Norsett, Wanner (1993), Solving ordinary differential equations I
@@ -11,7 +11,6 @@ aerodynamic effects (the equations); Hairer, Norsett, Wanner (1993), Solving ord
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -36,40 +35,30 @@ def _cross(a: Any, b: Any) -> Array:
 
 
 class Equations:
-    """Equations of motion of B vehicles with R rotors each; all arrays have B as their last axis.
+    """Equations of motion of a vehicle with R rotors: wind without gusts and turbulence, and no ground."""
 
-    Args:
-        configs: One for each vehicle, shape [B]: wind without gusts and turbulence, and no ground.
-    """
-
-    def __init__(self, configs: Sequence[MultirotorConfig]) -> None:
-        def stack(values: Sequence[Any]) -> Array:
-            return np.moveaxis(np.array(values, dtype=np.float64), 0, -1)
-
-        self._gravity = stack([c.gravity_m_s2 for c in configs])
-        self._mass = stack([c.mass_kg for c in configs])
-        self._inertia = stack([c.inertia_kg_m2 for c in configs])
-        self._inertia_inverse = stack([np.linalg.inv(c.inertia_kg_m2) for c in configs])
-        self._hub = np.swapaxes(stack([c.rotor_position_m for c in configs]), 0, 1)  # [3, R, B]
-        self._thrust = stack([c.thrust_coefficients_n_s2 for c in configs])
-        self._torque = stack([c.torque_coefficients_n_m_s2 * np.array(c.rotor_direction) for c in configs])
-        self._drag = stack([[c.rotor_drag_kg, c.rotor_drag_kg, c.rotor_inflow_kg] for c in configs])
-        self._lift = stack([c.translational_lift_kg_m for c in configs])
-        self._flapping = stack([c.flapping_kg_m for c in configs])
-        self._parasitic = stack([c.parasitic_drag_kg_m for c in configs])
-        self._wind = stack([c.wind_m_s for c in configs])
-        self.time_constant_s = stack([c.motor_time_constants_s for c in configs])
-        """Of the motors [s], shape [R, B]."""
+    def __init__(self, config: MultirotorConfig) -> None:
+        self._config = config
+        self._inertia = np.array(config.inertia_kg_m2)
+        self._inertia_inverse = np.linalg.inv(self._inertia)
+        self._hub = np.array(config.rotor_position_m).T
+        self._thrust = config.thrust_coefficients_n_s2
+        self._torque = config.torque_coefficients_n_m_s2 * np.array(config.rotor_direction)
+        self._drag = np.array([[config.rotor_drag_kg], [config.rotor_drag_kg], [config.rotor_inflow_kg]])
+        self._parasitic = np.array(config.parasitic_drag_kg_m)
+        self._wind = np.array(config.wind_m_s)
+        self.time_constant_s = config.motor_time_constants_s
+        """Of the motors [s], shape [R]."""
 
     def rate(self, y: Array, speed: Array) -> Array:
         """Return d/dt of position, velocity, orientation and body rate.
 
         Args:
-            y: p_WB [m], v_WB [m/s], q_WB (xyzw, of any length), w_WB in B [rad/s], shape [13, B].
-            speed: Rotor speeds [rad/s], shape [R, B].
+            y: p_WB [m], v_WB [m/s], q_WB (xyzw, of any length), w_WB in B [rad/s], shape [13].
+            speed: Rotor speeds [rad/s], shape [R].
         """
-        velocity, q, w = y[VELOCITY], y[ORIENTATION], y[BODY_RATE]
-        unit = q / np.sqrt((q * q).sum(axis=0))
+        config, velocity, q, w = self._config, y[VELOCITY], y[ORIENTATION], y[BODY_RATE]
+        unit = q / np.sqrt(q @ q)
         u, s = unit[:3], unit[3]
 
         def turn(v: Array, sign: float) -> Array:
@@ -78,24 +67,22 @@ class Equations:
 
         air = turn(velocity - self._wind, -1.0)
         flow = air[:, None] + _cross(w[:, None], self._hub)
-        force = -speed * self._drag[:, None] * flow
-        force[2] += self._thrust * speed**2 + self._lift * (flow[0] ** 2 + flow[1] ** 2)
+        force = -speed * self._drag * flow
+        force[2] += self._thrust * speed**2 + config.translational_lift_kg_m * (flow[0] ** 2 + flow[1] ** 2)
         torque = _cross(self._hub, force).sum(axis=1)
-        torque[2] += (self._torque * speed**2).sum(axis=0)
-        torque[0] -= self._flapping * (speed * flow[1]).sum(axis=0)
-        torque[1] += self._flapping * (speed * flow[0]).sum(axis=0)
-        total = force.sum(axis=1) - np.sqrt((air * air).sum(axis=0)) * self._parasitic * air
-        acceleration = turn(total, 1.0) / self._mass
-        acceleration[2] -= self._gravity
-        momentum = (self._inertia * w).sum(axis=1)
-        angular = (self._inertia_inverse * (torque - _cross(w, momentum))).sum(axis=1)
+        torque[2] += self._torque @ speed**2
+        torque[0] -= config.flapping_kg_m * (speed @ flow[1])
+        torque[1] += config.flapping_kg_m * (speed @ flow[0])
+        total = force.sum(axis=1) - np.sqrt(air @ air) * self._parasitic * air
+        acceleration = turn(total, 1.0) / config.mass_kg
+        acceleration[2] -= config.gravity_m_s2
+        angular = self._inertia_inverse @ (torque - _cross(w, self._inertia @ w))
         return np.concatenate([velocity, acceleration, spin(q, w), angular])
 
 
 def spin(q: Array, w: Array) -> Array:
-    """Return the rate of a quaternion q_WB [xyzw] that turns at w in B [rad/s], shape [4, B]."""
-    vector = 0.5 * (q[3] * w + _cross(q[:3], w))
-    return np.concatenate([vector, -0.5 * (q[:3] * w).sum(axis=0)[None]])
+    """Return the rate of a quaternion q_WB [xyzw] that turns at w in B [rad/s], shape [4]."""
+    return np.append(0.5 * (q[3] * w + _cross(q[:3], w)), -0.5 * (q[:3] @ w))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,24 +111,22 @@ TABLEAUX = (EULER, SEMI_IMPLICIT, RK4)
 the quaternion after each step, and have no guard: what they cannot resolve becomes infinite or NaN."""
 
 
-def integrate(flights: Sequence[Flight], steps_s: Sequence[float], method: Tableau) -> list[Array]:
-    """Fly several flights with one method, all at once.
+def integrate(flight: Flight, step_s: float, method: Tableau) -> Array:
+    """Fly with one method.
 
     Args:
-        flights: One for each vehicle of the batch.
-        steps_s: The step of each [s], a divisor of the hold.
-        method: Of all.
+        flight: What to fly.
+        step_s: Step [s], a divisor of the hold.
+        method: How.
 
     Returns:
-        States at the end of each hold, one array of shape [K, 13 + R] for each flight.
+        States at the end of each hold, shape [K, 13 + R].
     """
-    equations = Equations([flight.config for flight in flights])
-    step_counts = np.array([round(_HOLD_S / step_s) for step_s in steps_s])
+    equations = Equations(flight.config)
     tau = equations.time_constant_s
     lagging = tau > 0.0
-    hold_count = max(len(flight.commands) for flight in flights)
-    y = np.stack([np.concatenate(flight.start) for flight in flights], axis=-1)
-    ends = []
+    y = np.concatenate(flight.start)
+    states = []
 
     def rate(state: Array, command: Array) -> Array:
         speed = state[13:]
@@ -149,19 +134,16 @@ def integrate(flights: Sequence[Flight], steps_s: Sequence[float], method: Table
         return np.concatenate([equations.rate(state[:13], speed), motor])
 
     with np.errstate(all="ignore"):  # what blows up is a result
-        for hold in range(hold_count):
-            held = (flight.held(min(hold, len(flight.commands) - 1)) for flight in flights)
-            command = np.stack(list(held), axis=-1)
+        for hold in range(len(flight.commands)):
+            command = flight.held(hold)
             y[13:] = np.where(lagging, y[13:], command)
-            for step in range(step_counts.max()):
-                h = np.where(step < step_counts, _HOLD_S / step_counts, 0.0)  # those that are done stay
-                y = _step(y, h, command, method, rate)
-            ends.append(y)
-    states = np.stack(ends)
-    return [states[: len(flight.commands), :, index] for index, flight in enumerate(flights)]
+            for _ in range(round(_HOLD_S / step_s)):
+                y = _step(y, step_s, command, method, rate)
+            states.append(y.copy())
+    return np.array(states)
 
 
-def _step(y: Array, h: Array, command: Array, method: Tableau, rate: Any) -> Array:
+def _step(y: Array, h: float, command: Array, method: Tableau, rate: Any) -> Array:
     rates = [rate(y, command)]
     for row in method.stages:
         shift = sum(a * k for a, k in zip(row, rates, strict=True) if a)
@@ -170,7 +152,7 @@ def _step(y: Array, h: Array, command: Array, method: Tableau, rate: Any) -> Arr
     if method.semi_implicit:
         end[POSITION] = y[POSITION] + h * end[VELOCITY]
         end[ORIENTATION] = y[ORIENTATION] + h * spin(y[ORIENTATION], end[BODY_RATE])
-    end[ORIENTATION] /= np.sqrt((end[ORIENTATION] ** 2).sum(axis=0))
+    end[ORIENTATION] /= np.linalg.norm(end[ORIENTATION])
     return np.asarray(end)
 
 
@@ -188,12 +170,10 @@ def solve(flight: Flight, solver: Solver, rtol: float) -> Array:
     Raises:
         ArithmeticError: The solver gave up.
     """
-    equations = Equations([flight.config])
-    tau_s = equations.time_constant_s[:, 0]
-    slowest_s, decay_rate = (
-        tau_s.max(),
-        np.divide(1.0, tau_s, out=np.full_like(tau_s, np.inf), where=tau_s > 0.0),
-    )
+    equations = Equations(flight.config)
+    tau_s = equations.time_constant_s
+    slowest_s = tau_s.max()
+    decay_rate = np.divide(1.0, tau_s, out=np.full_like(tau_s, np.inf), where=tau_s > 0.0)
     y, speed = np.concatenate(flight.start[:4]), flight.start.rotor_speed
     states = []
     for hold in range(len(flight.commands)):
@@ -204,7 +184,7 @@ def solve(flight: Flight, solver: Solver, rtol: float) -> Array:
                 return np.asarray(held + (first - held) * np.nan_to_num(np.exp(-t * decay_rate)))
 
         def rate(t: float, y: Array, rotor_speed: Any = rotor_speed) -> Array:
-            return equations.rate(y[:, None], rotor_speed(t)[:, None])[:, 0]
+            return equations.rate(y, rotor_speed(t))
 
         solution = solve_ivp(
             rate, (0.0, _HOLD_S), y, method=solver, t_eval=[_HOLD_S], rtol=rtol, atol=0.1 * rtol,

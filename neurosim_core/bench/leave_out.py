@@ -1,21 +1,20 @@
-# mypy: disable-error-code="attr-defined,no-untyped-call,method-assign"
 """What a scene does not need is left out: kernels, memory, libraries and time of runs, small and large.
 
-Each case flies in a process of its own (`python -m neurosim_core.bench.leave_out`), where Warp's launches
-and allocators are wrapped before anything else is imported: what is counted is what happened. Kernels that
-leave terms out are compared with ones that have them with coefficients of zero.
+Each case flies in a process of its own (`python -m neurosim_core.bench.leave_out`); what it holds and has
+imported is counted there when it has flown. Kernels that leave terms out are compared with ones that have
+them with coefficients of zero.
 """
 
 from __future__ import annotations
 
+import gc
+import itertools
 import json
 import math
 import resource
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -105,54 +104,16 @@ def run_case(config: dict[str, Any], *, seconds: float) -> Row:
 # In the process of a run
 
 
-class _Counts:
-    """Counts launches, allocations and pictures of this process from now on."""
-
-    def __init__(self) -> None:
-        from warp._src import context
-
-        self.launches: Counter[str] = Counter()
-        self.allocations = self.bytes = self.pictures = 0
-        launch, replay, make = wp.launch, wp.Launch.launch, wp.array.__init__
-
-        def counted_launch(kernel: Any, *args: Any, **options: Any) -> Any:
-            self.launches[kernel.key] += not options.get("record_cmd")
-            return launch(kernel, *args, **options)
-
-        def counted_replay(command: Any, *args: Any, **options: Any) -> Any:
-            self.launches[command.kernel.key] += 1
-            return replay(command, *args, **options)
-
-        def counted_array(array: Any, *args: Any, **options: Any) -> None:
-            before = self.allocations
-            make(array, *args, **options)
-            made = self.allocations > before
-            self.pictures += made and (_HEIGHT_PX, _WIDTH_PX) in zip(
-                array.shape, array.shape[1:], strict=False
-            )
-
-        for owner, name, counted in (
-            (wp, "launch", counted_launch),
-            (wp.Launch, "launch", counted_replay),
-            (wp.array, "__init__", counted_array),
-        ):
-            setattr(owner, name, counted)
-        for name in ("CpuDefaultAllocator", "CpuPinnedAllocator"):
-            allocator = getattr(context, name)
-            allocator.allocate = self._counted(allocator.allocate)
-
-    def _counted(self, allocate: Callable[[Any, int], int]) -> Callable[[Any, int], int]:
-        def wrapped(allocator: Any, size_in_bytes: int) -> int:
-            self.allocations += 1
-            self.bytes += size_in_bytes
-            return allocate(allocator, size_in_bytes)
-
-        return wrapped
+def _held_arrays() -> list[Any]:
+    """Return the Warp arrays of this process that own their memory."""
+    objects = (thing for thing in gc.get_objects() if isinstance(thing, wp.array))
+    return [array for array in objects if getattr(array, "_allocator", None) is not None]
 
 
 def _fly(config: dict[str, Any], seconds: float) -> Row:
     """Fly, and return what was counted; for a process that does nothing else."""
-    counts = _Counts()
+    from warp._src.context import user_modules
+
     begin_s = time.process_time()  # what else runs on the machine does not count
 
     from neurosim_core.config import load_config
@@ -163,26 +124,21 @@ def _fly(config: dict[str, Any], seconds: float) -> Row:
     model = make_model(load_config({**config, "duration_s": 2.0 * seconds}))
     state = make_state(model)
     setup_s = time.process_time() - begin_s
-    arrays, held = counts.allocations, counts.bytes
-    launched: Counter[str] = Counter()
-    allocated, flown_ns, flight_s, halfway = 0, 0, 0.0, False
+    flown_ns, flight_s, halfway = 0, 0.0, False
     for packet in run_model(model, state):
         if not halfway and packet.stamp_ns >= 1e9 * seconds:
-            halfway, launched, allocated = True, counts.launches.copy(), counts.allocations
-            flown_ns, flight_s = packet.stamp_ns, time.process_time()
+            halfway, flown_ns, flight_s = True, packet.stamp_ns, time.process_time()
         last_ns = packet.stamp_ns
-    simulated_s = 1e-9 * (last_ns - flown_ns)
-    in_flight = counts.launches - launched
+    cpu_s = time.process_time() - flight_s
+    arrays = _held_arrays()
     return {
-        "kernels in flight": len(in_flight),
-        "launches per simulated s": sum(in_flight.values()) / simulated_s,
-        "allocations per simulated s": (counts.allocations - allocated) / simulated_s,
-        "arrays of the set-up": arrays,
-        "their size [MiB]": held / 2**20,
-        "pictures": counts.pictures,
+        "arrays": len(arrays),
+        "their size [MiB]": sum(array.capacity for array in arrays) / 2**20,
+        "pictures": sum((_HEIGHT_PX, _WIDTH_PX) in itertools.pairwise(array.shape) for array in arrays),
+        "modules of kernels": sum(bool(module.execs) for module in user_modules.values()),
         "most memory [MiB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "set-up [s of CPU]": setup_s,
-        "CPU per simulated s [ms]": 1e3 * (time.process_time() - flight_s) / simulated_s,
+        "CPU per simulated s [ms]": 1e3 * cpu_s / (1e-9 * (last_ns - flown_ns)),
         "libraries": ", ".join(name for name in LIBRARIES if name in sys.modules) or "none",
     }
 
@@ -261,7 +217,7 @@ def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
     cpu, setup = "CPU per simulated s [ms]", "set-up [s of CPU]"
     places = list(range(len(rows)))
     panels = []
-    for heading in (cpu, "launches per simulated s", "their size [MiB]"):
+    for heading in (cpu, "modules of kernels", "their size [MiB]"):
         values = [row[heading] for row in rows]
         series = Series(label="runs", x=values, y=places, style="points", names=list(map(cell, values)))
         ticks = {row["run"]: place for place, row in enumerate(rows)}
@@ -276,9 +232,8 @@ def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
         claims=[
             Claim(
                 "a run with an IMU only allocates no picture",
-                "Warp's allocators, counted in the process of the run",
-                f"{least['pictures']} of {least['arrays of the set-up']} arrays; {most['pictures']} with "
-                "all sensors",
+                "arrays of Warp in the process of the run",
+                f"{least['pictures']} of {least['arrays']} arrays; {most['pictures']} with all sensors",
                 least["pictures"] == 0 < most["pictures"],
             ),
             Claim(
@@ -295,9 +250,7 @@ def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
             ),
         ],
         tables=[
-            Table(
-                "leave-out", "Launches, memory, libraries and time", rows, "On the CPU, each in a process."
-            ),
+            Table("leave-out", "Kernels, memory, libraries and time", rows, "On the CPU, each in a process."),
             Table("leave-out-differences", "Reduced kernels against full ones with zeros", differences),
         ],
         plots=[Plot("leave-out", "What runs take, few parts to many", panels)],

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import hashlib
 import math
 import time
 from collections.abc import Callable
 from functools import partial
-from itertools import islice
 from typing import Any, cast
 
 import numpy as np
@@ -21,7 +19,6 @@ import warp as wp
 from neurosim_core.bench.engine import (
     EventCamera,
     EventCameraConfig,
-    Events,
     Model,
     View,
     device_title,
@@ -30,9 +27,7 @@ from neurosim_core.bench.engine import (
     fly,
     load_config,
     make_model,
-    make_state,
     refit,
-    run_model,
     upload_scene,
 )
 from neurosim_core.bench.naive_events import NaiveEventCamera
@@ -101,9 +96,7 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
         rows.append({"what is varied": what, "mode": mode, **_try(partial(_steps, make, quick))})
     progress("parts alone")
     parts = _parts(base, quick, progress)
-    progress("the same flight twice")
-    digests = {_digest(base, 4 if quick else 16) for _ in range(2)}
-    return _chapter(rows, parts, len(digests) == 1, device, on_cuda)
+    return _chapter(rows, parts, device, on_cuda)
 
 
 def _try(measure: Callable[[], Row]) -> Row:
@@ -124,15 +117,6 @@ def _steps(make: Callable[[], Model], quick: bool) -> Row:
     return time_steps(
         model, warm_up=warm_up, count=left // 6, repetitions=2 if quick else 5, repetition_s=0.8
     )
-
-
-def _digest(model: Model, count: int) -> str:
-    """Return a digest of the first packets of a flight."""
-    digest = hashlib.sha256()
-    for packet in islice(run_model(model, make_state(model)), count):
-        for column in cast(Events, packet).numpy():
-            digest.update(np.ascontiguousarray(column).tobytes())
-    return digest.hexdigest()
 
 
 def _seconds(call: Callable[[], object], device: str, seconds: float) -> float:
@@ -217,7 +201,7 @@ def _parts(model: Model, quick: bool, progress: Progress) -> list[Row]:
     return rows
 
 
-def _chapter(rows: list[Row], parts: list[Row], same: bool, device: str, on_cuda: bool) -> Chapter:
+def _chapter(rows: list[Row], parts: list[Row], device: str, on_cuda: bool) -> Chapter:
     known = [row for row in rows if "whole steps/s" in row]
     vga = next((row for row in known if row["pixels"] == "640x480" and row["mode"] == EXACT), None)
     by_part = {row.get("part"): row.get("frames/s") for row in parts}
@@ -254,12 +238,6 @@ def _chapter(rows: list[Row], parts: list[Row], same: bool, device: str, on_cuda
                 "one event per pixel and frame, unsorted, its count read by the host, in the same run",
                 f"{cell(stack)} against {cell(naive)} frames/s",
                 stack >= naive if stack and naive else None,
-            ),
-            Claim(
-                "the same flight again gives the same bytes",
-                "same settings, same seed, same device",
-                "the same" if same else "not the same",
-                same,
             ),
         ],
         tables=[

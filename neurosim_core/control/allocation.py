@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.vehicle.aerodynamics import quadratic_weights
-from neurosim_core.vehicle.multirotor import MultirotorConfig
+from neurosim_core.vehicle.airframe import MultirotorConfig
 
 wp.set_module_options({"enable_backward": False})
 

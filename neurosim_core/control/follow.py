@@ -15,7 +15,7 @@ from neurosim_core.control.modes import Controller, make_controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.frames import heading_rad
 from neurosim_core.trajectory.path import Path, PathCursor
-from neurosim_core.vehicle.multirotor import MultirotorConfig
+from neurosim_core.vehicle.airframe import MultirotorConfig
 
 FollowMode = Literal["motor_speeds", "velocity", "position"]
 """What a follower commands: the rotors themselves, or setpoints for whatever flies the vehicle."""

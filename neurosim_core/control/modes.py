@@ -18,7 +18,7 @@ sin yaw, 0). A mode is compiled when it is first used, and only then.
 import functools
 import logging
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -26,7 +26,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.control.air import air_terms, make_air_model
 from neurosim_core.control.allocation import allocate, allocation_matrix, clip
 from neurosim_core.control.flatness import AttitudeReference
 from neurosim_core.control.se3 import (
@@ -45,9 +44,9 @@ from neurosim_core.control.se3 import (
 )
 from neurosim_core.frames import UNIT_TOLERANCE, as_rows
 from neurosim_core.trajectory.path import Path, PathArrays, PathPoint, evaluate_path, upload_paths
-from neurosim_core.vehicle.aerodynamics import Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.aerodynamics import AIR_TERMS, Airframe, make_wrench, vec10d
+from neurosim_core.vehicle.airframe import MultirotorConfig, make_airframe
 from neurosim_core.vehicle.command_ranges import CommandRanges, command_ranges
-from neurosim_core.vehicle.multirotor import MultirotorConfig
 
 logger = logging.getLogger(__name__)
 wp.set_module_options({"enable_backward": False})
@@ -161,108 +160,23 @@ def _path(
     return point_wrench(parameters, state, evaluate_path(path, index, stamp_ns))
 
 
-def _make_wrench_kernel(name: str, wrench_of: Any, terms: frozenset[str]) -> Any:
-    """Return the kernel that allocates the wrench of one mode, with compensation of the air's given terms."""
-    air_wrench = make_wrench(terms)
-    compensate = len(terms) > 0
-
-    @wp.kernel(module=wp.get_module(".".join((__name__, name, *sorted(terms)))), enable_backward=False)
-    def command(
-        # Model:
-        parameters: Se3Parameters,
-        airframe: Airframe,
-        linear_weight: wp.array[vec10d],
-        matrix: wp.array2d[wp.float64],
-        path: PathArrays,
-        # In:
-        feedback: Feedback,
-        setpoint: wp.array2d[wp.float64],
-        # Out:
-        rotor_speed_command_out: wp.array2d[wp.float64],
-    ):
-        vehicle = wp.tid()
-        state = VehicleState()
-        state.position = feedback.position[vehicle]
-        state.velocity = feedback.velocity[vehicle]
-        state.orientation = feedback.orientation[vehicle]
-        state.body_rate = feedback.body_rate[vehicle]
-        if wp.static(compensate):
-            linear = vec10d()
-            for rotor in range(matrix.shape[0]):
-                linear += feedback.rotor_speed[vehicle, rotor] * linear_weight[rotor]
-            air_B = wp.quat_rotate_inv(state.orientation, state.velocity)
-            force, torque = air_wrench(airframe, wp.vec4d(), linear, air_B, state.body_rate)
-            state.air_acceleration = wp.quat_rotate(state.orientation, force) / parameters.mass_kg
-            state.air_torque = torque
-        wrench = wrench_of(parameters, path, setpoint, vehicle, feedback.stamp_ns[vehicle], state)
-        allocate(
-            matrix,
-            parameters.motors,
-            wrench.thrust_N,
-            wrench.torque,
-            vehicle,
-            feedback.rotor_speed,
-            rotor_speed_command_out,
-        )
-
-    return command
-
-
-def _make_motor_speeds_kernel(terms: frozenset[str]) -> Any:
-    """Return the kernel that only applies the limits, whatever the air does."""
-
-    @wp.kernel(module=wp.get_module(f"{__name__}.motor_speeds"), enable_backward=False)
-    def command(
-        # Model:
-        parameters: Se3Parameters,
-        airframe: Airframe,
-        linear_weight: wp.array[vec10d],
-        matrix: wp.array2d[wp.float64],
-        path: PathArrays,
-        # In:
-        feedback: Feedback,
-        setpoint: wp.array2d[wp.float64],
-        # Out:
-        rotor_speed_command_out: wp.array2d[wp.float64],
-    ):
-        vehicle = wp.tid()
-        for rotor in range(matrix.shape[0]):
-            rotor_speed_command_out[vehicle, rotor] = clip(
-                setpoint[vehicle, rotor], parameters.motors.speed_min_rad_s, parameters.motors.speed_max_rad_s
-            )
-
-    return command
-
-
 @dataclass(frozen=True, kw_only=True)
 class Mode:
     """One row of the table of command modes."""
 
     layout: tuple[str, ...]
     """Name and unit of each element of a setpoint row; that of `motor_speeds` repeats for every rotor."""
-    make_kernel: Callable[[frozenset[str]], Any]
-    """Makes the kernel from setpoint to rotor speed commands; all take the same arguments."""
+    wrench: Any = None
+    """Device function from setpoint and state to the wrench; None: a setpoint is rotor speeds."""
 
 
 MODES: dict[str, Mode] = {
-    "motor_speeds": Mode(layout=("rotor_speed_rad_s",), make_kernel=_make_motor_speeds_kernel),
-    "rates": Mode(
-        layout=("thrust_N", "w_B_x_rad_s", "w_B_y_rad_s", "w_B_z_rad_s"),
-        make_kernel=functools.partial(_make_wrench_kernel, "rates", _rates),
-    ),
-    "attitude": Mode(
-        layout=("thrust_N", "q_WB_x", "q_WB_y", "q_WB_z", "q_WB_w"),
-        make_kernel=functools.partial(_make_wrench_kernel, "attitude", _attitude),
-    ),
-    "velocity": Mode(
-        layout=("v_W_x_m_s", "v_W_y_m_s", "v_W_z_m_s", "yaw_rate_rad_s"),
-        make_kernel=functools.partial(_make_wrench_kernel, "velocity", _velocity),
-    ),
-    "position": Mode(
-        layout=("p_W_x_m", "p_W_y_m", "p_W_z_m", "yaw_rad"),
-        make_kernel=functools.partial(_make_wrench_kernel, "position", _position),
-    ),
-    "path": Mode(layout=(), make_kernel=functools.partial(_make_wrench_kernel, "path", _path)),
+    "motor_speeds": Mode(layout=("rotor_speed_rad_s",)),
+    "rates": Mode(layout=("thrust_N", "w_B_x_rad_s", "w_B_y_rad_s", "w_B_z_rad_s"), wrench=_rates),
+    "attitude": Mode(layout=("thrust_N", "q_WB_x", "q_WB_y", "q_WB_z", "q_WB_w"), wrench=_attitude),
+    "velocity": Mode(layout=("v_W_x_m_s", "v_W_y_m_s", "v_W_z_m_s", "yaw_rate_rad_s"), wrench=_velocity),
+    "position": Mode(layout=("p_W_x_m", "p_W_y_m", "p_W_z_m", "yaw_rad"), wrench=_position),
+    "path": Mode(layout=(), wrench=_path),
 }
 """The command modes by name."""
 
@@ -273,14 +187,66 @@ def mode_kernel(mode: str, terms: frozenset[str] = frozenset()) -> Any:
 
     Args:
         mode: Name of the mode.
-        terms: Aerodynamic terms to compensate, of `vehicle.aerodynamics.AIR_TERMS`.
+        terms: Aerodynamic terms to compensate, of `vehicle.aerodynamics.AIR_TERMS`; `motor_speeds` only
+            applies the limits.
 
     Raises:
         ValueError: There is no such mode.
     """
     if mode not in MODES:
         raise ValueError(f"unknown command mode {mode!r}, known: {sorted(MODES)}")
-    return MODES[mode].make_kernel(terms)
+    wrench_of, air_wrench = MODES[mode].wrench, make_wrench(terms)
+    allocates = wrench_of is not None
+    compensates = allocates and len(terms) > 0
+
+    @wp.kernel(module=wp.get_module(".".join((__name__, mode, *sorted(terms)))), enable_backward=False)
+    def command(
+        # Model:
+        parameters: Se3Parameters,
+        airframe: Airframe,
+        linear_weight: wp.array[vec10d],
+        matrix: wp.array2d[wp.float64],
+        path: PathArrays,
+        # In:
+        feedback: Feedback,
+        setpoint: wp.array2d[wp.float64],
+        # Out:
+        rotor_speed_command_out: wp.array2d[wp.float64],
+    ):
+        vehicle = wp.tid()
+        if wp.static(allocates):
+            state = VehicleState()
+            state.position = feedback.position[vehicle]
+            state.velocity = feedback.velocity[vehicle]
+            state.orientation = feedback.orientation[vehicle]
+            state.body_rate = feedback.body_rate[vehicle]
+            if wp.static(compensates):
+                linear = vec10d()
+                for rotor in range(matrix.shape[0]):
+                    linear += feedback.rotor_speed[vehicle, rotor] * linear_weight[rotor]
+                air_B = wp.quat_rotate_inv(state.orientation, state.velocity)
+                force, torque = air_wrench(airframe, wp.vec4d(), linear, air_B, state.body_rate)
+                state.air_acceleration = wp.quat_rotate(state.orientation, force) / parameters.mass_kg
+                state.air_torque = torque
+            wrench = wrench_of(parameters, path, setpoint, vehicle, feedback.stamp_ns[vehicle], state)
+            allocate(
+                matrix,
+                parameters.motors,
+                wrench.thrust_N,
+                wrench.torque,
+                vehicle,
+                feedback.rotor_speed,
+                rotor_speed_command_out,
+            )
+        else:
+            for rotor in range(matrix.shape[0]):
+                rotor_speed_command_out[vehicle, rotor] = clip(
+                    setpoint[vehicle, rotor],
+                    parameters.motors.speed_min_rad_s,
+                    parameters.motors.speed_max_rad_s,
+                )
+
+    return command
 
 
 class Controller:
@@ -503,15 +469,18 @@ def make_controller(
         raise ValueError(f"mode {mode!r} takes setpoints ({', '.join(MODES[mode].layout)}), not paths")
     gains = config or Se3Config()
     matrix = allocation_matrix(vehicle)
+    terms = frozenset(vehicle.terms()) & frozenset(AIR_TERMS) if gains.feed_forward_air else frozenset[str]()
     layout = MODES[mode].layout
     place = wp.get_device(device)
+    airframe = make_airframe(vehicle, place)
     return Controller(
         mode=mode,
         layout=layout * vehicle.rotor_count if mode == "motor_speeds" else layout,
-        kernel=mode_kernel(mode, air_terms(vehicle) if gains.feed_forward_air else frozenset()),
+        kernel=mode_kernel(mode, terms),
         model=[
             make_parameters(vehicle, gains, matrix),
-            *make_air_model(vehicle, place),
+            airframe.airframe,
+            airframe.linear_weight,
             wp.array(matrix, dtype=wp.float64, device=place),
             upload_paths(given, place) if given else PathArrays(),
         ],

@@ -23,8 +23,8 @@ from neurosim_core.control.allocation import Motors, clip
 from neurosim_core.control.flatness import AttitudeReference, Heading, attitude_reference
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory.path import PathPoint
+from neurosim_core.vehicle.airframe import MultirotorConfig
 from neurosim_core.vehicle.command_ranges import command_ranges
-from neurosim_core.vehicle.multirotor import MultirotorConfig
 
 wp.set_module_options({"enable_backward": False})
 

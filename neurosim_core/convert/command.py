@@ -1,4 +1,4 @@
-"""The command `neurosim convert`: a video or a folder of pictures to events."""
+"""The command `neurosim convert`: a video or a folder of pictures to events, or events to another format."""
 
 from __future__ import annotations
 
@@ -65,12 +65,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add `convert` to the commands of `neurosim`."""
     parser = commands.add_parser(
         "convert",
-        help="turn a video or a folder of pictures into events",
+        help="turn a video or a folder of pictures into events, or events into another format",
         description="Let a simulated event camera look at a video (needs PyAV) or at the pictures of a "
-        "folder, and write its events as `neurosim run` does. Log radiance is linear between frames.",
+        "folder, and write its events as `neurosim run` does. Log radiance is linear between frames. Or copy "
+        "events from one format to another: .raw (EVT3), .evt2.raw, .dat, .csv, .npz, .aedat4, .mcap (only "
+        "from), mvsec.h5 (with pictures, depth, poses and IMU), .h5.",
     )
-    parser.add_argument("source", type=Path, help="video file, or folder of pictures")
-    parser.add_argument("out", type=Path, help="HDF5 file to write")
+    parser.add_argument("source", type=Path, help="video file, folder of pictures, or file of events")
+    parser.add_argument("out", type=Path, help="file to write; HDF5 for videos and pictures")
     for name, option in _OPTIONS.items():
         parser.add_argument(
             f"--{name}",
@@ -80,6 +82,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
             choices=option.choices,
             dest=option.setting,
         )
+    events = parser.add_argument_group("events to another format")
+    events.add_argument("--from", dest="source_format", metavar="FORMAT", help="default: by the suffix")
+    events.add_argument("--to", dest="out_format", metavar="FORMAT", help="default: by the suffix")
+    events.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
+    events.add_argument("--from-zero", action="store_true", help="count time from the first event")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
     parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
     add_set_option(parser, "any setting by its dotted key, such as pixel.threshold_on=0.15; may be repeated")
@@ -87,6 +94,54 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _convert(arguments: argparse.Namespace) -> int:
+    from neurosim_core.io import is_event_file
+
+    if arguments.source_format is not None or (
+        not arguments.source.is_dir() and is_event_file(arguments.source)
+    ):
+        return _transfer(arguments)
+    return _convert_video(arguments)
+
+
+def _transfer(arguments: argparse.Namespace) -> int:
+    """Copy events from one format to another."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    from neurosim_core.convert.geometry import read_size
+    from neurosim_core.io.transfer import transfer
+
+    out, text = arguments.out, arguments.size
+    if out.exists() and not arguments.overwrite:
+        raise FileExistsError(f"{out} is already there: add --overwrite, or name another file")
+    console = Console()
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("converting", total=None)
+        done = transfer(
+            arguments.source,
+            out,
+            format=arguments.source_format,
+            out_format=arguments.out_format,
+            size=None if text is None else read_size(text),
+            sensor=arguments.sensor,
+            from_zero=arguments.from_zero,
+            on_block=lambda count: progress.update(task, description=f"{count:,} events"),
+        )
+    span_s = (done.end_us - done.begin_us) * 1e-6
+    more = f", {done.packet_count:,} other packets" if done.packet_count else ""
+    console.print(
+        f"{done.event_count:,} events of {done.width}x{done.height} pixels, {done.begin_us * 1e-6:.6f} s to "
+        f"{done.end_us * 1e-6:.6f} s ({done.event_count / max(span_s, 1e-6) / 1e6:.2f} M/s){more}",
+        highlight=False,
+    )
+    for note in done.notes:
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"{out}", markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def _convert_video(arguments: argparse.Namespace) -> int:
     import threading
 
     from rich.console import Console
@@ -142,8 +197,8 @@ def read_config(arguments: argparse.Namespace) -> ConversionConfig:
     """
     from pydantic import ValidationError
 
+    from neurosim_core.config_errors import explain
     from neurosim_core.convert.convert import ConversionConfig
-    from neurosim_core.mistakes import explain
 
     given = {option.setting: getattr(arguments, option.setting) for option in _OPTIONS.values()}
     settings = {key: value for key, value in given.items() if value is not None}

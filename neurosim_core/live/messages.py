@@ -27,6 +27,7 @@ ClockNs = Callable[[int], int]
 _TYPES: dict[type[pkt.Packet], type[Any]] = {
     pkt.Events: msg.Events,
     pkt.Image: msg.Image,
+    pkt.PointCloud: msg.PointCloud,
     pkt.ImuSample: msg.Imu,
     pkt.Odometry: msg.Odometry,
     pkt.Collision: msg.Collision,

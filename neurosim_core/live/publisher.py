@@ -165,6 +165,7 @@ class PacketPublisher:
         config = model.config
         self._sensor_names = tuple(config.sensors)
         sensors = describe_sensors(config.sensors)
+        self._image_names: list[str] = []
         self.topics: dict[str, PacketTopic] = {}
 
         def add(
@@ -176,6 +177,8 @@ class PacketPublisher:
             publisher = node.publisher(topic, message, latch=latch, expected_bytes=size_bytes)
             queue = Link(link, seed=config.seed, name=name)
             self.topics[name] = PacketTopic(name, publisher, queue, convert, **options)
+            if message is msg.Image:
+                self._image_names.append(name)
             if not link.delivers_at_once:
                 self.open_delivery(name)
 
@@ -211,8 +214,9 @@ class PacketPublisher:
             delivery.reset()
 
     def write_in_place(self, settle: Callable[[], object]) -> None:
-        """Let the device write pictures into the memory of the topics; `settle` waits until it has."""
-        for topic in self.topics.values():
+        """Let the device write images into the memory of the topics; `settle` waits until it has."""
+        for name in self._image_names:
+            topic = self.topics[name]
             topic.loan = PictureLoan(topic.publisher, device=self._device, settle=settle)
 
     def acquire_buffer(self, name: str, _stamp_ns: int, picture: NDArray[Any]) -> NDArray[Any] | None:

@@ -12,16 +12,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, to_yaml
-from neurosim_core.flight import new_folder
+from neurosim_core.flight import header_of, new_folder
 from neurosim_core.install import install_hint
 from neurosim_core.live.engine import Model
 from neurosim_core.live.links import payload_bytes
 from neurosim_core.packets import Packet
-from neurosim_core.record import RecordingHeader, RecordingWriter, describe_sensors
+from neurosim_core.record import RecordingWriter
 
 QUEUE_BYTES = 16_000_000
 """Most that waits to be written [bytes]: gzip writes it in 0.2 s."""
@@ -221,17 +218,7 @@ class Recorder:
             return entry
 
     def _open(self, entry: _Entry) -> RecordingWriter:
-        model = self._models[entry.vehicle]
-        stamps = np.linspace(0, model.duration_ns, 1001).astype(np.int64)
-        header = RecordingHeader(
-            config_yaml=to_yaml(entry.config),
-            seed=entry.config.seed,
-            version=__version__,
-            scene=model.scene.name,
-            sensors=describe_sensors(entry.config.sensors),
-            path_stamp_ns=stamps,
-            path_position=model.path.evaluate(stamps).position,
-        )
+        header = header_of(self._models[entry.vehicle], entry.config)
         return RecordingWriter(self._folders[entry.vehicle] / entry.file, header)
 
     def _write_changes(self, vehicle: str) -> None:

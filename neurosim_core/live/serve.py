@@ -14,8 +14,8 @@ from rich.markdown import Markdown
 from rich.status import Status
 from rich.table import Table
 
-from cortex import Node, latest
-from cortex.messages import Simulation, SimulatorStatus
+from cortex import Node
+from cortex.messages import SimulatorStatus
 from neurosim_core.config import SimulationConfig
 from neurosim_core.live.call import describe_status
 from neurosim_core.live.simulator import Simulator
@@ -25,10 +25,8 @@ from neurosim_core.signals import stop_at_signals
 
 _SWITCH_S = 2e-4
 """Longest turn of one Python thread while another one waits [s]: 5 ms by default, a whole control period."""
-LOOK_S = 0.3
-"""How long the discovery of another simulator takes at most [s]."""
 GONE_S = 2.0
-"""After this a simulator that was killed is no longer connected [s]."""
+"""After this a simulator that was killed is no longer known [s]."""
 _SLOW_STATUSES = 5
 """Statuses in a row, five a second, after which a run is called slow."""
 
@@ -85,14 +83,14 @@ def require_single_instance(node: Node) -> None:
     Raises:
         RuntimeError: There is one.
     """
-    with node.subscriber(SIMULATION, Simulation, policy=latest()) as others:
-        if not others.wait_for_publisher(LOOK_S):
-            return
-        deadline_s = time.monotonic() + GONE_S
-        while time.monotonic() < deadline_s:
-            if not others.publisher_count:
-                return
-            time.sleep(0.02)
+    node.wait_for_registry()
+    deadline_s = time.monotonic() + GONE_S
+    while any(topic.topic == SIMULATION and topic.publishers for topic in node.topics()):
+        if time.monotonic() >= deadline_s:
+            break
+        time.sleep(0.02)
+    else:
+        return
     raise RuntimeError(
         f"a simulator runs in domain {node.domain} already: end it, or set CORTEX_DOMAIN to another number "
         "for all processes that belong together"

@@ -104,6 +104,7 @@ class Simulator:
         with contextlib.ExitStack() as stack:
             node = node or stack.enter_context(Node("simulator"))
             services = stack.enter_context(Node("simulator services"))
+            self.status = StatusPublisher(node)  # before the commands: by it a second simulator sees this one
             self._recorder = None if folders is None else Recorder(folders, models)
             if self._recorder is not None:
                 stack.callback(self._recorder.close)
@@ -119,7 +120,6 @@ class Simulator:
                 self._streaming = StreamingLoop(
                     self.vehicles, self._cameras, self._pacer, self._stats, wakeup=self._wakeup
                 )
-            self.status = StatusPublisher(node)
             self._subscribers = SubscriberMonitor(self.vehicles, self.status)
             self._begin(make_reset(self.vehicles, config, Reset()))
             self.status.announce(config)

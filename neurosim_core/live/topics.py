@@ -90,6 +90,6 @@ def body_frame(vehicle: str) -> str:
 
 def sensor_frame(vehicle: str, sensor: SensorDescription) -> str:
     """Name of a sensor's frame: the optical frame of a camera, the body frame for odometry."""
-    if sensor.kind == "odometry":
+    if sensor.kind in ("odometry", "state_estimate"):
         return body_frame(vehicle)
     return f"{vehicle}/{sensor.name}" + ("" if sensor.intrinsics is None else "_optical_frame")

@@ -7,8 +7,9 @@ and shuffle are used, which are part of HDF5 itself.
     /config_yaml             the resolved configuration
     /path/{stamp_ns,position}
     /sensors/<name>          attributes: packet (name of the packet class), schema (JSON of its
-                             `packets.PacketSchema`), each constant field of the packet; for sensors in the
-                             header kind, rate_hz, p_BS, q_BS_xyzw, settings (JSON), and for cameras
+                             `packets.PacketSchema`), each constant field of the packet (long
+                             texts are datasets); for sensors in the header kind, rate_hz, p_BS, q_BS_xyzw,
+                             settings (JSON), and for cameras
                              intrinsics (fx fy cx cy), resolution (width height), and unless they are
                              pinholes distortion_model, distortion
         packet_count         how many packets are complete
@@ -59,6 +60,7 @@ LARGE_ROW_BYTES = 4096
 _FLAT_CHUNK = 65536  # 0.5 MB of t: fits HDF5's chunk cache, so appending never reads back
 _ROW_CHUNK = 1024
 _FIRST_FLUSH_BYTES = 65536
+_ATTRIBUTE_MAX_BYTES = 60000
 
 
 class RecordingWriter:
@@ -220,15 +222,19 @@ class _Column:
     ) -> None:
         # A chunk that is stored as it is, is extended in place; a compressed one is written anew, elsewhere.
         filters = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compressed else {}
+        room = [max(1, length) for length in shape]  # an axis may be empty
         self._dataset = group.create_dataset(
-            name, shape=(0, *shape), maxshape=(None, *shape), dtype=dtype, chunks=(chunk, *shape), **filters
+            name, shape=(0, *shape), maxshape=(None, *room), dtype=dtype, chunks=(chunk, *room), **filters
         )
         self._shape = shape
         self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
         self._rows: list[NDArray[Any]] = []
 
     def append(self, rows: Any) -> int:
-        block = np.asarray(rows).astype(self._dtype, casting="same_kind").reshape(-1, *self._shape)  # a copy
+        count = len(rows) if 0 in self._shape else -1
+        block = (
+            np.asarray(rows).astype(self._dtype, casting="same_kind").reshape(count, *self._shape)
+        )  # a copy
         self._rows.append(block)
         return block.nbytes
 
@@ -265,7 +271,7 @@ class _Stream:
             self._add_rows(name, np.int64)
         for field in self._fields:
             if field.constant:
-                group.attrs[field.name] = self._fixed[field.name]
+                _write_constant(group, field.name, self._fixed[field.name])
             else:
                 self._add_field(field, values[field.name])
         self._ends = {field.varying: 0 for field in self._fields if field.varying}
@@ -376,6 +382,20 @@ class _Stream:
         first = np.searchsorted(t, milliseconds * 1000) + self._ends["event"]
         self._ms_count += len(milliseconds)
         return self._columns["ms_to_idx"].append(first.astype(np.uint64))
+
+
+def _write_constant(group: Any, name: str, value: Any) -> None:
+    """Write a constant as an attribute; a long text, which no attribute can hold, as a dataset."""
+    if isinstance(value, str) and len(value.encode()) > _ATTRIBUTE_MAX_BYTES:
+        group.create_dataset(name, data=value)
+    else:
+        group.attrs[name] = value
+
+
+def read_constant(group: Any, name: str) -> Any:
+    """Return a constant of the packets of a sensor."""
+    value = group.attrs[name] if name in group.attrs else group[name].asstr()[()]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _write_header(file: Any, header: RecordingHeader) -> dict[str, Any]:

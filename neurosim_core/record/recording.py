@@ -20,6 +20,7 @@ from neurosim_core.record.hdf5 import (
     HEADER_COLUMNS,
     LARGE_ROW_BYTES,
     import_h5py,
+    read_constant,
 )
 from neurosim_core.record.header import Intrinsics, RecordingHeader, SensorDescription
 
@@ -182,8 +183,7 @@ class _Stream:
         dsec = DSEC_NAMES if issubclass(self.packet_class, Events) else {}
         for field in self.schema.fields:
             if field.constant:
-                value = group.attrs[field.name]
-                self._constants[field.name] = value.item() if isinstance(value, np.generic) else value
+                self._constants[field.name] = read_constant(group, field.name)
             else:
                 dataset = group[dsec.get(field.name, field.name)]
                 self._datasets[field.name] = dataset.asstr() if field.dtype == "str" else dataset

@@ -38,7 +38,7 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import spread_order
-from neurosim_core.render.outputs import RenderOutputs, radiance_writer
+from neurosim_core.render.outputs import RADIANCE, RenderOutputs, radiance_writer, requested_outputs
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS
@@ -152,6 +152,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel whose threads are pixels, for any device and all terms."""
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
+    requested = requested_outputs(outputs)
     write_radiance = radiance_writer(outputs, supersampled=False)
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
@@ -187,9 +188,9 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         if col >= view.width or row >= view.height:
             return
         slot = int(-1)
-        if wp.static("rgb" in outputs):
+        if wp.static(requested.images):
             slot = view.image_slot[instant]
-            if wp.static("log_radiance" not in outputs):
+            if wp.static(not requested.log):
                 if slot < 0:
                     return
         origin = view.p_WC[instant]
@@ -322,6 +323,7 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
 def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     find_tile = tile_finder(terms)
+    requested = requested_outputs(outputs)
     write_radiance = radiance_writer(outputs, supersampled=False)
     cast_packet = packet_caster(terms.embree)
     shade_block = _block_shader(textured=terms.textured, emissive=terms.emissive)
@@ -358,9 +360,9 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         if left >= view.width or top >= view.height:
             return
         slot = int(-1)
-        if wp.static("rgb" in outputs):
+        if wp.static(requested.images):
             slot = view.image_slot[instant]
-            if wp.static("log_radiance" not in outputs):
+            if wp.static(not requested.log):
                 if slot < 0:
                     return
         origin = view.p_WC[instant]
@@ -426,10 +428,10 @@ def antialiasing_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kern
     """Return the kernel of the second pass.
 
     Args:
-        outputs: Outputs of the renderer, of which log radiance and RGB are written.
+        outputs: Outputs of the renderer, of which those in `RADIANCE` are written.
         terms: Terms of the first pass.
     """
-    written = tuple(name for name in ("log_radiance", "rgb") if name in outputs)
+    written = tuple(name for name in RADIANCE if name in outputs)
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
     in_blocks = _in_blocks(terms)
     return (_block_kernel if in_blocks else _pixel_kernel)(written, plain)
@@ -475,7 +477,7 @@ class Antialiasing:
         *,
         pixel_count: int,
     ) -> None:
-        """Write log radiance and RGB.
+        """Write the light of the pixels.
 
         Args:
             scene: As for the first pass, as the next three.

@@ -49,8 +49,12 @@ def _darken_pixels(
     if out.rgb.shape[0] > 0:
         for channel in range(3):
             out.rgb[slot, row, col, channel] = wp.uint8(0)
+    if out.radiance.shape[0] > 0:
+        out.radiance[slot, row, col] = wp.vec3(0.0)
     if out.depth.shape[0] > 0:
         out.depth[slot, row, col] = wp.inf
+    if out.range.shape[0] > 0:
+        out.range[slot, row, col] = wp.inf
     if out.normal.shape[0] > 0:
         out.normal[slot, row, col] = wp.vec3(0.0)
     if out.instance.shape[0] > 0:

@@ -179,7 +179,8 @@ class _PolynomialLens(_ModelLens):
             g + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
         )
 
-    @functools.cached_property
+    @property
+    @functools.lru_cache(maxsize=32)  # noqa: B019  (a cached_property counts in comparisons)
     def _rising(self) -> tuple[Vectors, Vectors]:
         """Radii of x / z and y / z, and what becomes of them, as far as the latter grow."""
         r = np.tan(np.linspace(0.0, _ANGLE_MAX_RAD, _TABLE_SIZE))
@@ -295,7 +296,8 @@ class EquidistantConfig(_WideLens):
             1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4))),
         )
 
-    @functools.cached_property
+    @property
+    @functools.lru_cache(maxsize=32)  # noqa: B019  (as above)
     def _rising(self) -> Vectors:
         """Angles up to the border, or up to where the radius ceases to grow, evenly spaced."""
         k1, k2, k3, k4 = self.distortion

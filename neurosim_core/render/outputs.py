@@ -16,12 +16,14 @@ from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import albedo_reader
 
-OUTPUTS = ("log_radiance", "rgb", "depth", "normal", "instance", "returns")
+OUTPUTS = ("log_radiance", "rgb", "radiance", "depth", "range", "normal", "instance", "returns")
 """The outputs of the ray caster."""
 
 INSTANT_OUTPUTS = frozenset({"log_radiance"})
 """Those that all instants have, whether they have an image slot or not."""
-
+RADIANCE = ("log_radiance", "rgb", "radiance")
+"""Those of the light of a pixel."""
+_GEOMETRY = ("depth", "range", "normal", "instance", "returns")
 FACE = "face"
 """The output of a first pass (`antialias.py`), which all instants have."""
 
@@ -36,9 +38,9 @@ class RequestedOutputs(NamedTuple):
     images: bool
     """Another output, which instants with an image slot have, is requested."""
     radiance: bool
-    """Log radiance or RGB is requested."""
+    """Log radiance, RGB or radiance is requested."""
     geometry: bool
-    """Depth, normal, instance or returns are requested."""
+    """Depth, range, normal, instance or returns are requested."""
 
 
 def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
@@ -47,8 +49,8 @@ def requested_outputs(outputs: Collection[str]) -> RequestedOutputs:
         log="log_radiance" in outputs,
         faces=FACE in outputs,
         images=any(name not in ("log_radiance", FACE) for name in outputs),
-        radiance="log_radiance" in outputs or "rgb" in outputs,
-        geometry=any(name in outputs for name in ("depth", "normal", "instance", "returns")),
+        radiance=any(name in outputs for name in RADIANCE),
+        geometry=any(name in outputs for name in _GEOMETRY),
     )
 
 
@@ -62,8 +64,12 @@ class RenderOutputs:
     """Index of the face that the last ray of a pixel hits, -1: none, shape [K, H, W]."""
     rgb: wp.array4d[wp.uint8]
     """sRGB of exposure times radiance, shape [M, H, W, 3]."""
+    radiance: wp.array3d[wp.vec3]
+    """Exposure times linear radiance, of which 1 is white, shape [M, H, W]."""
     depth: wp.array3d[float]
     """Planar z [m], inf where nothing is hit, shape [M, H, W]."""
+    range: wp.array3d[float]
+    """Length of the ray [m], inf where nothing is hit, shape [M, H, W]."""
     normal: wp.array3d[wp.vec3]
     """Of the triangle, in W, towards the camera, zero where nothing is hit, shape [M, H, W]."""
     instance: wp.array3d[int]
@@ -108,6 +114,8 @@ def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function
     ) -> None:
         if wp.static("depth" in outputs):
             out.depth[slot, row, col] = wp.where(hit.face >= 0, hit.t * cosine, wp.inf)
+        if wp.static("range" in outputs):
+            out.range[slot, row, col] = wp.where(hit.face >= 0, hit.t, wp.inf)
         if wp.static("normal" in outputs):
             normal = wp.vec3(0.0)
             if hit.face >= 0:
@@ -132,7 +140,7 @@ def geometry_writer(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Function
 
 @cache
 def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Function:
-    """Return the function that writes log radiance and RGB of a pixel, those of them in `outputs`.
+    """Return the function that writes the light of a pixel, that of it which is in `outputs`.
 
     It takes the radiance of all samples of the pixel together, if it is `supersampled`.
     """
@@ -154,6 +162,9 @@ def radiance_writer(outputs: tuple[str, ...], *, supersampled: bool) -> wp.Funct
         if wp.static("log_radiance" in outputs):
             luma = 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
             out.log_radiance[instant, row, col] = wp.log(luma + scene.dark_floor)
+        if wp.static("radiance" in outputs):
+            if slot >= 0:
+                out.radiance[slot, row, col] = scene.exposure * radiance
         if wp.static("rgb" in outputs):
             if slot >= 0:
                 out.rgb[slot, row, col, 0] = _to_srgb(scene.exposure * radiance[0])

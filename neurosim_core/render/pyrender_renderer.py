@@ -223,7 +223,7 @@ class PyrenderRenderer:
         # The pass for segmentation is the one without multisampling: its depth is that of the pixel's centre.
         self._segment = pyrender.RenderFlags.SEG
         self._ids = dict.fromkeys(scene.nodes.mesh_nodes, (255, 255, 255))
-        self.log_radiance = self.normal = self.instance = self.returns = None
+        self.log_radiance = self.radiance = self.normal = self.range = self.instance = self.returns = None
         shape = (image_count, lens.height, lens.width)
         self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device="cpu") if "rgb" in outputs else None
         self.depth = wp.zeros(shape, dtype=float, device="cpu") if "depth" in outputs else None

@@ -42,8 +42,12 @@ class Renderer(Protocol):
     """Logarithm of linear luma plus the dark floor, float32 [N K, H, W]."""
     rgb: Any
     """8-bit sRGB, uint8 [M, H, W, 3]."""
+    radiance: Any
+    """Exposure times linear radiance, of which 1 is white, vec3 [M, H, W]."""
     depth: Any
     """Planar z [m], inf where nothing is hit, float32 [M, H, W]."""
+    range: Any
+    """Length of the ray [m], inf where nothing is hit, float32 [M, H, W]."""
     normal: Any
     """Normal of the surface in W, towards the camera, zero where nothing is hit, vec3 [M, H, W]."""
     instance: Any
@@ -217,7 +221,7 @@ def make_renderer(
     Args:
         scene: What `upload_scene` returned.
         lens: The camera.
-        outputs: Some of "log_radiance", "rgb", "depth", "normal", "instance", "returns".
+        outputs: Some of `render.outputs.OUTPUTS`.
         instant_count: K, the most instants of a world per call.
         image_count: M, number of image slots, of all worlds together.
         worlds: Who is rendered together: several only by `warp`.

@@ -209,7 +209,7 @@ class SyntheticRenderer:
         depth_card, self.depth = allocate("depth")
         log_card, self.log_radiance = allocate("log_radiance")
         self._cards = [rgb_card, depth_card, log_card]
-        self.normal = self.instance = self.returns = None
+        self.radiance = self.normal = self.range = self.instance = self.returns = None
         self._picture_place = wp.zeros(image_count, dtype=wp.vec2i, device=device)
         self._log_place = wp.zeros(instant_count, dtype=wp.vec2i, device=device)
         self._launches: dict[tuple[int, ...], tuple[wp.Launch, wp.Launch]] = {}

@@ -23,7 +23,7 @@ from neurosim_core.render.candidate_lists import CandidateLists, choose_candidat
 from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
-from neurosim_core.render.outputs import FACE, OUTPUTS, make_render_outputs, requested_outputs
+from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, make_render_outputs, requested_outputs
 from neurosim_core.render.ray_times import RayTimes, RayTiming
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms, instants_per_thread, with_candidate_lists
@@ -49,6 +49,8 @@ class RenderWorlds:
     """All scenes, device array of `SceneData`; None: every world is in the scene of the renderer."""
     scene_of_world: Any = None
     """Index into `scenes` of each world, device array of int32, shape [N]."""
+    arrays: Sequence[SceneArrays] = ()
+    """The scenes that `scene_of_world` counts; empty: that of the renderer."""
     terms: RenderTerms | None = None
     """What some scene needs in the kernel; None: as the scene of the renderer says."""
 
@@ -77,7 +79,9 @@ class WarpRenderer:
     Attributes:
         log_radiance: float32, shape [N K, H, W].
         rgb: uint8, shape [M, H, W, 3].
+        radiance: vec3, shape [M, H, W].
         depth: float32, shape [M, H, W].
+        range: float32, shape [M, H, W].
         normal: vec3, shape [M, H, W].
         instance: int32, shape [M, H, W].
         returns: vec3, shape [M, H, W].
@@ -129,7 +133,7 @@ class WarpRenderer:
         has_geometry = requested_outputs(outputs).geometry
         rays = np.concatenate([self._layers(each, adaptive, has_geometry) for each in lenses], axis=1)
         shared = self._choose_terms(rays, several=worlds.count > 1)
-        rendered = {FACE, *outputs} - {"log_radiance", "rgb"} if adaptive else set(outputs)
+        rendered = {FACE, *outputs}.difference(RADIANCE) if adaptive else set(outputs)
         self._kernel = raycast_kernel(rendered, self.terms)
         self._fallback = fallback_kernel(rendered, self.terms)
         self._group = instants_per_thread(self.terms)
@@ -164,7 +168,9 @@ class WarpRenderer:
         instants = (worlds.count * instant_count, *images[1:])
         self.log_radiance = allocate("log_radiance", instants, float)
         self.rgb = allocate("rgb", (*images, 3), wp.uint8)
+        self.radiance = allocate("radiance", images, wp.vec3)
         self.depth = allocate("depth", images, float)
+        self.range = allocate("range", images, float)
         self.normal = allocate("normal", images, wp.vec3)
         self.instance = allocate("instance", images, int)
         self.returns = allocate("returns", images, wp.vec3)

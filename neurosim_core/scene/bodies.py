@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="operator,arg-type"
+# mypy: disable-error-code="operator,arg-type,no-any-return"
 """Bodies that move through the scene on prescribed paths: their poses are pure functions of time.
 
 A body is rigid and has a frame O. With t the time since the start of the episode [s], and what is not given
@@ -206,6 +206,41 @@ def make_body_poses(instant_count: int, body_count: int, device: str) -> BodyPos
     )
 
 
+@wp.func
+def body_position(motion: Motion, stamp_ns: wp.int64) -> wp.vec3d:
+    """Return p_WO of a body [m]."""
+    time_s = wp.float64(stamp_ns) * _S_PER_NS
+    sway = _TWO_PI * motion.sway_hz * time_s + motion.sway_rad
+    orbit = _TWO_PI * motion.orbit_hz * time_s + motion.orbit_rad
+    return (
+        motion.position
+        + time_s * motion.velocity
+        + wp.sin(sway) * motion.sway
+        + wp.cos(orbit) * motion.orbit_e1
+        + wp.sin(orbit) * motion.orbit_e2
+    )
+
+
+@wp.func
+def body_orientation(motion: Motion, stamp_ns: wp.int64) -> wp.quatd:
+    """Return q_WO of a body."""
+    return motion.orientation * quaternion_exp(wp.float64(stamp_ns) * _S_PER_NS * motion.spin)
+
+
+@wp.func
+def body_velocity(motion: Motion, stamp_ns: wp.int64) -> wp.vec3d:
+    """Return the velocity of the origin of a body in W [m/s]; `spin` is its angular velocity in O."""
+    time_s = wp.float64(stamp_ns) * _S_PER_NS
+    sway_rate, orbit_rate = _TWO_PI * motion.sway_hz, _TWO_PI * motion.orbit_hz
+    sway = sway_rate * time_s + motion.sway_rad
+    orbit = orbit_rate * time_s + motion.orbit_rad
+    return (
+        motion.velocity
+        + sway_rate * wp.cos(sway) * motion.sway
+        + orbit_rate * (wp.cos(orbit) * motion.orbit_e2 - wp.sin(orbit) * motion.orbit_e1)
+    )
+
+
 @wp.kernel
 def _pose_bodies(
     # Model:
@@ -219,18 +254,9 @@ def _pose_bodies(
     q_WO_out: wp.array2d[wp.quatd],
 ) -> None:
     instant, body = wp.tid()
-    motion = motions[body]
-    time_s = wp.float64(stamps_ns[slots[instant], vehicle]) * _S_PER_NS
-    sway = _TWO_PI * motion.sway_hz * time_s + motion.sway_rad
-    orbit = _TWO_PI * motion.orbit_hz * time_s + motion.orbit_rad
-    p_WO_out[instant, body] = (
-        motion.position
-        + time_s * motion.velocity
-        + wp.sin(sway) * motion.sway
-        + wp.cos(orbit) * motion.orbit_e1
-        + wp.sin(orbit) * motion.orbit_e2
-    )
-    q_WO_out[instant, body] = motion.orientation * quaternion_exp(time_s * motion.spin)
+    stamp_ns = stamps_ns[slots[instant], vehicle]
+    p_WO_out[instant, body] = body_position(motions[body], stamp_ns)
+    q_WO_out[instant, body] = body_orientation(motions[body], stamp_ns)
 
 
 def pose_bodies(

@@ -166,69 +166,15 @@ _GROUND_SLACK_M = 0.01  # how far a floor may be above the plane meant by it
 def room_around(
     field: DistanceField, radius_m: float, exact_below: float, ground_height_m: wp.float64, p: wp.vec3d
 ) -> float:
-    """Return how much room a sphere has around it [m]; see `check_collision`."""
+    """Return how much room a sphere has around it [m], negative: it touches.
+
+    Exact (to float32 rounding) below `exact_below` less the radius, and a lower bound elsewhere. A sphere
+    that would reach the plane at `ground_height_m`, which may be landed on, is taken as one that ends 1 cm
+    above it.
+    """
     point = wp.vec3(float(p[0]), float(p[1]), float(p[2]))
     radius = wp.min(radius_m, float(p[2] - ground_height_m) - _GROUND_SLACK_M)
     return scene_distance(field, point, exact_below) - radius
-
-
-@wp.kernel
-def _check_collision(
-    # Model:
-    field: DistanceField,
-    radius_m: float,
-    exact_below: float,
-    ground_height_m: wp.float64,
-    # In:
-    position: wp.array[wp.vec3d],
-    # Out:
-    clearance_out: wp.array[wp.float32],
-) -> None:
-    vehicle = wp.tid()
-    clearance_out[vehicle] = room_around(field, radius_m, exact_below, ground_height_m, position[vehicle])
-
-
-def check_collision(
-    field: DistanceField,
-    position: Any,
-    clearance: Any,
-    *,
-    radius_m: float,
-    ground_height_m: float = -math.inf,
-) -> None:
-    """Write how much room spheres have around them; launches one kernel, allocates and reads back nothing.
-
-    Args:
-        field: Of the scene, on the device of the arrays.
-        position: Centres [m], world frame, wp.array of vec3d, shape [n].
-        clearance: Distance from each sphere to the nearest surface [m], float32, shape [n]; overwritten.
-        Negative:
-            it touches. Exact (to float32 rounding) below one voxel, and a lower bound, above one voxel,
-            elsewhere.
-        radius_m: Of the spheres [m].
-        ground_height_m: z of a plane that may be landed on [m]: a sphere that would reach it is taken as one
-            that ends 1 cm above it. -inf: none.
-    """
-    collision_check(field, position, clearance, radius_m=radius_m, ground_height_m=ground_height_m).launch()
-
-
-def collision_check(
-    field: DistanceField,
-    position: Any,
-    clearance: Any,
-    *,
-    radius_m: float,
-    ground_height_m: float = -math.inf,
-) -> wp.Launch:
-    """Return `check_collision` as a launch that can be made again and again; arguments as there."""
-    launch: wp.Launch = wp.launch(
-        _check_collision,
-        dim=position.shape[0],
-        inputs=[field, radius_m, radius_m + field.voxel, ground_height_m, position, clearance],
-        device=position.device,
-        record_cmd=True,
-    )
-    return launch
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

@@ -36,6 +36,8 @@ from neurosim_core.scene.source import (
 )
 
 _MAX_DEPTH = 256
+_LABELS = ("semantic", "class", "category", "label")
+"""Keys of extras that say what an object is."""
 
 
 def read_gltf(path: Path, *, textures_required: bool, pictures: bool = True) -> Source:
@@ -260,6 +262,9 @@ class _Reader:
                     Part(name=name, matrix=place, instance=len(source.instance_names), **arrays)
                 )
             source.instance_names.append(name)
+            extras = {**_extras(mesh), **_extras(node)}
+            if label := next((extras[key] for key in _LABELS if isinstance(extras.get(key), str)), ""):
+                source.instance_labels[name] = label
         self._orientation()
         return source
 
@@ -418,3 +423,8 @@ def _transformed(uv: NDArray[np.float64], transform: dict[str, Any]) -> NDArray[
         [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]
     )  # v points down
     return np.asarray(scaled @ turn.T + np.asarray(transform.get("offset", [0.0, 0.0]), dtype=np.float64))
+
+
+def _extras(holder: dict[str, Any]) -> dict[str, Any]:
+    extras = holder.get("extras")
+    return extras if isinstance(extras, dict) else {}

@@ -38,6 +38,13 @@ def srgb_to_linear(srgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return table.astype(np.float32)[srgb]
 
 
+def linear_to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return linear light as 8-bit sRGB (IEC 61966-2-1); what is above 1 is white."""
+    light = np.clip(linear, 0.0, 1.0)
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return np.asarray(np.rint(255.0 * code), dtype=np.uint8)
+
+
 def mip_chain(linear: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     """Return a picture and its averages at half, a quarter, … of the resolution, down to one texel.
 

@@ -130,6 +130,7 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True) -> Scene:
         lights=_lights(config, source, turn, np.array(config.position_m) - origin, triangles, notes),
         ambient=Ambient(up=config.ambient_up, down=config.ambient_down),
         instance_names=tuple(source.instance_names),
+        instance_labels=source.instance_labels,
         notes=tuple(notes),
         inside_m=config.inside_m,
         origin_m=(float(origin[0]), float(origin[1]), float(origin[2])),

@@ -5,7 +5,7 @@ Metres, z up, linear light.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -93,6 +93,8 @@ class Scene:
     """Radiance of rays that hit nothing."""
     notes: tuple[str, ...] = ()
     """What was assumed, dropped or repaired while loading, one sentence each; shown to the user."""
+    instance_labels: Mapping[str, str] = field(default_factory=dict)
+    """What instances are, such as "chair", by name, where the file says it."""
     inside_m: tuple[float, float, float] | None = None
     """A point known to be in free space, if the source of the scene knows one [m]."""
 

@@ -64,6 +64,8 @@ class Source:
     parts: list[Part] = field(default_factory=list)
     materials: list[Material] = field(default_factory=list)
     instance_names: list[str] = field(default_factory=list)
+    instance_labels: dict[str, str] = field(default_factory=dict)
+    """What instances are, by name, as far as the file says it."""
     lamps: list[Lamp] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     unit_m: float = 1.0

@@ -10,7 +10,7 @@ it is.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -22,7 +22,7 @@ from neurosim_core.frames import Mount
 from neurosim_core.packets import Image, ImageEncoding, Packet
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import AnyLens
-from neurosim_core.render.ray_times import RayTiming, ShutterConfig
+from neurosim_core.render.ray_times import RayTimes, RayTiming, ShutterConfig
 from neurosim_core.settings import Settings
 from neurosim_core.vehicle import Multirotor
 
@@ -79,6 +79,8 @@ class SamplerContext:
     """Seed of each world, device array of uint64, shape [world]."""
     active: Any
     """0 where a world is not measured, device array of int32, shape [world]."""
+    surfaces: Any = None
+    """What vehicles can touch (`sim.trace.Surfaces`)."""
 
 
 class Sampler(ABC):
@@ -97,8 +99,8 @@ class Sampler(ABC):
         """Measure all vehicles at their present state into a slot of the arrays; launches only."""
 
     @abstractmethod
-    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet:
-        """Return one sample of one world as a packet.
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
+        """Return one sample of one world as a packet; None: it is lost, and the sequence shows the gap.
 
         Args:
             rows: The sample's element of each array, on the host.
@@ -139,6 +141,11 @@ class RenderedConfig(SensorConfig):
     def timing(self) -> RayTiming | None:
         """When its rays are cast; None: all at the stamp."""
         return None
+
+    @property
+    def look_back_ns(self) -> int:
+        """How long before the end of a batch it needs the motion of the vehicle [ns]."""
+        return 0
 
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
@@ -181,6 +188,73 @@ def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig
     return expanded
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PictureContext:
+    """What the processing of the pictures of one sensor is made for."""
+
+    name: str
+    """Its name in the settings; two sensors with different names have independent noise."""
+    source: Any
+    """What the renderer writes, device array, shape [M, H, W, ...]; M image slots."""
+    sources: Mapping[str, Any]
+    """The same for all outputs that the sensor asks for, by name."""
+    lenses: Sequence[Lens]
+    """The lenses there are, all of one size."""
+    lens_of_world: Sequence[int]
+    """Index into them of each world, shape [N]."""
+    scenes: Sequence[Any]
+    """The scenes as the renderer has them."""
+    scene_of_world: Any
+    """Index into them of each world, device array of int32, shape [N]."""
+    motions: Any
+    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
+    times: RayTimes | None
+    """When its rays are cast; None: all at the stamp."""
+    stride: int
+    """K, the most instants of a world in one batch."""
+    seeds: Any
+    """Seed of each world, device array of uint64, shape [N]."""
+
+
+class PictureViews(NamedTuple):
+    """From where and when the pictures of a batch were taken; device arrays, rows are [world, K] in order."""
+
+    instant_count: int
+    """How many of the K instants of each world were rendered."""
+    image_slot: Any
+    """Where the picture of an instant is, int32, shape [N K]; -1: there is none."""
+    p_WC: Any
+    """Position of the camera [m], vec3, shape [N K J], for the J times of its rays (1: the stamp)."""
+    q_WC: Any
+    """Orientation, likewise."""
+    stamps: Any
+    """Times [ns], int64, shape [N K J, 1]."""
+    active: Any
+    """0 where a world is not rendered, int32, shape [N]; None: all are."""
+    bodies: Any
+    """Where bodies are at these times, `scene.bodies.BodyPoses`; None: there are none."""
+    then: PictureViews | None = None
+    """The same at the further time that the sensor asks for (`PictureSensorConfig.pose_offset_ns`)."""
+    twist: Any = None
+    """Velocity of the camera in W [m/s] and its angular velocity in C [rad/s] at the stamps, spatial_vectord,
+    shape [N K], where the sensor asks for it (`PictureSensorConfig.needs_twist`)."""
+
+
+class PictureProcess(Protocol):
+    """What makes of the pictures that are rendered those that a sensor takes: noise, and the like.
+
+    Its pictures are those of an output that has image slots. What it draws is addressed by the stamp.
+    """
+
+    terms: tuple[str, ...]
+    """What it computes."""
+    picture: Any
+    """What it makes, device array, shape [M, H, W, ...]."""
+
+    def launch(self, views: PictureViews) -> None:
+        """Process the pictures of a batch that was just rendered; launches only."""
+
+
 class PictureSensorConfig(RenderedConfig):
     """A sensor whose packet is made of one picture of one output of the renderer."""
 
@@ -190,9 +264,38 @@ class PictureSensorConfig(RenderedConfig):
     output: ClassVar[str]
     """What it takes pictures of, one of `render.outputs.OUTPUTS`."""
 
+    @property
+    def outputs(self) -> frozenset[str]:
+        """All outputs that its pictures are made of."""
+        return frozenset([self.output])
+
+    @property
+    def pose_offset_ns(self) -> int | None:
+        """From the stamp to a further time at which its processing needs poses [ns], <= 0; None: none."""
+        return None
+
+    @property
+    def look_back_ns(self) -> int:
+        """To that time."""
+        return -(self.pose_offset_ns or 0)
+
+    @property
+    def needs_twist(self) -> bool:
+        """Whether its processing needs the velocity of the camera."""
+        return False
+
     def render_request(self) -> RenderRequest:
         """Return what it asks of the renderer."""
-        return RenderRequest(outputs=frozenset([self.output]), rate_hz=self.rate_hz)
+        return RenderRequest(outputs=self.outputs, rate_hz=self.rate_hz)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a picture depends on those before: then one batch is rendered after the other."""
+        return False
+
+    def constants(self, context: PictureContext) -> Mapping[str, Any]:
+        """Return fields that all its packets have, such as names of what is in the scene."""
+        return {}
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
         """Return a picture as a packet.
@@ -203,9 +306,9 @@ class PictureSensorConfig(RenderedConfig):
         """
         raise NotImplementedError(f"{type(self).__name__} must say what its packets are")
 
-    def packet_maker(self, seed: int) -> Callable[..., Packet]:
-        """Return what makes its packets, called as `packet` is; noise comes from a seed."""
-        return self.packet
+    def make_process(self, context: PictureContext) -> PictureProcess | None:
+        """Return what its pictures go through on the device, before anyone has them; None: nothing."""
+        return None
 
 
 class ImageSensorConfig(CameraConfig, PictureSensorConfig):
@@ -260,6 +363,17 @@ class FrameContext:
     """The most batches that it has seen and that were not read."""
     seed: int
     """Of the episode."""
+    lens: Lens
+    scene: Any
+    """As the renderer has it."""
+    motions: Any
+    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
+    history: Any
+    """The flight, as far back as `look_back_ns` says (`vehicle.history.History`)."""
+    p_BC: Any
+    """Position of the camera on the body [m], vec3d."""
+    q_BC: Any
+    """Orientation of the camera against the body, quatd."""
 
 
 class WorldFrameSensor(Protocol):
@@ -290,8 +404,8 @@ class WorldFrameSensor(Protocol):
             parity: Which of the two states is the present one.
         """
 
-    def seed(self, seeds: Sequence[int]) -> None:
-        """Draw what stays in the pixels anew; waits for the device."""
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
+        """Draw what stays in the pixels of some worlds (None: of all) anew; waits for the device."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

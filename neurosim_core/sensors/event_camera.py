@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Packet
 from neurosim_core.registry import register
+from neurosim_core.render.projection import make_lens_data
 from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensorConfig,
@@ -21,6 +22,8 @@ from neurosim_core.sensors.base import (
     WorldFrameContext,
 )
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_labels import EventLabel, EventLabels
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.sensors.events import EventCamera
 
@@ -47,7 +50,20 @@ class EventSensorConfig(FrameSensorConfig):
     """How many packets of events are sent a second [Hz]; each holds the events of its whole window. null: the
     highest rate up to 100 Hz that divides the sampling rate."""
 
+    labels: tuple[EventLabel, ...] = ()
+    """The truth of each event, beside t, x, y and polarity: [depth, flow, instance, semantic, cause], some of
+    them; see `sensors/event_labels.py`. Empty: none is computed."""
+    classes: dict[str, tuple[str, ...]] | None = None
+    """With the label `semantic`: patterns of names by class, as of a `semantic` camera."""
+
     packet_type = Events
+
+    @property
+    def look_back_ns(self) -> int:
+        """Over the events of a packet, and of the batch that it ends in."""
+        if not set(self.labels) - {"cause"}:
+            return 0
+        return math.ceil(1e9 * (1.0 / self.packets.rate_hz + 1.0 / self.sampling_rate_hz))
 
     @property
     def clock(self) -> Rate:
@@ -91,6 +107,10 @@ class EventSensorConfig(FrameSensorConfig):
     def make_worlds(self, context: WorldFrameContext) -> WorldEventCamera:
         """Return the camera at work in many worlds."""
         pixels = [config.pixel for config in context.configs]
+        if self.labels:
+            raise ValueError(
+                f"labels of {context.name!r} are for single runs: packets have them, on the host"
+            )
         if any(pixel.readout is not None for pixel in pixels):
             raise ValueError(
                 f"readout of {context.name!r} is for single runs: events wait for each other on the host"
@@ -105,6 +125,14 @@ class EventSensorConfig(FrameSensorConfig):
             seeds=context.seeds,
             ordered=context.ordered,
         )
+
+    @model_validator(mode="after")
+    def _labels_can_be_had(self) -> EventSensorConfig:
+        if "cause" in self.labels and self.lens.width > 1 << (16 - CAUSE_BITS):
+            raise ValueError(f"the cause of events needs a width of at most {1 << (16 - CAUSE_BITS)} px")
+        if "flow" in self.labels:
+            make_lens_data(self.lens)
+        return self
 
     @model_validator(mode="after")
     def _packets_end_on_renders(self) -> EventSensorConfig:
@@ -127,6 +155,9 @@ class EventChannel:
     """
 
     def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
+        terms = terms_of(config.pixel)
+        self._has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
+        self._labels = EventLabels(config.labels, config.classes, context) if config.labels else None
         self.camera = EventCamera(
             config.pixel,
             width=context.width,
@@ -136,8 +167,12 @@ class EventChannel:
             seed=context.seed,
             scan_count_max=context.in_flight,
             on_host=True,
+            terms=(*terms, CAUSE) if self._has_cause else None,
         )
-        self.terms = self.camera.terms
+        self.terms = (
+            *self.camera.terms,
+            *(f"{label} of events" for label in config.labels if label != CAUSE),
+        )
         self.watching = False
         self._packets = config.packets
         self._sequence = 0
@@ -163,7 +198,7 @@ class EventChannel:
         self._seen_ns = max((stamp for stamp in stamps_ns if stamp <= until_ns), default=self._seen_ns)
         packets: list[Events] = self.camera.collect_windows(ends, scan_count=int(fed))
         self._sequence += len(ends)
-        return [*packets]
+        return self._labelled(packets)
 
     def flush(self, *, until_ns: int) -> list[Packet]:
         """Return the packet whose window has begun and not ended, cut at the last instant until a stamp."""
@@ -172,4 +207,9 @@ class EventChannel:
             return []
         packets = self.camera.collect_windows([cut_ns], scan_count=0)
         self._sequence += 1
-        return [*packets]
+        return self._labelled(packets)
+
+    def _labelled(self, packets: list[Events]) -> list[Packet]:
+        if self._labels is None:
+            return [*packets]
+        return [self._labels.add(packet, has_cause=self._has_cause) for packet in packets]

@@ -7,13 +7,12 @@ Every group is optional. What is left out is not compiled and allocates nothing;
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from neurosim_core.sensors.event_presets import PRESETS
-from neurosim_core.settings import Settings
+from neurosim_core.settings import Settings, fill_from_preset
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, Field(ge=0.0, le=1e6)]
@@ -205,17 +204,7 @@ class EventCameraConfig(Settings):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, given: Any) -> Any:
-        name = given.get("preset") if isinstance(given, Mapping) else None
-        if not isinstance(name, str):
-            return given
-        if name not in PRESETS:
-            raise ValueError(f"unknown preset {name!r}, known: {', '.join(PRESETS)}")
-        filled = dict(PRESETS[name].pixel)
-        for key, value in given.items():
-            old = filled.get(key)
-            merged = isinstance(old, Mapping) and isinstance(value, Mapping)
-            filled[key] = {**(old or {}), **value} if merged else value
-        return filled
+        return fill_from_preset(given, {name: preset.pixel for name, preset in PRESETS.items()})
 
     @model_validator(mode="after")
     def _law_is_one(self) -> EventCameraConfig:

@@ -36,6 +36,11 @@ wp.set_module_options({"enable_backward": False})
 
 TERMS = ("spread", "low_pass", "refractory", "leak", "spontaneous", "stochastic")
 """All terms that may be compiled in."""
+CAUSE = "cause"
+"""A further term: the column of an event is eight times the column plus its cause."""
+CAUSES = ("signal", "leak", "shot noise", "hot pixel", "threshold noise")
+"""Why pixels fire."""
+CAUSE_BITS = 3
 
 
 @wp.struct

@@ -16,7 +16,7 @@ import warp as wp
 
 from neurosim_core.random import random_bits, uniform2
 from neurosim_core.sensors.event_levels import COLUMN_SHIFT, key_after, level_at, quiet_range
-from neurosim_core.sensors.event_noise_model import TERMS, Memory, PixelModel
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, CAUSES, TERMS, Memory, PixelModel
 from neurosim_core.sensors.event_scan import LIMIT, PUT, call_up, write_key
 from neurosim_core.sensors.event_signal import (
     Crossing,
@@ -34,6 +34,7 @@ wp.set_module_options({"enable_backward": False})
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
+_SIGNAL, _LEAK, _SHOT, _HOT, _NOISE = (wp.constant(wp.int64(number)) for number in range(len(CAUSES)))
 _NEVER = wp.constant(wp.int64(2**62))
 _PIECE = wp.constant(wp.float64(0.125))
 """Change of log radiance over which tau is held constant."""
@@ -108,7 +109,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
 
     Its parameters are those of the kernel of `make_scan`, with the pixel in place of the range of pixels.
     """
-    if unknown := terms - set(TERMS):
+    if unknown := terms - {*TERMS, CAUSE}:
         raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
     spread = "spread" in terms
     low_pass = "low_pass" in terms
@@ -116,6 +117,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     leak = "leak" in terms
     spontaneous = "spontaneous" in terms
     stochastic = "stochastic" in terms
+    cause = CAUSE in terms
     resets = refractory or spontaneous
     value_at = curve_at if low_pass else line_at
     find_crossing = curve_crossing if low_pass else line_crossing
@@ -155,6 +157,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         deviation: wp.float64,
         first_light: wp.float64,
         light_slope: wp.float64,
+        leak_slope: wp.float64,
         start_ns: wp.int64,
         since_ns: wp.int64,
         frame: wp.int32,
@@ -217,6 +220,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 crossing = find_crossing(signal, now, end, quiet, lower, upper)
 
             polarity = crossing.polarity
+            origin = _SIGNAL + wp.int64(0)
             reset = wp.bool(False)
             if polarity >= 0:
                 now = crossing.time_ns
@@ -225,14 +229,29 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 if wp.static(spontaneous):  # noqa: SIM102, one of them is for the compiler
                     if noisy:
                         light = first_light + light_slope * now
-                        polarity = _noise_polarity(model, state, light, _spontaneous(model, pixel, state)[1])
+                        uniform = _spontaneous(model, pixel, state)[1]
+                        polarity = _noise_polarity(model, state, light, uniform)
+                        if wp.static(cause):
+                            is_hot = uniform * (state.shot_rate + state.hot_rate) < state.hot_rate
+                            origin = wp.where(is_hot, _HOT, _SHOT)
                         state = next_noise(model, pixel, state)
                         reset = wp.bool(True)
             if polarity >= 0:
                 if tabulate:
                     wp.atomic_add(table, frame, row, 1)
                 elif row < row_limit:
-                    key = key_after(now, start_ns, place, time_shift, polarity)
+                    where = place
+                    if wp.static(cause):
+                        if origin == _SIGNAL:
+                            upwards = wp.float64(2 * polarity - 1)
+                            if wp.static(leak):  # noqa: SIM102
+                                if polarity == 1 and leak_slope > light_slope:
+                                    origin = _LEAK
+                            if wp.static(stochastic):  # noqa: SIM102
+                                if deviation * deviation > upwards * drift:
+                                    origin = _NOISE
+                        where = place | (origin << COLUMN_SHIFT)
+                    key = key_after(now, start_ns, where, time_shift, polarity)
                     write_key(PUT, key, keys, counters)
                 if not reset:
                     state.up += polarity
@@ -273,7 +292,10 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         """Take one pixel from its state before a stack to that after it."""
         call_up(log_radiance, pixel, frame_count)
         row = pixel // width
-        place = (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+        column = wp.int64(pixel - row * width)
+        if wp.static(cause):
+            column = column << wp.int64(CAUSE_BITS)
+        place = (wp.int64(row) << wp.int64(row_shift)) | (column << COLUMN_SHIFT)
         state = _Pixel()
         state.on = model.threshold_on
         state.off = model.threshold_off
@@ -387,6 +409,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                             deviation,
                             light,
                             light_slope,
+                            leak_slope,
                             start_ns,
                             since_ns,
                             frame,

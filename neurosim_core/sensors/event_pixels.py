@@ -83,6 +83,10 @@ class Scan:
             start = number * _COUNTERS_ROOM
             self.inputs.rows[start : start + _COUNTERS] = chunk.first_key, 0, 0
 
+    def has_room(self, counts: Sequence[int]) -> bool:
+        """Return whether all events were written, of which each chunk has so many."""
+        return all(chunk.has_room(count) for count, chunk in zip(counts, self.chunks, strict=True))
+
 
 class Pixels:
     """The pixels of one camera.

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -150,24 +150,38 @@ class WorldEventCamera:
         for module in (scan, self._scan.module):
             wp.load_module(module, device=self.device)
 
-    def seed(self, seeds: Sequence[int]) -> None:
-        """Draw what stays in the pixels anew, and let later noise have other seeds; waits for the device."""
+    @property
+    def thresholds(self) -> Any:
+        """Thresholds of each world, up and down, device array of vec2d, shape [world]; None: others count."""
+        return None if self.terms else self._thresholds
+
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
+        """Draw what stays in the pixels anew, and let later noise have other seeds; waits for the device.
+
+        Args:
+            seeds: Of all worlds.
+            worlds: Indices of those that get other seeds; None: all.
+        """
         if not self.terms:
             return
-        noise = [
-            PixelNoise(
-                config,
+
+        def draw(world: int) -> PixelNoise:
+            noise = PixelNoise(
+                self._configs[world],
                 pixel_count=self._base.shape[1],
                 ring_size=2,
-                seed=seed,
+                seed=seeds[world],
                 sensor=self._sensor,
                 device=self.device,
                 terms=self.terms,
             )
-            for config, seed in zip(self._configs, seeds, strict=True)
+            noise.set_reset(0)
+            return noise
+
+        noise = [
+            draw(world) if worlds is None or world in worlds else self._noise[world]
+            for world in range(len(self._configs))
         ]
-        for each in noise:
-            each.set_reset(0)
         models: Any = wp.array([each.model for each in noise], dtype=PixelModel, device=self.device)
         memories: list[Any] = [
             wp.array([each.memory(slot) for each in noise], dtype=Memory, device=self.device)

@@ -10,7 +10,6 @@ in `event_scan`. What is not ideal in them is in `event_noise_model`, and the ar
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """
 
-import itertools
 import logging
 from collections import deque
 from collections.abc import Sequence
@@ -25,9 +24,10 @@ from neurosim_core.packets import Events
 from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_stream
 from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_input import are_ends, as_frames, as_stamps, check_stack, invalid_message
 from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise_model import terms_of
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_pixels import Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
@@ -74,7 +74,7 @@ class EventCamera:
         on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
         terms: What is compiled in beyond ideal pixels, some of `event_noise_model.TERMS`; by default what the
-            configuration asks for.
+            configuration asks for. With `CAUSE` besides, x is eight times the column plus the cause.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise_model.TERMS`, and "readout".
@@ -107,6 +107,8 @@ class EventCamera:
         self.sensor = sensor
         self.device = wp.get_device(device)
         self._row_shift = SUB_BITS + (width - 1).bit_length()
+        if CAUSE in (terms or ()):
+            self._row_shift += CAUSE_BITS
         self._time_shift = self._row_shift + (height - 1).bit_length() + 1
 
         # scans under way begin with a state each, and the last of them needs room for the state after it
@@ -192,12 +194,12 @@ class EventCamera:
         Raises:
             ValueError: If shape or dtype is wrong, or a value is not finite or beyond +-1000.
         """
-        frame = self._as_warp(log_radiance, (self.height, self.width))
+        frame = as_frames(log_radiance, (self.height, self.width), self.device)
         values = frame.numpy()
         valid = np.abs(values) <= LOG_RADIANCE_MAX
         if not valid.all():
             row, col = (int(index) for index in np.argwhere(~valid)[0])
-            raise ValueError(_invalid_message(int((~valid).sum()), f"[{row}, {col}]"))
+            raise ValueError(invalid_message(int((~valid).sum()), f"[{row}, {col}]"))
         for scan in (*self._idle, *self._under_way):
             scan.done.wait()  # it writes states, and reads what the host writes next
         self._pixels.reset(frame, int(stamp_ns))
@@ -224,8 +226,8 @@ class EventCamera:
             ValueError: If shape, dtype or stamps are wrong; also if a value is not finite or beyond +-1000,
                 in which case the camera must be reset.
         """
-        stamps = _as_stamps(stamps_ns)
-        frames = self._as_warp(log_radiance, (len(stamps), self.height, self.width))
+        stamps = as_stamps(stamps_ns)
+        frames = as_frames(log_radiance, (len(stamps), self.height, self.width), self.device)
         if len(stamps) > 0:
             scan = self._plan_scan(frames, stamps)
             self._pixels.launch(scan)
@@ -250,7 +252,7 @@ class EventCamera:
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
-        scan = self._plan_scan(log_radiance, _as_stamps(stamps_ns))
+        scan = self._plan_scan(log_radiance, as_stamps(stamps_ns))
         self._graphs.run(self._pixels.launch_key(scan), lambda: self._pixels.launch(scan))
         self._note_launched(scan)
 
@@ -292,21 +294,7 @@ class EventCamera:
         self._require_reset()
         if len(self._under_way) >= self._scan_count_max:
             raise RuntimeError(f"collect() must be called after {len(self._under_way)} feed_device()")
-        count = len(stamps)
-        fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == (self.height, self.width)
-        if not (fits and 1 <= count <= log_radiance.shape[0] and log_radiance.is_contiguous):
-            raise ValueError(
-                f"log_radiance must be contiguous of shape [>= {count}, {self.height}, {self.width}]"
-                f" for {count} >= 1 stamps, got {list(log_radiance.shape)}"
-                f" with strides {list(log_radiance.strides)}"
-            )
-        if log_radiance.dtype != wp.float32 or log_radiance.device != self.device:
-            raise ValueError(
-                f"log_radiance must be float32 on {self.device},"
-                f" got {log_radiance.dtype.__name__} on {log_radiance.device}"
-            )
-        if stamps[0] <= self._fed_ns:
-            raise ValueError(f"stamps_ns must be later than {self._fed_ns}, got {stamps[0]}")
+        check_stack(log_radiance, stamps, (self.height, self.width), self.device, after_ns=self._fed_ns)
         span_us = int(stamps[-1]) // NS_PER_US - self._keys.origin_us
         if span_us * NS_PER_US >= self.span_max_ns:
             limit_s = self.span_max_ns / 1e9
@@ -364,7 +352,7 @@ class EventCamera:
             now_ns = self._require_reset()
             if not ends:
                 return []
-            if not _are_ends(ends, self._window_start_ns, now_ns):
+            if not are_ends(ends, self._window_start_ns, now_ns):
                 raise ValueError(
                     f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
                     f" and not pass {now_ns}, got {ends}"
@@ -389,24 +377,6 @@ class EventCamera:
             raise RuntimeError("reset() must be called before frames are fed")
         return self._now_ns
 
-    def _as_warp(self, value: Any, shape: tuple[int, ...]) -> Any:
-        """Return an array as a contiguous float32 Warp array of this shape on the device."""
-        if not isinstance(value, wp.array):
-            on_device = hasattr(value, "__cuda_array_interface__")
-            value = wp.array(value) if on_device else np.asarray(value)
-        dtype = wp.dtype_to_numpy(value.dtype) if isinstance(value, wp.array) else value.dtype
-        if tuple(value.shape) != shape or dtype != np.float32:
-            raise ValueError(
-                f"log_radiance must be float32 of shape {list(shape)},"
-                f" got {np.dtype(dtype).name} of shape {list(value.shape)}"
-            )
-        if isinstance(value, wp.array):
-            if value.device != self.device:
-                raise ValueError(f"log_radiance must be on {self.device}, got {value.device}")
-            return value.contiguous()
-        flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
-        return wp.array(flat, dtype=wp.float32, shape=shape, device=self.device, copy=False)
-
     def _scan_again(self, scan: Scan) -> None:
         """Scan a stack again."""
         scan.begin()
@@ -417,7 +387,7 @@ class EventCamera:
         """Wait for the oldest scan, redo it if there was too little room, and add its keys to the others."""
         scan = self._under_way[0]
         counts = self._read_counts(scan)
-        if sum(counts) > self.config.event_count_max or not _have_room(scan, counts):
+        if sum(counts) > self.config.event_count_max or not scan.has_room(counts):
             with use_stream(self._reader):
                 counts = self._redo(scan, counts)
                 self._taken.set()
@@ -426,14 +396,16 @@ class EventCamera:
         else:
             for count, chunk in zip(counts, scan.chunks, strict=True):
                 self._keys.append(chunk.keys, 0, count, scan.origin_us)
-        self._finish(self._under_way.popleft())
+        self._now_ns = int(scan.stamps_ns[-1])
+        scan.frames = None
+        self._idle.append(self._under_way.popleft())
 
     def _redo(self, scan: Scan, counts: list[int]) -> list[int]:
         """Scan a stack again, within the limit and with room for all events; return how many there are."""
         limited = sum(counts) > self.config.event_count_max and self._limit_rows(scan)
         if limited:
             counts = self._read_counts(scan)
-        if not _have_room(scan, counts):
+        if not scan.has_room(counts):
             if self._in_place:
                 self._keys.reserve(self._keys.count + counts[0])
                 scan.chunks[0].keys = self._keys.room()
@@ -444,12 +416,6 @@ class EventCamera:
         if limited:
             scan.row_limit.fill_(self.height)
         return counts
-
-    def _finish(self, scan: Scan) -> None:
-        """Note that the oldest scan is read."""
-        self._now_ns = int(scan.stamps_ns[-1])
-        scan.frames = None
-        self._idle.append(scan)
 
     def _read_counts(self, scan: Scan) -> list[int]:
         """Wait for a scan and return the number of events of each chunk."""
@@ -462,7 +428,7 @@ class EventCamera:
             self._now_ns = None
             self._idle += self._under_way
             self._under_way.clear()
-            raise ValueError(_invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
+            raise ValueError(invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
         return [end - chunk.first_key for (end, _, _), chunk in zip(counters, scan.chunks, strict=True)]
 
     def _limit_rows(self, scan: Scan) -> bool:
@@ -531,38 +497,3 @@ class EventCamera:
             self._sequence += 1
             self._window_start_ns = end_ns
         return packets
-
-
-def _have_room(scan: Scan, counts: Sequence[int]) -> bool:
-    """Return whether all events of a scan were written, of which each chunk has so many."""
-    return all(chunk.has_room(count) for count, chunk in zip(counts, scan.chunks, strict=True))
-
-
-def _as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
-    stamps = np.asarray(stamps_ns)
-    if stamps.size == 0:
-        stamps = stamps.astype(np.int64)
-    if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
-        raise ValueError(
-            f"stamps_ns must be integers of shape [K], got {stamps.dtype} of shape {list(stamps.shape)}"
-        )
-    stamps = stamps.astype(np.int64)
-    if len(stamps) > 1 and (falls := stamps[1:] <= stamps[:-1]).any():
-        index = int(np.argmax(falls))
-        raise ValueError(
-            f"stamps_ns must be strictly increasing, got {stamps[index + 1]} after {stamps[index]}"
-        )
-    return stamps
-
-
-def _are_ends(ends_ns: Sequence[int], start_ns: int, now_ns: int) -> bool:
-    """Return whether windows that begin at a stamp can end so."""
-    bounds = [start_ns, *ends_ns]
-    return all(b - a >= NS_PER_US for a, b in itertools.pairwise(bounds)) and bounds[-1] <= now_ns
-
-
-def _invalid_message(count: int, first: str) -> str:
-    return (
-        f"log_radiance must be finite and within +-{LOG_RADIANCE_MAX:g}:"
-        f" {count} values are not, the first at {first}"
-    )

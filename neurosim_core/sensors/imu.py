@@ -23,13 +23,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neurosim_core.frames import Mount
 from neurosim_core.packets import ImuSample
 from neurosim_core.random import normal2, random_bits, stream_id
 from neurosim_core.registry import register
 from neurosim_core.sensors.base import Sampler, SamplerContext, StateSensorConfig
+from neurosim_core.sensors.imu_presets import PRESETS
+from neurosim_core.settings import fill_from_preset
 from neurosim_core.vehicle import Multirotor
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
@@ -52,6 +54,9 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 class ImuConfig(StateSensorConfig):
     """An inertial measurement unit: its place, its rate, and its errors, of which it has none by default."""
 
+    preset: str | None = None
+    """A sensor whose errors these are, unless given here: bmi088, icm20948, adis16448 (sources in
+    imu_presets.py)."""
     mount: Mount = Mount()
     """Pose on the body."""
     rate_hz: Annotated[float, Field(gt=0.0, le=1e6)] = 400.0
@@ -78,6 +83,11 @@ class ImuConfig(StateSensorConfig):
     """Largest angular rate that can be told about an axis, of either sign [rad/s]; none: no limit."""
     gyroscope_resolution_rad_s: NonNegative = 0.0
     """Step between values of angular rate [rad/s]; 0: continuous."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, given: Any) -> Any:
+        return fill_from_preset(given, PRESETS)
 
 
 @register("sensor", "imu")

@@ -29,6 +29,8 @@ class RenderGroup:
     """What a ray answers."""
     timing: RayTiming | None = None
     """When rays are cast; None: all at the stamp."""
+    look_back_ns: int = 0
+    """How long before the end of a batch a camera needs poses besides those of its rays [ns]."""
     max_displacement_px: float | None = None
     """Rays are cast only at the instants that this asks for (`sensors.displacement`); None: at all."""
 
@@ -39,8 +41,8 @@ class RenderGroup:
 
     @property
     def window_ns(self) -> int:
-        """How long before a stamp its first ray is cast [ns]."""
-        return 0 if self.timing is None else self.timing.window_ns
+        """How long before a stamp poses are needed [ns]."""
+        return max(self.look_back_ns, 0 if self.timing is None else self.timing.window_ns)
 
 
 def plan_render_groups(sensors: Mapping[str, SensorConfig]) -> tuple[RenderGroup, ...]:
@@ -72,7 +74,7 @@ def plan_render_groups(sensors: Mapping[str, SensorConfig]) -> tuple[RenderGroup
     images = [name for name, request in requests.items() if not request.every_instant]
     for name in sorted(images, key=lambda name: -requests[name].rate_hz):  # fastest first: others may join
         join(name)
-    return tuple(_group(plan, requests) for plan in plans)
+    return tuple(_group(plan, requests, cameras) for plan in plans)
 
 
 class _Clock(NamedTuple):
@@ -97,12 +99,15 @@ class _Plan(NamedTuple):
     members: list[str]
 
 
-def _group(plan: _Plan, requests: Mapping[str, RenderRequest]) -> RenderGroup:
+def _group(
+    plan: _Plan, requests: Mapping[str, RenderRequest], cameras: Mapping[str, RenderedConfig]
+) -> RenderGroup:
     frames = tuple(name for name in plan.members if requests[name].every_instant)
     return RenderGroup(
         lens=plan.lens,
         mount=plan.mount,
         timing=plan.timing,
+        look_back_ns=max(cameras[name].look_back_ns for name in plan.members),
         rate=Rate(plan.clock.rate_hz),
         frame_sensors=frames,
         image_sensors=tuple(name for name in plan.members if name not in frames),

@@ -10,8 +10,8 @@ from neurosim_core.packets import Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.render_group import (
-    RenderGroupState,
+from neurosim_core.sim.render_group import RenderGroupState
+from neurosim_core.sim.render_job import (
     RenderJob,
     acquire_room,
     choose_ticks,

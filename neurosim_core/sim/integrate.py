@@ -261,14 +261,14 @@ def _read_samplers(state: State, batch: Batch) -> list[Packet]:
         stamps = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.samplers]
         columns = {field: copy.rows(batch.slot, len(stamps))[:, 0] for field, copy in copies.items()}
         for sample, stamp_ns in enumerate(stamps):
-            packets.append(
-                state.samplers[name].packet(
-                    {field: column[sample] for field, column in columns.items()},
-                    stamp_ns=stamp_ns,
-                    sequence=state.sequence[name],
-                    sensor=name,
-                )
+            packet = state.samplers[name].packet(
+                {field: column[sample] for field, column in columns.items()},
+                stamp_ns=stamp_ns,
+                sequence=state.sequence[name],
+                sensor=name,
             )
+            if packet is not None:
+                packets.append(packet)
             state.sequence[name] += 1
     return packets
 

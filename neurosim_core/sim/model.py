@@ -83,12 +83,16 @@ def make_model(
     return next(iter(make_fleet(config, scene=scene, on_phase=on_phase).values()))
 
 
-def refit(model: Model, config: SimulationConfig) -> Model:
-    """Return a model with other sensors, rates and launches on the same path in the same scene and light.
+def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Model:
+    """Return a model with other sensors, rates and launches in the same scene and light.
 
     Args:
         model: What was made before.
-        config: Its scene, path, vehicle, device and renderer are those of `model`, or are not looked at.
+        config: Its scene, vehicle, device and renderer are those of `model`, or are not looked at.
+        replan: Fly the path of `config`; else that of `model`.
+
+    Raises:
+        ValueError: No path exists.
     """
     return _make_member(
         config,
@@ -96,7 +100,7 @@ def refit(model: Model, config: SimulationConfig) -> Model:
         model.scene,
         model.bodies,
         model.free_space,
-        model.path,
+        _plan(config, model.free_space) if replan else model.path,
         model.scene_on_device,
         model.setup_s,
     )

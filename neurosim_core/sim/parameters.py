@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from neurosim_core.mistakes import explain
+from neurosim_core.config_errors import explain
 from neurosim_core.sensors.base import CameraConfig, SensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup
 

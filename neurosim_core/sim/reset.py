@@ -167,3 +167,17 @@ def take_mask(
 wp.overload(take_mask, {"mask": wp.array[wp.bool]})
 wp.overload(take_mask, {"mask": wp.array[wp.uint8]})
 wp.overload(take_mask, {"mask": wp.array[wp.int32]})
+
+
+@wp.kernel
+def take_seeds(
+    # In:
+    mask: wp.array[wp.int32],
+    seeds: wp.array[wp.uint64],
+    # Out:
+    seeds_out: wp.array[wp.uint64],
+) -> None:
+    """Copy the seeds of some worlds."""
+    world = wp.tid()
+    if mask[world] != 0:
+        seeds_out[world] = seeds[world]

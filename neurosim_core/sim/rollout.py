@@ -29,13 +29,7 @@ from neurosim_core.sim.integrate import (
     set_command,
 )
 from neurosim_core.sim.model import Model, make_model
-from neurosim_core.sim.render_group import (
-    acquire_room,
-    disable_frame_sensors,
-    flush_frames,
-    is_due,
-    leave_out,
-)
+from neurosim_core.sim.render_job import acquire_room, disable_frame_sensors, flush_frames, is_due, leave_out
 from neurosim_core.sim.schedule import Boundary, batch_end_ns, boundaries, everything
 from neurosim_core.sim.state import Batch, PlannedStep, State, make_state
 from neurosim_core.sim.step import launch, read

@@ -27,7 +27,7 @@ from neurosim_core.sim.integrate import checked_command, command_buffer, plan_ba
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, Samples, VehicleStates
 from neurosim_core.sim.parameters import lenses_differ, vary_sensors
-from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows
+from neurosim_core.sim.reset import begin_of_paths, normalise, normalised, take_mask, take_rows, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
 from neurosim_core.sim.state import State, WorldSettings, make_state, reset_vehicles
@@ -68,7 +68,6 @@ class Simulation:
     Attributes:
         count: Number of worlds N.
         device: Where everything is.
-        seeds: Seed of each world.
         duration_ns: How long the last step was [ns].
 
     Raises:
@@ -96,7 +95,7 @@ class Simulation:
         chosen = _one_vehicle(config, device)
         rigs = vary_sensors(chosen.sensors, parameters or {}, worlds)
         self.count = worlds
-        self.seeds = make_seeds(chosen.seed if seeds is None else seeds, worlds)
+        first_seeds = make_seeds(chosen.seed if seeds is None else seeds, worlds)
         self._scenes = make_scene_table(
             chosen,
             count=worlds,
@@ -114,7 +113,7 @@ class Simulation:
             model,
             worlds=WorldSettings(
                 scenes=self._scenes,
-                seeds=self.seeds,
+                seeds=first_seeds,
                 rigs=rigs,
                 instant_count=self._timetable.instant_count_max(),
                 slot_count=self._timetable.boundary_count_max(),
@@ -136,6 +135,41 @@ class Simulation:
         return self._model
 
     @property
+    def seeds(self) -> list[int]:
+        """Seed of each world; waits for the device."""
+        return [int(seed) for seed in self._state.seeds.numpy()]
+
+    def thresholds(self, camera: str) -> Any:
+        """Return the thresholds of an event camera in each world, up and down, vec2d, shape [N].
+
+        They are on the device, and may be written where a world is about to begin anew.
+
+        Raises:
+            ValueError: There is no such event camera, or its pixels are not ideal.
+        """
+        for group in self._state.groups:
+            if camera in group.world_frames:
+                thresholds = getattr(group.world_frames[camera], "thresholds", None)
+                if thresholds is not None:
+                    return thresholds
+        raise ValueError(f"{camera!r} is no event camera with ideal pixels: its thresholds stay as they are")
+
+    @property
+    def fields(self) -> Any:
+        """Distance to each scene, device array of `scene.freespace.DistanceField`, shape [scene]."""
+        return self._scenes.fields
+
+    @property
+    def scene_of_world(self) -> Any:
+        """Index of the scene of each world, device array of int32, shape [N]."""
+        return self._scenes.scene
+
+    @property
+    def models(self) -> tuple[Model, ...]:
+        """The model of each scene: its free space, path and light."""
+        return self._scenes.models
+
+    @property
     def command_width(self) -> Mapping[str, int]:
         """Numbers in a command of each mode that was used; of `motor_speeds`, rotors."""
         return {mode: int(buffer.array.shape[1]) for mode, buffer in self._state.commands.items()}
@@ -149,7 +183,7 @@ class Simulation:
         self,
         *,
         mask: Any = None,
-        seed: int | ArrayLike | None = None,
+        seed: Any = None,
         position: Any = None,
         velocity: Any = None,
         orientation: Any = None,
@@ -163,8 +197,9 @@ class Simulation:
 
         Args:
             mask: Which worlds, shape [N], of bool, uint8 or int32, on host or device; None: all.
-            seed: New seeds, of world 0 (of the others: the next integers) or of each, shape [N]; None: the
-                same. For all worlds only.
+            seed: New seeds, of world 0 (of the others: the next integers) or of each, shape [N], on the host
+                or a Warp array of uint64 on the device; None: the same. Worlds that are not reset keep
+                theirs. Where the pixels of an event camera are not ideal, this waits for the device.
             position: p_WB [m], shape [N, 3] or [3]; None: where the configured path begins.
             velocity: v_WB in W [m/s], likewise.
             orientation: q_WB, xyzw, shape [N, 4] or [4]; normalised here.
@@ -185,15 +220,15 @@ class Simulation:
             names = ", ".join(name for name, value in given.items() if value is not None)
             raise ValueError(f"path.kind poses says where an episode starts: give no {names}")
         if mask is not None:
-            self._check_partial(seed)
-        seeds = None if seed is None else make_seeds(seed, self.count)
+            self._check_partial()
+        seeds = None if seed is None else self._checked_seeds(seed)
         chosen = None if mask is None else self._checked_mask(mask)
         start = self._checked_start(
             position=position, velocity=velocity, orientation=orientation, body_rate=body_rate
         )
-        if seeds is not None:  # all is checked: nothing is half done
+        self._take_mask(chosen)  # all is checked: nothing is half done
+        if seeds is not None:
             self._reseed(seeds)
-        self._take_mask(chosen)
         self._take_start(start)
         state, period = self._state, self._timetable.first()
         reset_vehicles(self._model, state, self._mask)
@@ -390,11 +425,9 @@ class Simulation:
             if name == "orientation":
                 self._launch(normalise, [], [array])
 
-    def _check_partial(self, seed: Any) -> None:
+    def _check_partial(self) -> None:
         if self._now_ns is None:
             raise ValueError("mask: the first reset is of all worlds")
-        if seed is not None:
-            raise ValueError("seed: new seeds are for a reset of all worlds")
         common_ns = self._timetable.common_ns
         if common_ns == 0 or self._now_ns % common_ns != 0:
             when = f"every {common_ns} ns" if common_ns else "never"
@@ -404,12 +437,26 @@ class Simulation:
                 f"control.rate_hz = {self._model.config.control.rate_hz:g}, or reset some worlds only then"
             )
 
-    def _reseed(self, seeds: list[int]) -> None:
-        self.seeds = seeds
-        self._state.seeds.assign(np.array(seeds, dtype=np.uint64))
-        for group in self._state.groups:
-            for sensor in group.world_frames.values():
-                sensor.seed(seeds)
+    def _checked_seeds(self, seed: Any) -> Any:
+        """Return seeds of all worlds: an array of the device."""
+        if not isinstance(seed, wp.array):
+            seeds = np.array(make_seeds(seed, self.count), dtype=np.uint64)
+            return wp.array(seeds, dtype=wp.uint64, device=self.device)
+        if seed.dtype != wp.uint64 or seed.shape != (self.count,):
+            raise ValueError(
+                f"seed must be uint64 of shape [{self.count}], "
+                f"got {seed.dtype.__name__} of shape {list(seed.shape)}"
+            )
+        return as_device_array(seed, self.device)
+
+    def _reseed(self, seeds: Any) -> None:
+        """Give the worlds of the mask other seeds."""
+        self._launch(take_seeds, [self._mask, seeds], [self._state.seeds])
+        sensors = [sensor for group in self._state.groups for sensor in group.world_frames.values()]
+        if any(sensor.terms for sensor in sensors):
+            worlds = set(np.flatnonzero(self._mask.numpy()).tolist())
+            for sensor in sensors:
+                sensor.seed(self.seeds, worlds)
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)

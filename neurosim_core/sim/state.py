@@ -7,6 +7,7 @@ import math
 from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,14 +32,8 @@ from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import Rig, lens_tables
-from neurosim_core.sim.render_group import (
-    Choice,
-    Instants,
-    MakeRoom,
-    RenderGroupState,
-    RenderJob,
-    make_render_group,
-)
+from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_group
+from neurosim_core.sim.render_job import Choice, Instants, RenderJob
 from neurosim_core.sim.reset import Start, begin_of_paths, normalised, restart
 from neurosim_core.sim.scene_table import SceneTable, single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max, boundary_count_within
@@ -241,15 +236,11 @@ def make_state(
     is_cuda = wp.get_device(device).is_cuda
     on_host = worlds is None
     if worlds is None:
-        worlds = WorldSettings(
-            scenes=single_scene(model),
-            seeds=[config.seed if seed is None else seed],
-            rigs=[config.sensors],
-            instant_count=0,
-            slot_count=boundary_count_max(model.schedule),
-        )
+        worlds = _single_world(model, seed)
     if in_flight is None:
         in_flight = _IN_FLIGHT_ON_CUDA if on_host and is_cuda and config.renderer.kind != "pyrender" else 1
+    if any(getattr(sensor, "remembers", False) for sensor in config.sensors.values()):
+        in_flight = 1
     count = len(worlds.seeds)
     flight_lane_count = max(in_flight, flight_lane_count or 0)
     slot_count = flight_lane_count * worlds.slot_count
@@ -259,12 +250,24 @@ def make_state(
     if carried and start is not None:
         raise ValueError("path.kind poses says where an episode starts: give no start")
     fleet = _make_fleet(vehicle)
+    ground = model.airframe.ground
+    surfaces = make_surfaces(
+        worlds.scenes.fields,
+        worlds.scenes.scene,
+        radius_m=-math.inf if carried else config.vehicle.collision_radius_m,  # it touches nothing
+        ground_height_m=None if ground is None else ground.height_m,
+        holds=config.vehicle.on_collision == "end",
+    )
+    context = partial(
+        SamplerContext,
+        vehicle=vehicle,
+        slot_count=slot_count,
+        seeds=seeds,
+        active=fleet.active,
+        surfaces=surfaces,
+    )
     samplers = {
-        name: sensor.make(
-            SamplerContext(
-                name=name, vehicle=vehicle, slot_count=slot_count, seeds=seeds, active=fleet.active
-            )
-        )
+        name: sensor.make(context(name=name))
         for name, sensor in config.sensors.items()
         if isinstance(sensor, StateSensorConfig)
     }
@@ -277,31 +280,24 @@ def make_state(
     )
     if on_host:
         trace.bring_to_host()
-    ground = model.airframe.ground
-    paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
     state = State(
         world_count=count,
         on_host=on_host,
         vehicle=vehicle,
         fleet=fleet,
-        surfaces=make_surfaces(
-            worlds.scenes.fields,
-            worlds.scenes.scene,
-            radius_m=-math.inf if carried else config.vehicle.collision_radius_m,  # it touches nothing
-            ground_height_m=None if ground is None else ground.height_m,
-            holds=config.vehicle.on_collision == "end",
-        ),
+        surfaces=surfaces,
         start=_make_start(worlds, start, device),
-        path_controller=make_controller(
-            "path",
-            model.airframe,
-            config.control.gains,
-            count=count,
-            device=device,
-            paths=paths[0] if all(path is paths[0] for path in paths) else paths,
-        ),
+        path_controller=_path_controller(model, worlds),
         trace=trace,
-        groups=_make_groups(model, worlds, in_flight=in_flight, on_host=on_host, make_room=make_room),
+        groups=_make_groups(
+            model,
+            worlds,
+            seeds,
+            trace.history,
+            in_flight=in_flight,
+            on_host=on_host,
+            make_room=make_room,
+        ),
         samplers=samplers,
         sampler_copies={
             name: {field: HostCopy(array) for field, array in sampler.arrays.items()}
@@ -330,6 +326,30 @@ def make_state(
     return state
 
 
+def _path_controller(model: Model, worlds: WorldSettings) -> Controller:
+    """Return what follows the paths of all worlds, which may share one."""
+    paths = [worlds.scenes.models[scene].path for scene in worlds.scenes.scene_of_world]
+    return make_controller(
+        "path",
+        model.airframe,
+        model.config.control.gains,
+        count=len(worlds.seeds),
+        device=model.device,
+        paths=paths[0] if all(path is paths[0] for path in paths) else paths,
+    )
+
+
+def _single_world(model: Model, seed: int | None) -> WorldSettings:
+    """Return the settings of the one world of a single run."""
+    return WorldSettings(
+        scenes=single_scene(model),
+        seeds=[model.config.seed if seed is None else seed],
+        rigs=[model.config.sensors],
+        instant_count=0,
+        slot_count=boundary_count_max(model.schedule),
+    )
+
+
 def _history_length(model: Model, slot_count: int) -> int:
     """Return how many boundaries are kept for rays with times of their own, whatever is flown ahead."""
     window_ns = max((group.window_ns for group in model.groups), default=0)
@@ -355,6 +375,8 @@ def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:
 def _make_groups(
     model: Model,
     worlds: WorldSettings,
+    seeds: Any,
+    history: Any,
     *,
     in_flight: int,
     on_host: bool,
@@ -391,6 +413,7 @@ def _make_groups(
                 in_flight=in_flight,
                 device=model.device,
                 seed=worlds.seeds[0],
+                seeds=seeds,
                 bodies=config.bodies,
                 worlds=RenderWorlds(
                     count=len(worlds.seeds),
@@ -398,11 +421,13 @@ def _make_groups(
                     lens_of_world=lens_of_world,
                     scenes=scenes.data,
                     scene_of_world=scenes.scene,
+                    arrays=[each.scene_on_device for each in scenes.models],
                     terms=scenes.terms,
                 ),
                 on_host=on_host,
                 make_room=make_room,
                 world_context=None if on_host else world_context,
+                history=history,
             )
         )
     return groups

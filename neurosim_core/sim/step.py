@@ -7,7 +7,7 @@ What does not change is in `model.py`, what does in `state.py`: arrays with a le
 a single run has one. A run is cut into batches (`schedule.py`). Within a batch the vehicles are integrated
 from boundary to boundary, and their states stay on the device (`integrate.py`, `trace.py`). Then every render
 group renders all its instants in one launch, every frame sensor scans them in one launch (`cameras.py`,
-`render_group.py`), and what goes to the host is read back once.
+`render_job.py`), and what goes to the host is read back once.
 
 How parts of a batch share a device (streams, graphs, several batches in flight) is in `runtime/cuda.py`; it
 changes no result.
@@ -31,7 +31,7 @@ from neurosim_core.sim.cameras import (
 )
 from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, read_flight
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.render_group import acquire_room, launch_key
+from neurosim_core.sim.render_job import acquire_room, launch_key
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.warp_start import refuse_forked_process
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy
 from neurosim_core.scene.freespace import DistanceField, room_around
-from neurosim_core.sim.ray_poses import History, append_history, make_history, write_ray_poses
+from neurosim_core.sim.ray_poses import write_ray_poses
+from neurosim_core.vehicle.history import History, append_history, make_history
 from neurosim_core.vehicle.status import STATUS_COLLISION, STATUS_OK
 
 wp.set_module_options({"enable_backward": False})
@@ -157,6 +158,34 @@ def _camera_poses(
 
 
 @wp.kernel
+def _camera_twists(
+    # Model:
+    p_BC: wp.vec3d,
+    q_BC: wp.quatd,
+    stride: int,
+    # In:
+    states: wp.array3d[wp.float64],
+    status: wp.array2d[wp.int32],
+    slots: wp.array[int],
+    # Out:
+    twist_out: wp.array[wp.spatial_vectord],
+) -> None:
+    world, instant = wp.tid()
+    slot = slots[instant]
+    q_WB = wp.quatd(
+        states[slot, world, 3], states[slot, world, 4], states[slot, world, 5], states[slot, world, 6]
+    )
+    v_W = wp.vec3d(states[slot, world, 7], states[slot, world, 8], states[slot, world, 9])
+    w_B = wp.vec3d(states[slot, world, 10], states[slot, world, 11], states[slot, world, 12])
+    v_W += wp.quat_rotate(q_WB, wp.cross(w_B, p_BC))
+    w_C = wp.quat_rotate_inv(q_BC, w_B)
+    twist = wp.spatial_vectord(v_W[0], v_W[1], v_W[2], w_C[0], w_C[1], w_C[2])
+    if status[slot, world] != STATUS_OK:
+        twist = wp.spatial_vectord()
+    twist_out[world * stride + instant] = twist
+
+
+@wp.kernel
 def _copy_rows(
     # In:
     first: int,
@@ -285,6 +314,32 @@ class Trace:
     def ray_poses(self, slots: wp.array[int], offsets_ns: Any, **poses: Any) -> None:
         """Write the poses of a camera when its rays are cast; see `ray_poses.write_ray_poses`."""
         write_ray_poses(self._rows.history, self._rows.entries, slots, offsets_ns, **poses)
+
+    def camera_twists(
+        self, slots: wp.array[int], *, count: int, p_BC: wp.vec3d, q_BC: wp.quatd, twist: Any
+    ) -> None:
+        """Write velocities of a camera, in W [m/s] and angular in C [rad/s]; 0 where it is held.
+
+        Args:
+            slots: Slots of the instants, shape [K].
+            count: How many of them to use.
+            p_BC: Position of the camera on the body [m].
+            q_BC: Orientation of the camera against the body, xyzw.
+            twist: spatial_vectord, shape [world K]; overwritten.
+        """
+        world_count = self.states.shape[1]
+        wp.launch(
+            _camera_twists,
+            dim=(world_count, count),
+            inputs=[p_BC, q_BC, twist.shape[0] // world_count, self.states, self.status, slots],
+            outputs=[twist],
+            device=self.states.device,
+        )
+
+    @property
+    def history(self) -> Any:
+        """The states at all boundaries, as far back as somebody needs (`vehicle.history`)."""
+        return self._rows.history
 
     def bring_to_host(self) -> None:
         """Allocate the copies on the host that `fetch` writes to."""

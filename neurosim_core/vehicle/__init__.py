@@ -1,15 +1,14 @@
 """Multirotor dynamics: `Multirotor(preset("hummingbird"))` is a vehicle to fly."""
 
+from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig
 from neurosim_core.vehicle.ground import GroundConfig
 from neurosim_core.vehicle.multirotor import (
-    TERMS,
     Acceleration,
     DynamicsError,
     Effort,
     Integrator,
     Multirotor,
     MultirotorArrays,
-    MultirotorConfig,
     MultirotorState,
 )
 from neurosim_core.vehicle.presets import preset

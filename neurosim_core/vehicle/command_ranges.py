@@ -13,7 +13,7 @@ from pydantic import Field
 from neurosim_core.settings import Settings
 
 if TYPE_CHECKING:
-    from neurosim_core.vehicle.multirotor import MultirotorConfig
+    from neurosim_core.vehicle.airframe import MultirotorConfig
 
 SPEED_CEILING_M_S = 100.0
 """Highest default of `speed_max_m_s`: a model without drag has no top speed of its own [m/s]."""
@@ -124,11 +124,10 @@ class CommandRanges:
 def command_ranges(vehicle: MultirotorConfig) -> CommandRanges:
     """Return what a vehicle can be asked for."""
     config = vehicle.command_ranges
-    thrust_n = float(vehicle.thrust_coefficients_n_s2.sum() * vehicle.rotor_speed_max_rad_s**2)
     return CommandRanges(
         refuse=config.beyond == "refuse",
         rotor_speed_max_rad_s=vehicle.rotor_speed_max_rad_s,
-        thrust_max_n=thrust_n if config.thrust_max_n is None else config.thrust_max_n,
+        thrust_max_n=vehicle.thrust_max_n if config.thrust_max_n is None else config.thrust_max_n,
         speed_max_m_s=top_speed_m_s(vehicle) if config.speed_max_m_s is None else config.speed_max_m_s,
         body_rate_max_rad_s=config.body_rate_max_rad_s,
         position_max_m=config.position_max_m,

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from neurosim_core.mistakes import explain
+from neurosim_core.config_errors import explain
 from neurosim_core.registry import register
 from neurosim_core.settings import Settings
-from neurosim_core.vehicle.multirotor import Integrator, Multirotor, MultirotorConfig
+from neurosim_core.vehicle.airframe import MultirotorConfig
+from neurosim_core.vehicle.multirotor import Integrator, Multirotor
 from neurosim_core.vehicle.presets import preset
 
 if TYPE_CHECKING:

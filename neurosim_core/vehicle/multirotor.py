@@ -1,49 +1,25 @@
 # mypy: disable-error-code="index,attr-defined,misc,no-untyped-call,call-overload,union-attr,assignment"
-"""Rigid multirotors: parameters, state, and stepping in integer time, for one vehicle or thousands."""
+"""Rigid multirotors: state, and stepping in integer time, for one vehicle or thousands."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
 
-from neurosim_core.frames import Vector3, as_rows
-from neurosim_core.settings import Settings
-from neurosim_core.vehicle.aerodynamics import (
-    AIR_TERMS,
-    Airframe,
-    lift_moments,
-    linear_weights,
-    quadratic_weights,
-    vec8d,
-    vec10d,
-)
-from neurosim_core.vehicle.command_ranges import CommandRangesConfig
-from neurosim_core.vehicle.ground import GroundConfig, make_ground
+from neurosim_core.frames import as_rows
+from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, make_airframe
+from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import Batch, Interval, make_kernels
 from neurosim_core.vehicle.motor import LagConstants, lag_constants
 from neurosim_core.vehicle.rotors import RotorLag, Rotors
 from neurosim_core.vehicle.status import STATUS_TERMS
 from neurosim_core.vehicle.surroundings import Surroundings
-from neurosim_core.vehicle.wind import GustConfig, TurbulenceConfig, make_wind
-
-TERMS = (
-    "motor_lag",
-    "rotor_lags",
-    *AIR_TERMS,
-    "wind",
-    "gusts",
-    "turbulence",
-    "ground",
-    "ground_effect",
-    "full_inertia",
-)
-"""Terms of the equations of motion that a vehicle may do without."""
+from neurosim_core.vehicle.wind import make_wind
 
 Integrator = Literal["rkmk4", "dormand_prince"]
 """How a vehicle is integrated: see `Multirotor`."""
@@ -51,154 +27,6 @@ Integrator = Literal["rkmk4", "dormand_prince"]
 _STEP_MAX_NS = 10**12
 _BLOCK_DIM = 32  # threads per CUDA block: a few thousand vehicles then reach every multiprocessor
 _LAUNCH_COUNT_MAX = 64  # recorded launches that are kept, one for each duration
-
-NonNegative = Annotated[float, Field(ge=0.0)]
-
-
-class MultirotorConfig(Settings):
-    """Parameters of a multirotor whose rotors all push along body z. What is 0 is not computed."""
-
-    mass_kg: Annotated[float, Field(gt=0.0)]
-    """Mass [kg]."""
-    inertia_kg_m2: tuple[Vector3, Vector3, Vector3]
-    """Inertia about the centre of mass in B, as three rows [kg m^2]."""
-    rotor_position_m: tuple[Vector3, ...]
-    """Hub of each rotor against the centre of mass in B [m]."""
-    rotor_direction: tuple[Literal[-1, 1], ...]
-    """Sign of each rotor's reaction torque about body z: 1 if it turns clockwise seen from above."""
-    thrust_coefficient_n_s2: NonNegative
-    """Thrust of a rotor per squared speed [N/(rad/s)^2]."""
-    torque_coefficient_n_m_s2: NonNegative
-    """Reaction torque of a rotor per squared speed [N m/(rad/s)^2]."""
-    rotor_thrust_scale: tuple[NonNegative, ...] = ()
-    """For each rotor, its thrust coefficient as a multiple of the common one, where they are not alike; 0: a
-    rotor that is lost."""
-    rotor_torque_scale: tuple[NonNegative, ...] = ()
-    """For each rotor, its torque coefficient as a multiple of the common one, where they are not alike."""
-    rotor_drag_kg: NonNegative = 0.0
-    """Drag of a rotor in its plane, per rotor speed and air speed [N/(rad/s)/(m/s)]."""
-    rotor_inflow_kg: NonNegative = 0.0
-    """Loss of thrust per rotor speed and air speed along the axis [N/(rad/s)/(m/s)]."""
-    translational_lift_kg_m: NonNegative = 0.0
-    """Thrust of a rotor gained per squared air speed in its plane [N/(m/s)^2]."""
-    flapping_kg_m: NonNegative = 0.0
-    """Flapping torque of a rotor per rotor speed and air speed [N m/(rad/s)/(m/s)]."""
-    parasitic_drag_kg_m: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
-    """Drag of the frame along body x, y, z per squared air speed [N/(m/s)^2]."""
-    motor_time_constant_s: NonNegative = 0.0
-    """Time to close 63 % of a step in commanded rotor speed [s]; 0 means at once."""
-    motor_time_constant_scale: tuple[NonNegative, ...] = ()
-    """For each rotor, its time constant as a multiple of the common one, where they are not alike."""
-    rotor_speed_min_rad_s: NonNegative = 0.0
-    """Slowest speed of a rotor [rad/s]; commands below saturate there, as in the motor controller."""
-    rotor_speed_max_rad_s: Annotated[float, Field(gt=0.0)]
-    """Fastest speed of a rotor [rad/s]; commands above saturate there."""
-    gravity_m_s2: NonNegative = 9.81
-    """Gravity along world -z [m/s^2]."""
-    wind_m_s: Vector3 = (0.0, 0.0, 0.0)
-    """Velocity of the air in W [m/s]."""
-    gusts: tuple[GustConfig, ...] = ()
-    """Discrete gusts, which add up."""
-    turbulence: TurbulenceConfig | None = None
-    """Random wind; null: none."""
-    ground: GroundConfig | None = None
-    """A horizontal plane to land on; null: the vehicle falls for ever."""
-    command_ranges: CommandRangesConfig = CommandRangesConfig()
-    """The largest commands that the vehicle accepts."""
-
-    @model_validator(mode="after")
-    def _is_a_body(self) -> MultirotorConfig:
-        inertia = np.array(self.inertia_kg_m2)
-        if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
-            raise ValueError(f"inertia_kg_m2 must be symmetric, got {self.inertia_kg_m2}")
-        moments = np.linalg.eigvalsh(inertia)
-        if not moments[0] > 0.0:
-            raise ValueError(
-                f"inertia_kg_m2 must be positive definite, got principal moments {moments.tolist()}"
-            )
-        # measured moments may miss the inequality a little: those published for the crazyflie do by 1 %
-        if moments[0] + moments[1] < 0.98 * moments[2]:
-            raise ValueError(
-                "inertia_kg_m2: no body has principal moments of which one exceeds the sum of the others, "
-                f"got {moments.tolist()}"
-            )
-        if not self.rotor_position_m or len(self.rotor_position_m) != len(self.rotor_direction):
-            raise ValueError(
-                "rotor_position_m and rotor_direction must have one entry for each rotor, "
-                f"got {len(self.rotor_position_m)} and {len(self.rotor_direction)}"
-            )
-        for name in ("rotor_thrust_scale", "rotor_torque_scale", "motor_time_constant_scale"):
-            if len(scale := getattr(self, name)) not in (0, self.rotor_count):
-                raise ValueError(
-                    f"{name} must have one entry for each of {self.rotor_count} rotors, or none, "
-                    f"got {len(scale)}"
-                )
-        if not self.rotor_speed_min_rad_s < self.rotor_speed_max_rad_s:
-            raise ValueError(
-                "rotor_speed_min_rad_s must be below "
-                f"rotor_speed_max_rad_s = {self.rotor_speed_max_rad_s:g}, got {self.rotor_speed_min_rad_s:g}"
-            )
-        air = {"wind_m_s": any(self.wind_m_s), "gusts": self.gusts, "turbulence": self.turbulence}
-        if (moved := [name for name, given in air.items() if given]) and not self._feels_air:
-            raise ValueError(
-                f"{', '.join(moved)}: moving air does nothing to a vehicle without drag; give it "
-                "rotor_drag_kg, parasitic_drag_kg_m or another coefficient of the air"
-            )
-        return self
-
-    @property
-    def rotor_count(self) -> int:
-        """Number of rotors."""
-        return len(self.rotor_position_m)
-
-    @property
-    def thrust_coefficients_n_s2(self) -> NDArray[np.float64]:
-        """Thrust of each rotor per squared speed [N/(rad/s)^2], shape [R]."""
-        return self._of_each(self.thrust_coefficient_n_s2, self.rotor_thrust_scale)
-
-    @property
-    def torque_coefficients_n_m_s2(self) -> NDArray[np.float64]:
-        """Reaction torque of each rotor per squared speed [N m/(rad/s)^2], shape [R]."""
-        return self._of_each(self.torque_coefficient_n_m_s2, self.rotor_torque_scale)
-
-    @property
-    def motor_time_constants_s(self) -> NDArray[np.float64]:
-        """Time constant of each rotor [s], shape [R]."""
-        return self._of_each(self.motor_time_constant_s, self.motor_time_constant_scale)
-
-    @property
-    def hover_rotor_speed_rad_s(self) -> float:
-        """Speed at which equal rotors carry the weight in still air [rad/s]; within their range."""
-        thrust = self.thrust_coefficients_n_s2.sum()
-        speed = np.sqrt(self.mass_kg * self.gravity_m_s2 / thrust) if thrust > 0.0 else 0.0
-        return float(np.clip(speed, self.rotor_speed_min_rad_s, self.rotor_speed_max_rad_s))
-
-    def _of_each(self, common: float, scale: tuple[float, ...]) -> NDArray[np.float64]:
-        return common * np.array(scale or self.rotor_count * (1.0,))
-
-    @property
-    def _feels_air(self) -> bool:
-        of_rotors = (self.rotor_drag_kg, self.rotor_inflow_kg, self.translational_lift_kg_m)
-        return any((*of_rotors, self.flapping_kg_m, *self.parasitic_drag_kg_m))
-
-    def terms(self) -> tuple[str, ...]:
-        """Return the terms (of `TERMS`) that these parameters need."""
-        inertia = np.array(self.inertia_kg_m2)
-        needed = {
-            "motor_lag": bool(self.motor_time_constants_s.any()),
-            "rotor_lags": bool(np.ptp(self.motor_time_constants_s) > 0.0),
-            "rotor_drag": self.rotor_drag_kg > 0.0 or self.rotor_inflow_kg > 0.0,
-            "translational_lift": self.translational_lift_kg_m > 0.0,
-            "flapping": self.flapping_kg_m > 0.0,
-            "parasitic_drag": any(self.parasitic_drag_kg_m),
-            "ground": self.ground is not None,
-            "ground_effect": self.ground is not None and self.ground.rotor_radius_m > 0.0,
-            "full_inertia": bool(np.any(inertia - np.diag(np.diag(inertia)))),
-        }
-        needed["wind"] = any(self.wind_m_s)
-        needed["gusts"] = bool(self.gusts)
-        needed["turbulence"] = self.turbulence is not None
-        return tuple(term for term in TERMS if needed[term])
 
 
 class MultirotorState(NamedTuple):
@@ -668,56 +496,3 @@ def _struct(kind: Any, **values: Any) -> Any:
     for name, value in values.items():
         setattr(filled, name, value)
     return filled
-
-
-class AirframeArrays(NamedTuple):
-    """Parameters of a multirotor as the kernels read them."""
-
-    airframe: Airframe
-    quadratic_weight: wp.array[wp.vec4d]
-    """See `aerodynamics.quadratic_weights`, [R]."""
-    linear_weight: wp.array[vec10d]
-    """See `aerodynamics.linear_weights`, [R]."""
-
-
-def make_airframe(config: MultirotorConfig, device: Any) -> AirframeArrays:
-    """Put the parameters of a multirotor on a device.
-
-    Raises:
-        ValueError: There is no such device.
-    """
-    position = np.array(config.rotor_position_m)
-    drag = np.array([config.rotor_drag_kg, config.rotor_drag_kg, config.rotor_inflow_kg])
-    quadratic = quadratic_weights(
-        position,
-        np.array(config.rotor_direction, dtype=np.float64),
-        thrust=config.thrust_coefficients_n_s2,
-        torque=config.torque_coefficients_n_m_s2,
-    )
-    return AirframeArrays(
-        _airframe(config, position, drag),
-        wp.array(quadratic, dtype=wp.vec4d, device=device),
-        wp.array(linear_weights(position, drag), dtype=vec10d, device=device),
-    )
-
-
-def _airframe(config: MultirotorConfig, position: NDArray[np.float64], drag: NDArray[np.float64]) -> Airframe:
-    inertia = np.array(config.inertia_kg_m2)
-    airframe = Airframe()
-    airframe.gravity = config.gravity_m_s2
-    airframe.mass_inverse = 1.0 / config.mass_kg
-    airframe.inertia = wp.mat33d(inertia)
-    airframe.inertia_inverse = wp.mat33d(np.linalg.inv(inertia))
-    airframe.inertia_diagonal = wp.vec3d(np.diag(inertia))
-    airframe.inertia_diagonal_inverse = wp.vec3d(1.0 / np.diag(inertia))
-    airframe.rotor_drag = wp.vec3d(drag)
-    airframe.flapping = config.flapping_kg_m
-    airframe.translational_lift = config.translational_lift_kg_m
-    airframe.lift_force = vec8d(lift_moments(position, np.ones(len(position))))
-    airframe.lift_torque_x = vec8d(lift_moments(position, position[:, 1]))
-    airframe.lift_torque_y = vec8d(lift_moments(position, -position[:, 0]))
-    airframe.parasitic_drag = wp.vec3d(*config.parasitic_drag_kg_m)
-    airframe.wind = wp.vec3d(*config.wind_m_s)
-    airframe.rotor_speed_min = config.rotor_speed_min_rad_s
-    airframe.rotor_speed_max = config.rotor_speed_max_rad_s
-    return airframe

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from neurosim_core.frames import Vector3
-from neurosim_core.vehicle.multirotor import MultirotorConfig
+from neurosim_core.vehicle.airframe import MultirotorConfig
 
 _DIAGONAL = 0.70710678118  # cos 45 degrees, with the digits of RotorPy's tables
 

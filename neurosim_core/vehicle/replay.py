@@ -18,7 +18,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.vehicle.aerodynamics import quadratic_weights
-from neurosim_core.vehicle.multirotor import Multirotor, MultirotorConfig, MultirotorState
+from neurosim_core.vehicle.airframe import MultirotorConfig
+from neurosim_core.vehicle.multirotor import Multirotor, MultirotorState
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.packets import EventArrays, Events, FieldSchema, Packet, as_numpy, schema_of
+from neurosim_core.packets import EventArrays, Events, FieldSchema, Packet, as_numpy, join_events, schema_of
 from neurosim_core.record.header import SensorDescription
-from neurosim_core.view.pictures import cut_events, join_events, picture_of
+from neurosim_core.view.pictures import picture_of
 from neurosim_core.view.rerun_layout import PICTURES
 
 _ROWS_MAX = 20_000
@@ -164,7 +164,7 @@ class FlightSummary:
             joined = join_events([packet.numpy() for packet in recent])
             begin, end = np.searchsorted(joined.t, [begin_us + 1, end_us + 1])
             views[name] = EventView(
-                events=cut_events(joined, slice(begin, end)),
+                events=joined.rows(slice(begin, end)),
                 width=recent[-1].width,
                 height=recent[-1].height,
                 window_ns=self._window_ns,

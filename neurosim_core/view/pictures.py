@@ -8,18 +8,20 @@ direction of optical flow is the hue, its length the saturation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.packets import EventArrays, Packet, as_numpy, schema_of
+from neurosim_core.packets import EventArrays, Packet, as_numpy, join_events, schema_of
 
 PictureKind = Literal["colour", "values", "depth", "segmentation", "normals", "flow"]
 _KINDS: dict[str, PictureKind] = {
     "rgb8": "colour",
     "mono8": "colour",
+    "rgb16": "colour",
+    "mono16": "colour",
+    **{f"bayer_{order}{bits}": "colour" for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)},
     "32FC1": "depth",
     "32FC2": "flow",
     "32FC3": "normals",
@@ -65,6 +67,8 @@ def picture_of(packet: Packet) -> tuple[PictureKind, NDArray[Any]]:
         encoding = getattr(packet, "encoding", None)
         if encoding is not None and encoding not in _KINDS:
             raise ValueError(f"cannot show a picture of encoding {encoding!r}, known: {', '.join(_KINDS)}")
+        if data.dtype == np.uint16:
+            data = (data >> 8).astype(np.uint8)
         kind = _KINDS[encoding] if encoding else "colour" if data.dtype == np.uint8 else "values"
     return kind, data
 
@@ -156,26 +160,11 @@ class EventWindow:
         done: list[tuple[int, EventArrays]] = []
         while stamp_ns >= self._end_ns:
             cut = int(np.searchsorted(events.t, self._end_ns // 1000, side="right"))
-            self._parts.append(cut_events(events, slice(0, cut)))
+            self._parts.append(events.rows(slice(0, cut)))
             done.append((self._end_ns, join_events(self._parts)))
             self._parts = []
-            events = cut_events(events, slice(cut, None))
+            events = events.rows(slice(cut, None))
             self._end_ns += self._length_ns
         if len(events.t):
             self._parts.append(join_events([events]))
         return done
-
-
-def cut_events(events: EventArrays, span: slice) -> EventArrays:
-    """Return a range of events, as views."""
-    return EventArrays(events.t[span], events.x[span], events.y[span], events.polarity[span])
-
-
-def join_events(parts: Sequence[EventArrays]) -> EventArrays:
-    """Return the events of all parts, one after the other, as new arrays."""
-    return EventArrays(
-        t=np.concatenate([part.t for part in parts]),
-        x=np.concatenate([part.x for part in parts]),
-        y=np.concatenate([part.y for part in parts]),
-        polarity=np.concatenate([part.polarity for part in parts]),
-    )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import warp as wp
+from small_room import room_scene
 
 from neurosim_core.bench import events, render, throughput, worlds
 from neurosim_core.bench.engine import (
@@ -118,14 +121,14 @@ def test_finer_triangles_are_the_same_surface():
 
 
 @pytest.mark.slow
-def test_throughput_study():
-    chapter = throughput.measure(Options(quick=True, device="cpu", samples=(1,)))
+def test_throughput_study(tmp_path):
+    scene = Path(room_scene(tmp_path)["file"])
+    chapter = throughput.measure(Options(quick=True, device="cpu", samples=(1,), scene=scene))
     steps, parts = (table.rows for table in chapter.tables)
     assert all(row["slowest"] <= row["whole steps/s"] <= row["fastest"] for row in steps)
     assert [row["triangles"] for row in steps[-2:]] == [steps[0]["triangles"], 4 * steps[0]["triangles"]]
     assert all(row["us per frame"] > 0.0 for row in parts)
-    claims = {claim.text: claim.met for claim in chapter.claims}
-    assert claims["the same flight again gives the same bytes"]
+    assert chapter.claims[0].met is None  # it is of a CUDA device
 
 
 def test_worlds_study():

@@ -289,7 +289,7 @@ class Peer:
 
     def heard(self) -> dict[str, Any]:
         """Return what came to our subscription."""
-        return {"lengths": self.lengths, "errors": self.listening.error_count}
+        return {"lengths": self.lengths}
 
 
 def _shown(sample: Any) -> Any:

@@ -43,7 +43,7 @@ class RecordedSubscription:
     ) -> None:
         self.type_name, self.qos, self._callback, self._on_close = type_name, qos, callback, on_close
         self.publisher_count = 0
-        self.lost_count = self.error_count = 0
+        self.lost_count = 0
         self.closed = False
 
     def put(self, message: object) -> None:
@@ -58,8 +58,6 @@ class RecordedSubscription:
 
 
 class RecordedService:
-    error_count = 0
-
     def __init__(self, type_name: str, callback: Serve, on_close: Callable[[], None]) -> None:
         self.type_name, self._callback, self._on_close = type_name, callback, on_close
 

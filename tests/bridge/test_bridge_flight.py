@@ -26,7 +26,7 @@ def test_a_figure_eight_through_dds(registry: None, dds_domain: int) -> None:
     """AttitudeTarget, a reset by topic, then Actuators: each is as close to the path as in one process.
 
     Lockstep makes delays harmless, so only the float32 of a thrust may differ. What delays cost,
-    `cortex-ros2-bridge bench` measures, streaming.
+    `python -m neurosim_core.bench.bridge_flight` measures, streaming.
     """
     flights = measure_flights("lockstep", domain=dds_domain)
     assert [flight.mode for flight in flights] == list(MODES)

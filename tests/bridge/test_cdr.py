@@ -12,7 +12,7 @@ from cdr_oracle import random_message, write
 
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.cdr import CdrError
-from cortex_ros2_bridge.convert import IN, OUT
+from cortex_ros2_bridge.convert import RULES
 from cortex_ros2_bridge.msgs import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -25,7 +25,7 @@ from cortex_ros2_bridge.msgs import (
 )
 from cortex_ros2_bridge.typestore import UnknownTypeError, typestore
 
-ROUTED = sorted({name for _, name in OUT} | {name for name, _ in IN})
+ROUTED = sorted({rule.ros_type for rule in RULES})
 
 
 def test_a_header_is_these_bytes():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import neurosim_core
-from cortex_ros2_bridge.convert import IN, OUT
+from cortex_ros2_bridge.convert import RULES
 from cortex_ros2_bridge.typestore import definitions, typestore
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,7 +88,7 @@ def test_what_messages_consist_of_is_depended_on():
 
 
 def test_what_the_bridge_sends_and_receives_is_depended_on():
-    packages = {name.split("/")[0] for name in [*(name for _, name in OUT), *(name for name, _ in IN)]}
+    packages = {rule.ros_type.split("/")[0] for rule in RULES}
     assert packages - {"neurosim"} - UNRELEASED <= depends("depend", "exec_depend")
 
 

@@ -11,15 +11,17 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from cortex import messages
-from cortex_ros2_bridge import cdr, convert, frames
-from cortex_ros2_bridge.convert import IN, OPTIONS, OUT, Context, ConvertError, static_transforms
-from cortex_ros2_bridge.event_codec import Evt3Decoder, decode_mono
+from cortex.evt3 import Evt3Decoder
+from cortex_ros2_bridge import cdr, frames
+from cortex_ros2_bridge.convert import RULES, Context, ConvertError, check_transform, static_transforms
+from cortex_ros2_bridge.event_codec import decode_mono
 from cortex_ros2_bridge.frames import FrameNames
 from cortex_ros2_bridge.msgs import (
     Actuators,
@@ -40,6 +42,13 @@ from cortex_ros2_bridge.options import OPTIONS as OPTIONS_OF_ROUTES
 from cortex_ros2_bridge.options import check_option
 from cortex_ros2_bridge.typestore import typestore
 
+OUT = {(r.cortex_type, r.ros_type): r for r in RULES if r.direction == "out"}
+IN = {(r.ros_type, r.cortex_type): r for r in RULES if r.direction != "out"}
+convert = SimpleNamespace(
+    **{rule.convert.__name__: rule.convert for rule in RULES},
+    static_transforms=static_transforms,
+    check_transform=check_transform,
+)
 GOLDEN = Path(__file__).with_name("golden")
 TURN = np.array([0.5, 0.5, 0.5, 0.5])
 """Takes x to y, y to z and z to x: so v_W = (c, a, b) for v_B = (a, b, c), exactly."""
@@ -249,6 +258,17 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
         "tf2_msgs/TFMessage",
         record("tf2_msgs/TFMessage", [transform("drone/odom", "drone/base_link", (1.0, -2.0, 3.0), TURN)]),
     ),
+    "pose_stamped": (
+        convert.pose_stamped,
+        ODOMETRY,
+        context(),
+        "geometry_msgs/PoseStamped",
+        record(
+            "geometry_msgs/PoseStamped",
+            header("drone/odom"),
+            record("geometry_msgs/Pose", point(1.0, -2.0, 3.0), quaternion(*TURN)),
+        ),
+    ),
     "transform": (
         convert.transform,
         messages.Transform(
@@ -353,10 +373,12 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
     "point_cloud": (
         convert.point_cloud,
         messages.PointCloud(
-            stamp_ns=STAMP_NS,
+            stamp_ns=STAMP_NS + 66_051,
             points=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], np.float32),
             intensity=np.array([0.5, 0.25], np.float32),
-            color=np.array([[1, 2, 3], [255, 254, 253]], U8),
+            ring=np.array([7, 258], np.uint16),
+            t=np.array([0, 66_051], np.uint32),
+            start_ns=STAMP_NS,
             frame_id="drone/lidar",
         ),
         context(),
@@ -367,16 +389,19 @@ EXPECTED: dict[str, tuple[Callable[..., Any], Any, Context, str, Any]] = {
             1,
             2,
             [
-                record("sensor_msgs/PointField", name, offset, 7, 1)
-                for name, offset in (("x", 0), ("y", 4), ("z", 8), ("intensity", 12), ("rgb", 16))
+                record("sensor_msgs/PointField", name, offset, kind, 1)
+                for name, offset, kind in (
+                    *(("x", 0, 7), ("y", 4, 7), ("z", 8, 7)),
+                    *(("intensity", 12, 7), ("ring", 16, 4), ("t", 20, 6)),
+                )
             ],
             False,
-            20,
-            40,
+            24,
+            48,
             np.array(
                 [
-                    *(*float_bytes(1.0, 2.0, 3.0, 0.5), 3, 2, 1, 0),
-                    *(*float_bytes(4.0, 5.0, 6.0, 0.25), 253, 254, 255, 0),
+                    *(*float_bytes(1.0, 2.0, 3.0, 0.5), 7, 0, 0, 0, 0, 0, 0, 0),
+                    *(*float_bytes(4.0, 5.0, 6.0, 0.25), 2, 1, 0, 0, 3, 2, 1, 0),
                 ],
                 U8,
             ),
@@ -595,11 +620,18 @@ def test_out_is_what_rosbags_writes_and_what_it_was_before(name):
 
 
 def test_every_way_out_is_tested():
-    tested = {(type(message), kind.replace("/", "/msg/")) for _, message, _, kind, _ in EXPECTED.values()}
-    below = {(messages.Events, "sensor_msgs/msg/Image"), (messages.Image, "sensor_msgs/msg/PointCloud2")}
-    assert OUT.keys() - tested == below
-    for (_, message, _, kind, _), name in zip(EXPECTED.values(), EXPECTED, strict=True):
-        assert OUT[type(message), kind.replace("/", "/msg/")] is EXPECTED[name][0]
+    tested = {
+        (f"cortex/{type(message).__name__}", kind.replace("/", "/msg/")): function
+        for function, message, _, kind, _ in EXPECTED.values()
+    }
+    below = {
+        ("cortex/Events", "sensor_msgs/msg/Image"),
+        ("cortex/Image", "sensor_msgs/msg/PointCloud2"),
+        ("cortex/Image", "sensor_msgs/msg/CompressedImage"),
+    }
+    assert OUT.keys() - tested.keys() == below
+    assert all(OUT[key].convert is function for key, function in tested.items() if key in OUT)
+    assert len(OUT) + len(IN) == len(RULES)
 
 
 def test_event_image_is_drawn_until_its_period_is_over():
@@ -879,9 +911,11 @@ def test_clouds():
         "sensor_msgs/msg/PointCloud2",
     )
     assert (sent.is_dense, sent.point_step, [f.name for f in sent.fields]) == (False, 12, ["x", "y", "z"])
-    color = messages.PointCloud(0, points, color=np.array([[1, 2, 3]], U8))
-    sent = cdr.decode(convert.point_cloud(color, context()), "sensor_msgs/msg/PointCloud2")
-    assert np.array(sent.data, U8).view("<u4")[3] == 0x010203
+    t = np.array([5], np.uint32)
+    for deskewed, stamp_ns in ((False, 3), (True, 9)):
+        cloud = messages.PointCloud(9, points, t=t, start_ns=3, deskewed=deskewed)
+        sent = cdr.decode(convert.point_cloud(cloud, context()), "sensor_msgs/msg/PointCloud2")
+        assert sent.header.stamp.nanosec == stamp_ns
     with pytest.raises(ConvertError, match="1 points and 2 values of intensity"):
         convert.point_cloud(messages.PointCloud(0, points, np.zeros(2, np.float32)), context())
 
@@ -991,8 +1025,7 @@ def test_a_picture_of_depths_becomes_a_cloud():
 
 
 def test_options_belong_to_conversions():
-    assert OPTIONS.keys() <= {*OUT.values(), *IN.values()}
-    known = {"queue", "stale_s", "stamp"}.union(*OPTIONS.values())
+    known = {"queue", "stale_s", "stamp"}.union(*(rule.options for rule in RULES))
     assert known == OPTIONS_OF_ROUTES.keys()
 
 
@@ -1312,7 +1345,7 @@ def test_everything_that_comes_in_is_checked_for_its_length(ros_type, kind):
     whole = cdr.encode(cdr.decode(cdr.encode(_default(ros_type)), ros_type))
     for data in (whole[:-4], bytes(whole) + bytes(8), b"\0\1\0\0", b""):
         with pytest.raises(cdr.CdrError):
-            IN[ros_type, kind](data, context())
+            IN[ros_type, kind].convert(data, context())
 
 
 def _default(ros_type: str) -> Any:

@@ -13,19 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cyclonedds.qos import Policy
 from foreigners import Foreigner
 from processes import SOON_S, wait_for
 
 from cortex_ros2_bridge.backend.base import BackendError, Qos, TopicInfo
-from cortex_ros2_bridge.backend.cyclone import (
-    NO_TYPE_HASH,
-    Fast,
-    Public,
-    Refused,
-    choose_transport,
-    self_test,
-)
 from cortex_ros2_bridge.backend.dds import DdsBackend
 from cortex_ros2_bridge.typestore import typestore
 
@@ -39,11 +30,6 @@ STRING = "std_msgs/msg/String"
 SOME = np.arange(1001, dtype=np.uint32).astype(np.uint8)  # odd: CDR is padded
 LARGE = np.tile(np.arange(256, dtype=np.uint8), 3600)  # 0.9 MB
 Start = Callable[..., Foreigner]
-
-
-@pytest.fixture(params=["fast", "public"])
-def transport(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
 
 
 @pytest.fixture
@@ -77,10 +63,9 @@ def seen_of(data: np.ndarray[Any, Any], second: int = 1) -> list[Any]:
     return [second, "lens", "mono8", data.size, zlib.crc32(data.tobytes())]
 
 
-def test_bytes_reach_a_foreign_subscriber(dds_domain: int, foreigner: Start, transport: Any) -> None:
-    with_close = DdsBackend(distro="jazzy", transport=transport)
+def test_bytes_reach_a_foreign_subscriber(dds_domain: int, foreigner: Start) -> None:
+    with_close = DdsBackend(distro="jazzy")
     try:
-        assert with_close.transport == transport
         publisher = with_close.publisher("/lens/image", IMAGE, Qos())
         assert publisher.subscriber_count == 0
         other = foreigner()
@@ -94,9 +79,9 @@ def test_bytes_reach_a_foreign_subscriber(dds_domain: int, foreigner: Start, tra
         with_close.close()
 
 
-def test_bytes_arrive_from_a_foreign_publisher(dds_domain: int, foreigner: Start, transport: Any) -> None:
+def test_bytes_arrive_from_a_foreign_publisher(dds_domain: int, foreigner: Start) -> None:
     """What the foreign serialiser writes is what rosbags writes, padded to whole words."""
-    node = DdsBackend(distro="jazzy", transport=transport)
+    node = DdsBackend(distro="jazzy")
     try:
         got: list[bytes] = []
         subscription = node.subscription("/lens/image", IMAGE, Qos(), got.append)
@@ -108,13 +93,13 @@ def test_bytes_arrive_from_a_foreign_publisher(dds_domain: int, foreigner: Start
         wait_for(lambda: got)
         expected = image()
         assert got == [expected + bytes(-len(expected) % 4)]
-        assert (subscription.lost_count, subscription.error_count) == (0, 0)
+        assert subscription.lost_count == 0
     finally:
         node.close()
 
 
-def test_the_end_of_a_publisher_is_no_message(dds_domain: int, foreigner: Start, transport: Any) -> None:
-    node = DdsBackend(distro="jazzy", transport=transport)
+def test_the_end_of_a_publisher_is_no_message(dds_domain: int, foreigner: Start) -> None:
+    node = DdsBackend(distro="jazzy")
     try:
         got: list[bytes] = []
         subscription = node.subscription("/words", STRING, Qos(), got.append)
@@ -126,76 +111,15 @@ def test_the_end_of_a_publisher_is_no_message(dds_domain: int, foreigner: Start,
             wait_for(lambda: subscription.publisher_count == 0)
         wait_for(lambda: len(got) == 2)
         assert [message[8:9] for message in got] == [b"a", b"b"]
-        assert subscription.error_count == 0
     finally:
         node.close()
-
-
-def test_the_public_functions_agree_with_the_fast_ones(backend: DdsBackend) -> None:
-    """Each reads what the other wrote, for a message of 0.9 MB and for one that has to be padded."""
-    site = backend._site()
-    from cortex_ros2_bridge.backend.idl import idl_struct
-
-    kind = idl_struct(IMAGE, "jazzy")
-    writer = site.writer("rt/x", kind, Qos(), b"")
-    reader = site.reader("rt/x", kind, Qos(), b"")
-    assert len(image(SOME)) % 4
-    for message in (image(LARGE), image(SOME)):
-        for source in (Fast(), Public()):
-            for sink in (Fast(), Public()):
-                source.write(writer, message)
-                assert sink.take(reader, 10) == [message + bytes(-len(message) % 4)]
-                assert sink.take(reader, 10) == []
-
-
-@pytest.mark.parametrize("broken", ["missing", "write", "take"])
-def test_the_fast_path_is_tried_out_before_it_is_used(
-    dds_domain: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, broken: str
-) -> None:
-    import cyclonedds._clayer
-
-    if broken == "missing":
-        monkeypatch.delattr(cyclonedds._clayer, "ddspy_take")
-    elif broken == "write":
-        monkeypatch.setattr(Fast, "write", lambda self, writer, message: None)
-    else:
-        monkeypatch.setattr(Fast, "take", lambda self, reader, limit: [b"\0\1\0\0????"])
-    node = DdsBackend(distro="jazzy")
-    try:
-        assert node.transport == "public"
-        assert "large messages will be slow" in caplog.text
-        got: list[bytes] = []
-        node.subscription("/words", STRING, Qos(), got.append)
-        node.publisher("/words", STRING, Qos()).publish(text("still"))
-        wait_for(lambda: got)
-        assert got == [text("still") + bytes(-len(text("still")) % 4)]
-    finally:
-        node.close()
-    with pytest.raises(BackendError, match="fast path of cyclonedds does not work"):
-        DdsBackend(distro="jazzy", transport="fast")
-
-
-def test_a_transport_that_takes_anything_fails_the_self_test(backend: DdsBackend) -> None:
-    """Its own endpoints show the hash of a type, of which nodes of Jazzy miss none."""
-
-    class Blind(Fast):
-        def write(self, writer: Any, message: Any) -> None:
-            assert writer.get_qos()[Policy.Userdata].data == NO_TYPE_HASH
-            if len(message) > 14:
-                super().write(writer, message)
-
-    participant = backend._participant
-    self_test(participant, Fast())
-    with pytest.raises(Refused, match="truncated"):
-        self_test(participant, Blind())
-    assert choose_transport(participant).name == "fast"
 
 
 @pytest.mark.parametrize(
     "message", [b"", b"\0\1\0\0", image()[:20], image()[:-1000], image()[:4] + b"\xff" * 40]
 )
-def test_a_malformed_message_is_refused(dds_domain: int, transport: Any, message: bytes) -> None:
-    node = DdsBackend(distro="jazzy", transport=transport)
+def test_a_malformed_message_is_refused(dds_domain: int, message: bytes) -> None:
+    node = DdsBackend(distro="jazzy")
     try:
         got: list[bytes] = []
         node.subscription("/lens/image", IMAGE, Qos(), got.append)
@@ -400,7 +324,6 @@ def test_a_stopped_subscription_goes_on_with_the_newest(backend: DdsBackend, for
         publisher.publish(text("last"))
     lengths = wait_for(lambda: [found for found in [other.do("heard")] if found["lengths"][-1:] == [16]])
     assert len(lengths[0]["lengths"]) <= 2001
-    assert lengths[0]["errors"] == 0
 
 
 def test_a_writer_of_another_type_is_not_heard(backend: DdsBackend, foreigner: Start) -> None:
@@ -435,12 +358,11 @@ def test_a_callback_that_raises_is_told_and_goes_on(
         if len(got) <= 3:
             raise ZeroDivisionError("on purpose")
 
-    subscription = backend.subscription("/words", STRING, Qos(), callback)
+    backend.subscription("/words", STRING, Qos(), callback)
     publisher = backend.publisher("/words", STRING, Qos())
     for word in "abcd":
         publisher.publish(text(word))
     wait_for(lambda: len(got) == 4)
-    assert subscription.error_count == 3
     assert "the callback of /words failed" in caplog.text
     assert "on purpose" in caplog.text
     assert sum("failed" in record.message for record in caplog.records) == 1  # once per second
@@ -574,11 +496,9 @@ def test_a_service_answers(backend: DdsBackend, foreigner: Start, caplog: pytest
     guid = "0x123456789abcdef0"
     assert other.do("call", name="/drone/reset", number=7) == [[guid, 7, True, "reset, t = 0 s"]]
     assert other.do("call", name="/drone/reset", number=8) == [[guid, 8, False, ""]]
-    assert service.error_count == 0
     with caplog.at_level(logging.CRITICAL):
         failed = other.do("call", name="/drone/reset", number=9)
     assert failed == [[guid, 9, False, ""]]
-    wait_for(lambda: service.error_count == 1)
     endpoints = [one for one in other.do("look").values() if "drone/reset" in str(one["topic"])]
     ids = {one["user_data"] for one in endpoints if one["user_data"]}
     assert len(ids) == 1  # clients recognise a service by the id that both its topics share

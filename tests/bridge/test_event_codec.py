@@ -8,18 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
 from cortex_ros2_bridge import cdr
-from cortex_ros2_bridge.event_codec import (
-    EventCodecError,
-    EventColumns,
-    EventPicture,
-    Evt3Decoder,
-    Evt3Encoder,
-    decode_mono,
-    dvs_size,
-    encode_mono,
-    write_dvs,
-)
+from cortex_ros2_bridge.event_codec import EventPicture, decode_mono, dvs_size, encode_mono, write_dvs
 
 WIDTH, HEIGHT = 640, 480
 SIZE = {"width": WIDTH, "height": HEIGHT}

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from bridge_rig import rig_of
 from processes import ROOT, wait_for
 
 from cortex import Array, Float32, UInt8, message
+from cortex.messages import Events
 from cortex_ros2_bridge import cdr, cli
 from cortex_ros2_bridge.convert import registry
 from cortex_ros2_bridge.convert.registry import load_converters, ros_type_of, share
@@ -59,6 +60,16 @@ class Gripper:
     frame_id: str = ""
 
 
+@message(name="my_robot/Labels")
+class Labels:
+    stamp_ns: int
+    data: Array["int32", "H", "W"]
+    labels: str
+    encoding: str
+    sequence: int
+    frame_id: str
+
+
 @message(name="my_robot/Wave")
 class Wave:
     spectrum: Array["complex64", "n"]
@@ -68,8 +79,7 @@ class Wave:
 def nothing_added(runtime: Path) -> Iterator[None]:
     """What a test registers is forgotten after it."""
     yield
-    for table in (registry.ADDED, registry.OUT, registry.IN):
-        table.clear()
+    registry.ADDED.clear()
 
 
 def test_names_in_ros() -> None:
@@ -107,6 +117,36 @@ def test_an_unknown_type_goes_out_field_by_field() -> None:
     assert (got.pose.tolist(), list(got.flags)) == ([1.0, 2.0, 3.0], [True, False])
     fields = [name for name, _ in typestore("humble").fielddefs["my_robot/msg/Arm"][1]]
     assert fields[:2] == ["header", "joints"]
+
+
+def test_a_picture_of_any_type_goes_out_as_an_image_with_what_its_labels_mean() -> None:
+    picture = Labels(
+        3_000_000_007, np.arange(6, dtype=np.int32).reshape(2, 3), '{"classes":[]}', "32SC1", 0, "c"
+    )
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/labels", Labels)
+        images, texts = rig.opens("/drone/labels/image_raw", "/drone/labels/labels")
+        assert (images.type_name, texts.type_name) == ("sensor_msgs/msg/Image", "std_msgs/msg/String")
+        with rig.listening(sent, "/drone/labels/image_raw", "/drone/labels/labels"):
+            sent.publish(picture)
+            wait_for(lambda: images.sent and texts.sent)
+        image, text = images.messages()[0], texts.messages()[0]
+    assert (image.height, image.width, image.encoding, image.step) == (2, 3, "32SC1", 12)
+    np.testing.assert_array_equal(np.asarray(image.data).view(np.int32), np.arange(6))
+    assert (image.header.stamp.sec, image.header.frame_id, text.data) == (3, "c", picture.labels)
+
+
+def test_events_with_their_truth_go_out_as_events() -> None:
+    """Whatever else a message of events has, it is packed as one."""
+    fields = get_type_hints(Events, include_extras=True)
+    more = type(
+        "More", (), {"__annotations__": {**fields, "depth": Array["float32", "m"]}, "__doc__": "More."}
+    )
+    kind = message(more, name="my_robot/More")
+    schema = registry.schema_of(kind)
+    assert registry.adopt(schema.to_json(), schema.fingerprint) == ""
+    (rule,) = registry.ADDED["my_robot/More"].rules
+    assert (rule.ros_type, rule.name) == ("event_camera_msgs/msg/EventPacket", "{topic}")
 
 
 def test_a_type_without_counterparts_has_no_route() -> None:

@@ -70,7 +70,7 @@ def test_messages_go_both_ways(make: Any) -> None:
     wait_for(lambda: len(got) == 3)
     assert {type(message) for message in got} == {bytes}
     assert all(message.startswith(text("hello")) for message in got)
-    assert (subscription.lost_count, subscription.error_count) == (0, 0)
+    assert subscription.lost_count == 0
     subscription.close()
     subscription.close()
     wait_for(lambda: publisher.subscriber_count == 0)
@@ -102,12 +102,12 @@ def test_a_callback_that_raises_does_not_end_the_node(make: Any, caplog: pytest.
         got.append(message)
         raise ZeroDivisionError("on purpose")
 
-    subscription = other.subscription("/words", STRING, Qos(), callback)
+    other.subscription("/words", STRING, Qos(), callback)
     publisher = node.publisher("/words", STRING, Qos())
     wait_for(lambda: publisher.subscriber_count == 1)
     for word in "ab":
         publisher.publish(text(word))
-    wait_for(lambda: subscription.error_count == 2)
+    wait_for(lambda: len(got) == 2)
     assert "the callback of /words failed" in caplog.text
     assert "on purpose" in caplog.text
 
@@ -163,7 +163,6 @@ def test_a_service_answers(fake: None, caplog: pytest.LogCaptureFixture) -> None
         (False, "not now"),
         (False, ""),
     ]
-    assert service.error_count == 1
     assert "the service /drone/reset failed" in caplog.text
     service.close()
     service.close()

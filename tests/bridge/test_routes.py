@@ -37,12 +37,16 @@ from cortex.messages import (
 from cortex.schema import schema_of
 from cortex_ros2_bridge import config
 from cortex_ros2_bridge.config import ConfigError, load
-from cortex_ros2_bridge.routes import Seen, SeenTopic, default_routes, look, make_routes, unfit, vehicle_of
+from cortex_ros2_bridge.routes import Seen, SeenTopic, look, make_routes, unfit, vehicle_of
 
 
 def topic(name, kind, *, published=True, fingerprint=None):
     schema = schema_of(kind)
     return SeenTopic(name, schema.name, fingerprint or schema.fingerprint, published)
+
+
+def default_routes(seen):
+    return make_routes(seen, config.BridgeConfig())[0]
 
 
 DRONE = Seen(
@@ -227,7 +231,7 @@ def test_what_cannot_be_is_said_and_the_rest_goes_on():
     settings = {
         "routes": [
             {"cortex": "/drone/imu", "type": "sensor_msgs/Image"},
-            {"cortex": "/drone/imu", "type": "sensor_msgs/Joy"},
+            {"cortex": "/drone/imu", "type": "sensor_msgs/LaserScan"},
         ]
     }
     routes, problems = make_routes(seen, load(settings))
@@ -238,7 +242,7 @@ def test_what_cannot_be_is_said_and_the_rest_goes_on():
         "/drone/gps: its cortex/Imu is of another version (0000000000000001)",
         "no route /2/imu -> /2/imu (sensor_msgs/msg/Imu): ROS allows no such name",
         "/drone/imu is a cortex/Imu, which does not become a sensor_msgs/msg/Image, but: sensor_msgs/msg/Imu",
-        "nothing converts to or from sensor_msgs/msg/Joy, known: actuator_msgs",
+        "nothing converts to or from sensor_msgs/msg/LaserScan, known: actuator_msgs",
     ):
         assert part in text
     assert len(problems) == 5

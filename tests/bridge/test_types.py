@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cortex_ros2_bridge import msgs
-from cortex_ros2_bridge.convert import IN, OUT
+from cortex_ros2_bridge.convert import RULES
 from cortex_ros2_bridge.msgs import (
     Actuators,
     AttitudeTarget,
@@ -48,7 +48,7 @@ from cortex_ros2_bridge.typestore import (
 
 WRONG = (AssertionError, OverflowError, TypeError)
 """What the classes raise with and without ROS_PYTHON_CHECK_FIELDS=1; ours always check."""
-ROUTED = sorted({name for _, name in OUT} | {name for name, _ in IN})
+ROUTED = sorted({rule.ros_type for rule in RULES})
 HASHES = Path(__file__).with_name("golden") / "type_hashes.txt"
 REAL_HASHES = {
     # As `ros2 topic info -v` of a Jazzy installation shows them.

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import warp as wp
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from neurosim_core.control import MODES, Se3Config, make_controller, mode_kernel
+from neurosim_core.control import MODES, Se3Config, make_controller
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import DynamicsError, Multirotor, preset
-from neurosim_core.vehicle.aerodynamics import AIR_TERMS
 
 HUMMINGBIRD = preset("hummingbird")
 WEIGHT = HUMMINGBIRD.mass_kg * HUMMINGBIRD.gravity_m_s2
@@ -218,15 +214,6 @@ def test_layouts_have_units():
     assert {mode: len(make_controller(mode, HUMMINGBIRD).layout) for mode in SETPOINTS} == {
         mode: len(row) for mode, row in SETPOINTS.items()
     }
-
-
-@pytest.mark.parametrize("mode", [*SETPOINTS, "path"])
-def test_builds_for_cuda(mode, tmp_path: Path):
-    """Compiled ahead of time for sm_90, which needs no GPU."""
-    terms = frozenset(AIR_TERMS if mode == "path" else ())
-    module = mode_kernel(mode, terms).module
-    wp.compile_aot_module(module, module_dir=str(tmp_path), arch=90)
-    assert list(tmp_path.glob("*.ptx")) + list(tmp_path.glob("*.cubin"))
 
 
 def test_every_mode_is_tested():

@@ -138,6 +138,20 @@ class Peer:
         publisher.flush()
         return {"delivered": delivered, "longest_s": longest_s, "took_s": time.monotonic() - begin_s}
 
+    def leave(
+        self, topic: str, count: int, size: int = 0, last_size: int = 0, orderly: bool = True
+    ) -> dict[str, Any]:
+        """Publish some messages, one of another size if that is given, and end the process at once."""
+        publisher = self.publishers[topic]
+        for k in range(count):
+            publisher.publish(make(publisher.codec.type, k, size))
+        if last_size:
+            publisher.publish(make(publisher.codec.type, count, last_size))
+        if orderly:
+            publisher.close()
+            self.node.close()
+        os._exit(0)
+
     def receive(self, topic: str, until: int, timeout_s: float = 60.0, keep: bool = False) -> dict[str, Any]:
         """Receive until a number has come; says what came."""
         subscriber = self.subscribers[topic]

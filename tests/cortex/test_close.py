@@ -6,16 +6,19 @@ import contextlib
 import os
 import signal
 import threading
+import time
 
 import pytest
-from peer import Block, make_block
+from peer import Block, Number, make_block
 from processes import SOON_S, wait_for
 
 import cortex.batch
 import cortex.gate
 import cortex.large
+import cortex.link
 import cortex.pipes
 import cortex.publisher
+import cortex.subscriber
 from cortex import native, reliable
 from cortex.context import Closed
 
@@ -320,3 +323,63 @@ def test_what_a_reader_without_a_pipe_loses_at_the_end_is_counted(make_node):
     assert subscriber.counters.lost == sent.refused
     thread.join(SOON_S)
     assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("policy", [["keep_last"], ["latest"], ["reliable"]], ids=lambda policy: policy[0])
+def test_a_publisher_that_dies_after_its_first_large_message(start_child, policy):
+    """Nobody can map its memory any more: the subscriber goes on, and accounts for every message."""
+    subscriber = start_child("endless_subscriber", topic="/blocks", policy=policy)
+    subscriber.hear()
+    for round_ in range(1, 3):
+        child = start_child("peer")
+        child.hear()
+        child.ask(do="publisher", topic="/blocks", type="Block")
+        assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
+        with subscriber.stopped():
+            child.say(do="leave", topic="/blocks", count=30, size=50, last_size=100_000, orderly=False)
+            child.process.wait(SOON_S)
+
+        def accounted(sent: int = 31 * round_) -> bool:
+            found = subscriber.ask()
+            return found["count"] + found["lost"] + found["overtaken"] == sent
+
+        wait_for(accounted)
+
+
+@pytest.mark.parametrize("listen", [{}, {"listen": "127.0.0.1", "host": "elsewhere"}], ids=["ipc", "tcp"])
+def test_a_publisher_leaves_while_its_reader_reads(make_node, start_child, monkeypatch, listen):
+    """What a socket has taken is not yet with the reader: the publisher waits for its word."""
+    monkeypatch.setattr(cortex.link, "Offer", no_pipe)
+    subscriber = make_node(listen=listen.get("listen")).subscriber("/blocks", Block, policy=reliable())
+    child = start_child("peer", **listen)
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block", max_wait_s=SOON_S)
+    assert child.ask(do="await_subscribers", topic="/blocks")["ok"]
+    child.say(
+        do="leave", topic="/blocks", count=900, size=16_000
+    )  # more than the kernel holds, less than a queue
+    time.sleep(0.3)  # until the publisher has handed over everything, and would be gone
+    for number in range(900):
+        assert subscriber.recv(SOON_S).number == number
+    assert subscriber.counters.lost == 0
+
+
+def test_a_stream_that_was_cut_off_is_counted(make_node, start_child, monkeypatch):
+    """Nobody knows how much of it was lost; one that was closed in order is complete."""
+    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 10**8)
+    subscriber = make_node().subscriber("/numbers", Number, policy=reliable())
+    for orderly in (True, False):
+        child = start_child("peer")
+        child.hear()
+        child.ask(do="publisher", topic="/numbers", type="Number")
+        assert child.ask(do="await_subscribers", topic="/numbers")["ok"]
+        child.say(do="leave", topic="/numbers", count=10, orderly=orderly)
+        for _ in range(10):
+            subscriber.recv(SOON_S)
+        wait_for(lambda: not subscriber.sources() and not subscriber._links)
+        assert subscriber.counters.cut_off == (not orderly)
+    assert subscriber.counters.lost == 0
+
+
+def no_pipe(*_: object) -> None:
+    raise OSError("no pipes here")

@@ -79,8 +79,10 @@ def everything(size: int = 1000, label: str = "a\x1b[31mb") -> Everything:
     )
 
 
-def start(*arguments: object, columns: int = 120, **options: object) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": str(columns)}
+def start(
+    *arguments: object, columns: int = 120, environment: dict[str, str] | None = None, **options: object
+) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": str(columns), **(environment or {})}
     command = [sys.executable, "-m", "cortex", *map(str, arguments)]
     child: subprocess.Popen[str] = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **options
@@ -260,6 +262,65 @@ def test_info_goes_on_until_interrupted_and_shows_rates(make_node: MakeNode) -> 
         assert rates[0] == "-"
         status, _, errors = interrupt(child)
     assert (status, errors) == (0, "")
+
+
+def test_top_shows_all_topics_with_rates_and_losses(make_node: MakeNode) -> None:
+    robot, viewer = make_node("robot"), make_node("viewer")
+    publisher = robot.publisher("/number", Number)
+    robot.publisher("/scan", Scan)
+    viewer.subscriber("/number", Number, lambda _: None)
+    viewer.subscriber("/*/imu", Scan)
+    assert publisher.wait_for_subscribers(1, SOON_S)
+    with publishing(publisher, 0.01):
+        wait_for(lambda: cortex("topics")[1].count("/") == 4)
+
+        def is_right() -> bool:
+            """A machine that stands still makes some rates wrong."""
+            status, output, errors = cortex("top", "--once", columns=200)
+            assert (status, errors) == (0, "")
+            rows = {line.split()[0]: line.split() for line in output.splitlines()}
+            assert list(rows) == ["topic", "/*/imu", "/number", "/scan"]
+            assert rows["/scan"][1:3] == ["1", "0"]
+            assert rows["/number"][6:10] == ["1", "0", "0", "0"]  # one subscriber; nothing lost
+            return float(rows["/number"][2]) == pytest.approx(100.0, rel=0.3)
+
+        wait_for(is_right)
+
+
+def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> None:
+    environment = {"XDG_CONFIG_HOME": str(tmp_path)}
+    status, output, _ = cortex("doctor", environment=environment)
+    assert status == 0, output
+    assert output.count("ok  ") == 7
+    assert "shared memory" in output.splitlines()[-1]
+    status, output, _ = cortex("doctor", environment={**environment, "CORTEX_PURE_PYTHON": "1"})
+    assert status == 1
+    assert "WRONG  C module: CORTEX_PURE_PYTHON leaves it out" in output
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o755)
+    open_to_all = {**environment, "CORTEX_RUNTIME_DIR": str(tmp_path / "open")}
+    status, output, _ = cortex("doctor", environment=open_to_all)
+    assert status == 1
+    assert "chmod 700" in output.splitlines()[0]
+
+
+def test_types_are_compared(make_node: MakeNode, tmp_path: Path) -> None:
+    make_node().publisher("/number", Number)
+    wait_for(lambda: "/number" in cortex("topics")[1])
+    (tmp_path / "robot.py").write_text(
+        "from cortex import message\n"
+        "@message(name='Number')\nclass Grown:\n    stamp_ns: int\n    value: int\n    note: str | None\n"
+        "@message(name='Number')\nclass Other:\n    stamp_ns: int\n    value: float\n"
+    )
+    status, output, _ = cortex("schema", "diff", "/number", "robot:Grown", cwd=tmp_path)
+    assert (status, output.splitlines()[0]) == (0, "field 2: + note optional str")
+    assert "compatible" in output.splitlines()[1]
+    status, output, _ = cortex("schema", "diff", "robot:Other", "/number", cwd=tmp_path)
+    assert (status, output.splitlines()[0]) == (1, "field 1: value float64 -> value int64")
+    assert cortex("schema", "diff", "/number", "/number")[0] == 0
+    status, _, errors = cortex("schema", "diff", "/number", "/none")
+    assert status == 1
+    assert "there are /number" in errors
 
 
 # Watching

@@ -68,7 +68,7 @@ EXAMPLES = [
     Parameters.of({"a": True, "b": 1, "c": 0.5, "d": "text"}),
     Parameter("a", integer=1),
     PointCloud(1, np.zeros((7, 3), np.float32), np.zeros(7, np.float32)),
-    PointCloud(1, np.zeros((0, 3), np.float32), color=np.zeros((0, 3), np.uint8)),
+    PointCloud(1, np.zeros((0, 3), np.float32), ring=np.zeros(0, np.uint16), t=np.zeros(0, np.uint32)),
     PoseCommand(1, V3),
     RateThrustCommand(1, 9.81, V3),
     RotorSpeeds(1, np.ones(6)),

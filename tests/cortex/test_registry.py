@@ -367,3 +367,40 @@ def test_a_heartbeat_on_another_connection_keeps_nobody_alive(context):
         assert registry.node_count == 1
         mine.close()
         stranger.close()
+
+
+def test_a_node_belongs_to_the_process_that_came_with_it(make):
+    """Another process of this host cannot put its record in its place, whatever revision it says."""
+    with serving(), node_process("owner", node=0xACE) as owner:
+        watcher = make("watcher")
+        drive([watcher], lambda: watcher.names == ["owner"])
+        thief = make("thief")
+        thief.record = make_record("thief", node=0xACE)
+        thief.directory._revision = 1000
+        thief.directory.announce()
+        drive_for([watcher, thief], 0.3)
+        assert watcher.directory.nodes[0xACE].name == "owner"
+        owner.kill()
+        drive([watcher], lambda: not watcher.directory.nodes.get(0xACE))
+
+
+def test_a_node_belongs_to_its_key(context, make):
+    """Over CURVE: neither another key's record nor its farewell counts, at a registry or at a peer."""
+    key, other = (zmq.curve_keypair()[0].decode() for _ in range(2))
+    endpoint = Endpoint("tcp", "tcp://h:1", "tcp://h:2", "tcp://h:3", key)
+    record = make_record("x", endpoints=[endpoint])
+    newer = dataclasses.replace(record, revision=9, name="theft")
+    peer = make("peer", registry="off")
+
+    def answer(message, sender):
+        frame = peer.directory.answer(control_frame(message), sender)
+        return None if frame is None else parse_control(frame, TYPES)[0]
+
+    assert isinstance(answer(Hello(False, record), other), Refused)
+    assert isinstance(answer(Hello(False, record), key), Changed)
+    assert isinstance(answer(Hello(False, newer), other), Refused)
+    answer(Leave(record.node), other)
+    assert peer.names == ["x"]
+    assert isinstance(answer(Hello(False, newer), key), Changed)
+    answer(Leave(record.node), key)
+    assert not peer.names

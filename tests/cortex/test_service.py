@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 
@@ -51,6 +52,26 @@ def served(child, name="/double"):
 
 
 # Replies
+
+
+def test_a_task_calls_without_blocking_the_loop(node):
+    """Other tasks go on while the handler works."""
+    go_on = threading.Event()
+
+    def slow(request):
+        assert go_on.wait(SOON_S)
+        return double(request)
+
+    node.service("/double", Number, Number, slow)
+
+    async def run(client):
+        call = asyncio.create_task(client.call_async(Number(0, 21), SOON_S))
+        await asyncio.sleep(0)
+        go_on.set()  # only a loop that is not blocked gets here
+        return await call
+
+    with node.client("/double", Number, Number) as client:
+        assert asyncio.run(run(client)).value == 42
 
 
 def test_a_call_is_answered(node):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import shutil
 import signal
@@ -157,7 +156,7 @@ ALL = ("simulator", "controller", "viewer")
 
 
 @pytest.mark.parametrize("stack", ["streaming"], indirect=True)
-@pytest.mark.parametrize("names", [*((name,) for name in ALL), *itertools.permutations(ALL)], ids="-".join)
+@pytest.mark.parametrize("names", [*((name,) for name in ALL), ALL, ALL[::-1]], ids="-".join)
 def test_the_others_go_on_without_those_that_are_killed_and_meet_them_again(stack, names):
     """Killed together with SIGKILL, and started again in this order; the others stay the same processes."""
     for name in names:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import importlib.metadata
 import logging
@@ -292,11 +293,19 @@ def test_the_tree_is_freed(width, monkeypatch):
     assert released == [(address,)]
 
 
+def forget(monkeypatch):
+    """Let the library be looked for again, for the time of a test.
+
+    A second device in a process would have Embree start threads, one of which may never rest.
+    """
+    monkeypatch.setattr(embree, "_library", functools.cache(embree._Library))
+
+
 def test_without_embree_warp_casts_the_rays(monkeypatch, caplog):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
-    embree._library.cache_clear()
+    forget(monkeypatch)
     monkeypatch.setattr(importlib.metadata, "files", missing)
     scene, poses = room()
     lighting = LightingConfig(mode="unshadowed")
@@ -312,7 +321,7 @@ def test_without_embree_warp_casts_the_rays(monkeypatch, caplog):
 
 
 def test_an_old_embreex_is_refused(monkeypatch):
-    embree._library.cache_clear()
+    forget(monkeypatch)
     monkeypatch.setattr(importlib.metadata, "files", lambda name: [])
     with pytest.raises(EmbreeError, match="carries no Embree 4"):
         packet_width()

@@ -178,6 +178,18 @@ def test_files_of_rays_are_beside_the_settings(tmp_path):
 def test_what_needs_a_pinhole_says_so():
     lens = {"kind": "equidistant", **SIZE}
     events = {"kind": "event_camera", "lens": lens, "max_displacement_px": 0.5}
-    config = load_config({"duration_s": 0.1, "device": "cpu", "sensors": {"events": events}})
+    scene = {"kind": "apartment", "rooms": 1}
+    config = load_config({"duration_s": 0.1, "device": "cpu", "scene": scene, "sensors": {"events": events}})
     with pytest.raises(ValueError, match="max_displacement_px of events needs a lens of kind pinhole"):
         next(iter(run(config)))
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.kind)
+def test_lenses_are_equal_by_their_settings(lens):
+    """Whatever has been computed of them: cameras with equal lenses share their rays."""
+    lens.ray_table()
+    other = type(lens).model_validate(lens.model_dump())
+    other.ray_table()
+    assert other == lens
+    assert hash(other) == hash(lens)
+    assert other.model_copy(update={"fx": 46.0}) != lens

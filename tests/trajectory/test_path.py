@@ -8,7 +8,6 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neurosim_core.trajectory import path as path_module
 from neurosim_core.trajectory.path import Path, PathArrays, PathCursor, evaluate_path, upload_paths
 
 FIELDS = ("position", "velocity", "acceleration", "jerk", "snap")
@@ -147,8 +146,3 @@ def test_any_path_agrees_with_numpy(lengths, fraction, seed):
     rows = oracle(path, stamp)
     assert samples.position[0] == pytest.approx(rows[0][:3], abs=1e-12)
     assert samples.velocity[0] == pytest.approx(rows[1][:3], rel=1e-12, abs=1e-11 * np.abs(rows[1]).max())
-
-
-def test_builds_for_cuda(tmp_path):
-    wp.compile_aot_module(path_module, module_dir=tmp_path, arch=90)
-    assert list(tmp_path.iterdir())

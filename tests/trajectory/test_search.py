@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from neurosim_core.trajectory import search as search_module
 from neurosim_core.trajectory.search import search
 
 
@@ -65,8 +63,3 @@ def test_a_limit_finds_what_is_nearer():
     near = search(slowness, 0.1, (0, 0, 0), cost_max_m=1.5).cost
     assert (near[whole <= 1.5] == whole[whole <= 1.5]).all()
     assert np.isinf(near[whole > 1.7]).all()
-
-
-def test_builds_for_cuda(tmp_path):
-    wp.compile_aot_module(search_module, module_dir=tmp_path, arch=90)
-    assert list(tmp_path.iterdir())

@@ -478,14 +478,6 @@ def test_device_form_can_be_captured(device):
     assert replayed.arrays.stamp_ns.numpy().tolist() == 3 * [20 * MS]
 
 
-@pytest.mark.parametrize("terms", [frozenset(TERMS), frozenset()])
-def test_kernels_build_for_cuda(terms, tmp_path):
-    from neurosim_core.vehicle.integrator import make_kernels
-
-    wp.compile_aot_module(make_kernels(terms).advance.module, module_dir=tmp_path, arch=90)
-    assert list(tmp_path.iterdir())
-
-
 def test_a_duration_is_an_integer():
     vehicle = Multirotor(preset("hummingbird"))
     with pytest.raises(TypeError, match=r"duration_ns must be an integer, got 1\.5"):

@@ -59,11 +59,12 @@ inline ControlFrame parse_control(Span<const std::uint8_t> frame) {
   return result;
 }
 
-inline bool is_topic(const std::string& topic) noexcept {
+inline bool is_topic(const std::string& topic, bool or_pattern = false) noexcept {
   if (topic.empty() || topic.size() > 200 || topic.front() != '/' || topic.back() == '/') return false;
   char before = ' ';
   for (const char c : topic) {
-    const bool word = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_';
+    const bool word = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '_' ||
+                      (or_pattern && c == '*');
     if (!word && (c != '/' || before == '/')) return false;
     before = c;
   }
@@ -121,7 +122,7 @@ class Directory {
       expire(*link, now_ns);
     }
     for (auto entry = inbound_.begin(); entry != inbound_.end();) {
-      if (now_ns - entry->second > lease_ns) {
+      if (now_ns - entry->second.seen_ns > lease_ns) {
         drop(nullptr, entry->first);
         entry = inbound_.erase(entry);
       } else {
@@ -131,7 +132,9 @@ class Directory {
   }
 
   // Answers a control frame that came to this node's own ROUTER: nodes may have it as static peer.
-  std::optional<zmq::message_t> answer(const ControlFrame& frame) {
+  //
+  // `sender` says whence it came: a node belongs to who came with it first.
+  std::optional<zmq::message_t> answer(const ControlFrame& frame, const std::string& sender) {
     const std::int64_t now_ns = monotonic_ns();
     if (frame.is<records::Describe>()) return control_frame(records::Changed{0, own_}, frame.header.sequence);
     if (frame.is<records::Hello>()) {
@@ -140,7 +143,11 @@ class Directory {
       if (inbound_.count(hello.record.node) == 0 && inbound_.size() >= 1024) {
         return control_frame(records::Refused{hello.record.node, "this node has 1024 peers already"});
       }
-      inbound_[hello.record.node] = now_ns;
+      const auto found = inbound_.emplace(hello.record.node, Inbound{now_ns, sender}).first;
+      if (found->second.sender != sender) {
+        return control_frame(records::Refused{hello.record.node, "it is the node of another process"});
+      }
+      found->second.seen_ns = now_ns;
       put(nullptr, hello.record);
       return control_frame(records::Changed{0, own_});
     }
@@ -149,7 +156,7 @@ class Directory {
       const auto known = inbound_.find(heartbeat.node);
       std::uint64_t held = 0;
       if (known != inbound_.end()) {
-        known->second = now_ns;
+        known->second.seen_ns = now_ns;
         held = known_[heartbeat.node][nullptr].revision;
       }
       if (heartbeat.held != own_.revision) return control_frame(records::Changed{0, own_});
@@ -157,7 +164,9 @@ class Directory {
     }
     if (frame.is<records::Leave>()) {
       const auto leave = frame.as<records::Leave>();
-      inbound_.erase(leave.node);
+      const auto found = inbound_.find(leave.node);
+      if (found == inbound_.end() || found->second.sender != sender) return std::nullopt;
+      inbound_.erase(found);
       drop(nullptr, leave.node);
       for (auto& link : links_) {
         if (!link->registry) drop(link.get(), leave.node);
@@ -174,6 +183,12 @@ class Directory {
   }
 
  private:
+  // A node that has us as static peer.
+  struct Inbound {
+    std::int64_t seen_ns;
+    std::string sender;
+  };
+
   // A connection to the registry or to a static peer.
   struct Link {
     std::string address;
@@ -225,7 +240,7 @@ class Directory {
   static void check(const records::NodeRecord& record) {
     bool good = record.node != 0 && record.revision != 0;
     for (const auto& publisher : record.publishers) good = good && publisher.source != 0 && is_topic(publisher.topic);
-    for (const auto& subscriber : record.subscribers) good = good && is_topic(subscriber.topic);
+    for (const auto& subscriber : record.subscribers) good = good && is_topic(subscriber.topic, true);
     for (const auto& service : record.services) good = good && is_topic(service.name);
     for (const auto& endpoint : record.endpoints) {
       for (const auto* address : {&endpoint.lossy, &endpoint.strict, &endpoint.control}) {
@@ -394,7 +409,7 @@ class Directory {
       link->heard_ns += stood_ns;
       for (auto& doubt : link->doubted) doubt.second += stood_ns;
     }
-    for (auto& entry : inbound_) entry.second += stood_ns;
+    for (auto& entry : inbound_) entry.second.seen_ns += stood_ns;
   }
 
   void expire(Link& link, std::int64_t now_ns) {
@@ -456,7 +471,7 @@ class Directory {
   std::int64_t tick_ns_ = 0;
   Nodes nodes_;
   std::map<std::uint64_t, std::map<Link*, records::NodeRecord>> known_;
-  std::map<std::uint64_t, std::int64_t> inbound_;
+  std::map<std::uint64_t, Inbound> inbound_;
 };
 
 }  // namespace cortex::detail

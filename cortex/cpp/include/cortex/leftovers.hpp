@@ -27,6 +27,8 @@ struct Leftover {
     std::uint32_t column = wire::no_column;
     std::unique_ptr<pipe::Writer> pipe;  // null: it has got all that it can get
     bool told = false;                   // that this was all
+    std::uint64_t number = 0;            // the reader's own
+    bool owes = false;                   // it has not said yet that it has everything: a socket may lose what it took
   };
 
   std::vector<Reader> readers;
@@ -54,14 +56,22 @@ struct Leftover {
     for (auto& reader : readers) {
       if (reader.key != key) continue;
       reader.pipe.reset();
+      reader.owes = false;
       if (reader.column == wire::no_column) continue;
       for (const auto& ring : rings) ring->free_column(reader.column);
     }
   }
 
+  void confirm(std::uint64_t number, std::uint64_t up_to) noexcept {
+    for (auto& reader : readers) {
+      if (reader.number == number && up_to >= sequence) reader.owes = false;
+    }
+  }
+
   bool empty() const noexcept {
-    return rings.empty() &&
-           std::all_of(readers.begin(), readers.end(), [](const auto& reader) { return reader.pipe == nullptr; });
+    return rings.empty() && std::all_of(readers.begin(), readers.end(), [](const auto& reader) {
+             return reader.pipe == nullptr && !reader.owes;
+           });
   }
 };
 
@@ -76,6 +86,11 @@ class Leftovers {
   // A reader has left or died.
   void detach(const std::string& key) noexcept {
     for (auto& leftover : list_) leftover.detach(key);
+  }
+
+  // A reader has accounted for all below a sequence.
+  void confirm(std::uint64_t number, std::uint64_t up_to) noexcept {
+    for (auto& leftover : list_) leftover.confirm(number, up_to);
   }
 
   // Delivers what can be delivered now; whether that was something.

@@ -146,6 +146,7 @@ class Link {
     key.reader = reader_ = random_number();
     key.shared_memory = shared_memory;
     key.strict = policy_.is_reliable;
+    key.confirms = policy_.is_reliable;
     key.quota = static_cast<std::uint8_t>(std::min<std::size_t>(policy_.depth + 2, 255));
     key.timeout_ms = static_cast<std::uint32_t>(policy_.timeout.count());
     key_ = wire::pack_key(key, flags());
@@ -208,15 +209,18 @@ class Link {
       if (sequence - expected_ > wire::jump_max) throw MalformedMessage("a sequence number from nowhere");
       counters_->lost += sequence - expected_;
       for (auto& ring : rings_) ring.second->heal(sequence);
-      if (policy_.is_reliable) {  // the publisher may have given us up
-        const std::string key = wire::pack_resume(source_, reader_, sequence, flags());
-        socket_.set(zmq::sockopt::subscribe, key);
-        socket_.set(zmq::sockopt::unsubscribe, key);
-      }
+      if (policy_.is_reliable) confirm(sequence);  // the publisher may have given us up
     }
     known_ = true;
     expected_ = sequence + count;
     return true;
+  }
+
+  // Tells the publisher that all below a sequence is accounted for.
+  void confirm(std::uint64_t sequence) {
+    const std::string key = wire::pack_resume(source_, reader_, sequence, flags());
+    socket_.set(zmq::sockopt::subscribe, key);
+    socket_.set(zmq::sockopt::unsubscribe, key);
   }
 
   Item& append(std::deque<Item>& queue, std::uint64_t sequence, std::int64_t stamp_ns, std::int64_t publish_ns) {
@@ -260,7 +264,7 @@ class Link {
     wire::body_of(header, arrival.bytes, wire::body_limit);
     if (header.aux == 0) {  // tells which number comes next, so that a loss at the end of a burst is known
       if (header.body_size != 0) throw MalformedMessage("a batch of bytes without records");
-      advance(header.sequence, 0);
+      if (advance(header.sequence, 0) && policy_.is_reliable && pipe_ == nullptr) confirm(header.sequence);
       return;
     }
     const auto shared = std::make_shared<zmq::message_t>(arrival.keep());
@@ -282,7 +286,10 @@ class Link {
     if (rings_.size() > 1) forget_rings(number);
     if (view == nullptr || (mask >> column_ & 1) == 0) {
       // While `L` is subscribed the message comes that way.
-      if (large_subscribed_ || (known_ && header.sequence < expected_)) return;
+      if (large_subscribed_ || (known_ && header.sequence < expected_)) {
+        reached_ = std::max(reached_, header.sequence + 1);  // lost if the publisher ends before
+        return;
+      }
       if (view != nullptr && !view->has(slot, header.body_size)) {
         throw MalformedMessage("a descriptor of slot " + std::to_string(slot) + ": the ring has no such");
       }

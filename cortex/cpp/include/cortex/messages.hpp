@@ -1018,14 +1018,17 @@ struct Codec<::cortex::messages::Path> {
 }  // namespace cortex
 #endif  // CORTEX_TYPE_cortex_messages_Path_AEE06658D5893930
 
-#ifndef CORTEX_TYPE_cortex_messages_PointCloud_C731F8FECE59BAFE
-#define CORTEX_TYPE_cortex_messages_PointCloud_C731F8FECE59BAFE
+#ifndef CORTEX_TYPE_cortex_messages_PointCloud_903F979B91D15184
+#define CORTEX_TYPE_cortex_messages_PointCloud_903F979B91D15184
 namespace cortex::messages {
 struct PointCloud {
   std::int64_t stamp_ns{};  // ns
   cortex::Array<float, 2> points{};  // [n, 3], m, frame sensor
   std::optional<cortex::Array<float, 1>> intensity{};
-  std::optional<cortex::Array<std::uint8_t, 2>> color{};
+  std::optional<cortex::Array<std::uint16_t, 1>> ring{};
+  std::optional<cortex::Array<std::uint32_t, 1>> t{};  // ns
+  std::int64_t start_ns{};  // ns
+  bool deskewed{};
   std::string frame_id{};
   std::uint64_t sequence{};
 
@@ -1033,7 +1036,10 @@ struct PointCloud {
     return a.stamp_ns == b.stamp_ns &&
            a.points == b.points &&
            a.intensity == b.intensity &&
-           a.color == b.color &&
+           a.ring == b.ring &&
+           a.t == b.t &&
+           a.start_ns == b.start_ns &&
+           a.deskewed == b.deskewed &&
            a.frame_id == b.frame_id &&
            a.sequence == b.sequence;
   }
@@ -1044,15 +1050,17 @@ namespace cortex {
 template <>
 struct Codec<::cortex::messages::PointCloud> {
   static constexpr std::string_view name = "cortex/PointCloud";
-  static constexpr std::uint64_t fingerprint = 0xC731F8FECE59BAFEu;
+  static constexpr std::uint64_t fingerprint = 0x903F979B91D15184u;
   static constexpr std::string_view schema =
       "{\"name\":\"cortex/PointCloud\",\"fields\":[{\"name\":\"stamp_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame"
       "\":\"\"},{\"name\":\"points\",\"type\":{\"array\":\"float32\",\"shape\":[\"n\",3]},\"unit\":\"m\",\"frame\":\"sens"
       "or\"},{\"name\":\"intensity\",\"type\":{\"optional\":{\"array\":\"float32\",\"shape\":[\"n\"]}},\"unit\":\"\",\""
-      "frame\":\"\"},{\"name\":\"color\",\"type\":{\"optional\":{\"array\":\"uint8\",\"shape\":[\"n\",3]}},\"unit\":\"\""
-      ",\"frame\":\"\"},{\"name\":\"frame_id\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"sequence\",\"typ"
-      "e\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
-  static constexpr std::size_t block = 80;
+      "frame\":\"\"},{\"name\":\"ring\",\"type\":{\"optional\":{\"array\":\"uint16\",\"shape\":[\"n\"]}},\"unit\":\"\",\""
+      "frame\":\"\"},{\"name\":\"t\",\"type\":{\"optional\":{\"array\":\"uint32\",\"shape\":[\"n\"]}},\"unit\":\"ns\",\"f"
+      "rame\":\"\"},{\"name\":\"start_ns\",\"type\":\"int64\",\"unit\":\"ns\",\"frame\":\"\"},{\"name\":\"deskewed\",\"ty"
+      "pe\":\"bool\",\"unit\":\"\",\"frame\":\"\"},{\"name\":\"frame_id\",\"type\":\"str\",\"unit\":\"\",\"frame\":\"\"},{\"n"
+      "ame\":\"sequence\",\"type\":\"uint64\",\"unit\":\"\",\"frame\":\"\"}]}";
+  static constexpr std::size_t block = 104;
   static constexpr std::size_t alignment = 8;
   static constexpr bool fixed = false;
   static constexpr bool stamped = true;
@@ -1075,15 +1083,23 @@ struct Codec<::cortex::messages::PointCloud> {
       out.intensity.reset();
     }
     if (reader.present(at + 40)) {
-      auto& item2 = out.color.emplace();
+      auto& item2 = out.ring.emplace();
       reader.array(at + 40 + 4, item2);
-      dimension_n(item2.shape()[0], "cortex/PointCloud.color");
-      check_extent<MalformedMessage>(item2.shape()[1], 3u, "cortex/PointCloud.color");
+      dimension_n(item2.shape()[0], "cortex/PointCloud.ring");
     } else {
-      out.color.reset();
+      out.ring.reset();
     }
-    reader.text(at + 60, out.frame_id);
-    reader.scalar(at + 72, out.sequence);
+    if (reader.present(at + 56)) {
+      auto& item2 = out.t.emplace();
+      reader.array(at + 56 + 4, item2);
+      dimension_n(item2.shape()[0], "cortex/PointCloud.t");
+    } else {
+      out.t.reset();
+    }
+    reader.scalar(at + 72, out.start_ns);
+    reader.scalar(at + 80, out.deskewed);
+    reader.text(at + 84, out.frame_id);
+    reader.scalar(at + 96, out.sequence);
   }
 
   template <class Sink>
@@ -1101,18 +1117,28 @@ struct Codec<::cortex::messages::PointCloud> {
     } else {
       sink.zero(at + 24, 16);
     }
-    if (message.color.has_value()) {
+    if (message.ring.has_value()) {
       sink.scalar(at + 40, std::uint8_t{1});
       sink.zero(at + 40 + 1, 3);
-      dimension_n((*message.color).shape()[0], "cortex/PointCloud.color");
-      check_extent<std::invalid_argument>((*message.color).shape()[1], 3u, "cortex/PointCloud.color");
-      sink.array(at + 40 + 4, (*message.color));
+      dimension_n((*message.ring).shape()[0], "cortex/PointCloud.ring");
+      sink.array(at + 40 + 4, (*message.ring));
     } else {
-      sink.zero(at + 40, 20);
+      sink.zero(at + 40, 16);
     }
-    sink.text(at + 60, message.frame_id);
-    sink.zero(at + 68, 4);
-    sink.scalar(at + 72, message.sequence);
+    if (message.t.has_value()) {
+      sink.scalar(at + 56, std::uint8_t{1});
+      sink.zero(at + 56 + 1, 3);
+      dimension_n((*message.t).shape()[0], "cortex/PointCloud.t");
+      sink.array(at + 56 + 4, (*message.t));
+    } else {
+      sink.zero(at + 56, 16);
+    }
+    sink.scalar(at + 72, message.start_ns);
+    sink.scalar(at + 80, message.deskewed);
+    sink.zero(at + 81, 3);
+    sink.text(at + 84, message.frame_id);
+    sink.zero(at + 92, 4);
+    sink.scalar(at + 96, message.sequence);
   }
 
   static void draft(Placer& placer, ::cortex::messages::PointCloud& out) {
@@ -1120,7 +1146,7 @@ struct Codec<::cortex::messages::PointCloud> {
   }
 };
 }  // namespace cortex
-#endif  // CORTEX_TYPE_cortex_messages_PointCloud_C731F8FECE59BAFE
+#endif  // CORTEX_TYPE_cortex_messages_PointCloud_903F979B91D15184
 
 #ifndef CORTEX_TYPE_cortex_messages_PoseCommand_005BB484B28E2421
 #define CORTEX_TYPE_cortex_messages_PoseCommand_005BB484B28E2421

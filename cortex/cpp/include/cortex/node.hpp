@@ -74,8 +74,10 @@ class Node {
   template <class T>
   Publisher<T> advertise(const std::string& topic, const PublisherOptions& options = {}) {
     check_open(topic);
+    const auto max_wait_ms = static_cast<std::uint32_t>(std::clamp<std::int64_t>(options.max_wait.count(), 0, 86'400'000));
     auto core = std::make_shared<detail::PublisherCore>(outlets_, topic, Codec<T>::fingerprint, Codec<T>::stamped,
-                                                        options.latch, options.inline_max, Codec<T>::fixed, complaints_);
+                                                        options.latch, options.inline_max, max_wait_ms, Codec<T>::fixed,
+                                                        complaints_);
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       publishers_.push_back({core, std::string(Codec<T>::name), std::string(Codec<T>::schema)});
@@ -382,7 +384,7 @@ class Node {
         const auto control = detail::parse_control(net::bytes(frame));
         std::optional<zmq::message_t> reply = control.is<records::StatsRequest>()
                                                   ? detail::control_frame(stats(), control.header.sequence)
-                                                  : directory_->answer(control);
+                                                  : directory_->answer(control, net::sender_of(frame));
         if (!reply) continue;
         router_.send(identity, zmq::send_flags::sndmore | zmq::send_flags::dontwait);
         router_.send(*reply, zmq::send_flags::dontwait);

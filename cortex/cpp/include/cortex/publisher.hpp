@@ -20,6 +20,7 @@ namespace cortex {
 struct PublisherOptions {
   bool latch = false;               // give the last message to subscribers that come later
   std::size_t inline_max = 16'384;  // larger bodies go through shared memory where that is possible
+  std::chrono::milliseconds max_wait{1000};  // longest that reliable subscribers hold up a `publish`, whatever they ask
 };
 
 // A message that is written where its readers will find it. Arrays whose dimensions were given are views to be

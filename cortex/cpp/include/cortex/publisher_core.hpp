@@ -32,7 +32,8 @@ namespace cortex::detail {
 class PublisherCore {
  public:
   PublisherCore(std::shared_ptr<Outlets> outlets, std::string topic, std::uint64_t fingerprint, bool stamped,
-                bool latch, std::size_t inline_max, bool exact, std::shared_ptr<net::Complaints> complaints)
+                bool latch, std::size_t inline_max, std::uint32_t max_wait_ms, bool exact,
+                std::shared_ptr<net::Complaints> complaints)
       : source(random_number()),
         outlets_(std::move(outlets)),
         topic_(std::move(topic)),
@@ -40,6 +41,7 @@ class PublisherCore {
         flags_(stamped ? wire::flag_stamp : 0),
         latch_(latch),
         inline_max_(inline_max),
+        max_wait_ms_(max_wait_ms),
         complaints_(std::move(complaints)),
         rings_(source, exact) {
     const Lock lock(outlets_->mutex);
@@ -163,8 +165,9 @@ class PublisherCore {
   }
 
   // A reader has come; called under the lock.
-  void attach(Outlet& outlet, const std::string& key, const wire::AttachKey& request) {
+  void attach(Outlet& outlet, const std::string& key, wire::AttachKey request) {
     if (closed_ || readers_.size() >= 1024) return;
+    request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
     const auto& reader = readers_.add(outlet, key, request, !unavailable_, outlets_->folder);
     if (reader->pipe != nullptr) {  // this tells the reader that all else comes there
       std::uint8_t nothing[wire::header_size];
@@ -183,8 +186,11 @@ class PublisherCore {
     if (reader->outlet->strict && reader->pipe == nullptr) is_late_ = false;
   }
 
-  // A reliable reader that was too late has seen what it lost, and reads again; called under the lock.
-  void resume(std::uint64_t sequence) noexcept {
+  // A reliable reader has accounted for all below a sequence; called under the lock.
+  void resume(std::uint64_t number, std::uint64_t sequence) noexcept {
+    for (const auto& reader : readers_.all()) {
+      if (reader->request.reader == number) reader->confirmed = std::max(reader->confirmed, sequence);
+    }
     if (sequence >= late_until_) is_late_ = false;  // else it was too late once more since
   }
 
@@ -255,8 +261,10 @@ class PublisherCore {
       if (has_sockets(outlets_->strict)) outlets_->strict.send_anyway(std::move(frame));
     }
     for (const auto& reader : readers_.release()) {
-      leftover.readers.push_back(
-          {reader->key, reader->outlet, reader->column, std::move(reader->pipe), told_ == sequence_});
+      const bool owes = reader->request.confirms && reader->outlet->strict && reader->pipe == nullptr &&
+                        reader->confirmed < sequence_;
+      leftover.readers.push_back({reader->key, reader->outlet, reader->column, std::move(reader->pipe),
+                                  told_ == sequence_, reader->request.reader, owes});
     }
     if (!outlets_->closed) outlets_->leftovers.add(std::move(leftover));
   }
@@ -453,6 +461,7 @@ class PublisherCore {
   const std::uint8_t flags_;
   const bool latch_;
   const std::size_t inline_max_;
+  const std::uint32_t max_wait_ms_;
   std::shared_ptr<net::Complaints> complaints_;
   Readers readers_;
   Rings rings_;
@@ -478,9 +487,15 @@ inline void Outlets::refresh() {
       if (bytes.empty()) continue;
       const Span<const std::uint8_t> subscription(bytes.data() + 1, bytes.size() - 1);
       if (!wire::read_key(subscription, request)) {
+        std::uint64_t reader = 0;
         std::uint64_t sequence = 0;
-        const auto resumed = publishers.find(wire::read_resume(subscription, sequence));
-        if (resumed != publishers.end() && outlet->strict && bytes[0] == 1) resumed->second->resume(sequence);
+        const auto resumed = publishers.find(wire::read_resume(subscription, reader, sequence));
+        if (!outlet->strict || bytes[0] != 1) continue;
+        if (resumed != publishers.end()) {
+          resumed->second->resume(reader, sequence);
+        } else {
+          leftovers.confirm(reader, sequence);
+        }
         continue;
       }
       const std::string key(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1);

@@ -29,6 +29,7 @@ struct Reader {
   std::shared_ptr<pipe::Relay::Member> member;  // of the relay that writes the pipe; null: we do
   bool late = false;  // its pipe was full for too long: it holds up nothing until it has room again
   bool left = false;
+  std::uint64_t confirmed = 0;  // it has accounted for all below this
 };
 
 // Calls are made under the publisher's lock. Readers are shared so that one may leave while the publisher, having let

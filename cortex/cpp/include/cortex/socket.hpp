@@ -61,6 +61,12 @@ inline Span<const std::uint8_t> bytes(const zmq::message_t& message) {
   return {static_cast<const std::uint8_t*>(message.data()), message.size()};
 }
 
+// Who sent a message: user, group and process of this host, or the address of another.
+inline std::string sender_of(const zmq::message_t& message) {
+  const char* found = zmq_msg_gets(message.handle(), "Peer-Address");
+  return found == nullptr ? "" : found;
+}
+
 // Takes in the parts of a message after the one that was read; returns how many there were.
 inline std::size_t drop_parts(zmq::socket_t& socket) {
   std::size_t dropped = 0;

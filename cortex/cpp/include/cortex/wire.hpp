@@ -157,6 +157,7 @@ struct AttachKey {
   bool strict = false;
   std::uint8_t quota = 0;
   std::uint32_t timeout_ms = 0;
+  bool confirms = false;  // it says how far it has read, when it is told how many messages there have been
 };
 
 inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
@@ -164,12 +165,12 @@ inline std::string pack_key(const AttachKey& key, std::uint8_t flags) {
   auto* out = reinterpret_cast<std::uint8_t*>(bytes.data());
   write_prefix(out, 'A', flags, key.source);
   store(out + 16, key.reader);
-  store(out + 24, static_cast<std::uint64_t>(key.shared_memory ? 1 : 0) | (key.strict ? 2u : 0u) |
+  store(out + 24, static_cast<std::uint64_t>(key.shared_memory ? 1 : 0) | (key.strict ? 2u : 0u) | (key.confirms ? 4u : 0u) |
                       static_cast<std::uint64_t>(key.quota) << 8 | static_cast<std::uint64_t>(key.timeout_ms) << 32);
   return bytes;
 }
 
-// What a reliable reader subscribes to, and at once gives up, when it has seen a gap: it reads again.
+// What a reliable reader subscribes to, and at once gives up: it has accounted for all below a sequence.
 inline std::string pack_resume(std::uint64_t source, std::uint64_t reader, std::uint64_t sequence,
                                std::uint8_t flags) {
   std::string bytes(resume_size, '\0');
@@ -180,9 +181,11 @@ inline std::string pack_resume(std::uint64_t source, std::uint64_t reader, std::
   return bytes;
 }
 
-// The source of a resume key and the sequence with which the gap ended; 0 if the subscription is something else.
-inline std::uint64_t read_resume(Span<const std::uint8_t> bytes, std::uint64_t& sequence) noexcept {
+// The source, reader and sequence of a resume key; a source of 0 if the subscription is something else.
+inline std::uint64_t read_resume(Span<const std::uint8_t> bytes, std::uint64_t& reader,
+                                 std::uint64_t& sequence) noexcept {
   if (bytes.size() != resume_size || std::memcmp(bytes.data(), "CTXR", 4) != 0) return 0;
+  reader = load<std::uint64_t>(bytes.data() + 16);
   sequence = load<std::uint64_t>(bytes.data() + 24);
   return load<std::uint64_t>(bytes.data() + 8);
 }
@@ -195,6 +198,7 @@ inline bool read_key(Span<const std::uint8_t> bytes, AttachKey& key) noexcept {
   key.reader = load<std::uint64_t>(bytes.data() + 16);
   key.shared_memory = (options & 1) != 0;
   key.strict = (options & 2) != 0;
+  key.confirms = (options & 4) != 0;
   key.quota = static_cast<std::uint8_t>(options >> 8);
   key.timeout_ms = static_cast<std::uint32_t>(options >> 32);
   return true;

@@ -1,4 +1,4 @@
-"""Mistakes in settings, in the words of those who write them: keys and values as they are in YAML."""
+"""Errors in settings, in the words of those who write them: keys and values as they are in YAML."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SHOWN_MAX = 80
 
 
 def explain(model: type[BaseModel], error: ValidationError) -> list[str]:
-    """Return one line for each mistake: path of the key, what is allowed, and the value.
+    """Return one line for each error: path of the key, what is allowed, and the value.
 
     Args:
         model: What was to be made.
@@ -37,6 +37,50 @@ def suggestion(wrong: str, known: list[str]) -> str:
         key for key in known if key.startswith(wrong) or wrong.startswith(key)
     ]
     return f"did you mean {close[0]!r}? " if close else ""
+
+
+def describe_errors(
+    origin: str, errors: list[str], options: Mapping[str, str], given: Mapping[str, Any]
+) -> str:
+    """Return the text of an error: each error by the name that the user gave its key.
+
+    Args:
+        origin: What the settings are from.
+        errors: Lines that begin with a dotted key.
+        options: Names of keys that were given otherwise.
+        given: What is in the settings without these.
+    """
+    lines = dict.fromkeys(_by_option(line, options, given) for line in errors)
+    elsewhere = any(line in errors for line in lines)
+    if not elsewhere and len(lines) == 1:
+        return next(iter(lines))
+    head = f"{origin} is not a valid configuration:" if elsewhere else "wrong options:"
+    return "\n".join([head, *(f"  {line}" for line in lines)])
+
+
+def _by_option(line: str, options: Mapping[str, str], given: Mapping[str, Any]) -> str:
+    """Name the option in place of its key; a key within it, or in a group that it made, is said as well."""
+    key, separator, reason = line.partition(": ")
+    for place in sorted(options, key=len, reverse=True):
+        if key == place:
+            return f"{options[place]}{separator}{reason}"
+        if key.startswith(f"{place}."):
+            return f"{options[place]}: {line}"
+    for group in (key, key.rpartition(".")[0]):
+        makers = [place for place in options if group and place.startswith(f"{group}.")]
+        if makers and not _holds(given, key) and (f"{group}.kind" in makers or not _holds(given, group)):
+            return f"{options[makers[0]]}: {line}"
+    return line
+
+
+def _holds(raw: Mapping[str, Any], key: str) -> bool:
+    """Return whether settings have a value at a dotted key."""
+    value: Any = raw
+    for part in key.split("."):
+        if not isinstance(value, Mapping) or part not in value:
+            return False
+        value = value[part]
+    return True
 
 
 def _line(model: type[BaseModel], item: Mapping[str, Any]) -> str:
@@ -95,7 +139,7 @@ def _shorten(value: Any) -> str:
 
 
 def _follow(model: type[BaseModel], loc: tuple[int | str, ...]) -> tuple[Any, list[str]]:
-    """Follow the place of a mistake; return the type that is wanted there and the keys as they were written.
+    """Follow the place of an error; return the type that is wanted there and the keys as they were written.
 
     The type is None where there is none.
     """
@@ -162,7 +206,7 @@ def _wanted(annotation: Any) -> str:
     choices = [choice for choice in _alternatives(annotation) if choice is not type(None)]
     kinds = [_tag(choice) for choice in choices if _is_model(choice)]
     if len(kinds) > 1:
-        return "keys with values, such as {kind: " + " or ".join(str(kind) for kind in kinds) + "}"
+        return "keys with values, such as {kind: " + " or ".join(sorted(str(kind) for kind in kinds)) + "}"
     texts = dict.fromkeys(_described(choice) for choice in choices)
     null = ["null"] if type(None) in _alternatives(annotation) else []
     return ", or ".join([*texts, *null])

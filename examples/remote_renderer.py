@@ -1,0 +1,93 @@
+"""Render in another process: pyrender there, the simulator here, Cortex between them.
+
+Put your own engine in place of `render`: it takes poses and returns frames. It prints how many pictures
+crossed, and whether the renderer conforms.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+from typing import Any
+
+import numpy as np
+
+import neurosim_core as ns
+from neurosim_core.live.remote_renderer import Frames, serve_frames
+
+SCENE = {"kind": "apartment", "rooms": 1}
+
+
+def render_process(topic: str, ready: Any, done: Any) -> None:
+    """Run the other process: answer requests for frames with pyrender."""
+    import warp as wp
+
+    config = ns.load_config({"scene": SCENE})
+    scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
+    cameras: dict[ns.PinholeConfig, Any] = {}
+
+    def render(request: Any) -> Frames:
+        lens = ns.PinholeConfig(
+            width=request.width, height=request.height,
+            fx=request.fx, fy=request.fy, cx=request.cx, cy=request.cy,
+        )  # fmt: skip
+        if lens not in cameras:
+            cameras[lens] = ns.make_renderer(scene, lens, outputs=["depth", "rgb"], instant_count=1)
+        camera, depths, pictures = cameras[lens], [], []
+        for position, orientation in zip(request.position, request.orientation, strict=True):
+            p_WC = wp.array([position], dtype=wp.vec3, device="cpu")
+            q_WC = wp.array([orientation], dtype=wp.quat, device="cpu")
+            camera.render(p_WC, q_WC, wp.zeros(1, dtype=int, device="cpu"), instant_count=1)
+            depths.append(camera.depth.numpy()[0].copy())
+            pictures.append(camera.rgb.numpy()[0].copy())
+        return Frames(srgb=np.array(pictures), depth=np.array(depths))
+
+    stop = threading.Event()
+    threading.Thread(target=lambda: (done.wait(), stop.set()), daemon=True).start()
+    serve_frames(render, topic=topic, stop=stop, on_ready=ready.set)
+
+
+def main() -> tuple[int, list[str]]:
+    """Fly with frames of the other process; return how many came, and what does not conform."""
+    spawn = multiprocessing.get_context("spawn")
+    ready, done = spawn.Event(), spawn.Event()
+    process = spawn.Process(target=render_process, args=("/example/renderer", ready, done), daemon=True)
+    process.start()
+    try:
+        while not ready.wait(0.1):
+            if not process.is_alive():
+                raise RuntimeError("the other process has ended")
+        lens = {"width": 160, "height": 120, "horizontal_fov_rad": 1.2}
+        config = ns.load_config(
+            {
+                "duration_s": 0.2,
+                "device": "cpu",
+                "scene": SCENE,
+                "renderer": {"kind": "remote", "topic": "/example/renderer"},
+                "sensors": {
+                    "rgb": {"kind": "rgb", "rate_hz": 20, "lens": lens},
+                    "depth": {"kind": "depth", "rate_hz": 20, "lens": lens},
+                },
+            }
+        )
+        model = ns.make_model(config)
+        pictures = [
+            packet for packet in ns.run_model(model, ns.make_state(model)) if isinstance(packet, ns.Image)
+        ]
+        from neurosim_core.render.conformance import check_renderer
+
+        complaints = check_renderer(
+            model.scene_on_device,
+            ns.PinholeConfig(**lens),
+            position=model.path.evaluate([0]).position[0],
+            orientation=[-0.5, 0.5, -0.5, 0.5],
+        )
+        print(f"{len(pictures)} pictures; {complaints or 'conforms'}")
+        return len(pictures), complaints
+    finally:
+        done.set()
+        process.join(10.0)
+
+
+if __name__ == "__main__":
+    main()

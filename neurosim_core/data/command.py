@@ -1,0 +1,139 @@
+"""The commands `neurosim dataset` and `neurosim compare`."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+
+from neurosim_core.overrides import add_set_option, read_settings, set_options
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `dataset` to the commands of `neurosim`."""
+    parser = commands.add_parser(
+        "dataset",
+        help="make a data set: many flights, each with seeds of its own",
+        description="Fly a configuration many times, with other seeds, and write recordings, a card and "
+        "checksums. Started again after an interruption, it goes on; the bytes are the same.",
+    )
+    parser.add_argument("config", nargs="?", type=Path, help="settings file (YAML); default: an apartment")
+    parser.add_argument("--flights", type=int, required=True, metavar="N", help="how many")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this one")
+    parser.add_argument(
+        "--flights-per-scene", type=int, default=10, metavar="N", help="flights in one generated scene"
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="simulated time of a flight [s]")
+    parser.add_argument("--seed", type=int, help="seed of the first flight")
+    parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
+    parser.set_defaults(command=_make)
+
+
+def _make(arguments: argparse.Namespace) -> int:
+    import threading
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from neurosim_core.config import load_config
+    from neurosim_core.data.card import write_card
+    from neurosim_core.data.make import DatasetPlan, make_flights, prepare, write_checksums
+    from neurosim_core.signals import stop_at_signals
+
+    overrides = read_settings(arguments.settings)
+    given = {"duration_s": arguments.duration, "seed": arguments.seed, "device": arguments.device}
+    overrides |= {key: value for key, value in given.items() if value is not None}
+    options = set_options(read_settings(arguments.settings))
+    if arguments.workers < 0:
+        raise ValueError(f"--workers must be at least 0, got {arguments.workers}")
+    plan = DatasetPlan(
+        config=load_config(arguments.config, overrides=overrides, options=options),
+        folder=arguments.out,
+        flight_count=arguments.flights,
+        flights_per_scene=arguments.flights_per_scene,
+    )
+    prepare(plan)
+    console = Console(soft_wrap=not sys.stdout.isatty())
+    stop = threading.Event()
+    left = len(plan.missing())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with stop_at_signals(stop), Progress(*columns, console=console) as progress:
+        task = progress.add_task("flights", total=plan.flight_count, completed=plan.flight_count - left)
+        for _ in make_flights(plan, workers=arguments.workers, stopped=stop.is_set):
+            progress.advance(task)
+    missing = len(plan.missing())
+    if missing:
+        console.print(f"interrupted; {missing} flights are missing: the same command goes on", style="yellow")
+        return 130
+    # The number of workers changes no byte, and so is no part of the command.
+    write_card(plan, command=shlex.join(["neurosim", *_without_workers(sys.argv[1:])]))
+    write_checksums(plan)
+    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {plan.flight_count} flights")
+    return 0
+
+
+def _without_workers(words: list[str]) -> list[str]:
+    kept, skip = [], False
+    for word in words:
+        if skip or word == "--workers":
+            skip = word == "--workers"
+        elif not word.startswith("--workers="):
+            kept.append(word)
+    return kept
+
+
+def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `compare` to the commands of `neurosim`."""
+    parser = commands.add_parser(
+        "compare",
+        help="compare the statistics of event files, such as a simulated and a real one",
+        description="Event rate, intervals, polarity and spatial spectrum of files of any format, as a table "
+        "and on one page of plots.",
+    )
+    parser.add_argument("files", nargs="+", type=Path, help="files of events")
+    parser.add_argument("--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write")
+    parser.add_argument("--size", metavar="WxH", help="resolution, of files that do not say it")
+    parser.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
+    parser.set_defaults(command=_compare)
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from neurosim_core.convert.geometry import read_size
+    from neurosim_core.data.compare import draw_comparison, measure_events
+
+    size = None if arguments.size is None else read_size(arguments.size)
+    console = Console(soft_wrap=not sys.stdout.isatty())
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "c/px")
+    for name in columns:
+        table.add_column(name, justify="left" if name == "file" else "right")
+    stats = []
+    with console.status("reading") as status:
+        for path in arguments.files:
+            status.update(f"reading {path}")
+            one = measure_events(path, size=size, sensor=arguments.sensor)
+            stats.append(one)
+            table.add_row(
+                one.name,
+                f"{one.width}x{one.height}",
+                f"{one.event_count:,}",
+                f"{one.duration_s:.3f}",
+                f"{one.mean_rate_hz / 1e6:.3f}",
+                f"{one.on_share:.1%}",
+                f"{one.median_interval_us / 1000.0:.3g} ms",
+                f"{one.silent_share:.1%}",
+                f"{one.centroid:.3f}",
+            )
+        status.update("drawing")
+        draw_comparison(stats, arguments.out)
+    console.print(table)
+    for note in (note for one in stats for note in one.notes):
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    console.print(f"{arguments.out}", markup=False, highlight=False)
+    return 0

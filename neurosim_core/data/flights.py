@@ -1,0 +1,203 @@
+"""Recorded flights: any window at any time, read from HDF5 a few windows at once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurosim_core.data.batch import FIELDS, Sample
+from neurosim_core.data.windows import AT_STAMP, ENCODINGS, WindowConfig, choose_sensors
+from neurosim_core.packets import NO_EVENTS, EventArrays, PacketSchema
+from neurosim_core.record.hdf5 import DSEC_NAMES, FORMAT, import_h5py
+
+_BATCH_WINDOWS_MAX = 64
+
+
+class RecordedFlight:
+    """The windows of one recording. It may be sent to other processes, and used after a fork.
+
+    Args:
+        path: File that `RecordingWriter` wrote.
+        config: Which windows.
+        name: For its samples; None: the path.
+
+    Attributes:
+        skipped_count: Windows that were left out, as their ground truth is missing.
+
+    Raises:
+        ValueError: It is no recording, or does not have what is wanted.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, path: Path, config: WindowConfig, *, name: str | None = None) -> None:
+        self.path, self._config = path, config
+        self.name = str(path) if name is None else name
+        self._file: Any = None
+        self._pid = 0
+        groups = self._groups()
+        found = {sensor: _field(group) for sensor, group in groups.items()}
+        chosen = choose_sensors(found, config, source=self.name)
+        self._events_sensor = chosen["events"]
+        self._sensors = {field: sensor for field, sensor in chosen.items() if config.takes(field)}
+        self._columns = {field: self._read_columns(groups[sensor]) for field, sensor in self._sensors.items()}
+        camera = groups[self._events_sensor]
+        self._camera = self._read_columns(camera)
+        self.width, self.height = int(camera.attrs["width"]), int(camera.attrs["height"])
+        self.ends_ns, self.skipped_count = self._find_windows(
+            int(camera["start_ns"][0]) if len(camera["start_ns"]) else 0
+        )
+        self.close()
+
+    def __len__(self) -> int:
+        return len(self.ends_ns)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None, "_group_of": {}}
+
+    def close(self) -> None:
+        """Close the file; it is opened again when it is needed."""
+        if self._file is not None and self._pid == os.getpid():
+            self._file.close()
+        self._file = None
+
+    def read(self, first: int, count: int) -> list[Sample]:
+        """Return consecutive windows.
+
+        Raises:
+            OSError: The file is damaged or gone.
+        """
+        samples: list[Sample] = []
+        for begin in range(first, first + count, _BATCH_WINDOWS_MAX):
+            samples += self._read(begin, min(_BATCH_WINDOWS_MAX, first + count - begin))
+        return samples
+
+    def _read(self, first: int, count: int) -> list[Sample]:
+        groups = self._groups()
+        ends_ns = self.ends_ns[first : first + count]
+        starts_ns = ends_ns - self._config.window_ns
+        values = {
+            field: self._read_rows(field, groups[sensor], starts_ns, ends_ns)
+            for field, sensor in self._sensors.items()
+        }
+        dropped, lost = self._count_losses(starts_ns, ends_ns)
+        return [
+            Sample(
+                stamp_ns=int(ends_ns[row]),
+                start_ns=int(starts_ns[row]),
+                source=self.name,
+                width=self.width,
+                height=self.height,
+                dropped_count=int(dropped[row]),
+                lost_count=int(lost[row]),
+                **{field: values[field][row] if field in values else None for field in FIELDS},
+            )
+            for row in range(count)
+        ]
+
+    def _read_rows(
+        self, field: str, group: Any, starts_ns: NDArray[np.int64], ends_ns: NDArray[np.int64]
+    ) -> list[Any]:
+        if field == "events":
+            return self._read_events(group, starts_ns // 1000, ends_ns // 1000)
+        columns = self._columns[field]
+        begin, end = (np.searchsorted(columns["stamp_ns"], ns, side="right") for ns in (starts_ns, ends_ns))
+        if field == "imu":
+            rows = columns["rows"]
+            return [rows[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
+        at = np.searchsorted(columns["stamp_ns"], ends_ns).tolist()
+        if field == "pose":
+            return [columns["rows"][row] for row in at]
+        return [group["data"][row] for row in at]
+
+    def _read_events(
+        self, group: Any, starts_us: NDArray[np.int64], ends_us: NDArray[np.int64]
+    ) -> list[EventArrays]:
+        index, total = group["ms_to_idx"], int(self._camera["event_end"][-1])
+
+        def first_at(millisecond: int) -> int:
+            return min(int(index[millisecond]), total) if millisecond < len(index) else total
+
+        low, high = first_at(int(starts_us.min()) // 1000), first_at(int(ends_us.max()) // 1000 + 1)
+        if low >= high:
+            return [NO_EVENTS] * len(starts_us)
+        names = (DSEC_NAMES[name] for name in EventArrays._fields)
+        events = EventArrays(*(group[name][low:high] for name in names))
+        begin, end = (np.searchsorted(events.t, us, side="right") for us in (starts_us, ends_us))
+        return [events.rows(slice(a, b)) for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
+
+    def _read_columns(self, group: Any) -> dict[str, NDArray[Any]]:
+        """Return what is small and needed of a sensor: stamps, and all rows that are not large."""
+        count = int(group["packet_count"][()])
+        columns = {"stamp_ns": group["stamp_ns"][:count]}
+        kind = PacketSchema.from_json(group.attrs["schema"]).name
+        if kind == "Events":
+            columns |= {name: group[name][:count] for name in ("dropped_count", "sequence", "event_end")}
+        elif kind == "ImuSample":
+            force, rate = (group[name][:count] for name in ("specific_force", "angular_rate"))
+            columns["rows"] = np.concatenate([columns["stamp_ns"][:, None] * 1e-9, force, rate], axis=1)
+        elif kind == "Odometry":
+            columns["rows"] = np.concatenate([group[n][:count] for n in ("position", "orientation")], axis=1)
+        return columns
+
+    def _find_windows(self, begin_ns: int) -> tuple[NDArray[np.int64], int]:
+        """Return the ends of all windows that have their ground truth, and how many have not."""
+        stamps = self._camera["stamp_ns"]
+        last_ns = int(stamps[-1]) if len(stamps) else -1
+        ends_ns = np.arange(self._config.first_end_ns(begin_ns), last_ns + 1, self._config.stride_ns)
+        whole = np.ones(len(ends_ns), bool)
+        for field in AT_STAMP:
+            if field in self._columns:
+                has = np.isin(ends_ns, self._columns[field]["stamp_ns"])
+                if len(has) and not has.any():
+                    raise ValueError(no_ground_truth(self.name, field, self._config))
+                whole &= has
+        return ends_ns[whole].astype(np.int64), int(np.count_nonzero(~whole))
+
+    def _count_losses(
+        self, starts_ns: NDArray[np.int64], ends_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return dropped events and missing packets of each window."""
+        stamps, sequence = self._camera["stamp_ns"], self._camera["sequence"]
+        gaps = np.maximum(np.diff(sequence, prepend=sequence[:1] - 1) - 1, 0)
+        begin, end = (np.searchsorted(stamps, ns, side="right") for ns in (starts_ns, ends_ns))
+        sums = [np.concatenate([[0], np.cumsum(counts)]) for counts in (self._camera["dropped_count"], gaps)]
+        return sums[0][end] - sums[0][begin], sums[1][end] - sums[1][begin]
+
+    def _groups(self) -> Mapping[str, Any]:
+        if self._file is None or self._pid != os.getpid():  # an open file does not survive a fork
+            h5py = import_h5py()
+            if not self.path.is_file():
+                raise FileNotFoundError(f"no file {self.path}")
+            try:
+                self._file = h5py.File(self.path, "r")
+            except OSError as error:
+                raise ValueError(f"{self.path} is not a readable HDF5 file: {error}") from None
+            self._pid = os.getpid()
+            if self._file.attrs.get("format") != FORMAT:
+                raise ValueError(
+                    f"{self.path} is no recording: `neurosim convert {self.path} flight.h5` makes one"
+                )
+            groups = {n: g for n, g in self._file["sensors"].items() if "packet_count" in g}
+            order = sorted(groups, key=lambda name: int(groups[name].attrs.get("index", 1 << 30)))
+            self._group_of = {name: groups[name] for name in order}
+        return self._group_of
+
+
+def no_ground_truth(source: str, field: str, config: WindowConfig) -> str:
+    """Return what to say where windows never end at a packet of a field."""
+    stride_s = 1e-9 * config.stride_ns
+    return (
+        f"{source}: no packet of {field} is stamped at the end of a window, a multiple of {stride_s:g} s: "
+        f"choose window_s or stride_s as multiples of its period, or leave {field} out of fields"
+    )
+
+
+def _field(group: Any) -> str | None:
+    kind = PacketSchema.from_json(group.attrs["schema"]).name
+    named = {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
+    return named or ENCODINGS.get(str(group.attrs.get("encoding", "")))

@@ -1,0 +1,309 @@
+"""Batches of windows, from recordings in any order, or from simulators as they come."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurosim_core.data.batch import Batch, Sample, collate
+from neurosim_core.data.flights import RecordedFlight
+from neurosim_core.data.windows import WindowConfig
+
+_OPEN_MAX = 64
+"""Most files that are open at a time."""
+
+
+class Dataset:
+    """The windows of recordings, by number: what `torch.utils.data.DataLoader` calls a map-style data set.
+
+    Give the loader `collate_fn=neurosim_core.data.collate`. Reading starts no device, so that workers may be
+    forked.
+
+    Args:
+        source: A recording, a file of events of any format (which is copied to a temporary recording), a
+            folder with such files or with a data set of `neurosim dataset`, or a list of these.
+        window_s: Length of a window [s].
+        stride_s: From one window to the next [s]; None: they follow on each other.
+        fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
+        sensors: Name of the sensor for a field, such as {"depth": "depth_left"}; by default the first.
+
+    Attributes:
+        flights: The recordings, in the order of their paths.
+
+    Raises:
+        ValueError: A file is no recording, or does not have what is wanted.
+        FileNotFoundError: There is no such file.
+    """
+
+    def __init__(
+        self,
+        source: str | Path | Sequence[str | Path],
+        *,
+        window_s: float = 0.05,
+        stride_s: float | None = None,
+        fields: Sequence[str] | None = None,
+        sensors: Mapping[str, str] | None = None,
+    ) -> None:
+        config = WindowConfig(
+            window_s=window_s,
+            stride_s=stride_s,
+            fields=None if fields is None else tuple(fields),
+            sensors=sensors or {},
+        )
+        self.flights = []
+        for path in find_recordings(source):
+            recording, folder = _as_recording(path)
+            flight = RecordedFlight(recording, config, name=str(path))
+            if folder is not None:
+                weakref.finalize(flight, _remove, folder, os.getpid())
+            self.flights.append(flight)
+        self._begins = np.concatenate([[0], np.cumsum([len(flight) for flight in self.flights])])
+        self._open: list[RecordedFlight] = []
+
+    @property
+    def skipped_count(self) -> int:
+        """Windows that were left out, as their ground truth is missing."""
+        return sum(flight.skipped_count for flight in self.flights)
+
+    def __len__(self) -> int:
+        return int(self._begins[-1])
+
+    def __getitem__(self, index: int) -> Sample:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"there are {len(self)} windows, got index {index}")
+        return self.read(index % len(self), 1)[0]
+
+    def read(self, first: int, count: int) -> list[Sample]:
+        """Return windows with consecutive numbers."""
+        samples: list[Sample] = []
+        while count > 0:
+            number = int(np.searchsorted(self._begins, first, side="right")) - 1
+            flight, offset = self.flights[number], first - int(self._begins[number])
+            part = min(count, len(flight) - offset)
+            samples += flight.read(offset, part)
+            self._note_open(flight)
+            first, count = first + part, count - part
+        return samples
+
+    def _note_open(self, flight: RecordedFlight) -> None:
+        if flight in self._open:
+            return
+        self._open.append(flight)
+        if len(self._open) > _OPEN_MAX:
+            self._open.pop(0).close()
+
+
+class Position(NamedTuple):
+    """Where a stream is."""
+
+    epoch: int
+    """How often it has been read to its end."""
+    batch: int
+    """The next batch of this epoch."""
+
+
+class Stream:
+    """Batches of windows: events in (t0, t1], ground truth at t1.
+
+    A loop over it reads one epoch. The order of recordings depends on `seed` and the number of the epoch
+    alone, not on workers; `state_dict` and `load_state_dict` continue in the middle of an epoch.
+
+    Args:
+        source: As for `Dataset`; or settings that are flown in this process; or a `Simulation`; or
+            `LiveSource(...)`, running simulators.
+        window_s: Length of a window [s].
+        stride_s: From one window to the next [s]; None: they follow on each other.
+        batch: Windows of a batch, a multiple of `sequence`; the last one of an epoch may have fewer.
+        fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
+        sensors: Name of the sensor for a field; by default the first.
+        shuffle: Take the recordings' sequences in random order.
+        sequence: Consecutive windows that stay together, for networks with memory; read faster, too. What is
+            left at the end of a flight is left out.
+        seed: Of the order.
+        rank: Of this process, of `ranks` that share the windows; all get equally many.
+        ranks: See `rank`.
+        transform: Called with each batch, in the worker: what it returns is yielded.
+
+    Raises:
+        ValueError: An argument is out of range, or goes with recordings only.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        *,
+        window_s: float = 0.05,
+        stride_s: float | None = None,
+        batch: int = 32,
+        fields: Sequence[str] | None = None,
+        sensors: Mapping[str, str] | None = None,
+        shuffle: bool = False,
+        sequence: int = 1,
+        seed: int = 0,
+        rank: int = 0,
+        ranks: int = 1,
+        transform: Callable[[Batch], Any] | None = None,
+    ) -> None:
+        if sequence < 1 or batch < 1 or batch % sequence:
+            raise ValueError(
+                f"batch must be a multiple of sequence, both at least 1: got {batch}, {sequence}"
+            )
+        if not 0 <= rank < ranks:
+            raise ValueError(f"rank must be in [0, ranks), got {rank} of {ranks}")
+        self._batch, self._sequence, self._shuffle, self._seed = batch, sequence, shuffle, seed
+        self._rank, self._ranks, self._transform = rank, ranks, transform
+        options: dict[str, Any] = {
+            "window_s": window_s,
+            "stride_s": stride_s,
+            "fields": fields,
+            "sensors": sensors,
+        }
+        self._source = _sequential(source)
+        self._data: Dataset | None = None
+        if self._source is None:
+            self._data = Dataset(source, **options)
+        else:
+            options["fields"] = None if fields is None else tuple(fields)
+            self._config = WindowConfig(**{**options, "sensors": sensors or {}})
+            if shuffle or ranks > 1 or sequence > 1:
+                raise ValueError("shuffle, ranks and sequence go with recordings, not with simulators")
+        self._position = Position(0, 0)
+        self._resume = False
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether it reads recordings."""
+        return self._data is not None
+
+    @property
+    def skipped_count(self) -> int:
+        """Windows that were left out, as their ground truth is missing."""
+        source: Any = self._source if self._data is None else self._data
+        return int(source.skipped_count)
+
+    def __len__(self) -> int:
+        """Return the number of batches of an epoch; TypeError for simulators, where nobody knows it."""
+        if self._data is None:
+            raise TypeError("how many windows a simulator gives is not known")
+        return -(-len(self._plan(0)) // (self._batch // self._sequence))
+
+    def __iter__(self) -> Iterator[Any]:
+        return self.batches()
+
+    def batches(self, *, worker: int = 0, workers: int = 1) -> Iterator[Any]:
+        """Yield the batches of an epoch, or every `workers`-th from number `worker` on."""
+        begin = self._position.batch if self._resume else 0
+        self._resume = False
+        epoch = self._position.epoch
+        for number, samples in self._samples(epoch, begin + worker, workers):
+            self._position = Position(epoch, number + 1)
+            batch = collate(samples)
+            yield batch if self._transform is None else self._transform(batch)
+        self._position = Position(epoch + 1, 0)
+
+    def state_dict(self) -> dict[str, int]:
+        """Return where the stream is, for `load_state_dict`."""
+        return self._position._asdict()
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Let the next loop begin where a stream with the same arguments was; recordings only."""
+        if self._data is None:
+            raise ValueError("only recordings can be read from the middle on")
+        self._position = Position(int(state["epoch"]), int(state["batch"]))
+        self._resume = True
+
+    def _samples(self, epoch: int, begin: int, step: int) -> Iterator[tuple[int, list[Sample]]]:
+        if self._data is None:
+            if step > 1:
+                raise ValueError("a simulator cannot be shared by workers: give each its own, or use none")
+            assert self._source is not None
+            samples = self._source.samples(self._config)
+            number = 0
+            while taken := list(islice(samples, self._batch)):
+                yield number, taken
+                number += 1
+            return
+        plan, count = self._plan(epoch), self._batch // self._sequence
+        for number in range(begin, -(-len(plan) // count), step):
+            yield number, self._read(plan[number * count : (number + 1) * count])
+
+    def _read(self, firsts: NDArray[np.int64]) -> list[Sample]:
+        """Return the windows of some sequences; those that follow on each other are read at once."""
+        assert self._data is not None
+        samples: list[Sample] = []
+        breaks = np.flatnonzero(np.diff(firsts) != self._sequence) + 1
+        for run in np.split(firsts, breaks):
+            samples += self._data.read(int(run[0]), len(run) * self._sequence)
+        return samples
+
+    def _plan(self, epoch: int) -> NDArray[np.int64]:
+        """Return the first window of each sequence of this rank, in the order of an epoch."""
+        assert self._data is not None
+        begin, parts = 0, []
+        for flight in self._data.flights:
+            parts.append(begin + np.arange(len(flight) // self._sequence) * self._sequence)
+            begin += len(flight)
+        firsts = np.concatenate(parts) if parts else np.zeros(0, np.int64)
+        if self._shuffle:
+            firsts = np.random.default_rng([self._seed, epoch]).permutation(firsts)
+        share = len(firsts) // self._ranks
+        return firsts[: share * self._ranks][self._rank :: self._ranks].astype(np.int64)
+
+
+def find_recordings(source: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return the files of a source: of folders all recordings and event files below, in alphabetical order.
+
+    Raises:
+        FileNotFoundError: There is none.
+    """
+    from neurosim_core.io import is_event_file
+
+    if not isinstance(source, str | Path):
+        return [path for one in source for path in find_recordings(one)]
+    path = Path(source)
+    if path.is_file():
+        return [path]
+    found = sorted(p for p in path.rglob("*") if p.is_file() and is_event_file(p) and p.name[0] != ".")
+    if not found:
+        raise FileNotFoundError(
+            f"{path} holds no recording" if path.is_dir() else f"no file or folder {path}"
+        )
+    return found
+
+
+def _as_recording(path: Path) -> tuple[Path, tempfile.TemporaryDirectory[str] | None]:
+    """Return a recording; a copy in a new folder if the file is of another format."""
+    from neurosim_core.io.transfer import is_recording, transfer
+
+    if is_recording(path):
+        return path, None
+    folder = tempfile.TemporaryDirectory(prefix="neurosim-")
+    copy = Path(folder.name) / "events.h5"
+    transfer(path, copy, from_zero=True)
+    return copy, folder
+
+
+def _remove(folder: tempfile.TemporaryDirectory[str], pid: int) -> None:
+    if os.getpid() == pid:  # not in a worker that was forked
+        folder.cleanup()
+
+
+def _sequential(source: Any) -> Any:
+    """Return a source whose flights come once; None for recordings."""
+    if hasattr(source, "samples"):
+        return source
+    if isinstance(source, str | Path) or (isinstance(source, Sequence) and not isinstance(source, Mapping)):
+        return None
+    from neurosim_core.data.sources import RunSource, WorldsSource
+
+    if hasattr(source, "rollout"):
+        return WorldsSource(source)
+    return RunSource(source)

@@ -1,0 +1,161 @@
+"""Batches in PyTorch: a DataLoader whose workers read recordings."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import is_dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from neurosim_core.data.batch import Batch
+from neurosim_core.data.stream import Position, Stream
+from neurosim_core.install import install_hint
+
+
+class Loader:
+    """Yields what `Stream` yields, with tensors of PyTorch, in the same order with any number of workers.
+
+    A loop over it reads one epoch. Workers are forked where the simulator is not loaded, else spawned: then
+    `transform` must be a function of a module. They hand tensors over in shared memory.
+
+    Args:
+        source: Recordings; without workers any source of `Stream`.
+        workers: Processes that read.
+        transform: Called with each batch in its worker: what it returns is yielded, such as
+            `(batch.events.voxel(5), batch.depth)`; arrays in it become tensors.
+        pin_memory: Yield tensors in pinned memory, from which copies to a CUDA device do not wait.
+        device: Yield tensors on this device; the next batch is copied while one is in use. None: on the host.
+        options: As for `Stream`.
+
+    Raises:
+        ImportError: PyTorch is not installed.
+        ValueError: As for `Stream`; or workers are to be spawned, and `transform` cannot be sent to them.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        *,
+        workers: int = 0,
+        transform: Callable[[Batch], Any] | None = None,
+        pin_memory: bool = False,
+        device: Any = None,
+        **options: Any,
+    ) -> None:
+        torch = _import_torch()
+        self.stream = Stream(source, transform=transform, **options)
+        self._device = device
+        self._position = Position(0, 0)
+        self._shared = torch.zeros(2, dtype=torch.int64).share_memory_()
+        more: dict[str, Any] = {}
+        if workers:
+            if not self.stream.is_recorded:
+                raise ValueError("workers read recordings; simulators run by themselves: leave workers at 0")
+            method = "spawn" if "warp" in sys.modules or sys.platform != "linux" else "fork"
+            if method == "spawn":
+                _require_sendable(transform)
+            more = {"multiprocessing_context": method, "persistent_workers": True}
+        self._loader = torch.utils.data.DataLoader(
+            sys.modules[__name__]._StreamDataset(self.stream, self._shared),
+            batch_size=None,
+            num_workers=workers,
+            pin_memory=pin_memory or (device is not None and torch.cuda.is_available()),
+            **more,
+        )
+
+    def __len__(self) -> int:
+        return len(self.stream)
+
+    def __iter__(self) -> Iterator[Any]:
+        begin = self._position
+        self._shared[0], self._shared[1] = begin
+        held: list[Any] = []
+        for number, batch in enumerate(self._loader, begin.batch):
+            held.append(batch if self._device is None else _move(batch, self._device))
+            if len(held) > (self._device is not None):
+                self._position = Position(begin.epoch, number + 1 - (len(held) - 1))
+                yield held.pop(0)
+        for batch in held:
+            yield batch
+        self._position = Position(begin.epoch + 1, 0)
+
+    def state_dict(self) -> dict[str, int]:
+        """Return where the loader is, for `load_state_dict`: behind the batch that was yielded last."""
+        return self._position._asdict()
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Let the next loop begin where a loader with the same arguments was."""
+        if not self.stream.is_recorded:
+            raise ValueError("only recordings can be read from the middle on")
+        self._position = Position(int(state["epoch"]), int(state["batch"]))
+
+
+def as_tensors(value: Any) -> Any:
+    """Return a value with tensors in place of the arrays in it: of dataclasses, tuples, lists and dicts."""
+    torch = _import_torch()
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value if value.flags.writeable else value.copy())
+    return _map(as_tensors, value)
+
+
+def _move(value: Any, device: Any) -> Any:
+    if hasattr(value, "to"):
+        return value.to(device, non_blocking=True)
+    return _map(lambda item: _move(item, device), value)
+
+
+def _map(change: Callable[[Any], Any], value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value)(**{name: change(item) for name, item in vars(value).items()})
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*(change(item) for item in value))
+    if isinstance(value, tuple | list):
+        return type(value)(change(item) for item in value)
+    return {key: change(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def _require_sendable(transform: Any) -> None:
+    try:
+        pickle.dumps(transform)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(
+            "the simulator is loaded in this process, so that workers are spawned, and transform must be a "
+            f"function of a module: {error}"
+        ) from None
+
+
+def _import_torch() -> ModuleType:
+    try:
+        import torch
+        import torch.utils.data
+    except ImportError as error:
+        raise ImportError(f"loaders need PyTorch: {install_hint('learn')}") from error
+    return torch
+
+
+def __getattr__(name: str) -> Any:
+    """Make the class of data sets on first use: its base is PyTorch's, which is loaded only then."""
+    if name != "_StreamDataset":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    torch = _import_torch()
+
+    def init(self: Any, stream: Stream, shared: Any) -> None:
+        self.stream, self.shared = stream, shared
+
+    def iterate(self: Any) -> Iterator[Any]:
+        info = torch.utils.data.get_worker_info()
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        epoch, batch = self.shared.tolist()
+        if self.stream.is_recorded:
+            self.stream.load_state_dict({"epoch": epoch, "batch": batch})
+        for one in self.stream.batches(worker=worker, workers=workers):
+            yield as_tensors(one)
+
+    body = {"__init__": init, "__iter__": iterate, "__module__": __name__}
+    made = type("_StreamDataset", (torch.utils.data.IterableDataset,), body)
+    globals()[name] = made
+    return made

@@ -1,0 +1,137 @@
+"""AEDAT4 files of iniVation, through faery."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from neurosim_core.install import install_hint
+from neurosim_core.io.event_file import BlockChecker, EventFileError, split_blocks
+from neurosim_core.packets import EventArrays
+
+_PACKET_EVENTS = 8192
+_SIZE_MAX = 1 << 15
+
+
+class Aedat4Reader:
+    """Reads the first stream of events of an AEDAT4 file."""
+
+    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
+        """Open a file.
+
+        Args:
+            path: The file.
+            size: Width and height of the sensor [px]; None: as the file says.
+
+        Raises:
+            EventFileError: It is not an AEDAT4 file with events.
+            ImportError: faery is not installed.
+            OSError: It cannot be read.
+        """
+        self._faery = _import_faery()
+        self._path = path
+        self.notes: list[str] = []
+        with open(path, "rb") as file:
+            if file.read(14) != b"#!AER-DAT4.0\r\n":
+                raise EventFileError(f"{path} is not an AEDAT4 file")
+        tracks = [track for track in self._decoder().tracks() if track.data_type == "events"]
+        if not tracks:
+            raise EventFileError(f"{path} holds no events")
+        self._track = tracks[0].id
+        dimensions: tuple[int, int] = size or tracks[0].dimensions
+        self.width, self.height = dimensions
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """See `EventReader.blocks`."""
+        self.notes.clear()
+        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        decoder = self._decoder()
+        while True:
+            try:
+                track, events = next(decoder)
+            except StopIteration:
+                return
+            except BaseException as error:
+                raise _damage(self._path, error) from None
+            if track.id == self._track and len(events):
+                t, p = (
+                    events["t"].astype(np.int64),
+                    events["on"] if "on" in events.dtype.names else events["p"],
+                )
+                yield checker.check(
+                    EventArrays(
+                        t, events["x"].astype(np.uint16), events["y"].astype(np.uint16), p.astype(np.uint8)
+                    )
+                )
+
+    def close(self) -> None:
+        """Nothing is open between blocks."""
+
+    def _decoder(self) -> Any:
+        try:
+            return self._faery.aedat.Decoder(self._path)
+        except BaseException as error:
+            raise _damage(self._path, error) from None
+
+
+class Aedat4Writer:
+    """Writes an AEDAT4 file, compressed with LZ4."""
+
+    def __init__(self, path: Path, *, width: int, height: int) -> None:
+        """Create a file, replacing one that exists.
+
+        Raises:
+            EventFileError: The sensor has more than 32768 columns or rows.
+            ImportError: faery is not installed.
+            OSError: It cannot be written.
+        """
+        faery = _import_faery()
+        if max(width, height) > _SIZE_MAX:
+            raise EventFileError(f"AEDAT4 files hold at most 32768 x 32768 pixels, not {width} x {height}")
+        self._dtype = faery.EVENTS_DTYPE
+        self._path = path
+        self._checker = BlockChecker(path, width=width, height=height)
+        node, attribute = faery.aedat.DescriptionNode, faery.aedat.DescriptionAttribute
+        size = {"sizeX": attribute("int", width), "sizeY": attribute("int", height)}
+        place = "/mainloop/Recorder/outInfo/"
+        info = node("info", f"{place}0/info/", {**size, "source": attribute("string", "Neurosim")}, [])
+        stream = {"compression": "LZ4", "originalOutputName": "events", "typeIdentifier": "EVTS"}
+        attributes = {name: attribute("string", value) for name, value in stream.items()}
+        tree = [node("outInfo", place, {}, [node("0", f"{place}0/", attributes, [info])])]
+        self._encoder: Any = faery.aedat.Encoder(path, tree, faery.aedat.LZ4_DEFAULT)
+        self._encoder.__enter__()
+
+    def write(self, events: EventArrays) -> None:
+        """See `EventWriter.write`."""
+        for block in split_blocks(self._checker.check(events), _PACKET_EVENTS):
+            if int(block.t[0]) < 0:
+                raise EventFileError(f"{self._path}: AEDAT4 files hold no time before 0, got {block.t[0]} us")
+            records = np.empty(len(block.t), self._dtype)
+            for name, column in zip(records.dtype.names or (), block, strict=True):
+                records[name] = column
+            self._encoder.write(0, records)
+
+    def close(self) -> None:
+        """Complete the file. Closing twice is allowed."""
+        if self._encoder is not None:
+            encoder, self._encoder = self._encoder, None
+            encoder.__exit__(None, None, None)
+
+
+def _import_faery() -> ModuleType:
+    try:
+        import faery
+    except ImportError as error:
+        raise ImportError(f"AEDAT4 files need faery: {install_hint('formats')}") from error
+    return faery  # type: ignore[no-any-return]
+
+
+def _damage(path: Path, error: BaseException) -> BaseException:
+    """Return what to raise for an error of faery: a panic of its Rust code is no Exception."""
+    if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit | MemoryError):
+        return error
+    return EventFileError(f"{path} is damaged: {str(error) or type(error).__name__}")

@@ -1,0 +1,99 @@
+"""Logs of Cortex (MCAP): the packets of a vehicle, as `cortex record` found them on its topics."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError
+from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet, join_events
+
+
+class LogReader:
+    """Reads the sensors of one vehicle from a log."""
+
+    def __init__(self, path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> None:
+        """Open a log.
+
+        Args:
+            path: The file.
+            size: Not needed: messages of events say it.
+            sensor: Event camera whose events are read, "NAME" or "VEHICLE/NAME"; empty: the first.
+
+        Raises:
+            EventFileError: It is no log, or has no such camera.
+            ImportError: mcap is not installed.
+            OSError: It cannot be read.
+        """
+        from cortex.log import LogError, open_log
+
+        self._path = path
+        try:
+            self._log = open_log(path)
+        except LogError as error:
+            raise EventFileError(str(error)) from None
+        self.notes = [f"{path}: {self._log.cut}"] if self._log.cut else []
+        known = _message_types()
+        self._types = {
+            entry.topic: known[entry.schema.name]
+            for entry in self._log.topics
+            if entry.schema.name in known and entry.topic.count("/") == 2
+        }
+        cameras = [topic for topic, kind in self._types.items() if kind.__name__ == "Events"]
+        chosen = [topic for topic in cameras if topic.endswith(f"/{sensor}") or not sensor]
+        if not chosen:
+            self._log.close()
+            raise EventFileError(f"{path} has no event camera {sensor!r}, known: {cameras}")
+        self._topic = chosen[0]
+        self._vehicle = self._topic.rpartition("/")[0]
+        first = next((packet for packet in self.packets() if isinstance(packet, Events)), None)
+        self.width, self.height = size or ((first.width, first.height) if first else (1, 1))
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield the packets of the camera's vehicle, in the order in which they arrived.
+
+        Raises:
+            EventFileError: The log is damaged in the middle.
+        """
+        from cortex import MalformedMessage, TypeMismatch
+        from cortex.log import LogError
+        from neurosim_core.live.messages import to_packet
+
+        types = {topic: kind for topic, kind in self._types.items() if topic.startswith(f"{self._vehicle}/")}
+        try:
+            for topic, message, _ in self._log.messages(types=types):
+                yield to_packet(message, topic.rpartition("/")[2])
+        except (LogError, MalformedMessage, TypeMismatch) as error:
+            raise EventFileError(f"{self._path}: {error}") from None
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """See `EventReader.blocks`."""
+        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        pending: list[EventArrays] = []
+        name = self._topic.rpartition("/")[2]
+        for packet in self.packets():
+            if isinstance(packet, Events) and packet.sensor == name:
+                pending.append(packet.numpy())
+                if sum(len(part.t) for part in pending) >= BLOCK_EVENTS:
+                    yield checker.check(join_events(pending))
+                    pending = []
+        if pending:
+            yield checker.check(join_events(pending))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._log.close()
+
+
+def _message_types() -> dict[str, type]:
+    """Return the message type of each packet class that has one, by its name."""
+    from cortex.schema import schema_of
+    from neurosim_core.live.messages import message_type
+
+    types = {}
+    for packet in PACKET_CLASSES.values():
+        with contextlib.suppress(TypeError):  # arrays without axes: no message can carry it
+            kind = message_type(packet)
+            types[schema_of(kind).name] = kind
+    return types

@@ -1,0 +1,115 @@
+"""Files of events: what readers and writers of all formats have in common, and the checks that all share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from neurosim_core.packets import EventArrays
+
+BLOCK_EVENTS = 1_000_000
+"""Events that are read, and held in memory, at a time."""
+_DISORDER_MAX_US = 10_000
+"""Cameras send events of neighbouring rows slightly out of order; what comes later than this is damage."""
+
+
+class EventFileError(ValueError):
+    """A file is damaged or not of its format, or its format cannot hold some events."""
+
+
+class EventReader(Protocol):
+    """Reads the events of one camera, in blocks."""
+
+    width: int
+    """Of the sensor [px]."""
+    height: int
+    """Of the sensor [px]."""
+    notes: list[str]
+    """What a user should know about the file; complete once all blocks have been read."""
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """Yield all events from the first on, sorted by time, about a million at a time.
+
+        Raises:
+            EventFileError: The file is damaged; what was yielded before is intact.
+        """
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class EventWriter(Protocol):
+    """Writes the events of one camera."""
+
+    def write(self, events: EventArrays) -> None:
+        """Append events, sorted by time.
+
+        Raises:
+            EventFileError: The format cannot hold them.
+            OSError: The disk is full.
+        """
+
+    def close(self) -> None:
+        """Complete the file. Closing twice is allowed."""
+
+
+class BlockChecker:
+    """Checks the blocks of a file: pixels inside of the sensor, polarity 0 or 1, times in order."""
+
+    def __init__(self, path: Path, *, width: int, height: int, notes: list[str] | None = None) -> None:
+        self._path, self._width, self._height = path, width, height
+        self._notes = notes
+        self._last_us: int | None = None
+        self._count = 0
+        self._disordered = 0
+
+    def check(self, events: EventArrays) -> EventArrays:
+        """Return a block, sorted; a reader's notes say whether it had to be.
+
+        Raises:
+            EventFileError: An event is impossible, or times decrease by more than 10 ms.
+        """
+        t, x, y, polarity = events
+        if not len(t):
+            return events
+        if int(x.max()) >= self._width or int(y.max()) >= self._height or int(polarity.max()) > 1:
+            wrong = (x >= self._width) | (y >= self._height) | (polarity > 1)
+            first = int(np.argmax(wrong))
+            raise EventFileError(
+                f"{self._path}: event {self._count + first} is impossible on {self._width}x{self._height} "
+                f"pixels: column {x[first]}, row {y[first]}, polarity {polarity[first]}"
+            )
+        late_us = np.maximum.accumulate(t) - t
+        worst_us = max(int(late_us.max()), 0 if self._last_us is None else self._last_us - int(t.min()))
+        crosses = self._last_us is not None and int(t.min()) < self._last_us
+        if worst_us > (0 if self._notes is None or crosses else _DISORDER_MAX_US):
+            where = self._count + int(np.argmax(late_us))
+            raise EventFileError(f"{self._path}: time goes back by {worst_us} us at event {where}")
+        if worst_us > 0 and self._notes is not None:
+            self._disordered += int(np.count_nonzero(late_us))
+            note = f"{self._disordered} events were out of order, by less than 10 ms, and have been sorted"
+            self._notes[:] = [n for n in self._notes if "out of order" not in n] + [note]
+            order = np.argsort(t, kind="stable")
+            events = events.rows(order)
+        self._last_us = int(events.t[-1])
+        self._count += len(t)
+        return events
+
+
+def find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:
+    """Return width and height of the smallest sensor that has all pixels that fire."""
+    width = height = 1
+    for events in blocks:
+        if len(events.t):
+            width = max(width, int(events.x.max()) + 1)
+            height = max(height, int(events.y.max()) + 1)
+    return width, height
+
+
+def split_blocks(events: EventArrays, count: int = BLOCK_EVENTS) -> Iterator[EventArrays]:
+    """Yield events in blocks of a limited size."""
+    for begin in range(0, len(events.t), count):
+        yield events.rows(slice(begin, begin + count))

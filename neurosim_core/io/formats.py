@@ -1,0 +1,129 @@
+"""The formats of event files by name: how to open one, and how to make one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from neurosim_core.io.event_file import EventFileError, EventReader, EventWriter
+from neurosim_core.io.hdf5_events import damage_of, open_hdf5
+
+
+class Format(NamedTuple):
+    """One format."""
+
+    module: str
+    """Module of `neurosim_core.io` with its classes, imported on first use."""
+    reader: str
+    writer: str
+    """Empty: it cannot be written."""
+    suffixes: tuple[str, ...]
+    options: dict[str, Any]
+    """More arguments of its writer."""
+
+
+FORMATS = {
+    "evt3": Format("raw", "RawReader", "RawWriter", (".raw",), {}),
+    "evt2": Format("raw", "RawReader", "RawWriter", (".evt2.raw",), {"encoding": "evt2"}),
+    "dat": Format("dat", "DatReader", "DatWriter", (".dat",), {}),
+    "csv": Format("csv", "CsvReader", "CsvWriter", (".csv", ".txt"), {}),
+    "npz": Format("npz", "NpzReader", "NpzWriter", (".npz",), {}),
+    "aedat4": Format("aedat4", "Aedat4Reader", "Aedat4Writer", (".aedat4",), {}),
+    "mvsec": Format("mvsec", "MvsecReader", "MvsecWriter", ("mvsec.h5", "mvsec.hdf5"), {}),
+    "recording": Format("hdf5_events", "Hdf5EventReader", "RecordingEventWriter", (".h5", ".hdf5"), {}),
+    "mcap": Format("cortex_log", "LogReader", "", (".mcap",), {}),
+}
+"""By name. Where two suffixes fit, the longer one counts."""
+
+
+def format_of(path: Path, name: str | None = None) -> str:
+    """Return the name of the format of a file, from its own name.
+
+    Args:
+        path: The file; what is in it does not count.
+        name: The format, if the user says it.
+
+    Raises:
+        EventFileError: No format has this name, or this suffix.
+    """
+    if name is not None:
+        if name not in FORMATS:
+            raise EventFileError(f"unknown format {name!r}, known: {', '.join(FORMATS)}")
+        return name
+    fits = {
+        suffix: key
+        for key, known in FORMATS.items()
+        for suffix in known.suffixes
+        if path.name.lower().endswith(suffix)
+    }
+    if not fits:
+        suffixes = [suffix for known in FORMATS.values() for suffix in known.suffixes]
+        raise EventFileError(f"{path}: no format of events has this suffix, known: {', '.join(suffixes)}")
+    return fits[max(fits, key=len)]
+
+
+def is_event_file(path: Path) -> bool:
+    """Whether the name of a file is that of a format of events."""
+    try:
+        return bool(format_of(path))
+    except EventFileError:
+        return False
+
+
+def open_events(
+    path: str | Path, *, format: str | None = None, size: tuple[int, int] | None = None, sensor: str = ""
+) -> EventReader:
+    """Open a file of events, of any format.
+
+    Args:
+        path: The file.
+        format: Key of `FORMATS`; None: by its suffix, and for HDF5 by what is in it.
+        size: Width and height of the sensor [px], where the file does not say it.
+        sensor: Event camera, of files that hold several; empty: the first.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        EventFileError: It is not of the format, or damaged.
+        ImportError: A library for the format is not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}")
+    name = format_of(path, format)
+    if format is None and name in ("mvsec", "recording"):
+        with open_hdf5(path) as file, damage_of(path):
+            name = "mvsec" if "davis" in file else "recording"
+    known = FORMATS[name]
+    more = {"sensor": sensor} if name in ("recording", "mcap") else {}
+    reader: EventReader = _load(known, known.reader)(path, size=size, **more)
+    return reader
+
+
+def create_events(path: str | Path, *, width: int, height: int, format: str | None = None) -> EventWriter:
+    """Make a file of events, replacing one that exists.
+
+    Args:
+        path: The file.
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+        format: Key of `FORMATS`; None: by the suffix.
+
+    Raises:
+        EventFileError: The format cannot be written, or not for such a sensor.
+        ImportError: A library for the format is not installed.
+        OSError: The file cannot be written.
+    """
+    path = Path(path)
+    name = format_of(path, format)
+    known = FORMATS[name]
+    if not known.writer:
+        raise EventFileError(f"{name} can be read only")
+    make: Callable[..., EventWriter] = partial(_load(known, known.writer), **known.options)
+    return make(path, width=width, height=height)
+
+
+def _load(known: Format, name: str) -> Any:
+    return getattr(import_module(f"neurosim_core.io.{known.module}"), name)

@@ -1,0 +1,230 @@
+"""Events in HDF5 files: recordings of Neurosim, files of DSEC, and any with the same four arrays.
+
+The group `events`, or `sensors/NAME/events` of a recording, holds t [us], x, y and p; `t_offset` beside it is
+added to t.
+
+Reference: Gehrig et al. (2021), DSEC, https://dsec.ifi.uzh.ch/data-format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurosim_core import __version__
+from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, find_size
+from neurosim_core.packets import NO_EVENTS, EventArrays, Events, Packet, packet_class
+from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
+from neurosim_core.record.hdf5 import FORMAT, import_h5py
+from neurosim_core.record.header import SensorDescription
+
+PACKET_US = 10_000
+"""Events that come without packets are put into packets of this length [us]."""
+_NAMES = ("t", "x", "y", "p")
+_SPAN_MAX_US = 30 * 24 * 3_600_000_000
+
+
+def open_hdf5(path: Path) -> Any:
+    """Open an HDF5 file for reading.
+
+    Raises:
+        EventFileError: It is no HDF5 file, or not a whole one.
+        OSError: It cannot be read.
+    """
+    h5py = import_h5py()
+    with open(path, "rb"):
+        pass
+    try:
+        return h5py.File(path, "r")
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise EventFileError(f"{path} is not a readable HDF5 file: {error}") from None
+
+
+class Hdf5EventReader:
+    """Reads the events of a recording, or of a file of DSEC."""
+
+    def __init__(self, path: Path, *, size: tuple[int, int] | None = None, sensor: str = "") -> None:
+        """Open a file.
+
+        Args:
+            path: The file.
+            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
+            sensor: Event camera of a recording; empty: the first.
+
+        Raises:
+            EventFileError: It has no such events.
+            ImportError: h5py is not installed.
+            OSError: It cannot be read.
+        """
+        self._path = path
+        self.notes: list[str] = []
+        self._file = open_hdf5(path)
+        try:
+            with damage_of(path):
+                self._open(sensor)
+                attributes = self._group.attrs
+                if size is None and "width" in attributes and "height" in attributes:
+                    size = int(attributes["width"]), int(attributes["height"])
+                self.width, self.height = size or find_size(self._read())
+        except BaseException:
+            self._file.close()
+            raise
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """See `EventReader.blocks`."""
+        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        for events in self._read():
+            yield checker.check(events)
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield what a recording has besides events, in the order of time; of files of DSEC nothing."""
+        if self._file.attrs.get("format") != FORMAT:
+            return
+        with Recording(self._path) as recording:
+            others = [name for name in recording.sensors if not issubclass(_class(recording, name), Events)]
+            if others:
+                yield from recording.packets(*others)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _open(self, sensor: str) -> None:
+        file, self._group = self._file, self._file
+        if file.attrs.get("format") == FORMAT:
+            cameras = [name for name, group in file["sensors"].items() if "events" in group]
+            if sensor not in ("", *cameras) or not cameras:
+                raise EventFileError(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
+            described = sorted(
+                cameras, key=lambda name: int(file[f"sensors/{name}"].attrs.get("index", 1 << 30))
+            )
+            self._group = file[f"sensors/{sensor or described[0]}"]
+            if not bool(file.attrs["clean"]):
+                self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
+        if "events" not in self._group or any(name not in self._group["events"] for name in _NAMES):
+            raise EventFileError(
+                f"{self._path} has no events/t, x, y and p; known HDF5 files: "
+                "recordings of Neurosim, DSEC, MVSEC"
+            )
+        self._columns = [self._group["events"][name] for name in _NAMES]
+        self._count = min(len(column) for column in self._columns)
+        if "packet_count" in self._group:
+            packets = int(self._group["packet_count"][()])
+            self._count = int(self._group["event_end"][packets - 1]) if packets else 0
+        elif len({len(column) for column in self._columns}) > 1:
+            raise EventFileError(f"{self._path}: events/t, x, y and p have different lengths")
+        offset = self._group.get("t_offset")
+        self._offset_us = 0 if offset is None else int(offset[()])
+
+    def _read(self) -> Iterator[EventArrays]:
+        for begin in range(0, self._count, BLOCK_EVENTS):
+            end = min(begin + BLOCK_EVENTS, self._count)
+            with damage_of(self._path):
+                t, x, y, p = (column[begin:end] for column in self._columns)
+            if len(t) != end - begin:
+                raise EventFileError(f"{self._path}: fewer events than its index says")
+            yield EventArrays(
+                t.astype(np.int64) + self._offset_us,
+                x.astype(np.uint16),
+                y.astype(np.uint16),
+                p.astype(np.uint8),
+            )
+
+
+class RecordingEventWriter:
+    """Writes events as a recording, in packets of 10 ms at least; files of DSEC are laid out like it."""
+
+    def __init__(self, path: Path, *, width: int, height: int, sensor: str = "events") -> None:
+        """Create a file, replacing one that exists.
+
+        Raises:
+            ImportError: h5py is not installed.
+            OSError: It cannot be written.
+        """
+        self._path, self._size, self._sensor = path, (width, height), sensor
+        self._checker = BlockChecker(path, width=width, height=height)
+        described = SensorDescription(
+            name=sensor,
+            kind="event_camera",
+            rate_hz=1e6 / PACKET_US,
+            position=np.zeros(3),
+            orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+        )
+        header = RecordingHeader(
+            config_yaml="conversion: {}\n", seed=0, version=__version__, sensors=(described,)
+        )
+        self._writer = RecordingWriter(path, header, flush_interval_s=float("inf"))
+        self._closed = False
+        self._pending: list[EventArrays] = []
+        self._end_us = self._start_us = self._sequence = 0
+
+    def write(self, events: EventArrays) -> None:
+        """See `EventWriter.write`."""
+        block = self._checker.check(events)
+        if not len(block.t):
+            return
+        if int(block.t[0]) < 0 or int(block.t[-1]) > _SPAN_MAX_US:
+            raise EventFileError(
+                f"{self._path}: times of recordings are from 0 to 30 days, got {block.t[0]} to {block.t[-1]} "
+                "us: --from-zero counts them from the first event"
+            )
+        tick = -(-block.t // PACKET_US)  # a window is (start, end]
+        begins = np.concatenate([[0], np.flatnonzero(np.diff(tick)) + 1, [len(tick)]])
+        for begin, end in zip(begins[:-1].tolist(), begins[1:].tolist(), strict=True):
+            end_us = max(int(tick[begin]), 1) * PACKET_US
+            if end_us != self._end_us:
+                self._send()
+                self._end_us = end_us
+            self._pending.append(block.rows(slice(begin, end)))
+
+    def write_packet(self, packet: Packet) -> None:
+        """Append a packet of another sensor."""
+        self._writer.write(packet)
+
+    def close(self) -> None:
+        """Complete the file. Closing twice is allowed."""
+        if self._closed:
+            return
+        self._closed = True
+        self._send(always=self._sequence == 0)
+        self._writer.close()
+
+    def _send(self, *, always: bool = False) -> None:
+        if not self._pending and not always:
+            return
+        self._sequence += 1
+        columns = [np.concatenate(part) for part in zip(NO_EVENTS, *self._pending, strict=True)]
+        self._writer.write(
+            Events(
+                stamp_ns=self._end_us * 1000, start_ns=self._start_us * 1000, sequence=self._sequence - 1,
+                sensor=self._sensor, width=self._size[0], height=self._size[1],
+                t=columns[0], x=columns[1], y=columns[2], polarity=columns[3],
+            )
+        )  # fmt: skip
+        self._pending = []
+        self._start_us = self._end_us
+
+
+def _class(recording: Recording, sensor: str) -> type[Packet]:
+    return packet_class(recording.schema(sensor))
+
+
+class damage_of:
+    """Turns what h5py raises on a damaged file into an EventFileError."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        """Nothing to do."""
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: Any) -> None:
+        if isinstance(error, EventFileError) or not isinstance(
+            error, OSError | RuntimeError | KeyError | ValueError | TypeError | OverflowError | IndexError
+        ):
+            return
+        plugin = "; DSEC compresses with Blosc: pip install hdf5plugin" if "filter" in str(error) else ""
+        raise EventFileError(f"{self._path} is damaged: {error}{plugin}") from None

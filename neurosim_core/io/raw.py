@@ -1,0 +1,192 @@
+"""RAW files of Prophesee, in EVT3 or EVT2: lines of text that begin with %, then words.
+
+Time is exact to the microsecond over hours and silences: each wrap is written. Where a file begins more than
+an hour after 0, the line `% t0` says what to add, as faery writes it too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from cortex.evt3 import EventCodecError, EventColumns, Evt3Decoder, Evt3Encoder
+from neurosim_core.io.event_file import (
+    BlockChecker,
+    EventFileError,
+    find_size,
+    split_blocks,
+)
+from neurosim_core.io.evt2 import Evt2Decoder, Evt2Encoder
+from neurosim_core.packets import EventArrays
+
+_BLOCK_BYTES = 4_000_000
+_SIZE_MAX = 2048
+_HOUR_US = 3_600_000_000
+_GAP_MAX_US = 48 * _HOUR_US
+_HEADER_LINE_MAX = 4096
+
+
+class RawReader:
+    """Reads a RAW file."""
+
+    def __init__(self, path: Path, *, size: tuple[int, int] | None = None) -> None:
+        """Open a file.
+
+        Args:
+            path: The file.
+            size: Width and height of the sensor [px]; None: as the file says, else the smallest that fits.
+
+        Raises:
+            EventFileError: It is not a RAW file of EVT2 or EVT3.
+            OSError: It cannot be read.
+        """
+        self._path = path
+        self.notes: list[str] = []
+        self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
+        try:
+            header = _read_header(self._file)
+            self._begin = self._file.tell()
+            self._encoding = _encoding(header, path)
+            self._t0_us = int(header["t0"]) if re.fullmatch(r"\d+", header.get("t0", "")) else 0
+            self.width, self.height = size or _size(header) or find_size(self._decode(_SIZE_MAX, _SIZE_MAX))
+        except BaseException:
+            self._file.close()
+            raise
+
+    def blocks(self) -> Iterator[EventArrays]:
+        """See `EventReader.blocks`."""
+        self.notes.clear()
+        checker = BlockChecker(self._path, width=self.width, height=self.height, notes=self.notes)
+        for events in self._decode(self.width, self.height):
+            yield checker.check(events)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _decode(self, width: int, height: int) -> Iterator[EventArrays]:
+        word = 2 if self._encoding == "evt3" else 4
+        evt2, evt3 = Evt2Decoder(), Evt3Decoder()
+        position = self._begin
+        while True:
+            self._file.seek(position)
+            data = self._file.read(_BLOCK_BYTES)
+            if len(data) % word:
+                self.notes.append(f"{self._path} ends within a word: it was cut off")
+                data = data[: len(data) - len(data) % word]
+            if not data:
+                return
+            try:
+                if self._encoding == "evt3":
+                    events = EventArrays(*evt3.decode(data, width=_SIZE_MAX, height=_SIZE_MAX))
+                else:
+                    events = evt2.decode(data)
+            except EventCodecError as error:
+                raise EventFileError(f"{self._path}, after byte {position}: {error}") from None
+            position += len(data)
+            if self._t0_us:
+                events = events._replace(t=events.t + self._t0_us)
+            if len(events.t):
+                yield events
+
+
+class RawWriter:
+    """Writes a RAW file."""
+
+    def __init__(self, path: Path, *, width: int, height: int, encoding: str = "evt3") -> None:
+        """Create a file, replacing one that exists.
+
+        Args:
+            path: The file.
+            width: Of the sensor [px].
+            height: Of the sensor [px].
+            encoding: evt3 or evt2.
+
+        Raises:
+            EventFileError: The sensor has more than 2048 columns or rows.
+            OSError: It cannot be written.
+        """
+        if max(width, height) > _SIZE_MAX:
+            raise EventFileError(f"RAW files hold at most 2048 x 2048 pixels, not {width} x {height}")
+        self._path, self._size, self._encoding = path, (width, height), encoding
+        self._checker = BlockChecker(path, width=width, height=height)
+        self._file = open(path, "wb")  # noqa: SIM115 (closed by close())
+        self._encoder: Any = None
+        self._t0_us = self._last_us = 0
+
+    def write(self, events: EventArrays) -> None:
+        """See `EventWriter.write`."""
+        for block in split_blocks(self._checker.check(events)):
+            if self._encoder is None:
+                self._begin(int(block.t[0]))
+            if np.diff(block.t, prepend=self._last_us).max() > _GAP_MAX_US:
+                raise EventFileError(f"{self._path}: a RAW file holds no silence of more than 48 hours")
+            self._last_us = int(block.t[-1])
+            times = block.t - self._t0_us if self._t0_us else block.t
+            if self._encoding == "evt2":
+                words = self._encoder.encode(block._replace(t=times))
+            else:
+                columns = EventColumns(times, block.x, block.y, block.polarity)
+                words = self._encoder.encode(
+                    columns, width=self._size[0], height=self._size[1], end_us=self._last_us
+                )
+            self._file.write(words.data)
+
+    def close(self) -> None:
+        """Complete the file. Closing twice is allowed."""
+        if not self._file.closed:
+            if self._encoder is None:
+                self._begin(0)
+            self._file.close()
+
+    def _begin(self, first_us: int) -> None:
+        if first_us < 0:
+            raise EventFileError(f"RAW files hold no time before 0, got {first_us} us")
+        width, height = self._size
+        self._t0_us = first_us if first_us > _HOUR_US else 0
+        self._last_us = first_us if self._t0_us else 0
+        version, name = ("3.0", "EVT3") if self._encoding == "evt3" else ("2.0", "EVT2")
+        lines = [
+            f"evt {version}",
+            f"format {name};height={height};width={width}",
+            f"geometry {width}x{height}",
+        ]
+        lines += [f"t0 {self._t0_us}"] if self._t0_us else []
+        self._file.write("".join(f"% {line}\n" for line in [*lines, "end"]).encode())
+        evt3 = self._encoding == "evt3"
+        self._encoder = Evt3Encoder(begin_us=0, epochs_max=1 << 20) if evt3 else Evt2Encoder()
+
+
+def _read_header(file: BinaryIO) -> dict[str, str]:
+    """Return the lines that begin with %, by their first word, and leave the file behind them."""
+    header: dict[str, str] = {}
+    while True:
+        begin = file.tell()
+        line = file.readline(_HEADER_LINE_MAX)
+        if not line.startswith(b"% ") or not line.endswith(b"\n"):
+            file.seek(begin)
+            return header
+        key, _, value = line[2:].decode("latin-1").strip().partition(" ")
+        if key == "end":
+            return header
+        header[key] = value
+
+
+def _encoding(header: dict[str, str], path: Path) -> str:
+    named = header.get("format", "").partition(";")[0] or "EVT" + header.get("evt", "").partition(".")[0]
+    if named not in ("EVT2", "EVT3"):
+        what = "has no header" if not header else f"holds {named!r}"
+        raise EventFileError(f"{path} {what}; RAW files of EVT2 and EVT3 can be read")
+    return named.lower()
+
+
+def _size(header: dict[str, str]) -> tuple[int, int] | None:
+    found = re.fullmatch(r"(\d+)x(\d+)", header.get("geometry", ""))
+    if found:
+        return int(found[1]), int(found[2])
+    values = dict(re.findall(r"(width|height)=(\d+)", header.get("format", "")))
+    return (int(values["width"]), int(values["height"])) if len(values) == 2 else None

@@ -1,0 +1,127 @@
+"""Copying a recording from one format to another, block by block."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from neurosim_core.io.formats import create_events, format_of, open_events
+from neurosim_core.io.hdf5_events import damage_of, open_hdf5
+from neurosim_core.packets import Events
+from neurosim_core.record.hdf5 import FORMAT
+
+
+@dataclass(kw_only=True)
+class Transfer:
+    """What was copied."""
+
+    event_count: int = 0
+    packet_count: int = 0
+    """Pictures, poses and other packets besides events."""
+    begin_us: int = 0
+    """Time of the first event [us]."""
+    end_us: int = 0
+    """Time of the last event [us]."""
+    width: int = 0
+    """[px]."""
+    height: int = 0
+    """[px]."""
+    notes: list[str] = field(default_factory=list)
+
+
+def transfer(
+    source: Path,
+    out: Path,
+    *,
+    format: str | None = None,
+    out_format: str | None = None,
+    size: tuple[int, int] | None = None,
+    sensor: str = "",
+    from_zero: bool = False,
+    on_block: Callable[[int], None] | None = None,
+) -> Transfer:
+    """Copy the events of a file to a file of another format; ground truth too, where both formats have it.
+
+    The file appears under its name once it is complete. Memory is bounded.
+
+    Args:
+        source: The file to read.
+        out: The file to make, replacing one that exists.
+        format: Format of `source`; None: as its name and content say.
+        out_format: Format of `out`; None: as its name says.
+        size: Width and height of the sensor [px], where `source` does not say it.
+        sensor: Event camera, of files that hold several; empty: the first.
+        from_zero: Count time from the first event.
+        on_block: Called with the number of events so far.
+
+    Raises:
+        EventFileError: `source` is damaged, or `out` cannot hold its events.
+        ImportError: A library for a format is not installed.
+        OSError: A file cannot be read or written.
+    """
+    name = format_of(out, out_format)
+    part = out.with_name(f".{out.name}.part")
+    reader = open_events(source, format=format, size=size, sensor=sensor)
+    done = Transfer(width=reader.width, height=reader.height)
+    shift_us: int | None = None if from_zero else 0
+    try:
+        writer = create_events(part, width=reader.width, height=reader.height, format=name)
+        try:
+            for events in reader.blocks():
+                if not len(events.t):
+                    continue
+                shift_us = int(events.t[0]) if shift_us is None else shift_us
+                moved = events._replace(t=events.t - shift_us) if shift_us else events
+                writer.write(moved)
+                done.begin_us = int(moved.t[0]) if not done.event_count else done.begin_us
+                done.end_us = int(moved.t[-1])
+                done.event_count += len(events.t)
+                if on_block is not None:
+                    on_block(done.event_count)
+            keep = getattr(writer, "write_packet", None)
+            if keep is not None:
+                for packet in reader.packets() if hasattr(reader, "packets") else ():
+                    if not isinstance(packet, Events):
+                        keep(replace(packet, stamp_ns=packet.stamp_ns - 1000 * (shift_us or 0)))
+                        done.packet_count += 1
+        finally:
+            writer.close()
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+        reader.close()
+    done.notes = list(reader.notes)
+    return done
+
+
+@contextlib.contextmanager
+def as_recording(path: Path) -> Iterator[Path]:
+    """Give a file of events as a recording: itself if it is one, else a copy that is removed afterwards.
+
+    Raises:
+        EventFileError: It is damaged.
+        OSError: It cannot be read, or there is no room for the copy.
+    """
+    if is_recording(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "events.h5"
+        transfer(path, copy, from_zero=True)
+        yield copy
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording of Neurosim.
+
+    Raises:
+        EventFileError: Its name says HDF5, and it is not.
+        OSError: It cannot be read.
+    """
+    if path.suffix.lower() not in (".h5", ".hdf5"):
+        return False
+    with open_hdf5(path) as file, damage_of(path):
+        return bool(file.attrs.get("format") == FORMAT)

@@ -1,0 +1,120 @@
+"""The commands `neurosim learn` and `neurosim deploy`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurosim_core.learn import need
+
+if TYPE_CHECKING:
+    _Commands = argparse._SubParsersAction[argparse.ArgumentParser]
+
+
+def add_parsers(commands: _Commands) -> None:
+    """Add both commands."""
+    learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
+    learn.add_argument("what", metavar="TASK", help="hover, avoid, or `eval`")
+    learn.add_argument("run", nargs="?", type=Path, metavar="RUN", help="folder of a run, for `eval`")
+    learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
+    learn.add_argument(
+        "--device", default=None, help="auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
+    )
+    learn.add_argument("--worlds", type=int, metavar="N", help="worlds of the student, or of `eval`")
+    learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
+    learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
+    learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
+    learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    learn.add_argument("--scenes", choices=["seen", "unseen"], default="unseen", help="eval: where to fly")
+    learn.add_argument("--blind", action="store_true", help="eval: without events as well")
+    learn.set_defaults(command=_learn)
+    deploy = commands.add_parser(
+        "deploy", help="fly a simulator or a vehicle by a trained policy, over Cortex"
+    )
+    deploy.add_argument("policy", help="policy.onnx of a run, or the name of one that comes with this: hover")
+    deploy.add_argument("--vehicle", default="drone", metavar="NAME", help="which one (default: drone)")
+    deploy.add_argument(
+        "--events", default="events", metavar="NAME", help="its event camera (default: events)"
+    )
+    deploy.add_argument(
+        "--print-config", action="store_true", help="print settings for `neurosim serve`, and stop"
+    )
+    deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
+    deploy.set_defaults(command=_deploy)
+
+
+def _learn(arguments: argparse.Namespace) -> int:
+    need("torch")
+    if arguments.what == "eval":
+        return _evaluate(arguments)
+    if arguments.run is not None:
+        raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
+    from neurosim_core.learn.train import TrainConfig, train
+
+    config = TrainConfig(task=arguments.what, device=arguments.device or "auto", seed=arguments.seed)
+    student, teacher = config.student, config.teacher
+    if arguments.worlds is not None:
+        student = dataclasses.replace(student, worlds=arguments.worlds)
+    if arguments.student_iterations is not None:
+        student = dataclasses.replace(student, iterations=arguments.student_iterations)
+    if arguments.teacher_iterations is not None:
+        teacher = dataclasses.replace(teacher, iterations=arguments.teacher_iterations)
+    folder = arguments.out or Path("runs") / arguments.what
+    if (folder / "checkpoint.pt").exists() and not arguments.resume:
+        raise ValueError(f"{folder} holds a run: give --resume, or another --out")
+    config = dataclasses.replace(config, student=student, teacher=teacher)
+    train(folder, config, resume=arguments.resume)
+    print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    if arguments.run is None:
+        raise ValueError("say which run: neurosim learn eval runs/hover")
+    from neurosim_core.learn.train import evaluate_run
+
+    for name, evaluation in evaluate_run(
+        arguments.run, scenes=arguments.scenes, device=arguments.device, worlds=arguments.worlds
+    ):
+        print(f"{arguments.scenes} scenes, {name}: {evaluation}")
+        if not arguments.blind:
+            break
+    return 0
+
+
+def fly_policy(arguments: argparse.Namespace, overrides: Mapping[str, Any]) -> int:
+    """Do `neurosim fly --policy`."""
+    from neurosim_core.learn import pilot
+
+    if arguments.config is not None:
+        raise ValueError("--policy flies in the default apartment; say --set scene.kind=mesh scene.file=...")
+    given = {key: value for key, value in overrides.items() if key not in ("duration_s", "seed")}
+    speed_m_s = pilot.fly_policy(
+        arguments.policy,
+        duration_s=arguments.duration or 6.0,
+        seed=arguments.seed or 0,
+        overrides=given,
+    )
+    return 0 if speed_m_s < float("inf") else 1
+
+
+def _deploy(arguments: argparse.Namespace) -> int:
+    from neurosim_core.learn.pilot import Pilot, pilot_settings, shipped_policy
+
+    file = shipped_policy(arguments.policy)
+    if arguments.print_config:
+        from neurosim_core.config import load_config, to_yaml
+
+        print(to_yaml(load_config(pilot_settings(Pilot(file).card)), comments=True), end="")
+        return 0
+    from neurosim_core.learn.deploy import deploy
+
+    return deploy(
+        file,
+        vehicle=arguments.vehicle,
+        events=arguments.events,
+        duration_s=arguments.duration,
+    )

@@ -1,0 +1,340 @@
+# mypy: disable-error-code="attr-defined"
+"""Environments: a task in N worlds, as PyTorch tensors that share memory with the simulator."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Literal
+
+import torch
+import warp as wp
+
+from neurosim_core.learn.episodes import COLUMN_COUNT, COLUMNS, Episodes, free_points, look_at_vehicles
+from neurosim_core.learn.surfaces import EventSurface, LeakySurface, SurfaceConfig
+from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
+from neurosim_core.registry import find
+from neurosim_core.sim.model import Model
+from neurosim_core.sim.scene_table import SceneSource
+from neurosim_core.sim.simulation import Simulation
+
+CAMERA = "front"
+"""Name of the event camera."""
+
+Scenes = Sequence[SceneSource] | Literal["seen", "unseen"]
+"""Scenes, or those of a task to train in (`seen`) or to test in (`unseen`)."""
+
+StepResult = tuple[Observations, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]
+
+
+def make_env(
+    task: str | Task,
+    *,
+    worlds: int = 64,
+    device: str = "auto",
+    observe: Collection[str] | None = None,
+    surface: SurfaceConfig | None = None,
+    scenes: Scenes = "seen",
+    models: Sequence[Model] | None = None,
+    randomise: bool | Randomisation = True,
+    seed: int = 0,
+) -> Env:
+    """Return a task in many worlds.
+
+    Args:
+        task: Its name in the registry ("hover", "avoid", ...), or a task.
+        worlds: N.
+        device: Where everything is: auto, cpu, cuda:0.
+        observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
+        surface: How events are shown; None: sums that decay with 20 ms and 200 ms.
+        scenes: Where to fly.
+        models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
+        randomise: Draw parameters anew in each episode; as the task says, or as told.
+        seed: Of world 0; world i has seed + i.
+
+    Raises:
+        ValueError: There is no such task, or a setting is not for worlds.
+    """
+    import neurosim_core.learn.tasks  # noqa: F401  (registers)
+
+    chosen = find("task", task)() if isinstance(task, str) else task
+    return Env(
+        chosen,
+        worlds=worlds,
+        device=device,
+        observe=observe,
+        surface=surface,
+        scenes=scenes,
+        models=models,
+        randomise=randomise,
+        seed=seed,
+    )
+
+
+class Env:
+    """A task in N worlds. Finished episodes begin anew within the step that ends them (SAME_STEP).
+
+    Observations, rewards and flags are tensors of the device. **Observations are valid until the next step**,
+    which overwrites event surfaces: clone what is to be kept. A step neither waits for a CUDA device
+    nor brings anything to the host; on a CPU it skips what no world needs.
+
+    Args:
+        task: What to do; the other arguments are those of `make_env`.
+
+    Attributes:
+        task: What is done.
+        num_envs: N.
+        device: Of all tensors.
+        sim: The simulator.
+        view: What the task sees.
+        episode_steps: Steps after which an episode is truncated.
+        action_count: Numbers in an action, each in [-1, 1].
+        episode_length: Steps since each episode began, int32, shape [N].
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        worlds: int = 64,
+        device: str = "auto",
+        observe: Collection[str] | None = None,
+        surface: SurfaceConfig | None = None,
+        scenes: Scenes = "seen",
+        models: Sequence[Model] | None = None,
+        randomise: bool | Randomisation = True,
+        seed: int = 0,
+    ) -> None:
+        self.task = task
+        self._observe = None if observe is None else frozenset(observe)
+        sees = observe is None or "events" in observe
+        if isinstance(scenes, str):
+            scenes = task.scenes(unseen=scenes == "unseen")
+        self.sim = Simulation(
+            _settings(task, device, sees),
+            worlds=worlds,
+            seeds=seed,
+            sorted=False,
+            **({"scenes": scenes} if models is None else {"models": models}),
+        )
+        self.num_envs, self.action_count = worlds, 4
+        self.randomisation = randomise if isinstance(randomise, Randomisation) else task.randomisation
+        if randomise is False:
+            self.randomisation = NO_RANDOMISATION
+        wp_device = self.sim.device
+        self.device = torch.device(wp.device_to_torch(wp_device))
+        self._points = free_points(
+            [model.free_space for model in self.sim.models],
+            clearance_m=task.start.clearance_m,
+            device=wp_device,
+        )
+        self._episodes = Episodes(
+            task.start, self._points, self.sim.scene_of_world, world_count=worlds, device=wp_device
+        )
+        self._rows: Any = wp.zeros((worlds, COLUMN_COUNT), dtype=wp.float32, device=wp_device)
+        self._surface: EventSurface | None = None
+        if sees:
+            self._surface = EventSurface(
+                LeakySurface(tau_s=(0.02, 0.2)) if surface is None else surface,
+                world_count=worlds,
+                width=task.camera["width"],
+                height=task.camera["height"],
+                step_s=1.0 / task.rate_hz,
+                device=str(wp_device),
+            )
+        self.episode_steps = round(task.episode_s * task.rate_hz)
+        self.episode_length = torch.zeros(worlds, dtype=torch.int32, device=self.device)
+        self._mask = torch.zeros(worlds, dtype=torch.bool, device=self.device)
+        self._mask_array = wp.from_torch(self._mask)
+        self._mask_int = torch.zeros(worlds, dtype=torch.int32, device=self.device)
+        latency = self.randomisation.latency_steps
+        self._queue = torch.zeros((latency + 1, worlds, 4), device=self.device)
+        self._queue_place = 0
+        self._each = torch.arange(worlds, device=self.device)
+        self.view = self._make_view()
+        self._seed = seed
+        self._seeds = wp.to_torch(self._episodes.seeds.view(wp.int64))
+        self._status: torch.Tensor | None = None
+        self._last_surface: torch.Tensor | None = None
+        self._started = False
+
+    @property
+    def obs_groups(self) -> Mapping[str, Sequence[str]]:
+        """Names of the observations that each group sees: actor, critic, teacher, student."""
+        return self.task.groups
+
+    @property
+    def surface_card(self) -> dict[str, Any]:
+        """What the event surfaces are: the name of their class and its settings."""
+        if self._surface is None:
+            return {}
+        config = self._surface.config
+        return {"kind": type(config).__name__, **dataclasses.asdict(config)}
+
+    def group(self, observations: Observations, name: str) -> torch.Tensor:
+        """Return the observations of a group that are vectors, in one tensor [N, n]."""
+        parts = [observations[key] for key in self.obs_groups[name]]
+        return torch.cat([part for part in parts if part.ndim == 2], dim=1)
+
+    def reset(self, *, seed: int | None = None, spread: bool = False) -> tuple[Observations, dict[str, Any]]:
+        """Begin an episode in all worlds.
+
+        Args:
+            seed: New seed of world 0 (of world i: seed + i), from which all episodes follow; None: go on.
+            spread: Let these first episodes be cut at different times, so that worlds do not end together.
+        """
+        if seed is not None or not self._started:
+            self._episodes.seed(self._seed if seed is None else seed)
+        self._started = True
+        self._mask.fill_(True)
+        self._queue_place = 0
+        self._begin(everywhere=True)
+        if spread:
+            self.episode_length.copy_(self.view.draws[:, 0] * self.episode_steps)
+        return self._observations(), {}
+
+    def step(self, actions: torch.Tensor) -> StepResult:
+        """Act in all worlds for one step.
+
+        Args:
+            actions: In [-1, 1], clamped here, shape [N, 4].
+
+        Returns:
+            Observations (of worlds whose episode ended: of their new one), rewards, terminated, truncated,
+            and a dictionary: `final_obs` (what was seen last where an episode ended), `metrics` of all
+            worlds, which count there, and `seed`, from which each episode can be played again.
+        """
+        view = self.view
+        view.last_action.copy_(view.action)
+        torch.clamp(actions.detach(), -1.0, 1.0, out=view.action)
+        observation = self.sim.step(self._delayed(self.task.command(view)), mode="rates")
+        if self._surface is not None:
+            self._surface.update(observation.events[CAMERA], observation.clock_ns)
+        self._look(observation)
+        self.episode_length += 1
+        torch.mul(self.episode_length, view.step_s, out=view.elapsed_s)
+        task = self.task
+        task.advance(view)
+        reward = task.reward(view)
+        terminated = task.terminated(view) | view.crashed
+        truncated = (self.episode_length >= self.episode_steps) & ~terminated
+        torch.logical_or(terminated, truncated, out=self._mask)
+        final = self._observations()
+        info = {"final_obs": final, "metrics": task.metrics(view), "seed": self._seeds.clone()}
+        if self.device.type == "cpu" and not self._mask.any():
+            return final, reward, terminated, truncated, info
+        if "events" in final:
+            final["events"] = self._keep(final["events"])
+        self._begin(everywhere=False)
+        return self._observations(), reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Nothing to close: memory is freed with the object."""
+
+    def _begin(self, *, everywhere: bool) -> None:
+        """Begin episodes in the worlds of the mask."""
+        episodes, view = self._episodes, self.view
+        episodes.begin(self._mask_array)
+        factor = self.randomisation.threshold_factor
+        if self._surface is not None and factor != (1.0, 1.0):
+            threshold = self.task.threshold
+            episodes.scale_thresholds(
+                self._mask_array,
+                self.sim.thresholds(CAMERA),
+                nominal=(threshold, threshold),
+                factor=factor,
+            )
+        observation = self.sim.reset(
+            mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
+        )
+        mask = self._mask[:, None]
+        for array in (view.action, view.last_action):
+            array.masked_fill_(mask, 0.0)
+        hover = torch.zeros(4, device=self.device)
+        hover[0] = view.vehicle.hover_thrust_n
+        self._queue = torch.where(mask, hover, self._queue)
+        self.episode_length.masked_fill_(self._mask, 0)
+        view.elapsed_s.masked_fill_(self._mask, 0.0)
+        if self._surface is not None:
+            self._mask_int.copy_(self._mask)
+            self._surface.forget(wp.from_torch(self._mask_int))
+        self._look(observation)
+        self.task.begin(view, self._mask)
+
+    def _keep(self, surface: torch.Tensor) -> torch.Tensor:
+        """Return the surfaces where episodes have ended, in memory that the next such step overwrites."""
+        if self._last_surface is None:
+            self._last_surface = torch.zeros_like(surface)
+        if self.device.type == "cpu":
+            self._last_surface[self._mask] = surface[self._mask]
+        else:  # which rows they are is known to the device only
+            mask = self._mask[:, None, None, None]
+            torch.where(mask, surface, self._last_surface, out=self._last_surface)
+        return self._last_surface
+
+    def _delayed(self, command: torch.Tensor) -> torch.Tensor:
+        """Return the commands that take effect now: each episode has a latency and a factor of thrust."""
+        low, high = self.randomisation.thrust_factor
+        draws = self.view.draws
+        command = command.clone()
+        command[:, 0] *= low + (high - low) * draws[:, -1]
+        length = self._queue.shape[0]
+        if length == 1:
+            return command
+        self._queue[self._queue_place] = command
+        late = (draws[:, -2] * length).long().clamp_(max=length - 1)
+        chosen = self._queue[(self._queue_place - late) % length, self._each]
+        self._queue_place = (self._queue_place + 1) % length
+        return chosen
+
+    def _look(self, observation: Any) -> None:
+        look_at_vehicles(
+            self._rows,
+            observation,
+            self._episodes,
+            fields=self.sim.fields,
+            scene_of_world=self.sim.scene_of_world,
+            gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
+            gravity_noise=self.randomisation.gravity_noise,
+        )
+        if self._status is None:  # the same array in each step
+            self._status = wp.to_torch(observation.status)
+        torch.not_equal(self._status, 0, out=self.view.crashed)
+
+    def _make_view(self) -> View:
+        rows = wp.to_torch(self._rows)
+        worlds = self.num_envs
+        return View(
+            **{name: rows[:, begin:end] for name, (begin, end) in COLUMNS.items()},
+            surface=None if self._surface is None else wp.to_torch(self._surface.array),
+            action=torch.zeros((worlds, 4), device=self.device),
+            last_action=torch.zeros((worlds, 4), device=self.device),
+            crashed=torch.zeros(worlds, dtype=torch.bool, device=self.device),
+            elapsed_s=torch.zeros(worlds, device=self.device),
+            draws=wp.to_torch(self._episodes.draws),
+            step_s=1.0 / self.task.rate_hz,
+            vehicle=self.sim.model.airframe,
+        )
+
+    def _observations(self) -> Observations:
+        seen = self.task.observe(self.view)
+        return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
+
+
+def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
+    """Return the settings of the simulator for a task."""
+    rate_hz = task.rate_hz * task.renders_per_step
+    camera = {
+        "kind": "event_camera",
+        "lens": dict(task.camera),
+        "sampling_rate_hz": rate_hz,
+        "packet_rate_hz": rate_hz,
+        "pixel": {"threshold_on": task.threshold, "threshold_off": task.threshold},
+    }
+    return {
+        "device": device,
+        "control": {"rate_hz": task.rate_hz},
+        "path": {"kind": "hover"},
+        "vehicle": {"on_collision": "end", "max_step_s": 0.004, **task.vehicle},
+        "sensors": {CAMERA: camera} if sees else {},
+    }

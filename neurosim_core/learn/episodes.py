@@ -1,0 +1,321 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
+# mypy: disable-error-code="assignment,return-value"
+"""Where episodes begin, and what a policy may know of a vehicle, in float32: drawn and written on the device.
+
+All numbers of a world come from its own seed: nothing of a world depends on its neighbours.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from neurosim_core.random import normal4, random_bits, stream_id, uniform4
+from neurosim_core.scene.freespace import DistanceField, FreeSpace, sample_distance
+from neurosim_core.sim.observation import Observation
+
+wp.set_module_options({"enable_backward": False})
+
+DRAW_COUNT = 8
+"""Uniform numbers of each episode that a task may use."""
+COLUMNS = {
+    "position": (0, 3),
+    "velocity": (3, 6),
+    "orientation": (6, 10),
+    "body_rate": (10, 13),
+    "velocity_B": (13, 16),
+    "gravity_B": (16, 19),
+    "goal_B": (19, 22),
+    "gyro": (22, 25),
+    "gravity_measured": (25, 28),
+    "clearance": (28, 29),
+}
+"""Columns of `look_at_vehicles`."""
+COLUMN_COUNT = 29
+
+_POINT_COUNT = 4096
+_GOAL_TRIES = 16
+_EPISODE = wp.constant(wp.uint32(stream_id("learn/episode")))
+_NOISE = wp.constant(wp.uint32(stream_id("learn/noise")))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartConfig:
+    """How vehicles begin: anywhere in free space, with any heading."""
+
+    clearance_m: float = 0.6
+    """Least distance to the scene at the start and at the goal [m]."""
+    speed_m_s: tuple[float, float] = (0.0, 0.0)
+    """Range of speeds, in any direction [m/s]."""
+    vertical_share: float = 0.5
+    """Vertical speed as a share of what a uniform direction gives."""
+    tilt_max_rad: float = 0.0
+    """Largest tilt [rad]."""
+    rate_max_rad_s: float = 0.0
+    """Largest body rate about each axis [rad/s]."""
+    goal_distance_m: tuple[float, float] = (0.0, 0.0)
+    """Range of distances of the goal; (0, 0): the goal is where the vehicle begins [m]."""
+
+
+@wp.struct
+class _Start:
+    speed: wp.vec2
+    vertical_share: wp.float32
+    tilt_max: wp.float32
+    rate_max: wp.float32
+    goal_distance: wp.vec2
+
+
+@wp.func
+def _signed(u: wp.vec4) -> wp.vec4:
+    return u * 2.0 - wp.vec4(1.0, 1.0, 1.0, 1.0)
+
+
+@wp.kernel
+def _begin(
+    # Model:
+    points: wp.array2d[wp.vec3],
+    scene_of_world: wp.array[wp.int32],
+    start: _Start,
+    # In:
+    mask: wp.array[wp.bool],
+    # In/out:
+    seeds: wp.array[wp.uint64],
+    # Out:
+    position_out: wp.array2d[wp.float64],
+    velocity_out: wp.array2d[wp.float64],
+    orientation_out: wp.array2d[wp.float64],
+    body_rate_out: wp.array2d[wp.float64],
+    goal_out: wp.array[wp.vec3],
+    draws_out: wp.array2d[wp.float32],
+) -> None:
+    world = wp.tid()
+    if not mask[world]:
+        return
+    mixed = random_bits(seeds[world], _EPISODE, wp.int64(0), 0)
+    seed = (wp.uint64(mixed[0]) << wp.uint64(32)) | wp.uint64(mixed[1])
+    seeds[world] = seed
+    scene = scene_of_world[world]
+    a = uniform4(random_bits(seed, _EPISODE, wp.int64(1), 0))
+    b = uniform4(random_bits(seed, _EPISODE, wp.int64(1), 1))
+    c = _signed(uniform4(random_bits(seed, _EPISODE, wp.int64(1), 2)))
+    point = points[scene, wp.min(int(a[0] * float(points.shape[1])), points.shape[1] - 1)]
+    yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 2.0 * wp.PI * a[1])
+    lean = 2.0 * wp.PI * a[2]
+    tilt = wp.quat_from_axis_angle(wp.vec3(wp.cos(lean), wp.sin(lean), 0.0), start.tilt_max * a[3])
+    q = yaw * tilt
+    z = 2.0 * b[0] - 1.0
+    around = 2.0 * wp.PI * b[1]
+    level = wp.sqrt(wp.max(1.0 - z * z, 0.0))
+    speed = start.speed[0] + (start.speed[1] - start.speed[0]) * b[2]
+    v = wp.vec3(level * wp.cos(around), level * wp.sin(around), start.vertical_share * z) * speed
+    for axis in range(3):
+        position_out[world, axis] = wp.float64(point[axis])
+        velocity_out[world, axis] = wp.float64(v[axis])
+        body_rate_out[world, axis] = wp.float64(start.rate_max * c[axis])
+    for part in range(4):
+        orientation_out[world, part] = wp.float64(q[part])
+    goal = point
+    if start.goal_distance[1] > 0.0:
+        found = 0
+        for trial in range(_GOAL_TRIES):
+            u = uniform4(random_bits(seed, _EPISODE, wp.int64(2), trial))
+            other = points[scene, wp.min(int(u[0] * float(points.shape[1])), points.shape[1] - 1)]
+            distance = wp.length(other - point)
+            if found == 0:
+                goal = other
+                found = wp.where(
+                    distance >= start.goal_distance[0] and distance <= start.goal_distance[1], 1, 0
+                )
+    goal_out[world] = goal
+    for block in range(DRAW_COUNT // 4):
+        u = uniform4(random_bits(seed, _EPISODE, wp.int64(3), block))
+        for part in range(4):
+            draws_out[world, 4 * block + part] = u[part]
+
+
+@wp.func
+def _write(rows: wp.array2d[wp.float32], world: int, column: int, value: wp.vec3) -> None:
+    for axis in range(3):
+        rows[world, column + axis] = value[axis]
+
+
+@wp.kernel
+def _look(
+    # Model:
+    fields: wp.array[DistanceField],
+    scene_of_world: wp.array[wp.int32],
+    gyro_noise: wp.float32,
+    gravity_noise: wp.float32,
+    # In:
+    seeds: wp.array[wp.uint64],
+    position: wp.array[wp.vec3d],
+    velocity: wp.array[wp.vec3d],
+    orientation: wp.array[wp.quatd],
+    body_rate: wp.array[wp.vec3d],
+    clock_ns: wp.array[wp.int64],
+    goal: wp.array[wp.vec3],
+    # Out:
+    rows_out: wp.array2d[wp.float32],
+) -> None:
+    world = wp.tid()
+    q = wp.quat(orientation[world])
+    p = wp.vec3(position[world])
+    v = wp.vec3(velocity[world])
+    w = wp.vec3(body_rate[world])
+    down = wp.quat_rotate_inv(q, wp.vec3(0.0, 0.0, -1.0))
+    stamp = clock_ns[world]
+    n = normal4(random_bits(seeds[world], _NOISE, stamp, 0))
+    m = normal4(random_bits(seeds[world], _NOISE, stamp, 1))
+    _write(rows_out, world, 0, p)
+    _write(rows_out, world, 3, v)
+    for part in range(4):
+        rows_out[world, 6 + part] = q[part]
+    _write(rows_out, world, 10, w)
+    _write(rows_out, world, 13, wp.quat_rotate_inv(q, v))
+    _write(rows_out, world, 16, down)
+    _write(rows_out, world, 19, wp.quat_rotate_inv(q, goal[world] - p))
+    _write(rows_out, world, 22, w + gyro_noise * wp.vec3(n[0], n[1], n[2]))
+    _write(rows_out, world, 25, down + gravity_noise * wp.vec3(m[0], m[1], m[2]))
+    rows_out[world, 28] = sample_distance(fields[scene_of_world[world]], p)[0]
+
+
+@wp.kernel
+def _scale_thresholds(
+    # Model:
+    nominal: wp.vec2d,
+    low: wp.float32,
+    high: wp.float32,
+    # In:
+    mask: wp.array[wp.bool],
+    seeds: wp.array[wp.uint64],
+    # Out:
+    thresholds_out: wp.array[wp.vec2d],
+) -> None:
+    world = wp.tid()
+    if mask[world]:
+        u = uniform4(random_bits(seeds[world], _EPISODE, wp.int64(4), 0))
+        on = wp.float64(low + (high - low) * u[0])
+        off = wp.float64(low + (high - low) * u[1])
+        thresholds_out[world] = wp.vec2d(on * nominal[0], off * nominal[1])
+
+
+def free_points(spaces: Sequence[FreeSpace], *, clearance_m: float, device: Any) -> Any:
+    """Return points in free space that are connected to each other, device array of vec3 [scene, 4096].
+
+    Args:
+        spaces: Of each scene.
+        clearance_m: Least distance to the scene [m].
+        device: Where they are needed.
+
+    Raises:
+        ValueError: A scene has no such point.
+    """
+    rows = []
+    for index, space in enumerate(spaces):
+        voxels = np.argwhere(space.reachable(clearance_m))
+        if not len(voxels):
+            raise ValueError(f"scene {index} has no free space with a clearance of {clearance_m:g} m")
+        chosen = np.random.default_rng(0).integers(len(voxels), size=_POINT_COUNT)
+        rows.append(space.centers(voxels[chosen]))
+    return wp.array(np.array(rows, dtype=np.float32), dtype=wp.vec3, device=device)
+
+
+class Episodes:
+    """Draws how the episodes of all worlds begin; launches only.
+
+    Attributes:
+        start: Arguments of `Simulation.reset`: arrays of the device that `begin` overwrites.
+        seeds: Seed of the present episode of each world, device array of uint64, shape [N].
+        goal: Where to go [m], device array of vec3, shape [N].
+        draws: Uniform numbers of each episode, device array of float32, shape [N, DRAW_COUNT].
+    """
+
+    def __init__(
+        self, config: StartConfig, points: Any, scene_of_world: Any, *, world_count: int, device: Any
+    ) -> None:
+        self._start = _Start()
+        self._start.speed = wp.vec2(*config.speed_m_s)
+        self._start.vertical_share = config.vertical_share
+        self._start.tilt_max = config.tilt_max_rad
+        self._start.rate_max = config.rate_max_rad_s
+        self._start.goal_distance = wp.vec2(*config.goal_distance_m)
+        self._points, self._scene_of_world, self._device = points, scene_of_world, device
+        widths = {"position": 3, "velocity": 3, "orientation": 4, "body_rate": 3}
+        self.start = {
+            name: wp.zeros((world_count, width), dtype=wp.float64, device=device)
+            for name, width in widths.items()
+        }
+        self.seeds: Any = wp.zeros(world_count, dtype=wp.uint64, device=device)
+        self.goal: Any = wp.zeros(world_count, dtype=wp.vec3, device=device)
+        self.draws: Any = wp.zeros((world_count, DRAW_COUNT), dtype=wp.float32, device=device)
+
+    def seed(self, seed: int) -> None:
+        """Let world i go on from seed + i."""
+        self.seeds.assign(np.arange(len(self.seeds), dtype=np.uint64) + np.uint64(seed))
+
+    def begin(self, mask: Any) -> None:
+        """Draw the next episode of the worlds of a mask, device array of bool, shape [N]."""
+        wp.launch(
+            _begin,
+            dim=len(self.seeds),
+            inputs=[self._points, self._scene_of_world, self._start, mask, self.seeds],
+            outputs=[*self.start.values(), self.goal, self.draws],
+            device=self._device,
+        )
+
+    def scale_thresholds(
+        self, mask: Any, thresholds: Any, *, nominal: tuple[float, float], factor: tuple[float, float]
+    ) -> None:
+        """Draw thresholds of an event camera for the worlds of a mask: a factor on each polarity."""
+        wp.launch(
+            _scale_thresholds,
+            dim=len(self.seeds),
+            inputs=[wp.vec2d(*nominal), *factor, mask, self.seeds],
+            outputs=[thresholds],
+            device=self._device,
+        )
+
+
+def look_at_vehicles(
+    rows: Any,
+    observation: Observation,
+    episodes: Episodes,
+    *,
+    fields: Any,
+    scene_of_world: Any,
+    gyro_noise_rad_s: float,
+    gravity_noise: float,
+) -> None:
+    """Write what is known of the vehicles of all worlds, in float32; launches only.
+
+    Args:
+        rows: Overwritten, float32, shape [N, COLUMN_COUNT]; see `COLUMNS`.
+        observation: Of the step.
+        episodes: Their seeds address the noise; and where to go.
+        fields: Distance to each scene, array of `DistanceField`.
+        scene_of_world: Index of the scene of each world.
+        gyro_noise_rad_s: Standard deviation of the gyroscope [rad/s].
+        gravity_noise: Standard deviation of each part of the measured direction of gravity.
+    """
+    state = observation.state
+    moving = [state.position, state.velocity, state.orientation, state.body_rate, observation.clock_ns]
+    wp.launch(
+        _look,
+        dim=rows.shape[0],
+        inputs=[
+            fields,
+            scene_of_world,
+            gyro_noise_rad_s,
+            gravity_noise,
+            episodes.seeds,
+            *moving,
+            episodes.goal,
+        ],
+        outputs=[rows],
+        device=rows.device,
+    )

@@ -1,0 +1,91 @@
+"""How well a policy does: one episode in each world of scenes that it may not have seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from neurosim_core.learn.env import Env
+from neurosim_core.learn.policies import EventPolicy
+from neurosim_core.learn.task import Observations
+
+Actor = Callable[[Observations, torch.Tensor], torch.Tensor]
+"""Returns actions, given observations and which worlds begin an episode (bool, [N])."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What came of an episode in each world."""
+
+    episodes: int
+    metrics: dict[str, float]
+    """Means over the episodes: `success`, `crash`, and what else the task measures."""
+    speeds: dict[str, float]
+    """Quantiles of the metric `speed_m_s` at the end of episodes without a crash [m/s]."""
+
+    def __str__(self) -> str:
+        parts = [f"{100.0 * self.metrics[name]:.0f} % {name}" for name in ("success", "crash")]
+        if self.speeds:
+            parts.append(f"median speed at the end {self.speeds['median']:.2f} m/s")
+        return ", ".join(parts) + f" ({self.episodes} episodes)"
+
+
+def student_actor(policy: EventPolicy, env: Env, *, blind: bool = False) -> Actor:
+    """Return the student as an actor; blind: its event surfaces are empty."""
+    memory = torch.zeros((env.num_envs, policy.memory_size), device=env.device)
+
+    def act(observations: Observations, begun: torch.Tensor) -> torch.Tensor:
+        memory.masked_fill_(begun[:, None], 0.0)
+        surfaces = observations["events"]
+        if blind:
+            surfaces = torch.zeros_like(surfaces)
+        action, new = policy(surfaces, env.group(observations, "student"), memory)
+        memory.copy_(new)
+        return action
+
+    return act
+
+
+def teacher_actor(policy: Callable[[torch.Tensor], torch.Tensor], env: Env) -> Actor:
+    """Return a teacher, who sees the group of that name, as an actor."""
+    return lambda observations, _: policy(env.group(observations, "teacher"))
+
+
+@torch.no_grad()
+def evaluate(
+    env: Env,
+    actor: Actor,
+    *,
+    seed: int = 1_000_000,
+    look: Callable[[Env, Observations], None] | None = None,
+) -> Evaluation:
+    """Fly the first episode of each world.
+
+    Args:
+        env: Where.
+        actor: Who flies.
+        seed: Of the episodes.
+        look: Called before each step.
+    """
+    observations, _ = env.reset(seed=seed)
+    begun = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    going = begun.clone()
+    found: dict[str, torch.Tensor] = {}
+    for _ in range(env.episode_steps):
+        if look is not None:
+            look(env, observations)
+        observations, _, terminated, truncated, info = env.step(actor(observations, begun))
+        begun = terminated | truncated
+        for name, value in info["metrics"].items():
+            found[name] = torch.where(going & begun, value, found.get(name, torch.zeros_like(value)))
+        going &= ~begun
+    speeds = {}
+    if "speed_m_s" in found and (whole := found["speed_m_s"][found["crash"] == 0.0]).numel():
+        speeds = {"median": float(whole.median()), "0.9": float(whole.quantile(0.9))}
+    return Evaluation(
+        episodes=env.num_envs,
+        metrics={name: float(value.mean()) for name, value in found.items()},
+        speeds=speeds,
+    )

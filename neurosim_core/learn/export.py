@@ -1,0 +1,118 @@
+"""A student as an ONNX file, which says itself what it was trained for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import nn
+
+from neurosim_core.learn import need
+from neurosim_core.learn.pilot import CARD
+from neurosim_core.learn.policies import EventPolicy
+
+_OPSET, _IR = 17, 8
+
+
+def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> None:
+    """Write one step of a student for one vehicle.
+
+    Inputs: `events` [1, C, H, W], `vector` [1, n], `memory` [1, m], zeros when an episode begins. Outputs:
+    `action` [1, 4] in [-1, 1], `memory_out`. All float32. The graph is written node by node: exporters of
+    PyTorch change from release to release.
+
+    Args:
+        policy: The student.
+        card: What whoever flies it needs to know; kept in the file.
+        file: Where to.
+    """
+    onnx = need("onnx")
+    shape, graph = policy.shape, _Graph(onnx)
+    feature = graph.add("Log", [graph.add("Add", ["events", graph.constant(np.float32(1.0))])])
+    for layer in policy.eyes:
+        feature = graph.layer(layer, feature)
+    inputs = graph.add("Concat", [feature, "vector"], axis=1)
+    memory = graph.gru(policy.memory, inputs, "memory")
+    head = graph.layer(policy.head, memory)
+    columns = [graph.constant(np.array([n], np.int64)) for n in (0, shape["action_count"], 1)]
+    action = graph.add("Slice", [head, columns[0], columns[1], columns[2]])
+    bounds = [graph.constant(np.float32(bound)) for bound in (-1.0, 1.0)]
+    graph.add("Clip", [action, *bounds], output="action")
+    graph.add("Identity", [memory], output="memory_out")
+
+    def tensor(name: str, *size: int) -> Any:
+        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, *size])
+
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(
+            graph.nodes,
+            "policy",
+            [
+                tensor("events", shape["channels"], shape["height"], shape["width"]),
+                tensor("vector", shape["vector_size"]),
+                tensor("memory", shape["memory_size"]),
+            ],
+            [tensor("action", shape["action_count"]), tensor("memory_out", shape["memory_size"])],
+            graph.constants,
+        ),
+        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
+        ir_version=_IR,
+    )
+    onnx.helper.set_model_props(model, {CARD: json.dumps(dict(card))})
+    onnx.checker.check_model(model)
+    onnx.save(model, str(file))
+
+
+class _Graph:
+    """Nodes and constants of an ONNX graph."""
+
+    def __init__(self, onnx: Any) -> None:
+        self._onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, value: Any) -> str:
+        name = f"c{len(self.constants)}"
+        self.constants.append(self._onnx.numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+    def add(self, kind: str, inputs: list[str], output: str | None = None, **attributes: Any) -> str:
+        name = output or f"n{len(self.nodes)}"
+        self.nodes.append(self._onnx.helper.make_node(kind, inputs, [name], **attributes))
+        return name
+
+    def linear(self, weight: Any, bias: Any, x: str) -> str:
+        values = [self.constant(each.detach().cpu().numpy()) for each in (weight, bias)]
+        return self.add("Gemm", [x, *values], transB=1)
+
+    def layer(self, layer: nn.Module, x: str) -> str:
+        if isinstance(layer, nn.Conv2d):
+            values = [self.constant(each.detach().cpu().numpy()) for each in layer.parameters()]
+            pads, strides = (int(layer.padding[0]),) * 4, layer.stride  # type: ignore[arg-type]
+            return self.add("Conv", [x, *values], pads=pads, strides=strides)
+        if isinstance(layer, nn.Linear):
+            return self.linear(layer.weight, layer.bias, x)
+        kinds: dict[type, str] = {nn.ELU: "Elu", nn.Flatten: "Flatten"}
+        return self.add(kinds[type(layer)], [x])
+
+    def gru(self, cell: nn.GRUCell, x: str, memory: str) -> str:
+        """Return the memory after a step, by the equations of `torch.nn.GRUCell`."""
+        parts = []
+        size = self.constant(np.full(3, cell.hidden_size, np.int64))
+        for weight, bias, value in (
+            (cell.weight_ih, cell.bias_ih, x),
+            (cell.weight_hh, cell.bias_hh, memory),
+        ):
+            names = [f"g{len(self.nodes)}_{part}" for part in range(3)]
+            joined = self.linear(weight, bias, value)
+            self.nodes.append(self._onnx.helper.make_node("Split", [joined, size], names, axis=1))
+            parts.append(names)
+        reset, update = (
+            self.add("Sigmoid", [self.add("Add", [parts[0][gate], parts[1][gate]])]) for gate in range(2)
+        )
+        kept = self.add("Mul", [reset, parts[1][2]])
+        new = self.add("Tanh", [self.add("Add", [parts[0][2], kept])])
+        return self.add("Add", [new, self.add("Mul", [update, self.add("Sub", [memory, new])])])

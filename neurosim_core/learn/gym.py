@@ -1,0 +1,114 @@
+"""Gymnasium: a task as a `VectorEnv` of NumPy arrays.
+
+`gymnasium.make_vec("neurosim_core.learn.gym:neurosim/hover-v0", 64)` makes one, too. For learning libraries
+that want NumPy; those of PyTorch take `Env` as it is, without copies.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from neurosim_core.learn.env import Env, make_env
+from neurosim_core.learn.task import Observations
+from neurosim_core.registry import kinds
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class NumpyEnv(VectorEnv[Arrays, NDArray[Any], NDArray[Any]]):
+    """A task in N worlds as a vector environment that begins anew in the step that ends an episode.
+
+    Args:
+        env: The environment.
+        group: Observations of this group of the task only; None: all.
+    """
+
+    def __init__(self, env: Env, *, group: str | None = None) -> None:
+        self._env = env
+        self._names = None if group is None else frozenset(env.obs_groups[group])
+        self.num_envs = env.num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        observations, _ = env.reset()
+        spaces: dict[str, gymnasium.Space[Any]] = {
+            name: Box(-np.inf, np.inf, shape=value.shape[1:], dtype=np.float32)
+            for name, value in self._arrays(observations).items()
+        }
+        self.single_observation_space = Dict(spaces)
+        self.single_action_space = Box(-1.0, 1.0, shape=(env.action_count,), dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Arrays, dict[str, Any]]:
+        """Begin an episode in all worlds; world i has seed + i."""
+        observations, _ = self._env.reset(seed=seed)
+        return self._arrays(observations), {}
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[Arrays, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Act in all worlds; `final_obs` and `metrics` are in the last, for all worlds."""
+        given = torch.as_tensor(actions, dtype=torch.float32, device=self._env.device)
+        observations, reward, terminated, truncated, info = self._env.step(given)
+        ended = (terminated | truncated).cpu().numpy()
+        extra: dict[str, Any] = {}
+        if ended.any():
+            final = self._arrays(info["final_obs"])
+            rows = np.empty(self.num_envs, dtype=object)
+            for world in np.flatnonzero(ended):
+                rows[world] = {name: value[world] for name, value in final.items()}
+            extra = {
+                "final_obs": rows,
+                "_final_obs": ended,
+                "final_info": {name: value.cpu().numpy() for name, value in info["metrics"].items()},
+                "_final_info": ended,
+            }
+        return (
+            self._arrays(observations),
+            reward.cpu().numpy(),
+            terminated.cpu().numpy(),
+            truncated.cpu().numpy(),
+            extra,
+        )
+
+    def close_extras(self, **_: Any) -> None:
+        """Nothing to close: memory is freed with the object."""
+
+    def _arrays(self, observations: Observations) -> Arrays:
+        """Return copies on the host."""
+        return {
+            name: np.array(value.cpu().numpy())
+            for name, value in observations.items()
+            if self._names is None or name in self._names
+        }
+
+
+def make_numpy_env(*, task: str, num_envs: int = 1, group: str | None = None, **options: Any) -> NumpyEnv:
+    """Return a task as a vector environment; `options` are those of `make_env`."""
+    return NumpyEnv(make_env(task, worlds=num_envs, **options), group=group)
+
+
+def register_all() -> None:
+    """Register all tasks as `neurosim/NAME-v0`."""
+    import neurosim_core.learn.tasks  # noqa: F401  (registers)
+
+    for name in kinds("task"):
+        identifier = f"neurosim/{name}-v0"
+        if identifier not in gymnasium.registry:
+            gymnasium.register(
+                identifier,
+                vector_entry_point="neurosim_core.learn.gym:make_numpy_env",
+                kwargs={"task": name},
+            )
+
+
+register_all()

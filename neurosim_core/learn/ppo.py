@@ -1,0 +1,155 @@
+"""Proximal policy optimisation (Schulman et al. 2017) of a policy on states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from neurosim_core.learn.env import Env
+from neurosim_core.learn.policies import ActorCritic
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig:
+    """How a teacher is trained."""
+
+    worlds: int = 256
+    iterations: int = 80
+    horizon: int = 24
+    """Steps of each world in an iteration."""
+    epochs: int = 4
+    minibatches: int = 4
+    learning_rate: float = 1.5e-3
+    """At first; it falls to a tenth."""
+    discount: float = 0.98
+    trace: float = 0.95
+    """Lambda of the generalised advantage estimate."""
+    clip: float = 0.2
+    entropy_weight: float = 0.002
+    gradient_max: float = 0.5
+
+
+class Ppo:
+    """Trains an actor and a critic in an environment, iteration by iteration.
+
+    Args:
+        env: Its observation groups `actor` and `critic` are seen; vectors only.
+        config: How.
+        generator: Of all random numbers, on the device of the environment.
+    """
+
+    def __init__(self, env: Env, config: PpoConfig, generator: torch.Generator) -> None:
+        self.env, self.config = env, config
+        self._generator = generator
+        observations, _ = env.reset()
+        sizes = [env.group(observations, name).shape[1] for name in ("actor", "critic")]
+        self.policy = ActorCritic(*sizes).to(env.device)
+        self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=config.learning_rate, eps=1e-5)
+        self._now = self._seen(observations)
+
+    def begin(self, seed: int) -> None:
+        """Begin anew in all worlds, at different times of their episodes."""
+        observations, _ = self.env.reset(seed=seed, spread=True)
+        self._now = self._seen(observations)
+
+    def iterate(self, done: float) -> dict[str, float]:
+        """Fly some steps and learn from them.
+
+        Args:
+            done: Share of the training that lies behind.
+
+        Returns:
+            What to log.
+        """
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * (1.0 - 0.9 * done)
+        with torch.no_grad():
+            batch, log = self._fly()
+        self._learn(batch)
+        return log
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what training goes on from."""
+        return {"policy": self.policy.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.policy.load_state_dict(state["policy"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    def _seen(self, observations: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.env.group(observations, "actor"), self.env.group(observations, "critic")
+
+    def _fly(self) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+        config, policy, env = self.config, self.policy, self.env
+        spread = torch.exp(policy.log_spread)
+        rows: dict[str, list[torch.Tensor]] = {
+            name: [] for name in ("actor", "critic", "action", "log_p", "value", "reward", "done")
+        }
+        ended = torch.zeros(3, device=env.device)  # episodes, successes, crashes
+        for _ in range(config.horizon):
+            seen, told = self._now
+            mean = policy(seen)
+            noise = torch.randn(mean.shape, generator=self._generator, device=mean.device)
+            action = mean + spread * noise
+            observations, reward, terminated, truncated, info = env.step(action)
+            cut = policy.value(self._seen(info["final_obs"])[1])  # the episode would have gone on
+            done = (terminated | truncated).float()
+            for name, value in (
+                ("actor", seen),
+                ("critic", told),
+                ("action", action),
+                ("log_p", policy.log_probability(mean, action)),
+                ("value", policy.value(told)),
+                ("reward", reward + config.discount * cut * truncated),
+                ("done", done),
+            ):
+                rows[name].append(value)
+            metrics = info["metrics"]
+            ended += torch.stack(
+                [done.sum(), (metrics["success"] * done).sum(), (metrics["crash"] * done).sum()]
+            )
+            self._now = self._seen(observations)
+        batch = {name: torch.stack(values) for name, values in rows.items()}
+        batch["advantage"] = self._advantages(batch)
+        batch["return"] = batch["advantage"] + batch["value"]
+        episodes, successes, crashes = ended.tolist()
+        log = {"reward": float(batch["reward"].mean()), "spread": float(spread.mean())}
+        if episodes:
+            log |= {"success": successes / episodes, "crash": crashes / episodes}
+        return {name: value.flatten(0, 1) for name, value in batch.items()}, log
+
+    def _advantages(self, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        config, value = self.config, batch["value"]
+        later, following = self.policy.value(self._now[1]), torch.zeros_like(value[0])
+        advantages = torch.empty_like(value)
+        for step in reversed(range(len(value))):
+            go_on = 1.0 - batch["done"][step]
+            delta = batch["reward"][step] + config.discount * go_on * later - value[step]
+            following = delta + config.discount * config.trace * go_on * following
+            advantages[step], later = following, value[step]
+        return advantages
+
+    def _learn(self, batch: dict[str, torch.Tensor]) -> None:
+        config, policy = self.config, self.policy
+        count = len(batch["value"])
+        advantage = batch["advantage"]
+        batch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        for _ in range(config.epochs):
+            order = torch.randperm(count, generator=self._generator, device=advantage.device)
+            for rows in order.chunk(config.minibatches):
+                part = {name: value[rows] for name, value in batch.items()}
+                log_p = policy.log_probability(policy(part["actor"]), part["action"])
+                ratio = torch.exp(log_p - part["log_p"])
+                gain = torch.minimum(
+                    ratio * part["advantage"],
+                    ratio.clamp(1.0 - config.clip, 1.0 + config.clip) * part["advantage"],
+                ).mean()
+                error = (policy.value(part["critic"]) - part["return"]).square().mean()
+                loss = 0.5 * error - gain - config.entropy_weight * policy.entropy()
+                self.optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_max)
+                self.optimizer.step()

@@ -1,0 +1,323 @@
+# mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
+# mypy: disable-error-code="no-untyped-call"
+"""Event surfaces: the events of a step of many worlds as pictures for a network, on the device.
+
+A surface is [world, channel, row, column], float32, written in place by one or two kernels after each step;
+nothing is allocated and nothing waits for the device. Sums are of fixed-point numbers, so that the order in
+which threads add does not change a bit.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+_ONE = wp.constant(65536.0)  # of the fixed-point sums: a pixel has room for 32,767 events in a step
+_NEVER_US = wp.constant(wp.int64(-(1 << 60)))
+_THREADS_ON_CUDA = 64
+"""Threads that share the events of a world."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeSurface:
+    """exp(-(now - t) / tau) of the last event of each pixel: channels off and on for each tau.
+
+    Reference: Lagorce et al. (2017), "HOTS", eq. (3).
+    """
+
+    tau_s: tuple[float, ...] = (0.01, 0.05)
+    """Time constants [s]."""
+
+    def __post_init__(self) -> None:
+        _check_tau(self.tau_s)
+
+    @property
+    def channel_count(self) -> int:
+        """Two for each time constant."""
+        return 2 * len(self.tau_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeakySurface:
+    """The sum of exp(-(now - t) / tau) over all events of a pixel: channels off and on for each tau.
+
+    It shows how recent and how frequent events are.
+    """
+
+    tau_s: tuple[float, ...] = (0.01,)
+    """Time constants [s]."""
+
+    def __post_init__(self) -> None:
+        _check_tau(self.tau_s)
+
+    @property
+    def channel_count(self) -> int:
+        """Two for each time constant."""
+        return 2 * len(self.tau_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """The events of the last step in each pixel: channels off and on."""
+
+    @property
+    def channel_count(self) -> int:
+        """One for each polarity."""
+        return 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoxelGrid:
+    """Polarity (-1, 1) of the events of the last step, shared between the two nearest of B moments of it.
+
+    Moment b is at b / (B - 1) of the step; with one bin all events are in it.
+
+    Reference: Zhu et al. (2019), "Unsupervised Event-based Learning of Optical Flow, Depth, and Egomotion",
+    eq. (1-2).
+    """
+
+    bins: int = 5
+    """B."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bins <= 64:
+            raise ValueError(f"bins must be in [1, 64], got {self.bins}")
+
+    @property
+    def channel_count(self) -> int:
+        """One for each bin."""
+        return self.bins
+
+
+SurfaceConfig = TimeSurface | LeakySurface | Counts | VoxelGrid
+"""What a surface shows."""
+
+
+def _check_tau(tau_s: tuple[float, ...]) -> None:
+    if not tau_s or not all(0.0 < tau < float("inf") for tau in tau_s):
+        raise ValueError(f"tau_s must be one or more numbers > 0, got {tau_s}")
+
+
+@wp.kernel
+def _note_last(
+    # In:
+    t: wp.array[wp.int64],
+    x: wp.array[wp.uint16],
+    y: wp.array[wp.uint16],
+    polarity: wp.array[wp.uint8],
+    offsets: wp.array[wp.int32],
+    stride: int,
+    # In/out:
+    last_us: wp.array4d[wp.int64],
+) -> None:
+    world, lane = wp.tid()
+    event = offsets[world] + lane
+    while event < offsets[world + 1]:
+        wp.atomic_max(last_us, world, int(polarity[event]), int(y[event]), int(x[event]), t[event])
+        event += stride
+
+
+@wp.kernel
+def _show_last(
+    # Model:
+    tau_us: wp.array[wp.float32],
+    # In:
+    last_us: wp.array4d[wp.int64],
+    now_ns: wp.array[wp.int64],
+    # Out:
+    surface_out: wp.array4d[wp.float32],
+) -> None:
+    world, channel, row, column = wp.tid()
+    last = last_us[world, channel % 2, row, column]
+    value = wp.float32(0.0)
+    if last != _NEVER_US:
+        value = wp.exp(-wp.float32(now_ns[world] / wp.int64(1000) - last) / tau_us[channel / 2])
+    surface_out[world, channel, row, column] = value
+
+
+@wp.func
+def _add(sums: wp.array4d[wp.int32], world: int, channel: int, row: int, column: int, weight: float) -> None:
+    wp.atomic_add(sums, world, channel, row, column, wp.int32(wp.round(weight * _ONE)))
+
+
+@wp.kernel
+def _add_leaky(
+    # Model:
+    tau_us: wp.array[wp.float32],
+    # In:
+    t: wp.array[wp.int64],
+    x: wp.array[wp.uint16],
+    y: wp.array[wp.uint16],
+    polarity: wp.array[wp.uint8],
+    offsets: wp.array[wp.int32],
+    now_ns: wp.array[wp.int64],
+    stride: int,
+    # In/out:
+    sums: wp.array4d[wp.int32],
+) -> None:
+    world, lane = wp.tid()
+    event = offsets[world] + lane
+    while event < offsets[world + 1]:
+        age_us = wp.float32(now_ns[world] / wp.int64(1000) - t[event])
+        for scale in range(tau_us.shape[0]):
+            channel = 2 * scale + int(polarity[event])
+            _add(sums, world, channel, int(y[event]), int(x[event]), wp.exp(-age_us / tau_us[scale]))
+        event += stride
+
+
+@wp.kernel
+def _add_counts(
+    # In:
+    x: wp.array[wp.uint16],
+    y: wp.array[wp.uint16],
+    polarity: wp.array[wp.uint8],
+    offsets: wp.array[wp.int32],
+    stride: int,
+    # In/out:
+    sums: wp.array4d[wp.int32],
+) -> None:
+    world, lane = wp.tid()
+    event = offsets[world] + lane
+    while event < offsets[world + 1]:
+        _add(sums, world, int(polarity[event]), int(y[event]), int(x[event]), 1.0)
+        event += stride
+
+
+@wp.kernel
+def _add_voxels(
+    # In:
+    t: wp.array[wp.int64],
+    x: wp.array[wp.uint16],
+    y: wp.array[wp.uint16],
+    polarity: wp.array[wp.uint8],
+    offsets: wp.array[wp.int32],
+    now_ns: wp.array[wp.int64],
+    duration_us: float,
+    stride: int,
+    # In/out:
+    sums: wp.array4d[wp.int32],
+) -> None:
+    world, lane = wp.tid()
+    bins = sums.shape[1]
+    event = offsets[world] + lane
+    while event < offsets[world + 1]:
+        sign = 2.0 * float(polarity[event]) - 1.0
+        age_us = wp.float32(now_ns[world] / wp.int64(1000) - t[event])
+        place = wp.clamp((1.0 - age_us / duration_us) * float(bins - 1), 0.0, float(bins - 1))
+        first = wp.min(int(place), bins - 1)
+        share = place - float(first)
+        _add(sums, world, first, int(y[event]), int(x[event]), sign * (1.0 - share))
+        if first + 1 < bins:
+            _add(sums, world, first + 1, int(y[event]), int(x[event]), sign * share)
+        event += stride
+
+
+@wp.kernel
+def _show_sums(
+    # Model:
+    decay: wp.array[wp.float32],
+    # In/out:
+    sums: wp.array4d[wp.int32],
+    surface: wp.array4d[wp.float32],
+) -> None:
+    world, channel, row, column = wp.tid()
+    added = wp.float32(sums[world, channel, row, column]) / _ONE
+    sums[world, channel, row, column] = 0
+    surface[world, channel, row, column] = surface[world, channel, row, column] * decay[channel] + added
+
+
+@wp.kernel
+def _forget(
+    # In:
+    mask: wp.array[wp.int32],
+    stride: int,
+    # Out:
+    last_us: wp.array4d[wp.int64],
+    surface: wp.array4d[wp.float32],
+) -> None:
+    world, lane = wp.tid()
+    if mask[world] == 0:
+        return
+    columns = surface.shape[3]
+    size = surface.shape[2] * columns
+    place = lane
+    while place < surface.shape[1] * size:
+        channel = place / size
+        row = place % size / columns
+        column = place % columns
+        surface[world, channel, row, column] = 0.0
+        if channel < last_us.shape[1]:
+            last_us[world, channel, row, column] = _NEVER_US
+        place += stride
+
+
+class EventSurface:
+    """The surfaces of one event camera in all worlds.
+
+    Args:
+        config: What they show.
+        world_count: N.
+        width: Of the sensor [px].
+        height: Of the sensor [px].
+        step_s: How long a step is [s].
+        device: Where they are.
+
+    Attributes:
+        array: The surfaces, float32, shape [N, channel, H, W]; overwritten by `update` and `forget`.
+    """
+
+    def __init__(
+        self, config: SurfaceConfig, *, world_count: int, width: int, height: int, step_s: float, device: str
+    ) -> None:
+        self.config = config
+        self._device = wp.get_device(device)
+        self._step_us = 1e6 * step_s
+        self._lanes = _THREADS_ON_CUDA if self._device.is_cuda else 1
+        shape = (world_count, config.channel_count, height, width)
+        self.array: Any = wp.zeros(shape, dtype=wp.float32, device=device)
+        tau_us = [1e6 * tau for tau in getattr(config, "tau_s", ())]
+        self._tau_us: Any = wp.array(tau_us, dtype=wp.float32, device=device)
+        decays = [0.0] * config.channel_count
+        if isinstance(config, LeakySurface):
+            decays = [2.718281828459045 ** (-self._step_us / tau) for tau in tau_us for _ in range(2)]
+        self._decay: Any = wp.array(decays, dtype=wp.float32, device=device)
+        is_last = isinstance(config, TimeSurface)
+        self._last: Any = wp.full(
+            (world_count, 2, height, width) if is_last else (0, 0, 0, 0),
+            value=wp.int64(-(1 << 60)), dtype=wp.int64, device=device,
+        )  # fmt: skip
+        self._sums: Any = wp.zeros((0, 0, 0, 0) if is_last else shape, dtype=wp.int32, device=device)
+
+    def update(self, events: Any, now_ns: Any) -> None:
+        """Add the events of a step.
+
+        Args:
+            events: Of the camera in this step (`sensors.event_worlds.WorldEvents`).
+            now_ns: Time of each world at the end of the step [ns], device array of int64, shape [N].
+        """
+        dim = (self.array.shape[0], self._lanes)
+        where = [events.x, events.y, events.polarity, events.offsets]
+        if isinstance(self.config, TimeSurface):
+            self._launch(_note_last, dim, [events.t, *where, self._lanes], [self._last])
+            self._launch(_show_last, self.array.shape, [self._tau_us, self._last, now_ns], [self.array])
+            return
+        if isinstance(self.config, LeakySurface):
+            self._launch(_add_leaky, dim, [self._tau_us, events.t, *where, now_ns, self._lanes], [self._sums])
+        elif isinstance(self.config, Counts):
+            self._launch(_add_counts, dim, [*where, self._lanes], [self._sums])
+        else:
+            inputs = [events.t, *where, now_ns, self._step_us, self._lanes]
+            self._launch(_add_voxels, dim, inputs, [self._sums])
+        self._launch(_show_sums, self.array.shape, [self._decay], [self._sums, self.array])
+
+    def forget(self, mask: Any) -> None:
+        """Clear the surfaces of worlds that begin anew; `mask` is a device array of int32, shape [N]."""
+        dim = (self.array.shape[0], self._lanes)
+        self._launch(_forget, dim, [mask, self._lanes], [self._last, self.array])
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

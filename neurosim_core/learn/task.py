@@ -1,0 +1,148 @@
+"""What a task is: one class that says what is observed, what is rewarded, and when an episode ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.vehicle import MultirotorConfig
+
+Observations = dict[str, torch.Tensor]
+"""What is observed, by name: float32, shape [N, ...]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomisation:
+    """What differs from episode to episode and from world to world, besides where it begins."""
+
+    thrust_factor: tuple[float, float] = (0.9, 1.1)
+    """Range of thrust per commanded thrust: a battery, or a mass that is not known."""
+    latency_steps: int = 1
+    """Most steps between an action and its effect; each episode has its own, from 0 on."""
+    threshold_factor: tuple[float, float] = (0.8, 1.25)
+    """Range of each threshold of the event camera against the nominal one."""
+    gyro_noise_rad_s: float = 0.02
+    """Standard deviation of the gyroscope [rad/s]."""
+    gravity_noise: float = 0.01
+    """Standard deviation of each part of the measured direction of gravity."""
+
+
+NO_RANDOMISATION = Randomisation(
+    thrust_factor=(1.0, 1.0),
+    latency_steps=0,
+    threshold_factor=(1.0, 1.0),
+    gyro_noise_rad_s=0.0,
+    gravity_noise=0.0,
+)
+"""All worlds are as configured."""
+
+
+@dataclass(kw_only=True, eq=False)
+class View:
+    """What a task sees of all worlds at the end of a step: views of the same memory in each step.
+
+    Vectors in B are in the body frame.
+    """
+
+    position: torch.Tensor
+    """p_WB [m], float32, shape [N, 3]."""
+    velocity: torch.Tensor
+    """v_WB in W [m/s], [N, 3]."""
+    orientation: torch.Tensor
+    """q_WB, xyzw, [N, 4]."""
+    body_rate: torch.Tensor
+    """w_WB in B [rad/s], [N, 3]."""
+    velocity_B: torch.Tensor
+    """v_WB in B [m/s], [N, 3]."""
+    gravity_B: torch.Tensor
+    """Direction of gravity in B, [N, 3]."""
+    goal_B: torch.Tensor
+    """From the vehicle to the goal, in B [m], [N, 3]."""
+    gyro: torch.Tensor
+    """Body rate as measured [rad/s], [N, 3]."""
+    gravity_measured: torch.Tensor
+    """`gravity_B` as an attitude estimator gives it, [N, 3]."""
+    clearance: torch.Tensor
+    """Distance from the centre to the scene [m], to a voxel, [N, 1]."""
+    surface: torch.Tensor | None
+    """Event surface, [N, C, H, W]; None: there is no camera."""
+    action: torch.Tensor
+    """The last action, in [-1, 1], [N, 4]."""
+    last_action: torch.Tensor
+    """The one before, [N, 4]."""
+    crashed: torch.Tensor
+    """The vehicle touched the scene, or could not be simulated on, bool, [N]."""
+    elapsed_s: torch.Tensor
+    """Time since the episode began [s], [N]."""
+    draws: torch.Tensor
+    """Uniform numbers in (0, 1) of the episode, for what a task draws itself, [N, 8]."""
+    step_s: float
+    """Length of a step [s]."""
+    vehicle: MultirotorConfig
+
+
+class Task:
+    """The base of tasks: settings, and what must be written for a task of one's own.
+
+    A task is registered by `@ns.register("task", "name")`. All methods work on tensors of all worlds, must
+    not wait for the device (no `.item()`, no `if tensor`), and must keep worlds apart.
+    """
+
+    rate_hz: float = 50.0
+    """Steps a second."""
+    episode_s: float = 6.0
+    """When an episode is cut (truncated) [s]."""
+    camera: Mapping[str, Any] = {"width": 24, "height": 24, "horizontal_fov_rad": 1.6}
+    """Lens of the event camera."""
+    threshold: float = 0.1
+    """Of the event camera, both ways."""
+    renders_per_step: int = 1
+    """Pictures that events are made of."""
+    vehicle: Mapping[str, Any] = {"preset": "hummingbird"}
+    """Settings of the vehicle."""
+    start: StartConfig = StartConfig()
+    randomisation: Randomisation = Randomisation()
+    rate_max_rad_s: Sequence[float] = (4.0, 4.0, 2.0)
+    """Body rates of an action of 1 [rad/s]."""
+    thrust_span: float = 0.6
+    """Change of thrust of an action of 1, as a share of the hover thrust."""
+    groups: Mapping[str, Sequence[str]] = {}
+    """Names of observations that each group sees: actor, critic, teacher, student."""
+
+    def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
+        """Return settings of the scenes to train in, or of others."""
+        first = 100 if unseen else 0
+        return [{"kind": "apartment", "rooms": 1, "seed": first + seed} for seed in range(4)]
+
+    def command(self, view: View) -> torch.Tensor:
+        """Return collective thrust [N] and body rate [rad/s] of the last actions, [N, 4]."""
+        hover_n = view.vehicle.hover_thrust_n
+        thrust = hover_n * (1.0 + self.thrust_span * view.action[:, :1])
+        rates = view.action[:, 1:] * torch.tensor(self.rate_max_rad_s, device=view.action.device)
+        return torch.cat([thrust, rates], dim=1)
+
+    def begin(self, view: View, mask: torch.Tensor) -> None:
+        """Note that the episodes of the worlds of a mask (bool, [N]) have begun."""
+
+    def advance(self, view: View) -> None:
+        """Note that a step has been made; before rewards and observations are asked for."""
+
+    def observe(self, view: View) -> Observations:
+        """Return what can be observed, by name."""
+        raise NotImplementedError
+
+    def reward(self, view: View) -> torch.Tensor:
+        """Return the reward of the step, [N]."""
+        raise NotImplementedError
+
+    def terminated(self, view: View) -> torch.Tensor:
+        """Return which episodes end for good, bool, [N]; those that crashed end in any case."""
+        return view.crashed
+
+    def metrics(self, view: View) -> dict[str, torch.Tensor]:
+        """Return what tells how an episode goes, [N] each; read at its end. `success` is 1 or 0."""
+        return {}

@@ -1,0 +1,90 @@
+"""hover: come to rest from a throw of unknown velocity, and stay, without touching the room."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+
+from neurosim_core.learn.episodes import StartConfig
+from neurosim_core.learn.task import Observations, Randomisation, Task, View
+from neurosim_core.registry import register
+
+SPEED_MAX_M_S = 0.2
+"""Slower than this is a hover [m/s]."""
+HOLD_S = 2.0
+"""For how long, to succeed [s]."""
+
+
+@register("task", "hover")
+class Hover(Task):
+    """Stop and hover.
+
+    The student sees event surfaces, a gyroscope, the direction of gravity and its last action: neither
+    position nor velocity. The teacher and the critic see the velocity.
+    """
+
+    episode_s = 6.0
+    start = StartConfig(clearance_m=0.9, speed_m_s=(0.3, 0.9), tilt_max_rad=0.15, rate_max_rad_s=0.2)
+    randomisation = Randomisation(thrust_factor=(0.98, 1.02))
+    rate_max_rad_s = (2.0, 2.0, 1.0)
+    thrust_span = 0.4
+    groups: Mapping[str, Sequence[str]] = {
+        "actor": ("state",),
+        "critic": ("state",),
+        "teacher": ("state",),
+        "student": ("proprioception", "events"),
+    }
+
+    def begin(self, view: View, mask: torch.Tensor) -> None:
+        """Forget how long vehicles have hovered."""
+        if not hasattr(self, "_held_s"):
+            self._held_s = torch.zeros_like(view.elapsed_s)
+            self._best_s = torch.zeros_like(view.elapsed_s)
+        self._held_s.masked_fill_(mask, 0.0)
+        self._best_s.masked_fill_(mask, 0.0)
+
+    def advance(self, view: View) -> None:
+        """Count for how long each vehicle has hovered."""
+        slow = view.velocity.norm(dim=1) < SPEED_MAX_M_S
+        self._held_s = torch.where(slow & ~view.crashed, self._held_s + view.step_s, 0.0)
+        self._best_s = torch.maximum(self._best_s, self._held_s)
+
+    def observe(self, view: View) -> Observations:
+        """Return state (17), proprioception (10) and events (surfaces)."""
+        seen = {
+            "state": torch.cat(
+                [
+                    view.velocity_B,
+                    view.gravity_B,
+                    0.3 * view.body_rate,
+                    view.action,
+                    view.last_action,
+                ],
+                dim=1,
+            ),
+            "proprioception": torch.cat([view.gravity_measured, 0.3 * view.gyro, view.action], dim=1),
+            "velocity": view.velocity_B,
+        }
+        if view.surface is not None:
+            seen["events"] = view.surface
+        return seen
+
+    def reward(self, view: View) -> torch.Tensor:
+        """Pay for slowness; tilt, rates and changes of the action cost something.
+
+        Gently, as who imitates the policy has to see its velocity first, and to stop at once is to overreact.
+        """
+        speed = view.velocity.norm(dim=1)
+        tilt = view.gravity_B[:, :2].square().sum(1)
+        change = (view.action - view.last_action).norm(dim=1)
+        cost = 0.4 * speed + 5.0 * tilt + 0.2 * view.body_rate.norm(dim=1) + 0.3 * change
+        return 0.5 + torch.exp(-((speed / 0.15) ** 2)) - cost - 20.0 * view.crashed
+
+    def metrics(self, view: View) -> dict[str, torch.Tensor]:
+        """Return success (hovered for 2 s, and never crashed), crash, and the final speed [m/s]."""
+        return {
+            "success": ((self._best_s >= HOLD_S - 1e-6) & ~view.crashed).float(),
+            "crash": view.crashed.float(),
+            "speed_m_s": view.velocity.norm(dim=1),
+        }

@@ -1,0 +1,287 @@
+"""Training of a task: a teacher by PPO on states, then a student on events who imitates it.
+
+A run is a folder: `run.json` (what was asked for), `checkpoint.pt`, TensorBoard's files, `policy.onnx` and
+`evaluation.json`. Training goes in blocks of some iterations. A block begins in all worlds anew, with a seed
+that hangs on the run's seed and the block's number, and ends with a checkpoint: a run that is resumed does
+what it would have done without the interruption, to the bit on a CPU.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import resource
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from neurosim_core.learn import need
+from neurosim_core.learn.dagger import Dagger, DaggerConfig
+from neurosim_core.learn.env import make_env
+from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
+from neurosim_core.learn.policies import ActorCritic, EventPolicy
+from neurosim_core.learn.ppo import Ppo, PpoConfig
+from neurosim_core.sim.model import Model
+
+Say = Callable[[str], None]
+
+_BLOCK = 20
+_SEEDS_APART = 1 << 20
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """What is trained, and how."""
+
+    task: str
+    device: str = "auto"
+    seed: int = 0
+    teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
+    student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    block: int = _BLOCK
+    """Iterations from one checkpoint to the next."""
+    evaluation_worlds: int = 96
+
+
+class Training:
+    """A run of training.
+
+    Args:
+        folder: Where everything goes.
+        config: What to do; None: as `run.json` in the folder says.
+        say: Told what happens, line by line.
+        models: What `make_model` made of the scenes to train in; None: those of the task are loaded.
+
+    Attributes:
+        config: What is done.
+        trained_s: Processor time that each stage took in this process [s], `teacher` and `student`.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: TrainConfig | None = None,
+        *,
+        say: Say = print,
+        models: Sequence[Model] | None = None,
+    ) -> None:
+        self.folder, self._say = folder, say
+        self.config = config = read_config(folder) if config is None else config
+        self.trained_s: dict[str, float] = {}
+        torch.manual_seed(config.seed)  # of the first weights
+        self._env = make_env(
+            config.task, worlds=config.student.worlds, device=config.device, models=models, seed=config.seed
+        )
+        device = self._env.device
+        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        states = {*self._env.obs_groups["actor"], *self._env.obs_groups["critic"]}
+        teacher_env = make_env(
+            config.task,
+            worlds=config.teacher.worlds,
+            device=config.device,
+            observe=states,
+            models=self._env.sim.models,
+            seed=config.seed,
+        )
+        self._teacher = Ppo(teacher_env, config.teacher, self._generator)
+        self._student = Dagger(self._env, self._teacher.policy, config.student, self._generator)
+        self._done = {"teacher": 0, "student": 0}
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
+
+    @property
+    def teacher(self) -> ActorCritic:
+        """The policy on states."""
+        return self._teacher.policy
+
+    @property
+    def student(self) -> EventPolicy:
+        """The policy on events."""
+        return self._student.policy
+
+    @property
+    def models(self) -> Sequence[Model]:
+        """Of the scenes it trains in."""
+        return self._env.sim.models
+
+    def resume(self) -> None:
+        """Go on from the checkpoint of the folder.
+
+        Raises:
+            FileNotFoundError: There is none.
+        """
+        state = torch.load(self.folder / "checkpoint.pt", map_location=self._env.device, weights_only=True)
+        self._teacher.load_state_dict(state["teacher"])
+        self._student.load_state_dict(state["student"])
+        self._generator.set_state(state["generator"].cpu())
+        self._done = state["done"]
+
+    def run(self, *, until: tuple[int, int] | None = None) -> None:
+        """Train what is missing.
+
+        Args:
+            until: Iterations of teacher and student after which to stop, multiples of `block`; None: all.
+        """
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        config = self.config
+        limits = (config.teacher.iterations, config.student.iterations) if until is None else until
+        with SummaryWriter(str(self.folder)) as writer:
+            while self._done["teacher"] < min(limits[0], config.teacher.iterations):
+                self._train_block("teacher", self._teacher, config.teacher.iterations, writer)
+            while self._done["student"] < min(limits[1], config.student.iterations):
+                self._train_block("student", self._student, config.student.iterations, writer)
+
+    def _train_block(self, stage: str, trainer: Ppo | Dagger, whole: int, writer: Any) -> None:
+        begin_s, done = _processor_s(), self._done[stage]
+        offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
+        trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART)
+        end = min(done + self.config.block, whole)
+        sums: dict[str, list[float]] = {}
+        for iteration in range(done, end):
+            log = trainer.iterate(iteration / whole)
+            for name, value in log.items():
+                writer.add_scalar(f"{stage}/{name}", value, iteration)
+                sums.setdefault(name, []).append(value)
+        self._done[stage] = end
+        self._save()
+        self.trained_s[stage] = self.trained_s.get(stage, 0.0) + _processor_s() - begin_s
+        means = ", ".join(f"{name} {sum(v) / len(v):.3g}" for name, v in sums.items())
+        self._say(f"{stage} {end}/{whole} ({self.trained_s[stage]:.0f} s of processor time): {means}")
+
+    def _save(self) -> None:
+        file = self.folder / "checkpoint.pt"
+        partial = file.with_suffix(".part")
+        torch.save(
+            {
+                "teacher": self._teacher.state_dict(),
+                "student": self._student.state_dict(),
+                "shape": self.student.shape,
+                "generator": self._generator.get_state(),
+                "done": self._done,
+            },
+            partial,
+        )
+        os.replace(partial, file)
+
+    def evaluate_teacher(self) -> Evaluation:
+        """Return how the teacher does in the scenes of the training, without noise on its actions."""
+        env = self._teacher.env
+        return evaluate(env, teacher_actor(self.teacher, env))
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """Return what a run was asked for.
+
+    Raises:
+        ValueError: The folder holds no run.
+    """
+    file = folder / "run.json"
+    if not file.is_file():
+        raise ValueError(f"{folder} is no run of training: it has no run.json")
+    values = json.loads(file.read_text())
+    values["teacher"] = PpoConfig(**values["teacher"])
+    values["student"] = DaggerConfig(**values["student"])
+    return TrainConfig(**values)
+
+
+def load_student(folder: Path, device: torch.device) -> EventPolicy:
+    """Return the student of a run.
+
+    Raises:
+        ValueError: The run has no checkpoint.
+    """
+    file = folder / "checkpoint.pt"
+    if not file.is_file():
+        raise ValueError(f"{folder} has no checkpoint.pt: train first")
+    state = torch.load(file, map_location=device, weights_only=True)
+    policy = EventPolicy(**state["shape"]).to(device)
+    policy.load_state_dict(state["student"]["policy"])
+    return policy
+
+
+def evaluate_run(
+    folder: Path,
+    *,
+    scenes: Literal["seen", "unseen"] = "unseen",
+    device: str | None = None,
+    worlds: int | None = None,
+) -> Iterator[tuple[str, Evaluation]]:
+    """Yield how the student of a run does: first with events (`events`), then without (`blind`).
+
+    Args:
+        folder: The run.
+        scenes: Those that it was trained in, or others.
+        device: None: as in the training.
+        worlds: Episodes; None: as configured.
+    """
+    config = read_config(folder)
+    worlds = worlds or config.evaluation_worlds
+    env = make_env(config.task, worlds=worlds, device=device or config.device, scenes=scenes)
+    policy = load_student(folder, env.device)
+    for blind in (False, True):
+        actor = student_actor(policy, env, blind=blind)
+        yield "blind" if blind else "events", evaluate(env, actor)
+
+
+def train(
+    folder: Path, config: TrainConfig, *, resume: bool = False, say: Say = print
+) -> dict[str, Evaluation]:
+    """Train, export and evaluate.
+
+    Args:
+        folder: Where everything goes.
+        config: What to do.
+        resume: Go on with the run in the folder, as it was configured.
+        say: Told what happens, line by line.
+
+    Returns:
+        Evaluations in scenes that were not trained in: `events`, and `blind`.
+    """
+    from neurosim_core.learn.export import export_onnx
+
+    need("tensorboard", "onnx")
+    begin_s = time.monotonic()
+    torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
+    training = Training(folder, None if resume else config, say=say)
+    if resume:
+        training.resume()
+    say(f"set up in {time.monotonic() - begin_s:.0f} s")
+    training.run()
+    say(f"teacher: {training.evaluate_teacher()}")
+    export_onnx(training.student, make_card(training), folder / "policy.onnx")
+    found = {}
+    for name, evaluation in evaluate_run(folder):
+        say(f"student, unseen scenes, {name}: {evaluation}")
+        found[name] = evaluation
+    values = {name: dataclasses.asdict(evaluation) for name, evaluation in found.items()}
+    values["trained_s"] = training.trained_s
+    (folder / "evaluation.json").write_text(json.dumps(values, indent=1) + "\n")
+    return found
+
+
+def make_card(training: Training) -> dict[str, Any]:
+    """Return what whoever flies a policy needs to know."""
+    env = training._env
+    task = env.task
+    return {
+        "task": training.config.task,
+        "rate_hz": task.rate_hz,
+        "camera": dict(task.camera),
+        "threshold": task.threshold,
+        "renders_per_step": task.renders_per_step,
+        "surface": env.surface_card,
+        "hover_thrust_n": env.view.vehicle.hover_thrust_n,
+        "thrust_span": task.thrust_span,
+        "rate_max_rad_s": list(task.rate_max_rad_s),
+        "vehicle": dict(task.vehicle),
+    }
+
+
+def _processor_s() -> float:
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime

@@ -1,0 +1,59 @@
+"""What the objects of scenes are: classes from settings, from what files say, or from names."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+UNLABELLED = "unlabelled"
+"""Class 0: what no class is known of."""
+
+_NUMBER = re.compile(r"[ _.#-]*[0-9]+$")
+
+
+class Labels(NamedTuple):
+    """The classes of the instances of scenes."""
+
+    classes: tuple[str, ...]
+    """Names of the classes; the first is `UNLABELLED`."""
+    instances: tuple[tuple[tuple[str, int], ...], ...]
+    """Name and class of each instance, then of each body, for each scene."""
+
+
+def label_scenes(scenes: Sequence[Any], classes: Mapping[str, Sequence[str]] | None) -> Labels:
+    """Return what the instances of scenes are, with the same classes in all.
+
+    Args:
+        scenes: Each as the renderer has it (`SceneArrays`).
+        classes: Patterns of names, such as "chair*", by class; the first class that matches counts, whatever
+            the case. None: an instance is what its file says, or what its name says without the number at its
+            end, so that chair_1 and Chair.002 are chairs.
+    """
+    found = [
+        [(name, _class_of(name, scene.scene.instance_labels, classes)) for name in scene.instance_names]
+        for scene in scenes
+    ]
+    names = list(classes) if classes is not None else sorted({label for row in found for _, label in row})
+    known = (UNLABELLED, *(name for name in names if name != UNLABELLED))
+    index = {name: number for number, name in enumerate(known)}
+    return Labels(known, tuple(tuple((name, index[label]) for name, label in row) for row in found))
+
+
+def _class_of(name: str, labels: Mapping[str, str], classes: Mapping[str, Sequence[str]] | None) -> str:
+    label = labels.get(name) or _NUMBER.sub("", name).strip().lower() or UNLABELLED
+    if classes is None:
+        return label
+    for kind, patterns in classes.items():
+        for pattern in patterns:
+            if any(fnmatch.fnmatchcase(text.lower(), pattern.lower()) for text in (name, label)):
+                return kind
+    return UNLABELLED
+
+
+def describe_labels(labels: Labels) -> str:
+    """Return labels as JSON; the instances only if there is one scene."""
+    instances = labels.instances[0] if len(labels.instances) == 1 else ()
+    return json.dumps({"instances": instances, "classes": labels.classes}, separators=(",", ":"))

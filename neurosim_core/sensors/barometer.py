@@ -1,0 +1,134 @@
+# mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator,no-any-return"
+"""The barometer: the pressure of the standard atmosphere at its place, up to 20 km, and its errors.
+
+Reference: ICAO Doc 7488 (1993), Manual of the standard atmosphere, eq. (8) to (13); ISO 2533.
+"""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from neurosim_core.frames import Mount
+from neurosim_core.packets import FieldSpec, Packet
+from neurosim_core.registry import register
+from neurosim_core.sensors.base import RateHz, SamplerContext, StateSensorConfig
+from neurosim_core.sensors.state_sampler import (
+    ErrorConfig,
+    Errors,
+    Motion,
+    StateSampler,
+    error_adder,
+    make_errors,
+)
+
+_EARTH_RADIUS_M = wp.constant(wp.float64(6_356_766.0))
+_LAPSE_K_M = wp.constant(wp.float64(0.0065))
+_G_OVER_R = wp.constant(wp.float64(9.80665 / 287.05287))  # [K/m]
+_TROPOPAUSE_M = wp.constant(wp.float64(11_000.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pressure(Packet):
+    """What a barometer reads."""
+
+    pressure_pa: Annotated[float, FieldSpec(unit="Pa")]
+    """Static pressure [Pa]."""
+
+
+@register("sensor", "barometer")
+class BarometerConfig(StateSensorConfig):
+    """A barometer, without errors by default."""
+
+    kind: Literal["barometer"] = "barometer"
+    rate_hz: RateHz = 50.0
+    """Readings a second [Hz]."""
+    mount: Mount = Mount()
+    """Pose on the body."""
+    altitude_m: Annotated[float, Field(ge=-5000.0, le=19_000.0)] = 0.0
+    """Height of z = 0 above sea level [m]."""
+    sea_level_pa: Annotated[float, Field(gt=0.0)] = 101_325.0
+    """Pressure at sea level [Pa]."""
+    sea_level_k: Annotated[float, Field(gt=200.0, le=340.0)] = 288.15
+    """Temperature at sea level [K]."""
+    errors: ErrorConfig = ErrorConfig()
+    """In Pa, such as {white: 1.3, markov: 30, markov_time_s: 600, resolution: 0.18}; weather is a walk."""
+
+    packet_type = Pressure
+
+    def make(self, context: SamplerContext) -> "Barometer":
+        """Return the sensor at work."""
+        return Barometer(self, context)
+
+
+@wp.struct
+class _Model:
+    position: wp.vec3d
+    altitude: wp.float64
+    sea_level: wp.float64
+    temperature: wp.float64
+    errors: Errors
+
+
+@wp.func
+def standard_pressure(altitude: wp.float64, sea_level: wp.float64, temperature: wp.float64) -> wp.float64:
+    """Return the pressure at a geometric altitude [m], for pressure [Pa] and temperature [K] at sea level."""
+    h = _EARTH_RADIUS_M * altitude / (_EARTH_RADIUS_M + altitude)  # geopotential
+    low = wp.min(h, _TROPOPAUSE_M)
+    ratio = wp.pow(wp.float64(1.0) - _LAPSE_K_M * low / temperature, _G_OVER_R / _LAPSE_K_M)
+    above = wp.max(h - _TROPOPAUSE_M, wp.float64(0.0))
+    return sea_level * ratio * wp.exp(-_G_OVER_R * above / (temperature - _LAPSE_K_M * _TROPOPAUSE_M))
+
+
+@functools.cache
+def make_kernel(terms: tuple[str, ...]) -> Any:
+    """Return the kernel with the given errors."""
+    add_errors = error_adder(terms)
+
+    @wp.kernel(
+        module=wp.get_module("neurosim_core.sensors.barometer." + ("_".join(terms) or "exact")),
+        enable_backward=False,
+    )
+    def measure(
+        model: _Model,
+        motion: Motion,
+        seeds: wp.array[wp.uint64],
+        active: wp.array[wp.int32],
+        sample: wp.array[wp.int64],
+        memory: wp.array2d[wp.vec3d],
+        slot: int,
+        pressure_out: wp.array2d[wp.float64],
+    ):
+        world = wp.tid()
+        if active[world] == 0:
+            return
+        p = motion.position[world] + wp.quat_rotate(motion.orientation[world], model.position)
+        pressure = standard_pressure(model.altitude + p[2], model.sea_level, model.temperature)
+        value = wp.vec3d(pressure, wp.float64(0.0), wp.float64(0.0))
+        k = sample[world]
+        value = add_errors(model.errors, seeds[world], k, value, memory, world, 0)
+        sample[world] = k + wp.int64(1)
+        pressure_out[slot, world] = value[0]
+
+    return measure
+
+
+class Barometer(StateSampler):
+    """The barometers of all worlds."""
+
+    def __init__(self, config: BarometerConfig, context: SamplerContext) -> None:
+        model, terms = _Model(), config.errors.terms()
+        model.position = wp.vec3d(*config.mount.position_m)
+        model.altitude, model.sea_level = wp.float64(config.altitude_m), wp.float64(config.sea_level_pa)
+        model.temperature = wp.float64(config.sea_level_k)
+        model.errors = make_errors(config.errors, rate_hz=config.rate_hz, name=f"{context.name}/pressure")
+        super().__init__(context, make_kernel(terms), model, outputs={"pressure_pa": wp.float64}, terms=terms)
+
+    def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Pressure:
+        """Return one sample as a packet."""
+        return Pressure(pressure_pa=float(rows["pressure_pa"]), **header)

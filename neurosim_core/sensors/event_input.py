@@ -1,0 +1,106 @@
+# mypy: disable-error-code="no-untyped-call"
+"""What an event camera is given: frames and stamps, as it takes them, or why it does not."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.clock import NS_PER_US
+from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
+
+
+def as_frames(value: Any, shape: tuple[int, ...], device: Any) -> Any:
+    """Return an array as a contiguous float32 Warp array of this shape on a device.
+
+    Raises:
+        ValueError: Shape, dtype or device is another.
+    """
+    if not isinstance(value, wp.array):
+        on_device = hasattr(value, "__cuda_array_interface__")
+        value = wp.array(value) if on_device else np.asarray(value)
+    dtype = wp.dtype_to_numpy(value.dtype) if isinstance(value, wp.array) else value.dtype
+    if tuple(value.shape) != shape or dtype != np.float32:
+        raise ValueError(
+            f"log_radiance must be float32 of shape {list(shape)},"
+            f" got {np.dtype(dtype).name} of shape {list(value.shape)}"
+        )
+    if isinstance(value, wp.array):
+        if value.device != device:
+            raise ValueError(f"log_radiance must be on {device}, got {value.device}")
+        return value.contiguous()
+    flat = np.ascontiguousarray(value).reshape(-1)  # axes of length 1 may have had any stride
+    return wp.array(flat, dtype=wp.float32, shape=shape, device=device, copy=False)
+
+
+def check_stack(
+    log_radiance: Any, stamps: NDArray[np.int64], shape: tuple[int, int], device: Any, *, after_ns: int
+) -> None:
+    """Check that a Warp array is a stack of frames for a camera.
+
+    Args:
+        log_radiance: Frames.
+        stamps: Their times [ns], shape [K].
+        shape: Rows and columns of the camera.
+        device: Of the camera.
+        after_ns: Time of the frame before [ns].
+
+    Raises:
+        ValueError: It is not.
+    """
+    count = len(stamps)
+    fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == shape
+    if not (fits and 1 <= count <= log_radiance.shape[0] and log_radiance.is_contiguous):
+        raise ValueError(
+            f"log_radiance must be contiguous of shape [>= {count}, {shape[0]}, {shape[1]}]"
+            f" for {count} >= 1 stamps, got {list(log_radiance.shape)}"
+            f" with strides {list(log_radiance.strides)}"
+        )
+    if log_radiance.dtype != wp.float32 or log_radiance.device != device:
+        raise ValueError(
+            f"log_radiance must be float32 on {device},"
+            f" got {log_radiance.dtype.__name__} on {log_radiance.device}"
+        )
+    if stamps[0] <= after_ns:
+        raise ValueError(f"stamps_ns must be later than {after_ns}, got {stamps[0]}")
+
+
+def as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
+    """Return times of frames [ns] as int64, shape [K].
+
+    Raises:
+        ValueError: They are no integers, of another shape, or do not increase strictly.
+    """
+    stamps = np.asarray(stamps_ns)
+    if stamps.size == 0:
+        stamps = stamps.astype(np.int64)
+    if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
+        raise ValueError(
+            f"stamps_ns must be integers of shape [K], got {stamps.dtype} of shape {list(stamps.shape)}"
+        )
+    stamps = stamps.astype(np.int64)
+    if len(stamps) > 1 and (falls := stamps[1:] <= stamps[:-1]).any():
+        index = int(np.argmax(falls))
+        raise ValueError(
+            f"stamps_ns must be strictly increasing, got {stamps[index + 1]} after {stamps[index]}"
+        )
+    return stamps
+
+
+def are_ends(ends_ns: Sequence[int], start_ns: int, now_ns: int) -> bool:
+    """Return whether windows that begin at a stamp can end so."""
+    bounds = [start_ns, *ends_ns]
+    return all(b - a >= NS_PER_US for a, b in itertools.pairwise(bounds)) and bounds[-1] <= now_ns
+
+
+def invalid_message(count: int, first: str) -> str:
+    """Say how many values of log radiance cannot be used, and where the first of them is."""
+    return (
+        f"log_radiance must be finite and within +-{LOG_RADIANCE_MAX:g}:"
+        f" {count} values are not, the first at {first}"
+    )

@@ -1,0 +1,240 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# ruff: noqa: SIM102, UP018, RUF046  (nested wp.static branches, typed literals: they have a meaning)
+"""The truth of each event: what its pixel sees when it fires, and why it fires.
+
+For each event a ray is cast through the centre of its pixel, at its time, from the pose between the entries
+of the history of the flight, and against bodies where they are then. What nobody asked for is not computed.
+
+The cause of an event is what moves its pixel most when it fires: *leak*, where the reference falls faster
+than light rises; *shot noise* and *hot pixel*, for events of the spontaneous process; *threshold noise*, for
+the first passage of a Brownian motion whose noise crosses a threshold sooner than its drift would; else
+*signal*.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+import functools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from neurosim_core.packets import Events, FieldSpec, as_numpy
+from neurosim_core.render.launch import launch_split
+from neurosim_core.render.projection import LensData, make_lens_data, velocity_projector
+from neurosim_core.scene.bodies import Motion, body_orientation, body_position, body_velocity
+from neurosim_core.scene.labels import label_scenes
+from neurosim_core.sensors.base import FrameContext
+from neurosim_core.sensors.event_noise_model import CAUSE_BITS, CAUSES
+from neurosim_core.vehicle.history import History, motion_at
+
+EventLabel = Literal["depth", "flow", "instance", "semantic", "cause"]
+_FAR_M = wp.constant(1.0e9)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabelledEvents(Events):
+    """Events with their truth; what was not asked for is empty."""
+
+    depth: Annotated[NDArray[np.float32], FieldSpec("depth", unit="m")]
+    """Planar z of what the pixel sees at the time of the event [m], inf: nothing."""
+    flow: Annotated[NDArray[np.float32], FieldSpec("flow", 2, unit="px/s")]
+    """How fast that moves in the picture: column and row [px/s]."""
+    instance: Annotated[NDArray[np.int32], FieldSpec("instance")]
+    """Which object it is, -1: none."""
+    semantic: Annotated[NDArray[np.int32], FieldSpec("semantic")]
+    """Of which class it is, 0: unlabelled, -1: nothing."""
+    cause: Annotated[NDArray[np.uint8], FieldSpec("cause")]
+    """Why the pixel fired, 0: signal, 1: leak, 2: shot noise, 3: hot pixel, 4: threshold noise."""
+    labels: Annotated[str, FieldSpec(constant=True)]
+    """What labels mean, as JSON: {"instances": [[name, class], ...], "classes": [...], "causes": [...]}."""
+
+
+@wp.struct
+class _Model:
+    lens: LensData
+    rays: wp.array2d[wp.vec3]
+    p_BC: wp.vec3d
+    q_BC: wp.quatd
+    mesh: wp.uint64
+    face_instance: wp.array[int]
+    class_of: wp.array[int]
+    motions: wp.array[Motion]
+    body_mesh: wp.array[wp.uint64]
+    body_sphere: wp.array[wp.vec4]
+    body_face: wp.array[int]
+
+
+@functools.cache
+def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> Any:
+    project_velocity = velocity_projector(lens_kind) if "flow" in labels else None
+    name = "_".join((lens_kind, *sorted(labels), "bodies" if has_bodies else "still"))
+
+    @wp.kernel(module=wp.get_module("neurosim_core.sensors.event_labels." + name), enable_backward=False)
+    def label_events(
+        first: int,
+        # Model:
+        model: _Model,
+        # In:
+        history: History,
+        t_us: wp.array[wp.int64],
+        x: wp.array[wp.uint16],
+        y: wp.array[wp.uint16],
+        # Out:
+        depth_out: wp.array[float],
+        flow_out: wp.array[wp.vec2],
+        instance_out: wp.array[int],
+        class_out: wp.array[int],
+    ):
+        event = first + wp.tid()
+        stamp_ns = wp.int64(1000) * t_us[event]
+        at = motion_at(history, 0, history.count[0] - wp.int64(1), stamp_ns)
+        p_WC = at.position + wp.quat_rotate(at.orientation, model.p_BC)
+        q_WC = at.orientation * model.q_BC
+        ray_C = wp.normalize(wp.vec3d(model.rays[int(y[event]), int(x[event])]))
+        ray_W = wp.quat_rotate(q_WC, ray_C)
+        face = int(-1)
+        body = int(-1)
+        r = _FAR_M
+        query = wp.mesh_query_ray(model.mesh, wp.vec3(p_WC), wp.vec3(ray_W), _FAR_M)
+        if query.result:
+            face = query.face
+            r = query.t
+        if wp.static(has_bodies):
+            for index in range(model.body_mesh.shape[0]):
+                p_WO = body_position(model.motions[index], stamp_ns)
+                q_WO = body_orientation(model.motions[index], stamp_ns)
+                p_O = wp.vec3(wp.quat_rotate_inv(q_WO, p_WC - p_WO))
+                ray_O = wp.vec3(wp.quat_rotate_inv(q_WO, ray_W))
+                sphere = model.body_sphere[index]
+                to_center = wp.vec3(sphere[0], sphere[1], sphere[2]) - p_O
+                along = wp.dot(to_center, ray_O)
+                beside = to_center - along * ray_O
+                if along > -sphere[3] and wp.dot(beside, beside) < sphere[3] * sphere[3]:
+                    met = wp.mesh_query_ray(model.body_mesh[index], p_O, ray_O, r)
+                    if met.result:
+                        face = model.body_face[index] + met.face
+                        r = met.t
+                        body = index
+        if wp.static("depth" in labels):
+            depth_out[event] = wp.where(face >= 0, r * float(ray_C[2]), wp.inf)
+        if wp.static("instance" in labels or "semantic" in labels):
+            number = int(-1)
+            label = int(-1)
+            if face >= 0:
+                number = model.face_instance[face]
+                if wp.static("semantic" in labels):
+                    label = model.class_of[number]
+            if wp.static("instance" in labels):
+                instance_out[event] = number
+            if wp.static("semantic" in labels):
+                class_out[event] = label
+        if wp.static("flow" in labels):
+            w_C = wp.quat_rotate_inv(model.q_BC, at.body_rate)
+            p_C = ray_C
+            v_C = -wp.cross(w_C, ray_C)
+            if face >= 0:
+                p_C = wp.float64(r) * ray_C
+                arm = wp.cross(at.body_rate, model.p_BC)
+                v_W = -(at.velocity + wp.quat_rotate(at.orientation, arm))
+                if wp.static(has_bodies):
+                    if body >= 0:
+                        p_WO = body_position(model.motions[body], stamp_ns)
+                        q_WO = body_orientation(model.motions[body], stamp_ns)
+                        arm_O = wp.quat_rotate_inv(q_WO, p_WC + wp.float64(r) * ray_W - p_WO)
+                        turning = wp.quat_rotate(q_WO, wp.cross(model.motions[body].spin, arm_O))
+                        v_W += body_velocity(model.motions[body], stamp_ns) + turning
+                v_C = wp.quat_rotate_inv(q_WC, v_W) - wp.cross(w_C, p_C)
+            rate = project_velocity(model.lens, p_C, v_C)
+            flow_out[event] = wp.vec2(float(rate[0]), float(rate[1]))
+            if rate[2] == wp.float64(0.0):
+                flow_out[event] = wp.vec2(wp.nan, wp.nan)
+
+    return label_events
+
+
+class EventLabels:
+    """Adds the truth to events of one camera.
+
+    Args:
+        labels: What to add.
+        classes: As of `SemanticSensorConfig`.
+        context: The camera; its history goes back as far as a packet does.
+    """
+
+    def __init__(
+        self, labels: Sequence[EventLabel], classes: Mapping[str, Sequence[str]] | None, context: FrameContext
+    ) -> None:
+        self._labels = frozenset(labels)
+        self._geometry = self._labels - {"cause"}
+        self._device = device = context.device
+        self._history = context.history
+        scene = context.scene
+        meaning: dict[str, Any] = {"causes": CAUSES} if "cause" in labels else {}
+        self._model = model = _Model()
+        if self._geometry:
+            if not hasattr(scene, "mesh_id"):
+                raise ValueError(f"labels of {context.name}: only the renderer 'warp' has them")
+            lens = context.lens
+            model.rays = wp.array(lens.ray_table(), dtype=wp.vec3, device=device)
+            if "flow" in labels:
+                model.lens = make_lens_data(lens)
+            model.p_BC, model.q_BC = context.p_BC, context.q_BC
+            model.mesh, model.face_instance = scene.mesh_id, scene.data.face_instance
+            has_bodies = scene.bodies is not None
+            if has_bodies:
+                bodies = scene.bodies
+                model.motions, model.body_mesh = context.motions, bodies.mesh
+                model.body_sphere, model.body_face = bodies.sphere, bodies.first_face
+            if {"instance", "semantic"} & self._geometry:
+                known = label_scenes([scene], classes)
+                numbers = np.array([number for _, number in known.instances[0]], np.int32)
+                model.class_of = wp.array(numbers, dtype=int, device=device)
+                meaning |= {"instances": known.instances[0], "classes": known.classes}
+            self._kernel = _make_kernel(getattr(lens, "kind", ""), self._geometry, has_bodies)
+        self._meaning = json.dumps(meaning, separators=(",", ":"))
+
+    def add(self, events: Events, *, has_cause: bool) -> LabelledEvents:
+        """Return events with their truth.
+
+        Args:
+            events: What the camera found.
+            has_cause: Columns are eight times the column plus the cause.
+        """
+        values = {field.name: getattr(events, field.name) for field in fields(events)}
+        causes = np.zeros(len(events) if "cause" in self._labels else 0, np.uint8)
+        if has_cause:
+            causes = (as_numpy(events.x) & ((1 << CAUSE_BITS) - 1)).astype(np.uint8)
+            values["x"] = as_numpy(events.x) >> CAUSE_BITS
+        count = {name: len(events) if name in self._labels else 0 for name in ("depth", "flow", "instance")}
+        count["semantic"] = len(events) if "semantic" in self._labels else 0
+        device = self._device
+        depth: Any = wp.zeros(count["depth"], dtype=float, device=device)
+        flow: Any = wp.zeros(count["flow"], dtype=wp.vec2, device=device)
+        instance, semantic = (wp.zeros(count[n], dtype=int, device=device) for n in ("instance", "semantic"))
+        if self._geometry and len(events):
+            columns: list[Any] = [
+                wp.array(as_numpy(values[name]), dtype=dtype, device=device)
+                for name, dtype in (("t", wp.int64), ("x", wp.uint16), ("y", wp.uint16))
+            ]
+            launch_split(
+                self._kernel,
+                dim=len(events),
+                inputs=[self._model, self._history, *columns],
+                outputs=[depth, flow, instance, semantic],
+                device=device,
+            )
+        return LabelledEvents(
+            **values,
+            depth=depth.numpy(),
+            flow=flow.numpy().reshape(-1, 2),
+            instance=instance.numpy(),
+            semantic=semantic.numpy(),
+            cause=causes,
+            labels=self._meaning,
+        )

@@ -1,0 +1,333 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# ruff: noqa: SIM102  (nested wp.static branches, typed literals: they have a meaning)
+"""Pictures as a camera makes them: exposure, electrons and their noise, colour filters, bits and a curve.
+
+The electrons of a pixel are full_well gain L, with L the linear radiance times the exposure of the scene, of
+which 1 is white: as many as that come, give or take the root of it (shot noise), plus the noise of reading.
+They are cut at the full well, divided by it, curved, and rounded to whole numbers.
+
+Automatic exposure looks at the mean logarithm of luma, as photographers do, and moves the logarithm of the
+gain towards what would bring it to `target`, by 1 - exp(-dt / lag) from picture to picture; its gain is that
+which the pictures before asked for. The first picture of an episode is exposed as if it had been on for long.
+
+Shot noise is Gaussian, as it is to 2 % in its third moment above 100 electrons.
+
+Reference: EMVA 1288 (2021), Standard for characterization of image sensors and cameras, for the linear model.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+import functools
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from neurosim_core.packets import Image
+from neurosim_core.random import normal4, random_bits, stream_id
+from neurosim_core.registry import register
+from neurosim_core.render.launch import launch_split
+from neurosim_core.sensors.base import ImageSensorConfig, PictureContext, PictureViews
+from neurosim_core.settings import Settings
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+_FIXED = wp.constant(wp.float64(2.0**20))
+"""Logarithms are summed in steps of 1e-6, as integers: the sum does not depend on the order."""
+_DARKEST = wp.constant(1.0e-6)
+
+
+class AutoExposureConfig(Settings):
+    """Exposure that follows the light."""
+
+    target: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.18
+    """Mean luma, geometric, that it aims at; 1 is white."""
+    lag_s: NonNegative = 0.2
+    """Time constant with which it follows [s]."""
+    gain_min: Annotated[float, Field(gt=0.0)] = 0.05
+    """Least gain."""
+    gain_max: Annotated[float, Field(gt=0.0)] = 50.0
+    """Largest gain."""
+
+
+@register("sensor", "frame_camera")
+class FrameCameraConfig(ImageSensorConfig):
+    """A camera with the exposure, noise, colour filter and number format of a real one.
+
+    With the lens and mount of an event camera it shares its pixels: the frames of a DAVIS.
+    """
+
+    kind: Literal["frame_camera"] = "frame_camera"
+    gain: Annotated[float, Field(gt=0.0)] = 1.0
+    """Factor of all light, fixed; with `auto_exposure` it does not count."""
+    auto_exposure: AutoExposureConfig | None = None
+    """Exposure that follows the light: {target: 0.18, lag_s: 0.2}; null: the gain is fixed."""
+    full_well_e: Annotated[float, Field(ge=100.0)] = 10000.0
+    """Electrons of white, of which shot noise is the root."""
+    shot_noise: bool = False
+    """Let the electrons of a pixel vary as they do."""
+    read_noise_e: NonNegative = 0.0
+    """Standard deviation of reading a pixel, in electrons."""
+    color: Literal["rgb", "mono", "bayer_rggb", "bayer_bggr", "bayer_gbrg", "bayer_grbg"] = "rgb"
+    """All colours at each pixel, luma, or one colour at each pixel, as a filter lets through."""
+    bits: Literal[8, 10, 12, 16] = 8
+    """Bits of a number; those of 10 and 12 bits are in the upper ones of 16."""
+    curve: Literal["srgb", "linear"] | Annotated[float, Field(gt=0.2, lt=5.0)] = "srgb"
+    """Curve between light and numbers; a number is the exponent of 1 / gamma."""
+
+    output = "radiance"
+    encoding: ClassVar[Any] = "rgb8"
+
+    @property
+    def remembers(self) -> bool:
+        """Automatic exposure follows the pictures before."""
+        return self.auto_exposure is not None
+
+    def make_process(self, context: PictureContext) -> "FrameProcess":
+        """Return what makes frames of radiance."""
+        return FrameProcess(self, context)
+
+    def packet(self, picture: NDArray[Any], **header: Any) -> Image:
+        """Return a picture as a packet."""
+        channels = 3 if self.color == "rgb" else 1
+        if self.bits == 8:
+            data = picture[..., :channels].astype(np.uint8)
+        else:
+            data = picture[..., :channels] << (16 - self.bits)
+        encoding: Any = f"{self.color}{8 if self.bits == 8 else 16}"
+        return Image(data=data if channels == 3 else data[..., 0], encoding=encoding, **header)
+
+
+@wp.struct
+class _Model:
+    pixel_count: int
+    width: int
+    stride: int
+    part_count: int
+    stream: wp.uint32
+    gain: float
+    target: float
+    lag_s: float
+    log_gain_min: float
+    log_gain_max: float
+    full_well: float
+    read_noise: float
+    top: float
+    gamma: float
+    filter: wp.vec4i
+    """Colour of the pixels of a square of 2 x 2."""
+
+
+@wp.kernel(module=wp.get_module("neurosim_core.sensors.frame_camera.meter"), enable_backward=False)
+def _meter(
+    first: int,
+    # Model:
+    model: _Model,
+    # In:
+    instant_count: int,
+    image_slot: wp.array[int],
+    radiance: wp.array3d[wp.vec3],
+    # In/out:
+    total: wp.array[wp.int64],
+) -> None:
+    index = first + wp.tid()
+    pixel = index % model.pixel_count
+    view = index // model.pixel_count
+    slot = image_slot[view // instant_count * model.stride + view % instant_count]
+    if slot >= 0:
+        light = radiance[slot, pixel // model.width, pixel % model.width]
+        luma = 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2]
+        logarithm = wp.float64(wp.log(wp.max(luma, _DARKEST)))
+        wp.atomic_add(total, slot, wp.int64(wp.rint(logarithm * _FIXED)))
+
+
+@wp.kernel(module=wp.get_module("neurosim_core.sensors.frame_camera.meter"), enable_backward=False)
+def _expose(
+    # Model:
+    model: _Model,
+    # In:
+    instant_count: int,
+    image_slot: wp.array[int],
+    stamps: wp.array2d[wp.int64],
+    active: wp.array[int],
+    # In/out:
+    total: wp.array[wp.int64],
+    log_gain: wp.array[float],
+    last_ns: wp.array[wp.int64],
+    # Out:
+    gain_out: wp.array[float],
+) -> None:
+    world = wp.tid()
+    if active.shape[0] > 0:
+        if active[world] == 0:
+            return
+    for instant in range(instant_count):
+        view = world * model.stride + instant
+        slot = image_slot[view]
+        if slot >= 0:
+            stamp_ns = stamps[(view + 1) * model.part_count - 1, 0]
+            mean = float(wp.float64(total[slot]) / _FIXED) / float(model.pixel_count)
+            total[slot] = wp.int64(0)
+            wanted = wp.clamp(wp.log(model.target) - mean, model.log_gain_min, model.log_gain_max)
+            elapsed_s = float(stamp_ns - last_ns[world]) * 1.0e-9
+            if last_ns[world] < wp.int64(0) or elapsed_s <= 0.0:  # the first of an episode
+                log_gain[world] = wanted
+            gain_out[slot] = wp.exp(log_gain[world])
+            share = 1.0 - wp.exp(-wp.max(elapsed_s, 0.0) / model.lag_s)
+            log_gain[world] += share * (wanted - log_gain[world])
+            last_ns[world] = stamp_ns
+
+
+@functools.cache
+def _make_kernel(terms: tuple[str, ...], color: str, curve: str) -> Any:
+    name = "_".join((*terms, color, curve)).replace(" ", "_")
+    noisy = bool({"shot noise", "read noise"} & set(terms))
+
+    @wp.func
+    def develop(model: _Model, gain: float, light: float, z: float) -> wp.uint16:
+        """Return the number of a pixel, of its light and a normal number."""
+        electrons = model.full_well * gain * light
+        if wp.static(noisy):
+            variance = model.read_noise * model.read_noise
+            if wp.static("shot noise" in terms):
+                variance += wp.max(electrons, 0.0)
+            electrons += wp.sqrt(variance) * z
+        share = wp.clamp(electrons / model.full_well, 0.0, 1.0)
+        if wp.static(curve == "srgb"):
+            if share <= 0.0031308:
+                share = 12.92 * share
+            else:
+                share = 1.055 * wp.pow(share, 1.0 / 2.4) - 0.055
+        elif wp.static(curve == "gamma"):
+            share = wp.pow(share, model.gamma)
+        return wp.uint16(int(model.top * share + 0.5))
+
+    @wp.kernel(module=wp.get_module("neurosim_core.sensors.frame_camera." + name), enable_backward=False)
+    def make_frame(
+        first: int,
+        # Model:
+        model: _Model,
+        seeds: wp.array[wp.uint64],
+        # In:
+        instant_count: int,
+        image_slot: wp.array[int],
+        stamps: wp.array2d[wp.int64],
+        active: wp.array[int],
+        gain: wp.array[float],
+        radiance: wp.array3d[wp.vec3],
+        # Out:
+        frame_out: wp.array4d[wp.uint16],
+    ):
+        index = first + wp.tid()
+        pixel = index % model.pixel_count
+        world = index // model.pixel_count // instant_count
+        view = world * model.stride + index // model.pixel_count % instant_count
+        slot = image_slot[view]
+        if slot < 0:
+            return
+        if active.shape[0] > 0:
+            if active[world] == 0:
+                return
+        row = pixel // model.width
+        col = pixel % model.width
+        light = radiance[slot, row, col]
+        factor = model.gain
+        if wp.static("auto exposure" in terms):
+            factor = gain[slot]
+        z = wp.vec4()
+        if wp.static(noisy):
+            stamp_ns = stamps[(view + 1) * model.part_count - 1, 0]
+            z = normal4(random_bits(seeds[world], model.stream, stamp_ns, pixel))
+        if wp.static(color == "rgb"):
+            for channel in range(3):
+                frame_out[slot, row, col, channel] = develop(model, factor, light[channel], z[channel])
+        else:
+            one = 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2]
+            if wp.static(color == "bayer"):
+                one = light[model.filter[2 * (row % 2) + col % 2]]
+            frame_out[slot, row, col, 0] = develop(model, factor, one, z[0])
+
+    return make_frame
+
+
+class FrameProcess:
+    """Makes frames of radiance.
+
+    Attributes:
+        picture: Numbers, uint16, shape [M, H, W, 3], or [M, H, W, 1] of one colour at each pixel.
+        terms: What is computed.
+    """
+
+    def __init__(self, config: FrameCameraConfig, context: PictureContext) -> None:
+        auto = config.auto_exposure
+        present = {
+            "auto exposure": auto is not None,
+            "shot noise": config.shot_noise,
+            "read noise": config.read_noise_e > 0.0,
+        }
+        self.terms = tuple(term for term, needed in present.items() if needed)
+        self._context = context
+        source = context.source
+        self._device = device = source.device
+        channels = 3 if config.color == "rgb" else 1
+        self.picture: Any = wp.zeros((*source.shape, channels), dtype=wp.uint16, device=device)
+        model = self._model = _Model()
+        model.pixel_count, model.width = source.shape[1] * source.shape[2], source.shape[2]
+        model.stride = context.stride
+        model.part_count = 1 if context.times is None else len(context.times.offsets_ns)
+        model.stream = stream_id(f"{context.name}/frame")
+        model.gain, model.full_well = config.gain, config.full_well_e
+        model.read_noise, model.top = config.read_noise_e, float(2**config.bits - 1)
+        if auto is not None:
+            model.target, model.lag_s = auto.target, max(auto.lag_s, 1e-9)
+            model.log_gain_min, model.log_gain_max = np.log(auto.gain_min), np.log(auto.gain_max)
+        kind = config.curve if isinstance(config.curve, str) else "gamma"
+        model.gamma = 1.0 if isinstance(config.curve, str) else 1.0 / config.curve
+        color, _, pattern = config.color.partition("_")
+        model.filter = wp.vec4i(*("rgb".index(letter) for letter in pattern or "rrrr"))
+        self._kernel = _make_kernel(self.terms, color, kind)
+        count = len(context.lens_of_world) if auto is not None else 0
+        slots = source.shape[0] if auto is not None else 0
+        self._log_gain: Any = wp.zeros(count, dtype=float, device=device)
+        self._last_ns: Any = wp.full(count, -1, dtype=wp.int64, device=device)
+        self._total: Any = wp.zeros(slots, dtype=wp.int64, device=device)
+        self._gain: Any = wp.zeros(slots, dtype=float, device=device)
+
+    def launch(self, views: PictureViews) -> None:
+        """Make the frames of a batch; launches only."""
+        context, device = self._context, self._device
+        world_count = views.image_slot.shape[0] // context.stride
+        dim = world_count * views.instant_count * self._model.pixel_count
+        seen = [views.instant_count, views.image_slot]
+        if "auto exposure" in self.terms:
+            launch_split(
+                _meter,
+                dim=dim,
+                inputs=[self._model, *seen, context.source],
+                outputs=[self._total],
+                device=device,
+            )
+            wp.launch(
+                _expose,
+                dim=world_count,
+                inputs=[self._model, *seen, views.stamps, views.active],
+                outputs=[self._total, self._log_gain, self._last_ns, self._gain],
+                device=device,
+            )
+        launch_split(
+            self._kernel,
+            dim=dim,
+            inputs=[
+                self._model,
+                context.seeds,
+                *seen,
+                views.stamps,
+                views.active,
+                self._gain,
+                context.source,
+            ],
+            outputs=[self.picture],
+            device=device,
+        )

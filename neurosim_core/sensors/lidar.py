@@ -1,0 +1,303 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
+"""LiDAR: points along the rays of a scan, each cast at a time of its own.
+
+A ray finds the range r, the cosine of incidence and the albedo of the surface. The signal of a Lambertian
+surface that is wider than the beam is albedo cos / r^2. Where `detection` is set, speckle multiplies it by
+exp(s z), z normal, and a ray is lost if it falls below the signal of a target of given reflectivity at its
+rated range: so half of the rays are lost there, and dark, far and grazing surfaces are seen less. Then come
+Gaussian noise of the range, and its resolution.
+
+Reference: Wagner, Ullrich, Ducic, Melzer, Studnicka (2006), Gaussian decomposition and calibration of a novel
+small-footprint full-waveform digitising airborne laser scanner, eq. (3), for the signal.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+import functools
+from statistics import NormalDist
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from neurosim_core.packets import PointCloud
+from neurosim_core.random import normal4, random_bits, stream_id
+from neurosim_core.registry import register
+from neurosim_core.render.launch import launch_split
+from neurosim_core.sensors.base import PictureContext, PictureSensorConfig, PictureViews
+from neurosim_core.sensors.lidar_presets import PRESETS
+from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan, SweepTiming
+from neurosim_core.settings import Settings, fill_from_preset
+
+NonNegative = Annotated[float, Field(ge=0.0)]
+_NEVER = -10.0  # |z| is at most 5.77
+
+
+class DetectionConfig(Settings):
+    """Which rays come back."""
+
+    range_m: Annotated[float, Field(gt=0.0)]
+    """Range at which half of the rays come back [m], from a surface that faces the sensor."""
+    reflectivity: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
+    """Albedo of that surface."""
+    speckle: Annotated[float, Field(gt=0.0, le=3.0)] = 0.3
+    """Standard deviation s of the logarithm of the signal."""
+
+
+@register("sensor", "lidar")
+class LidarConfig(PictureSensorConfig):
+    """A LiDAR; x of its mount looks forward, z up. One return for each ray; without errors by default."""
+
+    kind: Literal["lidar"] = "lidar"
+    preset: str | None = None
+    """A sensor whose settings these are, unless given here: velodyne_vlp16, ouster_os1_128, hesai_xt32,
+    livox_mid40 (sources in lidar_presets.py). Single keys win."""
+    scan: AnyScan = SpinningScan(elevations_rad=tuple(round(-0.26 + 0.52 * k / 15.0, 6) for k in range(16)))
+    """Which way rays go, and when: {kind: spinning, elevations_rad: [...], columns: 1024}, {kind: pattern,
+    file: rays.npy}, {kind: rosette, ...}."""
+    rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
+    """Sweeps a second [Hz]."""
+    sweep_s: NonNegative | None = None
+    """Time from the first ray of a sweep to the last, which is cast at the stamp [s]; null: as the scan says,
+    of a spinning one a period; 0: all rays at once."""
+    deskew: bool = False
+    """Give points where they are seen from the pose at the stamp; else each is seen from the sensor's pose
+    when its ray was cast, as real ones do."""
+    range_min_m: NonNegative = 0.1
+    """Nearer points are not seen [m]."""
+    range_max_m: Annotated[float, Field(gt=0.0)] = 100.0
+    """Farther points are not seen [m]."""
+    range_noise_m: NonNegative = 0.0
+    """Standard deviation of the range [m]."""
+    range_noise_ratio: NonNegative = 0.0
+    """A further part of it that grows with the range; the root of the sum of squares counts."""
+    range_resolution_m: NonNegative = 0.0
+    """Step between ranges [m]; 0: continuous."""
+    detection: DetectionConfig | None = None
+    """Rays with little signal are lost: {range_m: 100, reflectivity: 0.1, speckle: 0.3}; null: none is."""
+    dropout_probability: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    """Share of rays that are lost whatever they hit."""
+
+    packet_type = PointCloud
+    output: ClassVar[str] = "returns"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_preset(cls, given: Any) -> Any:
+        return fill_from_preset(given, PRESETS)
+
+    @model_validator(mode="after")
+    def _ranges_and_times_are_in_order(self) -> "LidarConfig":
+        if self.range_min_m >= self.range_max_m:
+            raise ValueError(
+                f"range_min_m must be below range_max_m = {self.range_max_m:g}, got {self.range_min_m:g}"
+            )
+        if not self.span_s * self.rate_hz <= 1.0 + 1e-9:
+            raise ValueError(
+                f"a sweep takes {self.span_s:g} s, longer than 1 / rate_hz = {1 / self.rate_hz:g}"
+            )
+        return self
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first ray of a sweep to the last [s]."""
+        return self.scan.span_s(1.0 / self.rate_hz) if self.sweep_s is None else self.sweep_s
+
+    @property
+    def optics(self) -> Any:
+        """The scan."""
+        return self.scan
+
+    @property
+    def timing(self) -> SweepTiming | None:
+        """When rays are cast; None: all at the stamp."""
+        return SweepTiming(span_s=self.span_s) if self.span_s > 0.0 else None
+
+    def make_process(self, context: PictureContext) -> "LidarProcess":
+        """Return what makes points of what rays find."""
+        return LidarProcess(self, context)
+
+    def packet(self, picture: NDArray[Any], **header: Any) -> PointCloud:
+        """Return the points of a sweep, in the order of time; the picture has x, y, z, intensity."""
+        rows = picture.swapaxes(0, 1).reshape(-1, 4)
+        seen = np.flatnonzero(np.isfinite(rows[:, 0]))
+        ring, t = _rings_and_times(self.scan, round(self.span_s * 1e9))
+        return PointCloud(
+            points=rows[seen, :3],
+            intensity=rows[seen, 3],
+            ring=ring[seen],
+            t=t[seen],
+            start_ns=header["stamp_ns"] - round(self.span_s * 1e9),
+            deskewed=self.deskew,
+            **header,
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def _rings_and_times(scan: AnyScan, span_ns: int) -> tuple[NDArray[np.uint16], NDArray[np.uint32]]:
+    """Return ring and time since the first ray [ns] of all rays of a sweep, column by column."""
+    ring = np.tile(np.arange(scan.height, dtype=np.uint16), scan.width)
+    return ring, np.rint(scan.fractions().T.ravel() * span_ns).astype(np.uint32)
+
+
+@wp.struct
+class _Model:
+    pixel_count: int
+    width: int
+    stride: int
+    part_count: int
+    stream: wp.uint32
+    range_min: float
+    range_max: float
+    noise: float
+    noise_ratio: float
+    resolution: float
+    signal_min: float
+    speckle: float
+    dropout: float  # quantile of the normal distribution
+
+
+@functools.cache
+def make_kernel(terms: tuple[str, ...]) -> Any:
+    """Return the kernel that makes points of returns, with what is in `terms`.
+
+    Places of rays that do not come back have intensity 0 and points that are nan.
+    """
+    draws = bool({"range noise", "detection", "dropout"} & set(terms))
+
+    @wp.kernel(
+        module=wp.get_module("neurosim_core.sensors.lidar." + ("_".join(terms).replace(" ", "_") or "exact")),
+        enable_backward=False,
+    )
+    def measure(
+        first: int,
+        # Model:
+        model: _Model,
+        rays: wp.array[wp.vec3],
+        part: wp.array[int],
+        seeds: wp.array[wp.uint64],
+        # In:
+        instant_count: int,
+        image_slot: wp.array[int],
+        p_WC: wp.array[wp.vec3],
+        q_WC: wp.array[wp.quat],
+        stamps: wp.array2d[wp.int64],
+        active: wp.array[wp.int32],
+        returns: wp.array3d[wp.vec3],
+        # Out:
+        points_out: wp.array3d[wp.vec4],
+    ):
+        index = first + wp.tid()
+        pixel = index % model.pixel_count
+        view = index // model.pixel_count
+        world = view // instant_count
+        view = world * model.stride + view % instant_count
+        slot = image_slot[view]
+        if slot < 0:
+            return
+        if active.shape[0] > 0:
+            if active[world] == 0:
+                return
+        row = pixel // model.width
+        col = pixel % model.width
+        found = returns[slot, row, col]
+        r = found[0]
+        signal = found[2] * found[1] / (r * r)
+        last = (view + 1) * model.part_count - 1  # the pose at the stamp
+        if wp.static(draws):
+            z = normal4(random_bits(seeds[world], model.stream, stamps[last, 0], pixel))
+            if wp.static("detection" in terms):
+                signal *= wp.exp(model.speckle * z[1])
+                if signal < model.signal_min:
+                    r = wp.inf
+            if wp.static("dropout" in terms):
+                if z[2] < model.dropout:
+                    r = wp.inf
+            if wp.static("range noise" in terms):
+                r += wp.sqrt(model.noise * model.noise + wp.pow(model.noise_ratio * r, 2.0)) * z[0]
+        if wp.static("resolution" in terms):
+            r = model.resolution * wp.rint(r / model.resolution)
+        if not (r >= model.range_min and r <= model.range_max):
+            points_out[slot, row, col] = wp.vec4(wp.nan, wp.nan, wp.nan, 0.0)
+            return
+        p = r * rays[pixel]
+        if wp.static("deskew" in terms):
+            then = view * model.part_count + part[pixel]
+            moved = p_WC[then] - p_WC[last] + wp.quat_rotate(q_WC[then], p)
+            p = wp.quat_rotate_inv(q_WC[last], moved)
+        points_out[slot, row, col] = wp.vec4(p[2], -p[0], -p[1], signal)
+
+    return measure
+
+
+class LidarProcess:
+    """Makes points of what the rays of a scan find.
+
+    Attributes:
+        picture: x, y, z in S [m] and intensity, vec4, shape [M, H, W]; nan and 0 where no ray comes back.
+        terms: What is computed.
+    """
+
+    def __init__(self, config: LidarConfig, context: PictureContext) -> None:
+        self._context = context
+        self.terms = _terms(config, moving=context.times is not None)
+        source = context.source
+        self._device = device = source.device
+        self.picture = wp.zeros(source.shape, dtype=wp.vec4, device=device)
+        model = self._model = _Model()
+        model.pixel_count = source.shape[1] * source.shape[2]
+        model.width = source.shape[2]
+        model.stride = context.stride
+        model.part_count = 1 if context.times is None else len(context.times.offsets_ns)
+        model.stream = stream_id(f"{context.name}/lidar")
+        model.range_min, model.range_max = config.range_min_m, config.range_max_m
+        model.noise, model.noise_ratio = config.range_noise_m, config.range_noise_ratio
+        model.resolution = config.range_resolution_m
+        if config.detection is not None:
+            model.speckle = config.detection.speckle
+            model.signal_min = config.detection.reflectivity / config.detection.range_m**2
+        lost = config.dropout_probability
+        model.dropout = NormalDist().inv_cdf(lost) if lost > 0.0 else _NEVER
+        rays = config.scan.ray_table().reshape(-1, 3)
+        self._rays: Any = wp.array(rays, dtype=wp.vec3, device=device)
+        part = np.zeros(len(rays), np.int32) if context.times is None else context.times.instant[0]
+        self._part: Any = wp.array(part, dtype=int, device=device)
+        self._kernel = make_kernel(self.terms)
+
+    def launch(self, views: PictureViews) -> None:
+        """Make the points of the sweeps of a batch; launches only."""
+        world_count = views.image_slot.shape[0] // self._context.stride
+        launch_split(
+            self._kernel,
+            dim=world_count * views.instant_count * self._model.pixel_count,
+            inputs=[
+                self._model,
+                self._rays,
+                self._part,
+                self._context.seeds,
+                views.instant_count,
+                views.image_slot,
+                views.p_WC,
+                views.q_WC,
+                views.stamps,
+                views.active,
+                self._context.source,
+            ],
+            outputs=[self.picture],
+            device=self._device,
+        )
+
+
+def _terms(config: LidarConfig, *, moving: bool) -> tuple[str, ...]:
+    present = {
+        "detection": config.detection is not None,
+        "dropout": config.dropout_probability > 0.0,
+        "range noise": config.range_noise_m > 0.0 or config.range_noise_ratio > 0.0,
+        "resolution": config.range_resolution_m > 0.0,
+        "deskew": config.deskew and moving,
+    }
+    return tuple(term for term, needed in present.items() if needed)

@@ -1,0 +1,325 @@
+"""Event files: there and back through every format, by independent readers, damaged, and cut off."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from neurosim_core import cli
+from neurosim_core.io import FORMATS, EventFileError, create_events, open_events
+from neurosim_core.io.transfer import transfer
+from neurosim_core.packets import EventArrays, Events, Image, ImuSample, Odometry
+from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
+
+WIDTH, HEIGHT = 346, 260
+HOUR_US = 3_600_000_000
+WRITABLE = [name for name, known in FORMATS.items() if known.writer]
+
+
+def draw(count: int, *, span_us: int, begin_us: int = 0, seed: int = 0) -> EventArrays:
+    """Sorted random events, among them runs of neighbours at one time, and the last pixel of the sensor."""
+    rng = np.random.default_rng(seed)
+    t = begin_us + np.sort(rng.integers(0, span_us, count))
+    t[count // 2 : count // 2 + 40] = t[count // 2]
+    t = np.sort(t)
+    x = rng.integers(0, WIDTH, count).astype(np.uint16)
+    y = rng.integers(0, HEIGHT, count).astype(np.uint16)
+    x[count // 2 : count // 2 + 40], y[count // 2 : count // 2 + 40] = np.arange(40) * 2, 9
+    x[-1], y[-1] = WIDTH - 1, HEIGHT - 1
+    return EventArrays(t, x, y, rng.integers(0, 2, count).astype(np.uint8))
+
+
+def path_of(folder: Path, name: str) -> Path:
+    suffix = FORMATS[name].suffixes[0]
+    return folder / (f"events{suffix}" if suffix.startswith(".") else suffix)
+
+
+def write(path: Path, events: EventArrays, *, parts: int = 3) -> Path:
+    writer = create_events(path, width=WIDTH, height=HEIGHT)
+    with contextlib.closing(writer):
+        for index in np.array_split(np.arange(len(events.t)), parts):
+            writer.write(events.rows(index))
+    return path
+
+
+def read(path: Path, **options) -> EventArrays:
+    with contextlib.closing(open_events(path, **options)) as reader:
+        blocks = [*reader.blocks()]
+    empty = EventArrays(*(np.zeros(0, kind) for kind in (np.int64, np.uint16, np.uint16, np.uint8)))
+    return EventArrays(*(np.concatenate(columns) for columns in zip(empty, *blocks, strict=True)))
+
+
+def same(found: EventArrays, events: EventArrays) -> bool:
+    return all(
+        a.dtype == b.dtype and np.array_equal(a, b)  # values and types
+        for a, b in zip(found, events, strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_there_and_back(name, tmp_path):
+    pytest.importorskip("faery") if name == "aedat4" else None
+    events = draw(20_000, span_us=40_000_000)
+    path = write(path_of(tmp_path, name), events)
+    assert same(read(path), events)
+    reader = open_events(path)
+    assert (reader.width, reader.height) == (WIDTH, HEIGHT)
+    reader.close()
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_no_events(name, tmp_path):
+    pytest.importorskip("faery") if name == "aedat4" else None
+    path = write(path_of(tmp_path, name), draw(100, span_us=100).rows(slice(0, 0)), parts=1)
+    assert len(read(path).t) == 0
+
+
+@pytest.mark.parametrize("name", ["evt3", "evt2", "csv", "npz", "mvsec"])
+def test_hours_and_long_silences(name, tmp_path):
+    """EVT3 counts 16.8 s and EVT2 4.8 h until time begins again: silences longer than both."""
+    parts = [
+        draw(500, span_us=3_000_000, begin_us=begin, seed=i)
+        for i, begin in enumerate(
+            (0, 20_000_000, 5 * HOUR_US, 15 * HOUR_US, 15 * HOUR_US + 16_777_216 + 3_000_000)
+        )
+    ]
+    events = EventArrays(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    assert same(read(write(path_of(tmp_path, name), events, parts=7)), events)
+
+
+@pytest.mark.parametrize("name", ["evt3", "evt2"])
+def test_times_since_1970(name, tmp_path):
+    events = draw(1000, span_us=30_000_000, begin_us=1_700_000_000_000_000)
+    assert same(read(write(path_of(tmp_path, name), events)), events)
+
+
+@pytest.mark.parametrize("name", ["evt3", "evt2", "dat", "aedat4"])
+def test_faery_reads_the_same(name, tmp_path):
+    faery = pytest.importorskip("faery")
+    span_us = 15_000_000 if name == "evt3" else 100_000_000  # its reader is wrong where evt3 wraps
+    events = draw(20_000, span_us=span_us)
+    stream = faery.events_stream_from_file(write(path_of(tmp_path, name), events))
+    assert stream.dimensions() == (WIDTH, HEIGHT)
+    found = np.concatenate([*stream])
+    columns = [found[field] for field in found.dtype.names]
+    assert all(np.array_equal(a, b) for a, b in zip(columns, events, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "version"), [("evt3", "evt3"), ("evt2", "evt2"), ("dat", "dat2"), ("aedat4", None)]
+)
+def test_what_faery_writes(name, version, tmp_path):
+    faery = pytest.importorskip("faery")
+    events = draw(20_000, span_us=12_000_000, begin_us=1000)
+    records = np.empty(len(events.t), faery.EVENTS_DTYPE)
+    for field, column in zip(records.dtype.names, events, strict=True):
+        records[field] = column
+    path = path_of(tmp_path, name)
+    faery.events_stream_from_array(records, (WIDTH, HEIGHT)).to_file(path, version=version, zero_t0=False)
+    assert same(read(path), events)
+
+
+def test_dv_processing_reads_aedat4(tmp_path):
+    dv = pytest.importorskip("dv_processing")
+    pytest.importorskip("faery")
+    events = draw(20_000, span_us=12_000_000, begin_us=1000)
+    recording = dv.io.MonoCameraRecording(str(write(tmp_path / "events.aedat4", events)))
+    found = []
+    while (batch := recording.getNextEventBatch()) is not None:
+        found.append(batch.numpy())
+    found = np.concatenate(found)
+    for field, column in zip(("timestamp", "x", "y", "polarity"), events, strict=True):
+        assert np.array_equal(found[field], column)
+
+
+def test_evt2_words():
+    """By hand: 4101 us = 64 * 64 + 5; column 7, row 3, brighter."""
+    from neurosim_core.io.evt2 import Evt2Encoder
+
+    events = EventArrays(*(np.array([v], k) for v, k in ((4101, "i8"), (7, "u2"), (3, "u2"), (1, "u1"))))
+    words = Evt2Encoder().encode(events).view("<u4").tolist()
+    assert words == [0x8 << 28 | 64, 0x1 << 28 | 5 << 22 | 7 << 11 | 3]
+
+
+def test_texts_of_others(tmp_path):
+    """Seconds, blanks, -1 and 1; columns in another order; a geometry."""
+    events = EventArrays(
+        np.array([1, 2_000_003]),
+        *(np.array(v, k) for v, k in (([3, 4], np.uint16), ([5, 6], np.uint16), ([0, 1], np.uint8))),
+    )
+    path = tmp_path / "events.txt"
+    path.write_text("346 260\n0.000001 3 5 -1\n2.000003 4 6 1\n")
+    assert same(read(path), events)
+    path.write_text("%geometry:346,260\nx,y,polarity,timestamp\n3,5,0,1\n4,6,1,2000003\n")
+    assert same(read(path), events)
+    assert open_events(path).width == 346
+
+
+def test_dsec(tmp_path):
+    """uint32 times after t_offset, as DSEC has them."""
+    events = draw(5000, span_us=3_000_000)
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name, column in zip(("t", "x", "y", "p"), events, strict=True):
+            file[f"events/{name}"] = column.astype(np.uint32) if name == "t" else column
+        file["t_offset"] = np.int64(49_599_300_523)
+    found = read(tmp_path / "events.h5")
+    assert same(found._replace(t=found.t - 49_599_300_523), events)
+
+
+def flight(path: Path, events: EventArrays) -> None:
+    """A recording with ground truth, at stamps that seconds in float64 hold exactly."""
+    with RecordingWriter(path, RecordingHeader(config_yaml="", seed=0, version="0")) as out:
+        rng = np.random.default_rng(1)
+        for k in range(1, 5):
+            stamp_ns = k * 500_000_000
+            part = events.rows((events.t > (k - 1) * 500_000) & (events.t <= k * 500_000))
+            head = {"stamp_ns": stamp_ns, "sequence": k - 1}
+            out.write(
+                Events(
+                    sensor="cam",
+                    width=WIDTH,
+                    height=HEIGHT,
+                    start_ns=stamp_ns - 500_000_000,
+                    t=part.t,
+                    x=part.x,
+                    y=part.y,
+                    polarity=part.polarity,
+                    **head,
+                )
+            )
+            depth = rng.random((HEIGHT, WIDTH)).astype(np.float32)
+            depth[0, 0] = np.inf
+            out.write(Image(sensor="depth", data=depth, encoding="32FC1", **head))
+            flow = rng.random((HEIGHT, WIDTH, 2)).astype(np.float32)
+            out.write(Image(sensor="flow", data=flow, encoding="32FC2", **head))
+            out.write(
+                ImuSample(sensor="imu", specific_force=rng.random(3), angular_rate=rng.random(3), **head)
+            )
+            still = {"velocity": np.zeros(3), "body_rate": np.zeros(3), "rotor_speed": np.zeros(4)}
+            turn = np.array([0.0, 0.0, 0.6, 0.8])
+            out.write(Odometry(sensor="odometry", position=rng.random(3), orientation=turn, **still, **head))
+
+
+def test_mvsec_has_the_ground_truth(tmp_path):
+    events = draw(5000, span_us=1_999_000, begin_us=1)
+    flight(tmp_path / "flight.h5", events)
+    done = transfer(tmp_path / "flight.h5", tmp_path / "mvsec.h5")
+    assert (done.event_count, done.packet_count) == (5000, 16)
+    with h5py.File(tmp_path / "mvsec.h5") as file:
+        left = file["davis/left"]
+        assert left["pose"].shape == (4, 4, 4)
+        assert np.isnan(left["depth_image_raw"][0, 0, 0])
+        assert set(np.unique(left["events"][:, 3])) == {-1.0, 1.0}
+    transfer(tmp_path / "mvsec.h5", tmp_path / "back.h5")
+    with Recording(tmp_path / "flight.h5") as one, Recording(tmp_path / "back.h5") as two:
+        for sensor, field in (("depth", "data"), ("flow", "data"), ("imu", "specific_force")):
+            assert np.array_equal(one.column(sensor, field), two.column(sensor, field))
+            assert np.array_equal(one.column(sensor, "stamp_ns"), two.column(sensor, "stamp_ns"))
+        assert np.allclose(
+            one.column("odometry", "orientation"), two.column("pose", "orientation"), atol=1e-15
+        )
+        assert np.array_equal(one.column("cam", "t"), two.column("events", "t"))
+
+
+def test_the_command(tmp_path, capsys):
+    events = draw(3000, span_us=2_000_000, begin_us=7_000_000)
+    write(tmp_path / "a.raw", events)
+    assert cli.main(["convert", str(tmp_path / "a.raw"), str(tmp_path / "b.h5"), "--from-zero"]) == 0
+    assert "3,000 events of 346x260 pixels, 0.000000 s to" in capsys.readouterr().out
+    assert same(read(tmp_path / "b.h5"), events._replace(t=events.t - events.t[0]))
+    assert cli.main(["convert", str(tmp_path / "a.raw"), str(tmp_path / "b.h5")]) == 1  # it is there
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_any_event_file_can_be_viewed(tmp_path):
+    pytest.importorskip("rerun")
+    write(tmp_path / "a.evt2.raw", draw(3000, span_us=200_000, begin_us=1_700_000_000_000_000))
+    assert cli.main(["view", str(tmp_path / "a.evt2.raw"), "--save", str(tmp_path / "a.rrd")]) == 0
+    assert (tmp_path / "a.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_damaged_files(name, tmp_path):
+    """Cut off: an error, or the first events. Flipped bits: an error, or sorted events on the sensor."""
+    pytest.importorskip("faery") if name == "aedat4" else None
+    events = draw(2000, span_us=400_000)
+    path = write(path_of(tmp_path, name), events)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(3)
+    intact = 0
+    for turn in range(24):
+        if cut := turn % 2 == 0:
+            data = whole[: int(rng.integers(0, len(whole)))]
+        else:
+            changed = np.frombuffer(whole, np.uint8).copy()
+            changed[rng.integers(0, len(whole), 3)] ^= rng.integers(1, 256, 3).astype(np.uint8)
+            data = changed.tobytes()
+        path.write_bytes(data)
+        try:
+            found = read(path)
+        except EventFileError:
+            continue
+        intact += 1
+        if cut:
+            assert same(found, events.rows(slice(0, len(found.t))))
+        assert (np.diff(found.t) >= 0).all()
+    assert intact > 0 or name in ("npz", "aedat4", "recording", "mvsec")
+
+
+@pytest.mark.parametrize(
+    ("name", "events", "words"),
+    [
+        ("dat", draw(90, span_us=10, begin_us=2 * HOUR_US), "71 minutes"),
+        ("evt3", draw(90, span_us=10, begin_us=-100), "no time before 0"),
+        ("recording", draw(90, span_us=10, begin_us=1 << 50), "--from-zero"),
+        ("npz", draw(90, span_us=1000).rows(slice(None, None, -1)), "time goes back"),
+    ],
+)
+def test_what_a_format_cannot_hold(name, events, words, tmp_path):
+    with pytest.raises(EventFileError, match=words):
+        write(path_of(tmp_path, name), events, parts=1)
+
+
+def test_wrong_files(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        open_events(tmp_path / "none.raw")
+    (tmp_path / "a.xyz").write_bytes(b"")
+    with pytest.raises(EventFileError, match=r"known: \.raw, "):
+        open_events(tmp_path / "a.xyz")
+    for name, known in FORMATS.items():
+        path = path_of(tmp_path, name)
+        path.write_bytes(b"neither one nor the other\n" * 10)
+        with pytest.raises((EventFileError, ImportError), match=str(path) + "|faery|mcap"):
+            open_events(path)
+        assert known.suffixes
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    """10^7 events are 130 MB: a process that streams them through stays far below."""
+    code = """
+import resource, sys
+import numpy as np
+from neurosim_core.io import create_events, open_events
+from neurosim_core.packets import EventArrays
+writer = create_events(sys.argv[1], width=346, height=260)
+base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+x = (np.arange(1_000_000) * 7 % 346).astype(np.uint16)
+for k in range(10):
+    writer.write(EventArrays(np.arange(1_000_000) + k * 1_000_000, x, x % 260, (x % 2).astype(np.uint8)))
+writer.close()
+count = sum(len(block.t) for block in open_events(sys.argv[1]).blocks())
+print(count, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) // 1024)
+"""
+    for name in ("a.raw", "a.dat"):
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path / name)], capture_output=True, text=True
+        )
+        count, grown_mb = map(int, done.stdout.split())
+        assert count == 10_000_000
+        assert grown_mb < 250  # a block of a million in hand, with the arrays of the encoder

@@ -1,0 +1,40 @@
+"""A room to learn in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from runtime_directory import runtime
+
+import neurosim_core as ns
+
+__all__ = ["runtime"]
+
+
+@pytest.fixture(scope="session")
+def hall(tmp_path_factory):
+    """A textured room, loaded once: what `make_model` returns."""
+    scene = trimesh.Scene()
+    walls = trimesh.creation.box(extents=[8.0, 8.0, 4.0])
+    for _ in range(4):
+        walls = walls.subdivide()
+    walls.invert()
+    walls.apply_translation([0.0, 0.0, 2.0])
+    shades = np.random.default_rng(1).integers(30, 255, (len(walls.faces), 1)).repeat(3, axis=1)
+    walls.visual.face_colors = np.hstack([shades, np.full((len(shades), 1), 255)])
+    scene.add_geometry(walls, node_name="walls")
+    path = tmp_path_factory.mktemp("hall") / "hall.glb"
+    scene.export(path)
+    mesh = {"kind": "mesh", "file": str(path), "up_axis": "z", "unit_m": 1.0, "inside_m": [0.0, 0.0, 2.0]}
+    lens = {"width": 8, "height": 8, "horizontal_fov_rad": 1.5}
+    return ns.make_model(
+        ns.load_config(
+            {
+                "device": "cpu",
+                "scene": mesh,
+                "path": {"kind": "hover"},
+                "sensors": {"front": {"kind": "event_camera", "lens": lens}},
+            }
+        )
+    )

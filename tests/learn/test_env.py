@@ -1,0 +1,161 @@
+"""What whoever writes a training loop relies on: episodes, seeds, isolation, memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import neurosim_core as ns
+
+torch = pytest.importorskip("torch", reason="needs the extra learn")
+
+from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
+
+torch.set_num_threads(1)
+
+
+class Brief(Hover):
+    """Hover with small pictures and short episodes."""
+
+    camera = {"width": 8, "height": 8, "horizontal_fov_rad": 1.5}  # noqa: RUF012
+    episode_s = 0.2
+
+
+@pytest.fixture
+def make(hall):
+    def make_env(worlds: int = 3, task=None, **options):
+        return ns.learn.make_env(task or Brief(), worlds=worlds, device="cpu", models=[hall], **options)
+
+    return make_env
+
+
+def actions_of(steps: int, worlds: int) -> torch.Tensor:
+    return 0.5 * torch.randn((steps, worlds, 4), generator=torch.Generator().manual_seed(5))
+
+
+def roll(env, actions: torch.Tensor, seed: int = 3):
+    """Return all observations, rewards and flags, stacked, [step, N, ...]."""
+    observations, _ = env.reset(seed=seed)
+    rows = [{name: value.clone() for name, value in observations.items()}]
+    flags = []
+    for action in actions:
+        observations, reward, terminated, truncated, _ = env.step(action)
+        rows.append({name: value.clone() for name, value in observations.items()})
+        flags.append(torch.stack([reward, terminated.float(), truncated.float()]))
+    return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}, torch.stack(flags)
+
+
+def test_the_same_seed_gives_the_same_episodes_whatever_was_flown_before(make):
+    env = make()
+    actions = actions_of(25, 3)
+    first = roll(env, actions)
+    roll(env, actions_of(7, 3).flip(0), seed=9)
+    again, fresh = roll(env, actions), roll(make(), actions)
+    assert first[1][:, 2].any()  # episodes were cut, and began anew
+    assert first[0]["events"].abs().sum() > 10.0
+    for other in (again, fresh):
+        for name, value in first[0].items():
+            assert torch.equal(value, other[0][name]), name
+        assert torch.equal(first[1], other[1])
+    assert not torch.equal(first[0]["state"], roll(env, actions, seed=4)[0]["state"])
+
+
+def test_nothing_of_a_world_depends_on_its_neighbours(make):
+    """World 1 of three is world 0 of one whose seed is the next, also where neighbours begin anew."""
+    actions = actions_of(25, 3)
+    actions[:, 0, 0] = -1.0  # a neighbour that falls
+    together, flags = roll(make(task=type("Long", (Brief,), {"episode_s": 0.3})()), actions)
+    alone, own = roll(make(1, task=type("Long", (Brief,), {"episode_s": 0.3})()), actions[:, 1:2], seed=4)
+    for name, value in alone.items():
+        assert torch.equal(value[:, 0], together[name][:, 1]), name
+    assert torch.equal(own[:, :, 0], flags[:, :, 1])
+
+
+def test_an_episode_that_is_cut_begins_anew_in_the_same_step(make):
+    env = make(worlds=2)
+    observations, _ = env.reset(seed=0)
+    assert env.episode_steps == 10
+    for step in range(10):
+        observations, _, terminated, truncated, info = env.step(torch.zeros(2, 4))
+        assert truncated.all() == (step == 9)
+    assert not terminated.any()
+    assert env.episode_length.tolist() == [0, 0]
+    assert not observations["events"].any()
+    assert info["final_obs"]["events"].any()
+    assert not torch.equal(observations["state"], info["final_obs"]["state"])
+    np.testing.assert_allclose(env.view.elapsed_s, 0.0)
+
+
+def test_a_crash_terminates_and_is_no_time_out(make):
+    env = make(worlds=2, task=type("Long", (Brief,), {"episode_s": 10.0})())
+    env.reset(seed=0)
+    fall = torch.tensor([[-1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    for _ in range(200):
+        _, reward, terminated, truncated, info = env.step(fall)
+        if terminated[0]:
+            break
+    assert terminated[0]
+    assert not truncated[0]
+    assert reward[0] < -5.0
+    assert info["metrics"]["crash"][0] == 1.0
+    assert info["metrics"]["success"][0] == 0.0
+
+
+def test_observations_share_memory_with_the_simulator(make):
+    env = make()
+    observations, _ = env.reset()
+    assert observations["events"].data_ptr() == env._surface.array.ptr
+    assert observations["events"].dtype == torch.float32
+
+
+def test_the_student_sees_neither_velocity_nor_position(make):
+    """Two worlds that differ in nothing else look alike to it before the first event."""
+    env = make(worlds=2, randomise=False)
+    env.reset(seed=1)
+    env.view.velocity_B[:] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    env.view.gravity_measured[:], env.view.gyro[:] = 0.5, 0.25
+    seen = env.task.observe(env.view)
+    student = env.group(seen, "student")
+    assert torch.equal(student[0], student[1])
+    assert not torch.equal(*env.group(seen, "teacher"))
+
+
+def test_starts_are_in_free_space_and_differ(make, hall):
+    env = make(worlds=64)
+    env.reset(seed=0)
+    position = env.view.position.numpy()
+    assert hall.free_space.clearance(position).min() > 0.85
+    assert len(np.unique(position, axis=0)) > 32
+    speed = env.view.velocity.norm(dim=1)
+    assert speed.max() <= 0.9 + 1e-6
+    assert speed.min() < 0.5
+    np.testing.assert_allclose(env.view.clearance[:, 0], hall.free_space.clearance(position), atol=0.2)
+    thresholds = env.sim.thresholds("front").numpy()
+    assert thresholds.min() >= 0.08 - 1e-6
+    assert thresholds.max() <= 0.125 + 1e-6
+    assert np.ptp(thresholds) > 0.02
+
+
+def test_without_events_nothing_is_rendered(make):
+    env = make(observe=["state"])
+    observations, _ = env.reset()
+    assert set(observations) == {"state"}
+    assert not env.sim.model.config.sensors
+
+
+def test_an_unknown_task_is_said():
+    with pytest.raises(ValueError, match=r"unknown task kind 'juggle', known: .*'hover'"):
+        ns.learn.make_env("juggle")
+
+
+def test_gymnasium(hall):
+    gymnasium = pytest.importorskip("gymnasium")
+    env = gymnasium.make_vec(
+        "neurosim_core.learn.gym:neurosim/hover-v0", num_envs=2, device="cpu", models=[hall], group="actor"
+    )
+    observations, _ = env.reset(seed=1)
+    assert env.observation_space.contains(observations)
+    observations, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+    assert observations["state"].shape == (2, 17)
+    assert {each.shape for each in (reward, terminated, truncated)} == {(2,)}
+    env.close()

@@ -1,0 +1,36 @@
+"""What the command line says to wrong use, and without the extra."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+import neurosim_core as ns
+from neurosim_core.cli import main
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["learn", "eval"], "say which run: neurosim learn eval runs/hover"),
+        (["learn", "eval", "nowhere"], "nowhere is no run of training: it has no run.json"),
+        (["learn", "hover", "runs/hover"], "a folder is for `neurosim learn eval`; say --out"),
+        (["learn", "juggle", "--out", "{folder}/new"], "unknown task kind 'juggle', known: ["),
+        (["learn", "hover", "--out", "{folder}"], "holds a run: give --resume, or another --out"),
+        (["deploy", "nobody"], "unknown policy 'nobody', known: "),
+    ],
+)
+def test_wrong_use_is_said(arguments, message, tmp_path, capsys):
+    pytest.importorskip("torch", reason="needs the extra learn")
+    (tmp_path / "checkpoint.pt").touch()
+    assert main([argument.format(folder=tmp_path) for argument in arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_without_the_extra_the_error_names_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ImportError, match=r"pip install -e '\.\[learn\]'"):
+        ns.learn.make_env  # noqa: B018
+    assert main(["learn", "hover"]) == 1
+    assert "learning needs torch" in capsys.readouterr().err

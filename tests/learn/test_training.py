@@ -1,0 +1,143 @@
+"""Training that can be interrupted, what it leaves, and who flies it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from processes import ROOT
+
+import neurosim_core as ns
+from neurosim_core.registry import register
+
+torch = pytest.importorskip("torch", reason="needs the extra learn")
+
+from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
+from neurosim_core.learn.evaluate import evaluate, student_actor, teacher_actor  # noqa: E402
+from neurosim_core.learn.ppo import Ppo, PpoConfig  # noqa: E402
+from neurosim_core.learn.tasks.hover import Hover  # noqa: E402
+from neurosim_core.learn.train import TrainConfig, Training, load_student, make_card  # noqa: E402
+
+torch.set_num_threads(1)
+
+
+@register("task", "brief-hover")
+class BriefHover(Hover):
+    """Hover with small pictures and short episodes."""
+
+    camera = {"width": 8, "height": 8, "horizontal_fov_rad": 1.5}  # noqa: RUF012
+    episode_s = 0.4
+
+
+def small(**changes) -> TrainConfig:
+    return TrainConfig(
+        task="brief-hover",
+        device="cpu",
+        seed=2,
+        teacher=PpoConfig(worlds=4, iterations=4, horizon=6, epochs=2, minibatches=2),
+        student=DaggerConfig(worlds=4, iterations=4, horizon=6),
+        block=2,
+        **changes,
+    )
+
+
+def run(folder, hall, *, stops=()) -> Training:
+    """Train, in a process of its own from each stop on, as it were."""
+    pytest.importorskip("tensorboard")
+    for until in (*stops, None):
+        going_on = (folder / "checkpoint.pt").exists()
+        training = Training(folder, None if going_on else small(), say=lambda line: None, models=[hall])
+        if going_on:
+            training.resume()
+        training.run(until=until)
+    return training
+
+
+def test_a_run_that_is_resumed_ends_where_it_would_have(tmp_path, hall):
+    whole = run(tmp_path / "whole", hall)
+    parts = run(tmp_path / "parts", hall, stops=[(2, 0), (4, 2)])
+    for policy in ("teacher", "student"):
+        states = [getattr(training, policy).state_dict() for training in (whole, parts)]
+        for name, value in states[0].items():
+            assert torch.equal(value, states[1][name]), (policy, name)
+    fresh = Training(tmp_path / "fresh", small(), models=[hall])
+    moved = [
+        (a - b).abs().max()
+        for a, b in zip(whole.student.parameters(), fresh.student.parameters(), strict=True)
+    ]
+    assert min(moved) > 0.0
+    assert list((tmp_path / "whole").glob("events.out.tfevents.*"))
+
+
+def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
+    pytest.importorskip("onnxruntime")
+    from neurosim_core.learn.export import export_onnx
+    from neurosim_core.learn.pilot import Pilot, pilot_settings
+
+    training = Training(tmp_path, small(), models=[hall])
+    policy = training.student
+    export_onnx(policy, make_card(training), tmp_path / "policy.onnx")
+    pilot = Pilot(tmp_path / "policy.onnx")
+    rng = np.random.default_rng(0)
+    memory, action = torch.zeros(1, policy.memory_size), torch.zeros(1, 4)
+    surface = np.zeros((4, 8, 8))
+    for step in range(1, 6):
+        count = 40
+        t = np.sort(rng.integers(20_000 * (step - 1) + 1, 20_000 * step + 1, count))
+        x, y, polarity = (rng.integers(0, top, count) for top in (8, 8, 2))
+        rate = rng.normal(size=3)
+        command = pilot.act(
+            t, x, y, polarity, stamp_ns=20_000_000 * step, orientation=[0.0, 0.0, 0.0, 1.0], body_rate=rate
+        )
+        for scale, tau_s in enumerate((0.02, 0.2)):
+            surface[2 * scale : 2 * scale + 2] *= np.exp(-0.02 / tau_s)
+            np.add.at(surface, (2 * scale + polarity, y, x), np.exp(-(20_000 * step - t) / (1e6 * tau_s)))
+        vector = torch.tensor(np.concatenate([[0.0, 0.0, -1.0], 0.3 * rate]), dtype=torch.float32)[None]
+        seen = torch.tensor(surface, dtype=torch.float32)[None]
+        with torch.no_grad():
+            action, memory = policy(seen, torch.cat([vector, action], dim=1), memory)
+        np.testing.assert_allclose(pilot.action, action[0], atol=2e-4)
+        card = pilot.card
+        thrust_n = card["hover_thrust_n"] * (1.0 + card["thrust_span"] * pilot.action[0])
+        assert command.thrust_n == pytest.approx(thrust_n)
+    ns.load_config(pilot_settings(pilot.card))
+    with pytest.raises(ValueError, match="there is no policy"):
+        Pilot(tmp_path / "nothing.onnx")
+
+
+def test_ppo_learns_to_stop(hall):
+    """In a tenth of the usual time rewards rise well above those of the first iterations."""
+    torch.manual_seed(0)
+    config = dataclasses.replace(PpoConfig(), worlds=192, iterations=24)
+    env = ns.learn.make_env("hover", worlds=config.worlds, device="cpu", observe=["state"], models=[hall])
+    ppo = Ppo(env, config, torch.Generator().manual_seed(0))
+    before = evaluate(env, teacher_actor(ppo.policy, env))
+    ppo.begin(1)
+    rewards = [ppo.iterate(i / config.iterations)["reward"] for i in range(config.iterations)]
+    after = evaluate(env, teacher_actor(ppo.policy, env))
+    assert np.mean(rewards[-3:]) > np.mean(rewards[2:6]) + 0.2
+    assert after.metrics["speed_m_s"] < before.metrics["speed_m_s"]
+
+
+def test_evaluation_counts_one_episode_of_each_world(tmp_path, hall):
+    training = run(tmp_path, hall)
+    env = ns.learn.make_env("brief-hover", worlds=6, device="cpu", models=[hall])
+    policy = load_student(tmp_path, env.device)
+    first = evaluate(env, student_actor(policy, env))
+    assert first == evaluate(env, student_actor(policy, env))
+    assert first.episodes == 6
+    assert set(first.metrics) == {"success", "crash", "speed_m_s"}
+    assert first.metrics["success"] == 0.0  # an episode is shorter than the time to hold
+    assert first.metrics != evaluate(env, student_actor(policy, env, blind=True)).metrics
+    assert "% success" in str(first)
+    del training
+
+
+def test_a_task_of_ones_own_is_learnt(monkeypatch):
+    """The example ends nearer to its height after a third of its training than without any."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import custom_task
+
+    errors = [custom_task.main(iterations) for iterations in (0, 30)]
+    assert errors[1] < 0.8 * errors[0]
