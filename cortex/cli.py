@@ -21,8 +21,8 @@ BROKEN_PIPE = 141
 _HELP_WIDTH = 78
 
 _EXAMPLES = """examples:
-  cortex doctor                                does everything work here, and if not, why
-  cortex top                                   all topics with rate, bandwidth, losses, delay
+  cortex doctor                                whether all works here
+  cortex top                                   topics: rate, bandwidth, losses
   cortex topics                                what is published and subscribed
   cortex info /scan                            counters, live, and the type
   cortex echo /scan                            messages as they come

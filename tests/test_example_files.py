@@ -52,11 +52,13 @@ def test_an_unknown_seam_or_kind_is_said():
 
     with pytest.raises(ValueError, match="unknown seam 'sensors', known: sensor, vehicle"):
         registry.kinds("sensors")
-    with pytest.raises(ValueError, match=r"unknown sensor kind 'sonar', known: \['depth', 'event_camera'"):
+    with pytest.raises(ValueError, match=r"unknown sensor kind 'sonar', known: .*'depth'"):
         registry.find("sensor", "sonar")
 
 
-def test_a_renderer_in_another_process_conforms():
+def test_a_renderer_in_another_process_conforms(monkeypatch):
+    """The other process imports the example by its name."""
+    monkeypatch.syspath_prepend(EXAMPLES)
     pytest.importorskip("pyrender")
     if ctypes.util.find_library("EGL") is None:
         pytest.skip("OpenGL without a display needs EGL")
