@@ -56,7 +56,9 @@ def test_an_unknown_seam_or_kind_is_said():
         registry.find("sensor", "sonar")
 
 
-def test_a_renderer_in_another_process_conforms():
+def test_a_renderer_in_another_process_conforms(monkeypatch):
+    """The other process imports the example by its name."""
+    monkeypatch.syspath_prepend(EXAMPLES)
     pytest.importorskip("pyrender")
     if ctypes.util.find_library("EGL") is None:
         pytest.skip("OpenGL without a display needs EGL")

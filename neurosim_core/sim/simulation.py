@@ -22,6 +22,7 @@ from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
+from neurosim_core.sim.carrier import Carrier
 from neurosim_core.sim.inputs import as_device_array, make_seeds
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
@@ -284,6 +285,10 @@ class Simulation:
         self._require_reset()
         if periods < 1:
             raise ValueError(f"periods must be 1 at least, got {periods}")
+        if not isinstance(
+            self._state.vehicle, Carrier
+        ):  # worlds that were reset, or stepped, have no command of it
+            self._state.path_controller.update(self._state.vehicle.arrays)
         for _ in range(periods):
             observation = self._advance(closed_loop=True)
         return observation

@@ -670,3 +670,21 @@ def test_a_flight_without_cameras(plain):
         )
         for step, packets in enumerate(alone):
             assert_same(seen[step][world], packets)
+
+
+def test_worlds_that_follow_the_path_fly_as_a_run_does():
+    """From the first control period on: the controller commands at stamp 0, and anew after a reset."""
+    config = ns.load_config(
+        {
+            "duration_s": 0.1,
+            "device": "cpu",
+            "scene": {"kind": "apartment", "rooms": 1},
+            "sensors": {"odometry": {"kind": "odometry"}},
+        }
+    )
+    flown = [packet.position for packet in ns.run(config) if isinstance(packet, ns.Odometry)]
+    worlds = Simulation(config, worlds=2)
+    for _ in range(2):
+        positions = [worlds.reset().state.position.numpy()[1].copy()]
+        positions += [worlds.rollout(1).state.position.numpy()[1].copy() for _ in range(20)]
+        np.testing.assert_array_equal(positions, flown)

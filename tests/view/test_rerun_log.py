@@ -381,7 +381,7 @@ def test_memory_is_bounded(tmp_path):
 
 def test_wrong_input_is_refused(tmp_path):
     strange = Image(data=np.zeros((2, 2), np.int32), encoding="64FC9")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="encoding '64FC9', known: rgb8, mono8, 32FC1"):
+    with pytest.raises(ValueError, match="encoding '64FC9', known: rgb8, mono8, rgb16"):
         encode_picture(strange)
     with pytest.raises(ValueError, match=r"no field of shape \[H, W\]"):
         encode_picture(make_imu(0))
