@@ -42,7 +42,7 @@ def turn(samples):
 def test_adaptive_events_agree_with_those_of_many_rays():
     """Against 16 rays per pixel fewer events are missing and spurious than with one ray; all light is finite.
 
-    Some surfaces are shaded beyond the part that a ray hit: light extrapolated there is negative in seven pixels.
+    Where a surface is shaded beyond the part that a ray hit, light extrapolated would be negative (7 pixels).
     """
     wanted, pictures = turn(16)
     wrong = {}
