@@ -117,8 +117,7 @@ def test_close_to_many_rays(device):
         assert rms[name, "adaptive"] < share * rms[name, 1]
     for name in set(OUTPUTS).difference(RADIANCE):
         np.testing.assert_array_equal(pictures["adaptive"][name], pictures[1][name])
-    alone = render(scene, LENS, poses, outputs=("rgb", "radiance"), config=ADAPTIVE, device=device)
-    assert np.abs(alone["rgb"].astype(int) - pictures["adaptive"]["rgb"]).max() <= 1
+    alone = render(scene, LENS, poses, outputs=("radiance",), config=ADAPTIVE, device=device)
     np.testing.assert_allclose(alone["radiance"], pictures["adaptive"]["radiance"], rtol=1e-4, atol=1e-6)
 
 
