@@ -172,7 +172,7 @@ class RemoteScene:
             if array.size and array.shape != wanted:
                 raise RemoteRendererError(f"{where} sent {name} of shape {array.shape}, asked for {wanted}")
         missing = {"radiance": not reply.linear.size and not reply.srgb.size, "depth": not reply.depth.size}
-        if lacks := [name for name in outputs if missing[name]]:
+        if lacks := [name for name in sorted(outputs) if missing[name]]:
             raise RemoteRendererError(f"{where} sent no {', '.join(lacks)}")
         return Frames(
             linear=reply.linear if reply.linear.size else None,

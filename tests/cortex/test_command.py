@@ -9,6 +9,7 @@ import signal
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -296,10 +297,10 @@ def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path: Path) -> Non
     status, output, _ = cortex("doctor", environment={**environment, "CORTEX_PURE_PYTHON": "1"})
     assert status == 1
     assert "WRONG  C module: CORTEX_PURE_PYTHON leaves it out" in output
-    (tmp_path / "open").mkdir()
-    (tmp_path / "open").chmod(0o755)
-    open_to_all = {**environment, "CORTEX_RUNTIME_DIR": str(tmp_path / "open")}
-    status, output, _ = cortex("doctor", environment=open_to_all)
+    with tempfile.TemporaryDirectory(prefix="ctx-", dir="/tmp") as opened:  # paths of sockets are short
+        Path(opened).chmod(0o755)
+        open_to_all = {**environment, "CORTEX_RUNTIME_DIR": opened}
+        status, output, _ = cortex("doctor", environment=open_to_all)
     assert status == 1
     assert "chmod 700" in output.splitlines()[0]
 
