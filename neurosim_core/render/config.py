@@ -66,7 +66,7 @@ class RenderConfig(Settings):
     samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = 1
     """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray
     finds the surfaces around a pixel, and 16 points of the pixel tell how much of it each covers; 16 rays
-    where many small surfaces meet and for moving bodies. On a CPU it takes 2.6 to 2.8 times as long as one
+    where many small surfaces meet and for moving bodies. On a CPU it takes 2 to 5 times as long as one
     ray. An integer: as many rays in all pixels. With 1, edges alias, and a quarter to a half of the events at
     346x260 are aliasing. Geometry (depth, range, normal, instance) is always that of the ray through the
     pixel's centre."""
