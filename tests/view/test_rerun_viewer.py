@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -22,7 +23,8 @@ def listening(pid: int) -> set[tuple[str, int]]:
     """Addresses and ports on which a process listens."""
     sockets = set()
     for entry in Path(f"/proc/{pid}/fd").iterdir():
-        sockets.update(re.findall(r"socket:\[(\d+)\]", os.readlink(entry)))
+        with contextlib.suppress(FileNotFoundError):  # it closes files while they are listed
+            sockets.update(re.findall(r"socket:\[(\d+)\]", os.readlink(entry)))
     found = set()
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
