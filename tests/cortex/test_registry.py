@@ -109,7 +109,10 @@ def test_the_registry_is_detached_from_who_started_it(base):
         pid = registry_pid()
         process = Path(f"/proc/{pid}")
         wait_for(lambda: (runtime_dir(0) / REGISTRY_SOCKET).is_socket())
-        open_files = {os.readlink(entry) for entry in (process / "fd").iterdir()}
+        open_files = set()
+        for entry in (process / "fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # it closes files while they are listed
+                open_files.add(os.readlink(entry))
         assert os.readlink(f"/proc/self/fd/{write}") not in open_files
         assert os.readlink(process / "fd" / "0") == "/dev/null"
         assert os.readlink(process / "fd" / "2") == str(runtime_dir(0) / REGISTRY_LOG)
