@@ -116,6 +116,7 @@ class Publisher(Generic[T]):
         )
         self._fanout = Fanout(
             topic,
+            self.source,
             batch_head,
             gate=self._gate,
             large=self._large,
@@ -376,7 +377,7 @@ class Publisher(Generic[T]):
             head = self._large_kind + TAIL.pack(self._fingerprint, *stamps, size, 0)
             fanout.latched = head + slot.buffer[:size].tobytes()
         sent, inline_passed_over = self._large.send(
-            slot, size, mask, stamps, fanout.send_strict, fanout.pipes.send
+            slot, size, mask, stamps, fanout.send_strict, fanout.ring.send
         )
         self._skipped += passed_over or inline_passed_over
         on_time &= sent and not fanout.late
