@@ -166,7 +166,9 @@ class LargeSender:
         self._has_strict = any(r.request.strict for r in (*self._columns.values(), *self._inline))
         self._inline_strict = any(reader.request.strict for reader in self._inline)
         self._timeout_s = max((r.timeout_s for r in (*self._columns.values(), *self._inline)), default=0.0)
-        self._slot_outlets = list({reader.outlet for reader in self._columns.values() if reader.member is None})
+        self._slot_outlets = list(
+            {reader.outlet for reader in self._columns.values() if reader.member is None}
+        )
         self._has_members = any(reader.member is not None for reader in self._columns.values())
         self._inline_outlets = list({reader.outlet for reader in self._inline})
 
@@ -175,9 +177,7 @@ class LargeSender:
         wanted = 2 * self._shares + 2
         return max(wanted, min(DEEP_SLOTS, DEEP_RING_BYTES // slot_bytes)) if self._is_deep else wanted
 
-    def admit(
-        self, key: bytes, request: AttachKey, outlet: Outlet, join: Callable[[Reader], None]
-    ) -> Reader:
+    def admit(self, key: bytes, request: AttachKey, outlet: Outlet, join: Callable[[Reader], None]) -> Reader:
         """Take a reader in, with a column of the lease table if it can map memory: then it may `join` the ring."""
         column = None
         if request.shared_memory and outlet.local:

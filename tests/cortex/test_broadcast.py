@@ -279,7 +279,9 @@ def test_a_reader_cannot_write_to_the_ring(ring):
         file.write(b"x")
 
 
-@pytest.mark.parametrize("said", [b"", b"x" * 24, (b"CTXCAST1" * 3)], ids=["nothing", "nonsense", "no descriptors"])
+@pytest.mark.parametrize(
+    "said", [b"", b"x" * 24, (b"CTXCAST1" * 3)], ids=["nothing", "nonsense", "no descriptors"]
+)
 def test_who_says_something_else_is_refused(ring, said):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
         other.connect(ring.path)

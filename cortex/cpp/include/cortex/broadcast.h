@@ -215,7 +215,7 @@ static inline int64_t cortex_reader_peek(CortexReader *reader, const uint8_t **f
             cortex_reader_skip(reader);
         } else if (entry[1] == CORTEX_MOVED) {
             reader->broken = cortex_reader_follow(reader) < 0;
-        } else if (entry[1] != CORTEX_FRAME || cortex_entry_bytes(entry[0]) > left) {
+        } else if (entry[1] != CORTEX_FRAME || !entry[0] || cortex_entry_bytes(entry[0]) > left) {
             reader->broken = 1;
         } else {
             *frame = place + CORTEX_ENTRY_BYTES;
