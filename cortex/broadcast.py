@@ -175,7 +175,7 @@ class Broadcast:
                 self._ring.send(frame)
 
     def end(self, last: bytes) -> None:
-        """Send the last frame of all, for which there is room; what readers have not read yet stays theirs."""
+        """Send the last frame, for which there is room; what readers have not read yet stays theirs."""
         if self._readers:
             self._ring.end(last)
 

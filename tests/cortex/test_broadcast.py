@@ -1,4 +1,4 @@
-"""The ring that carries a publisher's frames to the readers of its host: what each of them gets, and when it is woken."""
+"""The ring that carries a publisher's frames to local readers: what each gets, and when it is woken."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from processes import SOON_S, wait_for
 import cortex.link
 from cortex import wire
 from cortex.codec import codec_of
-from cortex.node import Node
 from cortex.compiled import native
+from cortex.node import Node
 from cortex.policy import Policy, keep_last, latest, reliable
 from cortex.shm import RingView
 
@@ -73,7 +73,7 @@ def test_all_sizes_to_cpp_in_one_order(start: Callable[..., Peer], make_node: Ca
 
 def test_all_sizes_from_cpp_in_one_order(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
-    peer = start("publish", "/scan", 3000, SIZES)
+    start("publish", "/scan", 3000, SIZES)
     for number in range(3000):
         received = scans.recv(SOON_S)
         assert (received.stamp_ns, received.ranges.size) == (number, sizes()[number % 5])
@@ -94,7 +94,7 @@ def test_cpp_to_cpp_in_one_order(start: Callable[..., Peer]) -> None:
 def test_messages_without_a_slot_go_through_the_ring(
     start: Callable[..., Peer], make_node: Callable[..., Node]
 ) -> None:
-    """A C++ publisher that has no descriptor left for a ring sends whole bodies, larger than the first ring."""
+    """A C++ publisher that has no descriptor left for slots sends whole bodies through the ring."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 100, "100000,10", "full")
     for number in range(100):
