@@ -5,7 +5,6 @@
 #include "cpp/include/cortex/broadcast.h"
 
 #include <poll.h>
-#include <sched.h>
 
 enum { RING_BYTES = 1 << 19 };
 
@@ -221,14 +220,7 @@ static int reader_wait(RingReader *reader) {
 /* The next frame, from the ring or else from the socket; NULL if there is none, perhaps with an error. */
 static PyObject *reader_take(PyObject *self, int may_wait) {
     RingReader *reader = (RingReader *)self;
-    PyObject *frame = next_frame(reader);
-    if (frame != NULL || PyErr_Occurred()) return frame;
-    if (may_wait) { /* whoever writes has the processor, perhaps: to sleep would cost it a call for each message */
-        Py_BEGIN_ALLOW_THREADS
-        sched_yield();
-        Py_END_ALLOW_THREADS
-    }
-    frame = next_or_arm(reader);
+    PyObject *frame = next_or_arm(reader);
     if (frame != NULL || PyErr_Occurred()) return frame;
     frame = take_frame(reader->receive, reader->again, 0); /* after this its descriptor shows what comes */
     if (frame != NULL || PyErr_Occurred() || !may_wait || !reader_wait(reader)) return frame;

@@ -178,7 +178,7 @@ class LargeSender:
         return max(wanted, min(DEEP_SLOTS, DEEP_RING_BYTES // slot_bytes)) if self._is_deep else wanted
 
     def admit(self, key: bytes, request: AttachKey, outlet: Outlet, join: Callable[[Reader], None]) -> Reader:
-        """Take a reader in; with a column of the lease table, and a try to `join` the ring, if it can map memory."""
+        """Take a reader in; with a column of the lease table and a try to `join` if it can map memory."""
         column = None
         if request.shared_memory and outlet.local:
             column = next((c for c in range(COLUMNS) if c not in self._columns), None)

@@ -147,12 +147,12 @@ static inline void cortex_writer_wake(CortexWriter *writer) {
     }
 }
 
-/* Make room for frames of a size in principle: a larger ring where this one could not hold two. */
+/* Make room for frames of a size in principle: a larger ring, if there is memory for it, where this one could not hold two. */
 static inline int cortex_writer_fits(CortexWriter *writer, uint64_t bytes) {
     if (2 * bytes + CORTEX_SPARE_BYTES <= writer->capacity) return 1;
     uint64_t capacity = writer->capacity;
     while (capacity < 4 * bytes) capacity *= 2;
-    return cortex_writer_grow(writer, capacity) == 0;
+    return cortex_writer_grow(writer, capacity) == 0 || bytes <= writer->capacity;
 }
 
 /* Send a frame to all readers. If all are late it is not written: what waits for them stays. With `mind`, somebody who is

@@ -174,6 +174,9 @@ class Link {
 
   void accept(const wire::Header& header, const Arrival& arrival, std::deque<Item>& queue) {
     if (header.source != source_ || header.flags != flags()) throw MalformedMessage("not a frame of this publisher");
+    if (arrival.message == nullptr && std::strchr("MBS", header.kind) == nullptr) {
+      throw MalformedMessage("a frame in the ring that belongs into the socket");
+    }
     if (header.kind == 'A') return on_answer(arrival.bytes, queue);
     if (in_ring_ && arrival.message != nullptr && header.kind != 'L') return;  // it came through the ring
     if (header.fingerprint != type_.fingerprint) throw MalformedMessage("a message of another type");
