@@ -156,8 +156,12 @@ class EventChannel:
 
     def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
         terms = terms_of(config.pixel)
-        self._has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
-        self._labels = EventLabels(config.labels, config.classes, context) if config.labels else None
+        has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
+        self._labels = (
+            EventLabels(config.labels, config.classes, context, has_cause=has_cause)
+            if config.labels
+            else None
+        )
         self.camera = EventCamera(
             config.pixel,
             width=context.width,
@@ -167,7 +171,8 @@ class EventChannel:
             seed=context.seed,
             scan_count_max=context.in_flight,
             on_host=True,
-            terms=(*terms, CAUSE) if self._has_cause else None,
+            terms=(*terms, CAUSE) if has_cause else None,
+            labels=self._labels,
         )
         self.terms = (
             *self.camera.terms,
@@ -180,6 +185,8 @@ class EventChannel:
 
     def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
         """Launch the scan of the instants of a batch; the first that it sees is its reference."""
+        if self._labels is not None:
+            self._labels.note_flown()
         first = 0
         if not self.watching:
             self.camera.reset(frames[0], stamps_ns[0], sequence=self._sequence)
@@ -212,4 +219,4 @@ class EventChannel:
     def _labelled(self, packets: list[Events]) -> list[Packet]:
         if self._labels is None:
             return [*packets]
-        return [self._labels.add(packet, has_cause=self._has_cause) for packet in packets]
+        return [self._labels.add(packet) for packet in packets]

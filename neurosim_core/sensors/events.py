@@ -25,7 +25,7 @@ from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_strea
 from neurosim_core.sensors import event_cut
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_input import are_ends, as_frames, as_stamps, check_stack, invalid_message
-from neurosim_core.sensors.event_keys import EventKeys
+from neurosim_core.sensors.event_keys import EventKeys, Labeller
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_pixels import Pixels, Scan
@@ -75,6 +75,7 @@ class EventCamera:
             later: nothing is allocated on the device, and nothing that was launched since is waited for.
         terms: What is compiled in beyond ideal pixels, some of `event_noise_model.TERMS`; by default what the
             configuration asks for. With `CAUSE` besides, x is eight times the column plus the cause.
+        labels: Is told of all events, sorted, while they are on the device.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise_model.TERMS`, and "readout".
@@ -95,6 +96,7 @@ class EventCamera:
         scan_count_max: int = 1,
         on_host: bool = False,
         terms: Sequence[str] | None = None,
+        labels: Labeller | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -130,8 +132,7 @@ class EventCamera:
         self._scan_count_max = scan_count_max
         self._graphs = GraphCache(device)
         self._reader = make_stream(device, high_priority=True)
-        self._taken = Fence(device)
-        """All that was launched to the reader, the only stream that moves keys; feeders wait for it."""
+        self._taken = Fence(device)  # of the reader, the only stream that moves keys; feeders wait for it
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
             pixel_count=width * height,
@@ -139,6 +140,7 @@ class EventCamera:
             time_shift=self._time_shift,
             device=self.device,
             on_host=self._on_host,
+            labels=labels,
         )
         # a scan that nothing is cut beside writes its keys to where they stay
         self._in_place = scan_count_max == 1 and self._pixels.chunk_count == 1
@@ -238,9 +240,8 @@ class EventCamera:
         """Launch the scan of a stack of frames, without waiting for it.
 
         Nothing is allocated unless the stack is longer than any before, or there is no room for one event
-        more. After `scan_count_max` calls
-        `collect` or `collect_windows` comes next; until then `log_radiance` must stay as it is. All calls
-        must be on one stream.
+        more. After `scan_count_max` calls `collect` or `collect_windows` comes next; until then
+        `log_radiance` must stay as it is. All calls must be on one stream.
 
         Args:
             log_radiance: Frames on the camera's device, float32, contiguous, shape [K_max, H, W].
