@@ -13,7 +13,6 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Packet
 from neurosim_core.registry import register
-from neurosim_core.render.projection import make_lens_data
 from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensorConfig,
@@ -130,8 +129,6 @@ class EventSensorConfig(FrameSensorConfig):
     def _labels_can_be_had(self) -> EventSensorConfig:
         if "cause" in self.labels and self.lens.width > 1 << (16 - CAUSE_BITS):
             raise ValueError(f"the cause of events needs a width of at most {1 << (16 - CAUSE_BITS)} px")
-        if "flow" in self.labels:
-            make_lens_data(self.lens)
         return self
 
     @model_validator(mode="after")

@@ -219,7 +219,7 @@ class EventLabels:
         model.column_shift = CAUSE_BITS if self._has_cause else 0
         model.rays = wp.array(lens.ray_table(), dtype=wp.vec3, device=device)
         if "flow" in self._labels:
-            model.lens = make_lens_data(lens)
+            model.lens = make_lens_data(lens, device)
         model.p_BC, model.q_BC = context.p_BC, context.q_BC
         model.mesh, model.face_instance = scene.mesh_id, scene.data.face_instance
         if scene.bodies is not None:
