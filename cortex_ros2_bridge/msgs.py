@@ -47,6 +47,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
     # A message definition may give a default; rosbags leaves out these, of standard messages.
     "geometry_msgs/msg/Quaternion": {"w": 1.0},
     "sensor_msgs/msg/NavSatStatus": {"status": -2},
+    "simulation_interfaces/srv/StepSimulation_Request": {"steps": 1},
 }
 _FLOAT32_MAX = 3.402823466e38
 _EMPTY = "structure_needs_at_least_one_member"  # a byte that stands for an empty message on the wire

@@ -70,6 +70,14 @@ def check_stack(
         raise ValueError(f"stamps_ns must be later than {after_ns}, got {stamps[0]}")
 
 
+def check_reference(log_radiance: NDArray[np.float32]) -> None:
+    """Refuse a frame, shape [H, W], that has values of which pixels cannot start."""
+    valid = np.abs(log_radiance) <= LOG_RADIANCE_MAX
+    if not valid.all():
+        row, col = (int(index) for index in np.argwhere(~valid)[0])
+        raise ValueError(invalid_message(int((~valid).sum()), f"[{row}, {col}]"))
+
+
 def as_stamps(stamps_ns: Any) -> NDArray[np.int64]:
     """Return times of frames [ns] as int64, shape [K].
 

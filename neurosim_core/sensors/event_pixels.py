@@ -7,6 +7,7 @@ Scans may be under way one behind the other: each has the state before it and th
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -25,12 +26,43 @@ from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 from neurosim_core.warp_start import refuse_forked_process
 
+_log = logging.getLogger(__name__)
+
 _PIXELS_PER_THREAD_MIN = 16_384
 _KEYS_PER_PIXEL = 4
 """Events of a scan for which there is room on CUDA before any have come."""
 _COUNTERS = 3
 _COUNTERS_ROOM = 16
 """Numbers from the counters of a chunk to those of the next, which another core writes."""
+
+
+class LostEvents:
+    """Counts the events between two frames that are more than a camera may have, and warns of the first."""
+
+    def __init__(self, sensor: str, event_count_max: int) -> None:
+        self._sensor, self._event_count_max = sensor, event_count_max
+        self._lost: list[tuple[int, int]] = []
+        self._reported = False
+
+    def add(self, stamp_ns: int, count: int) -> None:
+        """Note how many events before a frame are lost."""
+        self._lost.append((stamp_ns, count))
+        if not self._reported:
+            _log.warning(
+                "%s: more than event_count_max = %d events between two frames, %d dropped before %d ns;"
+                " further losses are only counted in Events.dropped_count",
+                self._sensor or "event camera",
+                self._event_count_max,
+                count,
+                stamp_ns,
+            )
+            self._reported = True
+
+    def take(self, end_ns: int) -> int:
+        """Return how many were lost until a stamp, and forget them."""
+        count = sum(lost for stamp_ns, lost in self._lost if stamp_ns <= end_ns)
+        self._lost = [(stamp_ns, lost) for stamp_ns, lost in self._lost if stamp_ns > end_ns]
+        return count
 
 
 @dataclass
@@ -104,6 +136,7 @@ class Pixels:
         terms: What is compiled in beyond ideal pixels: some of `event_noise_model.TERMS`.
 
     Attributes:
+        base: Log radiance of the reset, shape [pixel].
         noise: What is not ideal; None: nothing.
         screened: Frames that are quiet are skipped first, as is fast on a CPU.
     """
@@ -127,7 +160,7 @@ class Pixels:
         self._row_shift, self._time_shift = row_shift, time_shift
         self._device = device
         pixel_count = width * height
-        self._base = self._empty(pixel_count, wp.float32)
+        self.base = self._empty(pixel_count, wp.float32)
         self._last = [self._empty(pixel_count, wp.float32) for _ in range(ring_size)]
         self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in range(ring_size)]
         self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=device)
@@ -154,11 +187,11 @@ class Pixels:
 
     def reset(self, log_radiance: wp.array2d[wp.float32], stamp_ns: int) -> None:
         """Make a frame every pixel's reference; the first state of the ring is the one that follows."""
-        wp.copy(self._base, log_radiance.flatten())
-        wp.copy(self._last[0], self._base)
+        wp.copy(self.base, log_radiance.flatten())
+        wp.copy(self._last[0], self.base)
         self._crossed[0].zero_()
         if self.noise is not None:
-            self.noise.reset(self._base, stamp_ns)
+            self.noise.reset(self.base, stamp_ns)
 
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""
@@ -250,7 +283,7 @@ class Pixels:
                 wp.launch(
                     event_scan.screen,
                     dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),
-                    inputs=[*thresholds, *extent, frame_count, self._base, self._crossed[before]],
+                    inputs=[*thresholds, *extent, frame_count, self.base, self._crossed[before]],
                     outputs=[*self._quiet_range, self._lead],
                     device=self._device,
                 )
@@ -276,7 +309,7 @@ class Pixels:
                     frame_count,
                     *frames,
                     scan.row_limit,
-                    self._base,
+                    self.base,
                     self._last[before],
                     self._crossed[before],
                     *memory[0],

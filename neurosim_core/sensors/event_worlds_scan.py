@@ -99,6 +99,36 @@ def begin_step(
 
 
 @wp.kernel
+def begin_frame(
+    # In:
+    start_ns: wp.int64,
+    stamp_ns: wp.int64,
+    # In/out:
+    stack: Stack,
+) -> None:
+    """Set the stamps of a world that sees one frame: those of the frame before and of this one [ns]."""
+    world = wp.tid()
+    origin_us = start_ns // _US
+    stack.origin_us[world] = origin_us
+    stack.stamps[world, 0] = start_ns - origin_us * _US
+    stack.stamps[world, 1] = stamp_ns - origin_us * _US
+
+
+@wp.kernel
+def hand_over_counters(
+    # In/out:
+    counters: wp.array2d[wp.int64],
+    # Out:
+    counters_out: wp.array2d[wp.int64],
+) -> None:
+    """Copy the counters of each world, to memory of the host for example, and begin to count anew."""
+    world = wp.tid()
+    for counter in range(3):
+        counters_out[world, counter] = counters[world, counter]
+        counters[world, counter] = wp.int64(0)
+
+
+@wp.kernel
 def screen(
     # Model:
     thresholds: wp.array[wp.vec2d],
@@ -437,9 +467,9 @@ def decode(
 ) -> None:
     """Take the keys of all worlds apart, world after world; threads are [world, lane]."""
     world, lane = wp.tid()
-    count = wp.int32(stack.counters[world, 0])
-    for index in range(lane, count, lane_count):
-        event = offsets[world] + index
+    first = offsets[world]
+    for index in range(lane, offsets[world + 1] - first, lane_count):
+        event = first + index
         found = take_apart(stack.keys[world, index], row_shift, time_shift)
         t_out[event] = stack.origin_us[world] + found.time_us
         x_out[event] = found.x
