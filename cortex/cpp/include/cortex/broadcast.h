@@ -232,11 +232,12 @@ static inline int cortex_reader_take(CortexReader *reader, int64_t size) {
     return 1;
 }
 
-/* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. */
+/* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may ring
+   later than we look: whoever finds nothing twice silences what was left of that. */
 static inline int cortex_reader_arm(CortexReader *reader) {
-    if (!reader->armed || !__atomic_load_n(&reader->page->sleeping, __ATOMIC_RELAXED)) {
-        if (reader->armed) cortex_hush_bell(reader->bell);
-        reader->armed = 1;
+    if (reader->armed) cortex_hush_bell(reader->bell);
+    reader->armed = 1;
+    if (!__atomic_load_n(&reader->page->sleeping, __ATOMIC_RELAXED)) {
         __atomic_store_n(&reader->page->sleeping, 1, __ATOMIC_RELAXED);
         __atomic_thread_fence(__ATOMIC_SEQ_CST); /* see `cortex_writer_wake` */
     }
