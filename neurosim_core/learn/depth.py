@@ -66,7 +66,7 @@ class DepthNet(nn.Module):
         self.up = nn.ModuleList(_block(a + b, b) for a, b in zip(sizes[:0:-1], sizes[-2::-1], strict=True))
         self.out = nn.Conv2d(c, 1, 1)
         nn.init.zeros_(self.out.weight)
-        nn.init.constant_(self.out.bias, float(torch.tensor(depth_m).log()))
+        self.out.bias = nn.Parameter(torch.tensor([depth_m]).log())
 
     def forward(self, voxel: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
         """Return log depth [log m], shape [B, H, W], and the memory after the window.
