@@ -320,6 +320,8 @@ class WorldEventCamera:
                     inputs=[
                         self._thresholds,
                         first,
+                        0,
+                        self._base.shape[1],
                         frame_count,
                         self.stack,
                         self._base,
@@ -353,6 +355,8 @@ class WorldEventCamera:
                 self.row_shift,
                 self.time_shift,
                 first,
+                0,
+                self._base.shape[1],
                 frame_count,
                 part,
                 *lead,
@@ -390,6 +394,7 @@ class WorldEventCamera:
         stack.log_radiance = frames
         stack.stamps = self._zeros((world_count, frame_count + 1), wp.int64)
         stack.origin_us = self._zeros(world_count, wp.int64)
+        stack.since_reset_ns = self._zeros(world_count, wp.int64)
         stack.row_limit = wp.full(
             (world_count, frame_count), self._height, dtype=wp.int32, device=self.device
         )
