@@ -472,6 +472,7 @@ def decode(
     time_shift: wp.int32,
     lane_count: wp.int32,
     # In:
+    origin_us: wp.int64,
     stack: Stack,
     offsets: wp.array[wp.int32],
     # Out:
@@ -480,13 +481,16 @@ def decode(
     y_out: wp.array[wp.uint16],
     polarity_out: wp.array[wp.uint8],
 ) -> None:
-    """Take the keys of all worlds apart, world after world; threads are [world, lane]."""
+    """Take the keys of all worlds apart, world after world; threads are [world, lane].
+
+    Times are from `origin_us` before the origins of the worlds.
+    """
     world, lane = wp.tid()
     first = offsets[world]
     for index in range(lane, offsets[world + 1] - first, lane_count):
         event = first + index
         found = take_apart(stack.keys[world, index], row_shift, time_shift)
-        t_out[event] = stack.origin_us[world] + found.time_us
+        t_out[event] = origin_us + stack.origin_us[world] + found.time_us
         x_out[event] = found.x
         y_out[event] = found.y
         polarity_out[event] = found.polarity
