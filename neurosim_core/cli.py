@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
-from neurosim_core import __version__
+from neurosim_core import __version__, docs
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         dataset.add_compare_parser,
         bench.add_parser,
         learn.add_parsers,
+        docs.add_parser,
     )
     for add in (*parsers, *others):
         add(commands)
