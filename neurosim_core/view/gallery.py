@@ -105,7 +105,7 @@ def _pixels() -> dict[str, Any]:
 
 
 def _views() -> dict[str, Any]:
-    return {lens["kind"]: {"kind": "rgb", "lens": lens} for lens in _LENSES}
+    return {str(lens["kind"]): {"kind": "rgb", "lens": lens} for lens in _LENSES}
 
 
 def _show_scene(scene: Mapping[str, Any], device: str) -> str:
@@ -159,13 +159,15 @@ def _picture(packets: list[Packet]) -> NDArray[np.uint8] | None:
         return color_picture(kind, data)
     low, high = np.nanquantile(np.where(np.isfinite(data), data, np.nan), [0.01, 0.99])
     share = np.nan_to_num(np.clip((data - low) / max(high - low, 1e-9), 0.0, 1.0))
-    return (255 * _turbo(share)).round().astype(np.uint8)
+    colors: NDArray[np.uint8] = (255 * _turbo(share)).round().astype(np.uint8)
+    return colors
 
 
 def _turbo(share: NDArray[Any]) -> NDArray[Any]:
     """Return colours from blue over green to red, shape [..., 3]."""
     centres = np.array([0.85, 0.5, 0.15])
-    return np.clip(1.6 - 4.0 * np.abs(share[..., None] - centres), 0.05, 1.0)
+    colors: NDArray[np.float64] = np.clip(1.6 - 4.0 * np.abs(share[..., None] - centres), 0.05, 1.0)
+    return colors
 
 
 def _from_above(points: NDArray[np.float32]) -> NDArray[np.uint8]:
