@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from cortex import Node, Publisher
 from cortex_ros2_bridge import cdr, convert, diagnostics
@@ -55,11 +55,7 @@ TWICE_S = 12.0
 Key = tuple[str, str, str, str]
 
 
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-V = TypeVar("V", bound=_Closable)
+V = TypeVar("V", bound=Any)
 
 
 class Shared(Generic[V]):
@@ -379,17 +375,11 @@ class Bridge:
         topics = () if self._seen is None else self._seen.topics
         latched = any(t.topic == topic and t.latched for t in topics)
         return self._feeds.take(
-            stack,
-            (topic, type_name),
-            lambda: Feed(self._node, topic, kind_of(type_name), latched=latched),
+            stack, (topic, type_name), lambda: Feed(self._node, topic, kind_of(type_name), latched=latched)
         )
 
     def _tap(
-        self,
-        feed: Feed,
-        tap: Callable[[Any], None],
-        wants: Callable[[], bool],
-        stack: contextlib.ExitStack,
+        self, feed: Feed, tap: Callable[[Any], None], wants: Callable[[], bool], stack: contextlib.ExitStack
     ) -> None:
         feed.tap(tap, wants)
         stack.callback(feed.untap, tap)

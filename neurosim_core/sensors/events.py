@@ -169,11 +169,7 @@ class EventCamera:
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the last frame that was waited for [ns].
-
-        Raises:
-            RuntimeError: If the camera was not reset.
-        """
+        """Time of the last frame that was waited for [ns]; there is none before a reset."""
         return self._require_reset()
 
     @property
