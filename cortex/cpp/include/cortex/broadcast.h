@@ -89,6 +89,7 @@ static inline int cortex_reader_open(CortexReader *reader, const char *path, uin
 static inline int cortex_reader_welcomed(CortexReader *reader); /* 1 once the publisher has taken the reader in, else 0 */
 static inline int cortex_reader_follow(CortexReader *reader);
 static inline void cortex_reader_close(CortexReader *reader);
+static inline int cortex_is_gone(int socket); /* whether the other end is closed */
 static inline void cortex_ring_bell(int bell);
 static inline void cortex_hush_bell(int bell);
 
@@ -101,7 +102,9 @@ static inline int cortex_member_is_full(CortexWriter *writer, CortexMember *memb
     if (!member->used || !member->strict || member->late) return 0;
     if (writer->head + bytes - member->tail <= writer->capacity) return 0;
     member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE); /* what it has read may be written over */
-    return writer->head + bytes - member->tail > writer->capacity;
+    if (writer->head + bytes - member->tail <= writer->capacity) return 0;
+    member->strict = !cortex_is_gone(member->socket); /* who is dead is not waited for */
+    return member->strict;
 }
 
 /* Whether somebody gets what comes; `late` is set if somebody does not. Who was late takes part once half is free. */

@@ -37,6 +37,11 @@ static inline void cortex_hush_bell(int bell) {
     if (read(bell, &count, sizeof count) < 0) return; /* it did not ring */
 }
 
+static inline int cortex_is_gone(int socket) {
+    char byte;
+    return recv(socket, &byte, 1, MSG_PEEK | MSG_DONTWAIT) == 0;
+}
+
 /* Sealed memory of its own: nobody can change its size, and if `others_read` nobody else can write to it. */
 static inline int cortex_memory(uint64_t bytes, int others_read) {
     const int fd = (int)syscall(SYS_memfd_create, "cortex", 3u /* MFD_CLOEXEC | MFD_ALLOW_SEALING */);
@@ -351,6 +356,7 @@ static inline int cortex_unsupported(void) {
     errno = ENOSYS;
     return -1;
 }
+static inline int cortex_is_gone(int socket) { return (void)socket, 0; }
 static inline void cortex_ring_bell(int bell) { (void)bell; }
 static inline void cortex_hush_bell(int bell) { (void)bell; }
 static inline int cortex_listen(const char *path) { return (void)path, cortex_unsupported(); }
