@@ -310,9 +310,12 @@ def test_processes_speak_through_the_ring(make_node, start_child, policy):
         block = subscriber.recv(SOON_S)
         assert is_whole(block)
         numbers.append(block.number)
-    assert numbers == list(range(numbers[0], numbers[0] + 60))
+    assert numbers == sorted(set(numbers))
     assert subscriber.carriers == ["ipc, ring, shared memory"]
-    assert subscriber.counters.lost == subscriber.counters.rejected == 0
+    counters = subscriber.counters
+    assert numbers[-1] - numbers[0] <= 59 + counters.lost + counters.overtaken
+    assert counters.rejected == 0
+    assert counters.lost == 0 or not policy.reliable
     child.finish()
 
 
