@@ -49,7 +49,7 @@ from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 
 SAMPLE_COUNT = 16
 """Points of a pixel."""
-FACE_COUNT_MAX = 16
+FACE_COUNT_MAX = 48
 """Most faces of a block of 4 x 4 pixels and the ring around it."""
 SHARPNESS = wp.constant(0.7)
 """Width of the footprint that a texture is averaged over [px]: a lookup blurs more than a mean does."""
