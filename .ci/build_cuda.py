@@ -86,7 +86,7 @@ def make_kernels() -> None:
     ):
         raycast_kernel(OUTPUTS, terms)
         fallback_kernel(OUTPUTS, terms)
-        antialiasing_kernel(OUTPUTS, terms)
+        antialiasing_kernel(OUTPUTS, terms, is_cuda=True)
     frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

@@ -34,7 +34,9 @@ from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
+from neurosim_core.render.antialias_groups import group_kernel
 from neurosim_core.render.camera import Lens
+from neurosim_core.render.coverage import FACE_COUNT_MAX, SAMPLE_COUNT, SHARPNESS, sample_point
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import spread_order
@@ -47,12 +49,6 @@ from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 
-SAMPLE_COUNT = 16
-"""Points of a pixel."""
-FACE_COUNT_MAX = 48
-"""Most faces of a block of 4 x 4 pixels and the ring around it."""
-SHARPNESS = wp.constant(0.7)
-"""Width of the footprint that a texture is averaged over [px]: a lookup blurs more than a mean does."""
 _CELLS = 4
 _SIDE = 4
 _LANES = _SIDE * _SIDE
@@ -114,12 +110,6 @@ def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     return np.stack([center, right - left, lower - upper])
 
 
-@wp.func_native(read_native(__file__, "sample_point", SAMPLES=SAMPLE_COUNT))
-def _sample_point(sample: int) -> wp.vec2:
-    """Return a point of a pixel, from its centre [px]."""
-    ...
-
-
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _cover_pixel(
     scene: SceneData,
@@ -147,7 +137,6 @@ def _cover_pixel(
     ...
 
 
-@cache
 def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel whose threads are pixels, for any device and all terms."""
     find_tile = tile_finder(terms)
@@ -247,7 +236,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                 v = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
                 front = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
                 for sample in range(SAMPLE_COUNT):
-                    point = _sample_point(sample)
+                    point = sample_point(sample)
                     toward[sample] = wp.quat_rotate(
                         q, wp.normalize(center + point[0] * across + point[1] * down)
                     )
@@ -255,7 +244,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     scene.embree_intersect, scene.embree_scene, origin, toward, FAR_M, part, t, u, v, front
                 )
             for sample in range(SAMPLE_COUNT):
-                point = _sample_point(sample)
+                point = sample_point(sample)
                 direction_C = wp.normalize(center + point[0] * across + point[1] * down)
                 direction = wp.quat_rotate(q, direction_C)
                 hit = Hit()
@@ -319,7 +308,6 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
     return wp.func_native(code)(shade_block)
 
 
-@cache
 def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     find_tile = tile_finder(terms)
@@ -400,7 +388,7 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
             total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             for sample in range(SAMPLE_COUNT):
-                point = _sample_point(sample)
+                point = sample_point(sample)
                 for y in range(rows):
                     for x in range(columns):
                         lane = _SIDE * y + x
@@ -424,17 +412,20 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     return average_blocks
 
 
-def antialiasing_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
+@cache
+def antialiasing_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, is_cuda: bool) -> wp.Kernel:
     """Return the kernel of the second pass.
 
     Args:
         outputs: Outputs of the renderer, of which those in `RADIANCE` are written.
         terms: Terms of the first pass.
+        is_cuda: Whether it is for CUDA.
     """
     written = tuple(name for name in RADIANCE if name in outputs)
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
-    in_blocks = _in_blocks(terms)
-    return (_block_kernel if in_blocks else _pixel_kernel)(written, plain)
+    if is_cuda:
+        return group_kernel(written, plain)
+    return (_block_kernel if _in_blocks(terms) else _pixel_kernel)(written, plain)
 
 
 def _in_blocks(terms: RenderTerms) -> bool:
@@ -463,7 +454,8 @@ class Antialiasing:
             thread_count: Threads on a CPU device; all cores if None.
         """
         self._device, self._thread_count = device, thread_count
-        self._kernel = antialiasing_kernel(outputs, terms)
+        is_cuda = wp.get_device(device).is_cuda
+        self._kernel = antialiasing_kernel(tuple(sorted(outputs)), terms, is_cuda=is_cuda)
         self._pixels_per_thread = _LANES if _in_blocks(terms) else 1
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
 
