@@ -36,7 +36,14 @@ from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.antialias_groups import group_kernel
 from neurosim_core.render.camera import Lens
-from neurosim_core.render.coverage import FACE_COUNT_MAX, SAMPLE_COUNT, SHARPNESS, sample_point
+from neurosim_core.render.coverage import (
+    FACE_COUNT_MAX,
+    RAY_COUNT,
+    RAY_WIDTH,
+    SAMPLE_COUNT,
+    SHARPNESS,
+    ray_point,
+)
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import spread_order
@@ -227,24 +234,24 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             total += number[entry] * light
             whole += number[entry]
         if count < 0:
-            whole = float(SAMPLE_COUNT)
+            whole = float(RAY_COUNT)
             if wp.static(bool(terms.embree)):
-                toward = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-                part = wp.zeros(shape=(SAMPLE_COUNT,), dtype=int)
-                t = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-                u = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-                v = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-                front = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-                for sample in range(SAMPLE_COUNT):
-                    point = sample_point(sample)
+                toward = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+                part = wp.zeros(shape=(_LANES,), dtype=int)
+                t = wp.zeros(shape=(_LANES,), dtype=float)
+                u = wp.zeros(shape=(_LANES,), dtype=float)
+                v = wp.zeros(shape=(_LANES,), dtype=float)
+                front = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+                for sample in range(RAY_COUNT):
+                    point = ray_point(sample)
                     toward[sample] = wp.quat_rotate(
                         q, wp.normalize(center + point[0] * across + point[1] * down)
                     )
                 cast_packet(
                     scene.embree_intersect, scene.embree_scene, origin, toward, FAR_M, part, t, u, v, front
                 )
-            for sample in range(SAMPLE_COUNT):
-                point = sample_point(sample)
+            for sample in range(RAY_COUNT):
+                point = ray_point(sample)
                 direction_C = wp.normalize(center + point[0] * across + point[1] * down)
                 direction = wp.quat_rotate(q, direction_C)
                 hit = Hit()
@@ -260,7 +267,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                 if wp.static(terms.bodies):
                     hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
                 total += radiance_of(
-                    scene, bodies, instant, body, q, direction, origin, 0.25 * spread_rad, hit
+                    scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
         write_radiance(scene, total / whole, 1, instant, slot, row, col, out)
 
@@ -387,8 +394,8 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             normal = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
             total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            for sample in range(SAMPLE_COUNT):
-                point = sample_point(sample)
+            for sample in range(RAY_COUNT):
+                point = ray_point(sample)
                 for y in range(rows):
                     for x in range(columns):
                         lane = _SIDE * y + x
@@ -397,14 +404,14 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                             sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
                             toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
                             ray[lane] = wp.quat_rotate(q, toward)
-                            spread_rad[lane] = 0.25 * rays[0, pixel][3]
+                            spread_rad[lane] = RAY_WIDTH * rays[0, pixel][3]
                 cast_packet(
                     scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
                 )
                 shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
             for lane in range(_LANES):
                 if (unresolved >> lane) & 1:
-                    radiance[lane] = total[lane] / float(SAMPLE_COUNT)
+                    radiance[lane] = total[lane] / float(RAY_COUNT)
         for y in range(rows):
             for x in range(columns):
                 write_radiance(scene, radiance[_SIDE * y + x], 1, instant, slot, top + y, left + x, out)

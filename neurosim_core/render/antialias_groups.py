@@ -6,7 +6,7 @@
 
 It computes what `antialias.py` describes. The threads of a block list its faces together, and each of them
 prepares some. Each tests the points of its own pixel, and shades what they show. A pixel that has to be
-rendered by rays is rendered by all 16, a ray each.
+rendered by rays is rendered by 8 of them, a ray each.
 """
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
@@ -15,7 +15,7 @@ import warp as wp
 
 from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.coverage import FACE_COUNT_MAX, SAMPLE_COUNT, SHARPNESS, sample_point
+from neurosim_core.render.coverage import FACE_COUNT_MAX, RAY_COUNT, RAY_WIDTH, SAMPLE_COUNT, SHARPNESS, ray_point
 from neurosim_core.render.outputs import RenderOutputs, radiance_writer, requested_outputs
 from neurosim_core.render.ray_intersection import UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.render_terms import RenderTerms
@@ -25,6 +25,8 @@ from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 
 _NO_LAYER = wp.constant(255.0)
 _ALL_POINTS = wp.constant((1 << SAMPLE_COUNT) - 1)
+_TOGETHER = 16 // RAY_COUNT
+"""Pixels of a block that are rendered by rays together."""
 _BOUNDS = (64, 10)
 """Threads of a block, and blocks of a multiprocessor."""
 Coverage = wp.types.vector(length=7, dtype=int)
@@ -72,7 +74,7 @@ def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) ->
 
 @wp.func_native(read_native(__file__, "group_sum"))
 def _group_sum(value: wp.vec3) -> wp.vec3:
-    """Return the sum over the threads of a block of pixels."""
+    """Return the sums over threads 0 to 7 and 8 to 15 of a block of pixels, to even and to odd threads."""
     ...
 
 
@@ -176,10 +178,13 @@ def group_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                 whole += shown[2]
         unresolved = _group_votes(coverage[0] < 0 and not outside)
         if unresolved != 0:
-            point = sample_point(lane)
-            for turn in range(16):
-                if (unresolved >> turn) & 1:
-                    pixel = first_ray + (top + turn // 4) * view.width + left + turn % 4
+            point = ray_point(lane % RAY_COUNT)
+            for turn in range(wp.static(16 // _TOGETHER)):
+                if (unresolved >> (_TOGETHER * turn)) & 3:
+                    member = _TOGETHER * turn + lane // RAY_COUNT
+                    if not ((unresolved >> member) & 1):
+                        member = member ^ 1
+                    pixel = first_ray + (top + member // 4) * view.width + left + member % 4
                     sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
                     direction_C = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
                     direction = wp.quat_rotate(q, direction_C)
@@ -188,12 +193,12 @@ def group_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                     if wp.static(terms.bodies):
                         hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
                     light = radiance_of(
-                        scene, bodies, instant, body, q, direction, origin, 0.25 * rays[0, pixel][3], hit
+                        scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * rays[0, pixel][3], hit
                     )
                     light = _group_sum(light)
-                    if lane == turn:
+                    if lane // _TOGETHER == turn and coverage[0] < 0:
                         total = light
-                        whole = float(SAMPLE_COUNT)
+                        whole = float(RAY_COUNT)
         if not outside:
             write_radiance(scene, total / whole, 1, instant, slot, row, col, out)
 

@@ -8,6 +8,10 @@ from neurosim_core.native_code import read_native
 
 SAMPLE_COUNT = 16
 """Points of a pixel."""
+RAY_COUNT = 8
+"""Rays of a pixel that is rendered by rays."""
+RAY_WIDTH = wp.constant(RAY_COUNT**-0.5)
+"""Width of the footprint of one of them [px]."""
 FACE_COUNT_MAX = 64
 """Most faces of a block of 4 x 4 pixels and the ring around it."""
 SHARPNESS = wp.constant(0.7)
@@ -18,3 +22,9 @@ SHARPNESS = wp.constant(0.7)
 def sample_point(sample: int) -> wp.vec2:
     """Return a point of a pixel, from its centre [px]."""
     ...
+
+
+@wp.func
+def ray_point(ray: int) -> wp.vec2:
+    """Return the point of a pixel that one of its rays goes through, from its centre [px]: every other one."""
+    return sample_point(2 * ray + (ray + ray // 2 + ray // 4) % 2)
