@@ -14,13 +14,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from cortex import Node, Publisher
 from cortex_ros2_bridge import cdr, convert, diagnostics
 from cortex_ros2_bridge.backend.base import Backend, BackendError, RosPublisher
 from cortex_ros2_bridge.config import QOS, BridgeConfig
-from cortex_ros2_bridge.incoming import Caller, Incoming, Target
+from cortex_ros2_bridge.incoming import SERVICES, Caller, Incoming, Target
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.outgoing import Feed, Outgoing, StaticTransforms, Whereabouts
 from cortex_ros2_bridge.routes import (
@@ -36,6 +36,7 @@ from cortex_ros2_bridge.routes import (
     unfit,
     vehicle_of,
 )
+from cortex_ros2_bridge.simulation import SERVED, SimulationServices
 from cortex_ros2_bridge.tally import Tally, Totals
 
 logger = logging.getLogger(__name__)
@@ -54,11 +55,7 @@ TWICE_S = 12.0
 Key = tuple[str, str, str, str]
 
 
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-V = TypeVar("V", bound=_Closable)
+V = TypeVar("V", bound=Any)
 
 
 class Shared(Generic[V]):
@@ -143,6 +140,7 @@ class Bridge:
         self._static = StaticTransforms(self._frames)
         self._resources = contextlib.ExitStack()
         self._static_publisher: RosPublisher | None = None
+        self._simulation: SimulationServices | None = None
         about = config.ros_topic(diagnostics.TOPIC)
         self._diagnostics = self._ros_publishers.take(
             self._resources, about, lambda: backend.publisher(about, diagnostics.TYPE, QOS["default"])
@@ -250,6 +248,9 @@ class Bridge:
             logger.info("%d routes are open; --verbose or /diagnostics names them", len(self._links))
         self._cortex_gone(len(wanted))
         self._watch_vehicles(seen)
+        if self._simulation is None and self.config.defaults and SERVED.keys() <= dict(seen.services).keys():
+            self._simulation = SimulationServices(self._node, self._backend, self.config)
+            self._resources.callback(self._simulation.close)
         self.problems = problems
         for problem in problems:
             if problem not in self._said:
@@ -357,10 +358,9 @@ class Bridge:
         stack.callback(caller.close)
         subscription = self._backend.subscription(route.ros_topic, route.ros_type, route.qos, caller.take)
         stack.callback(subscription.close)
-        if route.ros_type.startswith("std_msgs/"):  # a Trigger has no more to say than these
-            service = self._backend.service(route.ros_topic, "std_srvs/srv/Trigger", caller.serve)
-            if service is not None:
-                stack.callback(service.close)
+        service = self._backend.service(route.ros_topic, SERVICES[route.ros_type], caller.serve)
+        if service is not None:
+            stack.callback(service.close)
         return caller.tally, lambda: subscription.publisher_count
 
     def _context(self, route: Route) -> convert.Context:
@@ -375,17 +375,11 @@ class Bridge:
         topics = () if self._seen is None else self._seen.topics
         latched = any(t.topic == topic and t.latched for t in topics)
         return self._feeds.take(
-            stack,
-            (topic, type_name),
-            lambda: Feed(self._node, topic, kind_of(type_name), latched=latched),
+            stack, (topic, type_name), lambda: Feed(self._node, topic, kind_of(type_name), latched=latched)
         )
 
     def _tap(
-        self,
-        feed: Feed,
-        tap: Callable[[Any], None],
-        wants: Callable[[], bool],
-        stack: contextlib.ExitStack,
+        self, feed: Feed, tap: Callable[[Any], None], wants: Callable[[], bool], stack: contextlib.ExitStack
     ) -> None:
         feed.tap(tap, wants)
         stack.callback(feed.untap, tap)

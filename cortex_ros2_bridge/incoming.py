@@ -11,16 +11,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from cortex import (
-    Closed,
-    Node,
-    Publisher,
-    ServiceFailed,
-    ServiceTimeout,
-    ServiceUnavailable,
-    TypeMismatch,
-)
+from cortex import Closed, Node, Publisher, ServiceFailed, ServiceTimeout, ServiceUnavailable, TypeMismatch
 from cortex.messages import SimulatorReply
+from cortex.service import Client
 from cortex_ros2_bridge import cdr
 from cortex_ros2_bridge.backend.base import RosSubscription
 from cortex_ros2_bridge.convert import Context, ConvertError
@@ -36,6 +29,13 @@ PENDING_S = 1.0
 """How long a command waits for a simulator that is about to subscribe to it [s]."""
 CALL_TIMEOUT_S = 30.0
 """How long a service may take to answer; `step` answers when the steps are over [s]."""
+ENDS = "the bridge ends"
+SERVICES = {
+    "std_msgs/msg/Empty": "std_srvs/srv/Trigger",
+    "std_msgs/msg/UInt32": "std_srvs/srv/Trigger",
+    "neurosim/msg/Reset": "neurosim/srv/Reset",
+}
+"""The service that stands beside a topic of requests, by the type of the topic."""
 
 
 class Target:
@@ -226,9 +226,15 @@ class Caller:
             self.tally.refuse(str(error))
 
     def serve(self, request: Any, response: Any) -> Any:
-        """Call the service for a request of ROS (std_srvs/Trigger); waits for the answer."""
+        """Call the service for a request of ROS, of one of `SERVICES`; waits for the answer."""
         self.tally.receive()
-        response.message = self._call(self._default)
+        try:
+            begin = getattr(request, "begin", None)
+            asked = self._default if begin is None else self._convert(bytes(cdr.encode(begin)), self._context)
+            response.message = self._call(asked)
+        except ConvertError as error:
+            response.message = str(error)
+            self.tally.refuse(response.message)
         response.success = not response.message
         return response
 
@@ -246,18 +252,25 @@ class Caller:
 
     def _call(self, request: Any) -> str:
         """Call the service; returns why it did not do what was asked, empty if it did."""
-        try:
-            reply = self._client.call(request, timeout_s=CALL_TIMEOUT_S)
-        except Closed:
-            return "the bridge ends"
-        except (ServiceFailed, ServiceTimeout, ServiceUnavailable, TypeMismatch) as error:
-            self.tally.lose(str(error))
-            return str(error)
-        if not reply.accepted:
-            self.tally.refuse(reply.reason)
-            return str(reply.reason)
-        self.tally.send()
-        return ""
+        reason, was_answered = ask(self._client, request)
+        if not reason:
+            self.tally.send()
+        elif was_answered:
+            self.tally.refuse(reason)
+        elif reason != ENDS:
+            self.tally.lose(reason)
+        return reason
+
+
+def ask(client: Client[Any, SimulatorReply], request: Any) -> tuple[str, bool]:
+    """Call a service; returns why it did not do what was asked, empty if it did, and whether it answered."""
+    try:
+        reply = client.call(request, timeout_s=CALL_TIMEOUT_S)
+    except Closed:
+        return ENDS, False
+    except (ServiceFailed, ServiceTimeout, ServiceUnavailable, TypeMismatch) as error:
+        return str(error), False
+    return "" if reply.accepted else str(reply.reason or "refused"), True
 
 
 def _staleness(stamp_ns: int, now_ns: int | None, stale_ns: int | None) -> str:

@@ -47,6 +47,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
     # A message definition may give a default; rosbags leaves out these, of standard messages.
     "geometry_msgs/msg/Quaternion": {"w": 1.0},
     "sensor_msgs/msg/NavSatStatus": {"status": -2},
+    "simulation_interfaces/srv/StepSimulation_Request": {"steps": 1},
 }
 _FLOAT32_MAX = 3.402823466e38
 _EMPTY = "structure_needs_at_least_one_member"  # a byte that stands for an empty message on the wire
@@ -225,6 +226,7 @@ def _field(name: str, desc: Any) -> Field:
             dtype = np.dtype("uint8" if base == "char" else base)
             check = _fixed(name, base, dtype, size)
             default = functools.partial(np.zeros, size, dtype)
+            convert = functools.partial(np.array, dtype=dtype)
         elif base in TYPE_CODES:
             check = _sequence(name, base, size)
             default = functools.partial(array.array, TYPE_CODES[base])

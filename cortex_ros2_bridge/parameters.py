@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from cortex_ros2_bridge.backend.base import Backend
+from cortex_ros2_bridge.backend.names import service_path
 from cortex_ros2_bridge.bridge import Bridge
 from cortex_ros2_bridge.config import BridgeConfig, RouteChange
 from cortex_ros2_bridge.msgs import message_class
@@ -79,8 +80,7 @@ class Parameters:
             ("SetParameters", self._set),
             ("SetParametersAtomically", self._set_together),
         ):
-            path = "".join(f"_{c.lower()}" if c.isupper() else c for c in name).strip("_")
-            service = backend.service(f"{node}/{path}", f"rcl_interfaces/srv/{name}", answer)
+            service = backend.service(f"{node}/{service_path(name)}", f"rcl_interfaces/srv/{name}", answer)
             if service is not None:
                 self._resources.callback(service.close)
 

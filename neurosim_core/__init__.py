@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from neurosim_core.registry import register
     from neurosim_core.render.camera import PinholeConfig
     from neurosim_core.render.renderer import make_renderer, upload_scene
+    from neurosim_core.sensors.event_batch import EventCameraBatch
     from neurosim_core.sensors.event_config import EventCameraConfig
     from neurosim_core.sensors.events import EventCamera
     from neurosim_core.sim.model import Model, make_model
@@ -43,6 +44,7 @@ _HOMES = {
     "neurosim_core.registry": ("register",),
     "neurosim_core.render.camera": ("PinholeConfig",),
     "neurosim_core.render.renderer": ("make_renderer", "upload_scene"),
+    "neurosim_core.sensors.event_batch": ("EventCameraBatch",),
     "neurosim_core.sensors.event_config": ("EventCameraConfig",),
     "neurosim_core.sensors.events": ("EventCamera",),
     "neurosim_core.sim.model": ("Model", "make_model"),
@@ -61,6 +63,7 @@ __all__ = [
     "ConfigError",
     "DynamicsError",
     "EventCamera",
+    "EventCameraBatch",
     "EventCameraConfig",
     "Events",
     "Image",

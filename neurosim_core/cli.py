@@ -7,13 +7,14 @@ import atexit
 import gc
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
-from neurosim_core import __version__
+from neurosim_core import __version__, docs
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
@@ -50,10 +51,33 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Takes no abbreviations of options: what `--ou` means may change with the next option."""
+    """Takes no abbreviations of options: what `--ou` means may change with the next option.
+
+    A wrong word is answered in one line, with the word that is most like it.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{**options, "allow_abbrev": False})
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Refuse unknown options here, where it is known which command they were given to."""
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            from neurosim_core.config_errors import suggestion
+
+            options = [option for action in self._actions for option in action.option_strings]
+            hint = suggestion(unknown[0].partition("=")[0], options) if unknown[0].startswith("-") else ""
+            self.error(f"unrecognized arguments: {' '.join(unknown)}; {hint}")
+        return parsed, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Say in one line what is wrong and where to read on; exit with 2."""
+        wrong = re.search(r"invalid choice: '?([^' ]*)'? \(choose from (.*)\)", message)
+        if wrong:
+            from neurosim_core.config_errors import suggestion
+
+            message += f"; {suggestion(wrong[1], re.findall(r'[^ ,]+', wrong[2].replace(chr(39), '')))}"
+        self.exit(2, f"{self.prog}: {message.rstrip('; ')}; `{self.prog} --help` lists what there is\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -70,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         dataset.add_compare_parser,
         bench.add_parser,
         learn.add_parsers,
+        docs.add_parser,
     )
     for add in (*parsers, *others):
         add(commands)
@@ -256,15 +281,17 @@ def _live_overrides(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from neurosim_core.config import load_config, to_yaml
+    from rich.console import Console
 
-    config = load_config(arguments.config, overrides=_overrides(arguments), options=_options(arguments))
+    with Console(stderr=True).status("preparing: libraries"):  # on the screen before they are there
+        from neurosim_core.config import load_config, to_yaml
+
+        config = load_config(arguments.config, overrides=_overrides(arguments), options=_options(arguments))
+        if not arguments.print_config:
+            from neurosim_core.flight import fly, new_folder
     if arguments.print_config:
         print(to_yaml(config, comments=True), end="")
         return 0
-
-    from neurosim_core.flight import fly, new_folder
-
     folder = new_folder(arguments.out, overwrite=arguments.overwrite)
     report = fly(config, folder, rerun=not arguments.no_rrd)
     return 130 if report.interrupted else 0

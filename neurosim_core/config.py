@@ -352,15 +352,28 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{path} is binary, no settings; a mesh is named in them: scene: {{kind: mesh, file: {path}}}"
         ) from None
+    except FileNotFoundError:
+        raise ConfigError(
+            f"no settings file {path}: `neurosim run --print-config > {path}` makes one"
+        ) from None
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error}") from error
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not YAML: {error}") from error
+        raise ConfigError(f"{path} is not YAML: {_in_one_line(error)}") from error
     if raw is None:
         return {}
     if not isinstance(raw, dict):
         raise ConfigError(f"{path} must hold a mapping of keys to values, got a {type(raw).__name__}")
     return raw
+
+
+def _in_one_line(error: yaml.YAMLError) -> str:
+    """Return where YAML ends to be YAML, and what to look for."""
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
+        return " ".join(str(error).split())
+    mark = error.problem_mark
+    tab = "; indent with spaces" if "'\\t'" in str(error.problem) else ""
+    return f"line {mark.line + 1}, column {mark.column + 1}: {error.problem}{tab}"
 
 
 def _nest(key: str, value: Any) -> dict[str, Any]:
@@ -433,6 +446,10 @@ def _explain(error: ValidationError, raw: Mapping[str, Any]) -> Iterator[str]:
             yield f"{line}; {suggestion(group.removeprefix('sensors.'), others)}".rstrip("; ")
         elif path == "scene.path":
             yield f"{path}: unknown key; the file of a scene is scene.file"
+        elif path == "vehicle.kind" and reason.startswith(("Input should", "must be")):
+            yield f"{line}; the airframe is the preset: vehicle: {{preset: hummingbird}}"
+        elif path == "scene.kind" and reason.startswith("must be"):
+            yield f"{line}; the file of a scene is scene: {{kind: mesh, file: house.glb}}"
         elif path == "device" and "pattern" in reason:
             yield f"{path}: must be auto, cpu, cuda, or cuda:0 and so on, got {raw['device']!r}"
         else:

@@ -93,7 +93,9 @@ def fly(
     begin = time.perf_counter()
     with _new_folder(folder), console.status("preparing") as status:
         model = make_model(config, on_phase=lambda phase: status.update(f"preparing: {phase}"))
-        status.update("preparing: kernels (compiled on the first run, then cached)")
+        status.update(
+            "preparing: kernels (the first run compiles them, 10 s to a minute; then they are kept)"
+        )
         state = make_state(model)
         packets = run_model(model, state)
         first = next(packets, None)  # builds all kernels; there is none without sensors
@@ -163,8 +165,14 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     made = recorded.with_suffix(".rrd")
     if save is None and made.exists():
         return made
-    if not recorded.exists() or not is_event_file(recorded):
-        raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {flight}` makes one")
+    if not recorded.exists():
+        folder = flight if flight.suffix == "" else "DIR"
+        raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {folder}` makes one")
+    if not is_event_file(recorded):
+        raise FileNotFoundError(
+            f"no flight at {recorded}: neither a recording nor a file of events; "
+            f"`neurosim convert {recorded} events.h5` makes events of a film"
+        )
     with as_recording(recorded) as file, Recording(file) as source:
         header = source.header
         settings = yaml.safe_load(header.config_yaml)

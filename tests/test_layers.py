@@ -21,7 +21,6 @@ LAZY = {"torch", "rerun", "h5py", "matplotlib", "pyrender", "OpenGL", "gymnasium
 LAZY |= {"cyclonedds", "rclpy", "mcap", "zenoh", "iceoryx2", "lcm", "rotorpy", "av", "faery"}
 """Heavy or optional: imported where they are used, never when a module is imported."""
 SPEAKS_DDS = {f"cortex_ros2_bridge.backend.{name}" for name in ("cyclone", "dds", "graph", "idl")}
-SPEAKS_DDS |= {"neurosim_core.bench.bridge_controller"}
 """They are about cyclonedds from their first line to the last; others import them where they are used."""
 
 

@@ -60,3 +60,8 @@ def ros_type(dds_type: str) -> str:
     """Return the ROS name of a DDS type; other types keep their name."""
     match = _DDS_TYPE.fullmatch(dds_type)
     return "/".join(match.groups()) if match else dds_type
+
+
+def service_path(name: str) -> str:
+    """Return what a service of a type is called: set_parameters for SetParameters."""
+    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).strip("_")

@@ -8,14 +8,14 @@ import math
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar, cast, get_args
+from typing import Any, TypeVar, cast, get_args
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 from rich.console import Console
 
-from cortex import Closed, Info, Node, Subscriber, keep_last, latest, reliable
+from cortex import Closed, Info, Node, Publisher, Subscriber, keep_last, latest, reliable
 from cortex.messages import Odometry, RotorSpeeds, Simulation, SimulatorStatus
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import FollowMode, PathFollower
@@ -84,7 +84,8 @@ class PathController:
         self._misses = 0
         self._logged_s = -math.inf
         self._closed = threading.Event()
-        self._commands = node.publisher(command_topic(vehicle, follower.mode), COMMANDS[follower.mode])
+        self._node = node
+        self._commands: Publisher[Any] | None = None
         self._rotor_speeds = node.subscriber(
             stream_topic(vehicle, "rotor_speeds"),
             RotorSpeeds,
@@ -107,10 +108,8 @@ class PathController:
             Closed: The controller or its node was closed.
             ValueError: The vehicle has another number of rotors than the follower's.
         """
-        if not self.command_count:  # a command that is sent before the simulator is connected is lost
-            wait_s = math.inf if timeout_s is None else timeout_s
-            if not self._commands.wait_for_subscribers(timeout_s=wait_s):
-                return False
+        if not self.command_count and not self._connect(math.inf if timeout_s is None else timeout_s):
+            return False
         try:
             odometry = self._odometry.recv(timeout_s)
         except TimeoutError:
@@ -129,6 +128,7 @@ class PathController:
         message = command_of(
             self._follower.mode, command, stamp_ns=odometry.stamp_ns, sequence=self.command_count
         )
+        assert self._commands is not None
         if not self._commands.publish(message):
             self.lost_count += 1
             self._warn("the simulator does not take its commands")
@@ -146,13 +146,28 @@ class PathController:
         """Leave the topics, from any thread; `run` returns soon after."""
         self._closed.set()
         for end in (self._odometry, self._rotor_speeds, self._commands):
-            end.close()
+            if end is not None:
+                end.close()
 
     def __enter__(self) -> PathController:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _connect(self, timeout_s: float) -> bool:
+        """Wait until commands reach a simulator; False if they do not in time.
+
+        A simulator repeats its state for who begins to send commands. They are offered when that state can be
+        heard, or lockstep would begin with rotor speeds that nobody has told.
+        """
+        if self._commands is None:
+            if not self._odometry.wait_for_publisher(timeout_s):
+                return False
+            self._rotor_speeds.wait_for_publisher(self._wait_s)
+            mode = self._follower.mode
+            self._commands = self._node.publisher(command_topic(self.vehicle, mode), COMMANDS[mode])
+        return self._commands.wait_for_subscribers(timeout_s=timeout_s)
 
     def _rotor_speed_of(self, odometry: Odometry) -> NDArray[np.float64]:
         """Return the rotor speeds with the sequence of odometry, which a link may have delayed."""

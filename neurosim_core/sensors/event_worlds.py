@@ -15,6 +15,7 @@ import warp as wp
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_worlds_scan as scan
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
@@ -83,6 +84,7 @@ class WorldEventCamera:
         sensor: Name of the sensor: noise depends on it.
         seeds: Of each world.
         ordered: Sort the events.
+        takes_apart: Have room for `results`; False: somebody else reads the keys.
     """
 
     def __init__(
@@ -96,14 +98,15 @@ class WorldEventCamera:
         sensor: str,
         seeds: Sequence[int],
         ordered: bool = True,
+        takes_apart: bool = True,
     ) -> None:
         self.device: Any = wp.get_device(frames.device)
         world_count, frame_count, pixel_count = frames.shape
         self._configs = list(configs)
         self._width, self._height, self._sensor = width, height, sensor
         self._ordered = ordered
-        self._row_shift = SUB_BITS + (width - 1).bit_length()
-        self._time_shift = self._row_shift + (height - 1).bit_length() + 1
+        self.row_shift = SUB_BITS + (width - 1).bit_length()
+        self.time_shift = self.row_shift + (height - 1).bit_length() + 1
         self._capacity = capacity
         self._event_count_max: Any = wp.array(
             [config.event_count_max for config in configs], dtype=wp.int32, device=self.device
@@ -122,10 +125,11 @@ class WorldEventCamera:
         scratch = (world_count, pixel_count if self._screened else 0)
         self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
         self._lead = self._zeros((world_count, 0 if self.terms else pixel_count), wp.int32)
-        self._stack = self._make_stack(frames, frame_count)
+        self.stack: Any = self._make_stack(frames, frame_count)
+        """What a step sees and what comes of it, `event_worlds_scan.Stack`."""
         self._sections = self._zeros(-(-world_count // int(scan.SECTION)), wp.int64)
         self._offsets_ns: dict[tuple[int, ...], Any] = {}
-        room = world_count * capacity
+        room = world_count * capacity if takes_apart else 0
         self.results = WorldEvents(
             t=self._empty(room, wp.int64),
             x=self._empty(room, wp.uint16),
@@ -133,8 +137,8 @@ class WorldEventCamera:
             polarity=self._empty(room, wp.uint8),
             offsets=self._zeros(world_count + 1, wp.int32),
             counts=self._zeros(world_count, wp.int32),
-            dropped=self._stack.dropped,
-            counters=self._stack.counters,
+            dropped=self.stack.dropped,
+            counters=self.stack.counters,
             width=width,
             height=height,
         )
@@ -155,12 +159,13 @@ class WorldEventCamera:
         """Thresholds of each world, up and down, device array of vec2d, shape [world]; None: others count."""
         return None if self.terms else self._thresholds
 
-    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None, *, reset_ns: int = 0) -> None:
         """Draw what stays in the pixels anew, and let later noise have other seeds; waits for the device.
 
         Args:
             seeds: Of all worlds.
             worlds: Indices of those that get other seeds; None: all.
+            reset_ns: Time of the reset that follows, where it is not the origin of the world's time [ns].
         """
         if not self.terms:
             return
@@ -175,7 +180,7 @@ class WorldEventCamera:
                 device=self.device,
                 terms=self.terms,
             )
-            noise.set_reset(0)
+            noise.set_reset(reset_ns)
             return noise
 
         noise = [
@@ -207,13 +212,13 @@ class WorldEventCamera:
             parity: Which of the two states is the present one.
         """
         shape = self._base.shape
-        for array in (self.results.offsets, self.results.counts, self._stack.dropped, self._stack.counters):
+        for array in (self.results.offsets, self.results.counts, self.stack.dropped, self.stack.counters):
             array.zero_()
         wp.launch(
             scan.begin_pixels,
             dim=shape,
-            inputs=[mask, self._stack.log_radiance],
-            outputs=[self._base, self._last[parity], self._crossed[parity], self._stack.counters],
+            inputs=[mask, self.stack.log_radiance],
+            outputs=[self._base, self._last[parity], self._crossed[parity], self.stack.counters],
             device=self.device,
         )
         if self.terms:
@@ -245,33 +250,41 @@ class WorldEventCamera:
             parity: Which of the two states is the present one; the other is after this, if there is a frame.
         """
         frame_count = len(offsets_ns) - 1
-        world_count = self._base.shape[0]
-        self._launch(scan.begin_step, world_count, [clock_ns, self.offsets(offsets_ns)], [self._stack])
+        offsets = self.offsets(offsets_ns)
+        self._launch(scan.begin_step, self._base.shape[0], [clock_ns, offsets], [self.stack])
         if frame_count > 0:
-            self._take_frames(frame_count, scan.ALL, parity)
-            self._launch(
-                scan.find_overflow, world_count, [self._capacity, self._event_count_max], [self._stack]
-            )
-            if self.device.is_cuda or self._stack.overflow.numpy().any():
-                self._take_frames(frame_count, scan.COUNT, parity)
-                each = self._capacity // frame_count
-                self._launch(scan.limit_rows, world_count, [each, self._event_count_max], [self._stack])
-                self._take_frames(frame_count, scan.AGAIN, parity)
+            self.find_keys(frame_count, parity)
         self._hand_out()
+
+    def find_keys(self, frame_count: int, parity: int) -> None:
+        """Scan the frames of a step that has begun, and drop the events that do not fit."""
+        world_count = self._base.shape[0]
+        self.take_frames(frame_count, scan.ALL, parity)
+        self._launch(scan.find_overflow, world_count, [self._capacity, self._event_count_max], [self.stack])
+        if self.device.is_cuda or self.stack.overflow.numpy().any():
+            self.take_frames(frame_count, scan.COUNT, parity)
+            each = self._capacity // frame_count
+            self._launch(scan.limit_rows, world_count, [each, self._event_count_max], [self.stack])
+            self.take_frames(frame_count, scan.AGAIN, parity)
+
+    def grow(self, capacity: int) -> None:
+        """Have room for more keys; those there are are lost."""
+        self._capacity = capacity
+        self.stack.keys = self._empty((self._base.shape[0], capacity), wp.int64)
 
     def _hand_out(self) -> None:
         events, world_count = self.results, self._base.shape[0]
         lanes = BLOCK_SIZE if self.device.is_cuda else 1
         if self._ordered:
             self._sort()
-        counters, sections = self._stack.counters, self._sections
+        counters, sections = self.stack.counters, self._sections
         self._launch(scan.add_up_sections, sections.shape[0], [counters], [sections])
         self._launch(scan.add_up, world_count + 1, [counters, sections], [events.offsets, events.counts])
         wp.launch(
             scan.decode,
             dim=(world_count, lanes),
             block_dim=BLOCK_SIZE,
-            inputs=[self._row_shift, self._time_shift, lanes, self._stack, events.offsets],
+            inputs=[self.row_shift, self.time_shift, lanes, 0, self.stack, events.offsets],
             outputs=[events.t, events.x, events.y, events.polarity],
             device=self.device,
         )
@@ -284,11 +297,11 @@ class WorldEventCamera:
                 scan.sort_keys,
                 dim=(world_count, block),
                 block_dim=block,
-                inputs=[self._stack.counters, self._stack.keys],
+                inputs=[self.stack.counters, self.stack.keys],
                 device=self.device,
             )
             return
-        keys, counts = self._stack.keys.numpy(), self._stack.counters.numpy()[:, 0]
+        keys, counts = self.stack.keys.numpy(), self.stack.counters.numpy()[:, 0]
 
         def sort(first: int, end: int) -> None:
             for world in range(first, end):
@@ -296,7 +309,7 @@ class WorldEventCamera:
 
         self._share(sort)
 
-    def _take_frames(self, frame_count: int, part: int, parity: int) -> None:
+    def take_frames(self, frame_count: int, part: int, parity: int) -> None:
         """Scan all pixels: on a CUDA device at once, on the CPU some worlds on each core."""
 
         def take(first: int, end: int) -> None:
@@ -308,42 +321,69 @@ class WorldEventCamera:
                     inputs=[
                         self._thresholds,
                         first,
+                        0,
+                        self._base.shape[1],
                         frame_count,
-                        self._stack,
+                        self.stack,
                         self._base,
                         self._crossed[parity],
                     ],
                     outputs=[*self._quiet_range, self._lead],
                     device=self.device,
                 )
-            block = BLOCK_SIZE if self.device.is_cuda else 1
-            own = [self._models] if self.terms else [self._thresholds]
-            lead = [] if self.terms else [self._lead]
-            memory = [[self._memories[slot]] if self.terms else [] for slot in (parity, 1 - parity)]
-            wp.launch(
-                self._scan,
-                dim=(end - first, -(-self._base.shape[1] // block) * block),  # whole blocks to a world
-                block_dim=BLOCK_SIZE,
-                inputs=[
-                    *own,
-                    self._width,
-                    self._row_shift,
-                    self._time_shift,
-                    first,
-                    frame_count,
-                    part,
-                    *lead,
-                    self._base,
-                    self._last[parity],
-                    self._crossed[parity],
-                    *memory[0],
-                    self._stack,
-                ],
-                outputs=[self._last[1 - parity], self._crossed[1 - parity], *memory[1]],
-                device=self.device,
-            )
+            self._launch_scan(first, end, frame_count, part, parity)
 
         self._share(take)
+
+    def record_scan(self, parity: int) -> Any:
+        """Return the launch of the scan of one frame of all worlds, on CUDA; `stack` may change meanwhile."""
+        world_count, pixel_count = self._base.shape
+        if self.terms:
+            return self._launch_scan(0, world_count, 1, scan.ALL, parity, record_cmd=True)
+        blocks = -(-pixel_count // (BLOCK_SIZE * PIXELS_PER_THREAD))
+        states = [self._base, self._last[parity], self._crossed[parity]]
+        return wp.launch(
+            scan_frame,
+            dim=(world_count, blocks * BLOCK_SIZE),
+            block_dim=BLOCK_SIZE,
+            inputs=[self._thresholds, self._width, self.row_shift, self.time_shift, *states, self.stack],
+            outputs=[self._last[1 - parity], self._crossed[1 - parity]],
+            device=self.device,
+            record_cmd=True,
+        )
+
+    def _launch_scan(
+        self, first: int, end: int, frame_count: int, part: int, parity: int, *, record_cmd: bool = False
+    ) -> Any:
+        block = BLOCK_SIZE if self.device.is_cuda else 1
+        own = [self._models] if self.terms else [self._thresholds]
+        lead = [] if self.terms else [self._lead]
+        memory = [[self._memories[slot]] if self.terms else [] for slot in (parity, 1 - parity)]
+        return wp.launch(
+            self._scan,
+            dim=(end - first, -(-self._base.shape[1] // block) * block),  # whole blocks to a world
+            block_dim=BLOCK_SIZE,
+            inputs=[
+                *own,
+                self._width,
+                self.row_shift,
+                self.time_shift,
+                first,
+                0,
+                self._base.shape[1],
+                frame_count,
+                part,
+                *lead,
+                self._base,
+                self._last[parity],
+                self._crossed[parity],
+                *memory[0],
+                self.stack,
+            ],
+            outputs=[self._last[1 - parity], self._crossed[1 - parity], *memory[1]],
+            device=self.device,
+            record_cmd=record_cmd,
+        )
 
     def _share(self, work: Callable[[int, int], None]) -> None:
         """Do some worlds on each core of a CPU; on a CUDA device all at once."""
@@ -368,6 +408,7 @@ class WorldEventCamera:
         stack.log_radiance = frames
         stack.stamps = self._zeros((world_count, frame_count + 1), wp.int64)
         stack.origin_us = self._zeros(world_count, wp.int64)
+        stack.since_reset_ns = self._zeros(world_count, wp.int64)
         stack.row_limit = wp.full(
             (world_count, frame_count), self._height, dtype=wp.int32, device=self.device
         )

@@ -10,7 +10,7 @@ in `event_scan`. What is not ideal in them is in `event_noise_model`, and the ar
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """
 
-import logging
+import functools
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -22,31 +22,30 @@ from numpy.typing import NDArray
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
 from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_stream
-from neurosim_core.sensors import event_cut
+from neurosim_core.sensors import event_cut, event_input
+from neurosim_core.sensors.event_batch import EventCameraBatch, FrameEvents
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_input import are_ends, as_frames, as_stamps, check_stack, invalid_message
-from neurosim_core.sensors.event_keys import EventKeys
+from neurosim_core.sensors.event_keys import EventKeys, Labeller
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
-from neurosim_core.sensors.event_pixels import Pixels, Scan
+from neurosim_core.sensors.event_pixels import LostEvents, Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.sensors.event_scan import LOG_RADIANCE_MAX
 
-__all__ = ["EventCamera", "EventCameraConfig"]
-
-_log = logging.getLogger(__name__)
+_MIXED = "step() and feed() must not be mixed: call reset() between them"
 
 
 class EventCamera:
     """An event camera that is fed frames of log radiance.
 
     Its state survives between calls, and neither the split of frames into calls, the number of threads nor
-    the device's scheduling changes the events. Two ways to use it, which may be mixed:
+    the device's scheduling changes the events. Three ways to use it, of which the first two may be mixed:
 
     - `feed` takes a stack of frames and returns its events.
     - `feed_device` launches the scan of a stack without waiting for it, and later `collect` or
       `collect_windows` reads back the number of events and hands them out, sorted. They do so on a stream of
       their own: on another stream than `feed_device`, they wait for one scan and not for later launches.
+    - `step` takes one frame and counts its events, which stay on the device, unsorted. It is the fastest
+      where frames come one by one; `EventCameraBatch` does it for many cameras.
 
     A pixel's levels are base + m threshold_on - n threshold_off, where base is its log radiance at the reset.
     Tie rule: a sample rises to a level if it may have been that level, or more, before it was rounded,
@@ -60,8 +59,7 @@ class EventCamera:
     At other levels an event may be early by the time that the signal takes to change by these roundings,
     about one ulp (5e-7 at 5). A crossing found so is stamped at the sample.
 
-    With a readout, events are stamped when they are read: those of a window may have happened before it, and
-    those that wait at its end come later.
+    With a readout, events are stamped when they are read, and may have happened before their window.
 
     Args:
         config: Thresholds, limits, and what is not ideal.
@@ -71,10 +69,10 @@ class EventCamera:
         sensor: Name of the sensor in the packets; cameras with different names have independent noise.
         seed: Seed of the run for all noise, 0 <= seed < 2^64.
         scan_count_max: How many stacks may be fed before the first of them is collected.
-        on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
-            later: nothing is allocated on the device, and nothing that was launched since is waited for.
+        on_host: Hand events out as NumPy arrays also on a CUDA device: faster than to copy them later.
         terms: What is compiled in beyond ideal pixels, some of `event_noise_model.TERMS`; by default what the
             configuration asks for. With `CAUSE` besides, x is eight times the column plus the cause.
+        labels: Is told of all events, sorted, while they are on the device.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise_model.TERMS`, and "readout".
@@ -95,6 +93,7 @@ class EventCamera:
         scan_count_max: int = 1,
         on_host: bool = False,
         terms: Sequence[str] | None = None,
+        labels: Labeller | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -130,8 +129,7 @@ class EventCamera:
         self._scan_count_max = scan_count_max
         self._graphs = GraphCache(device)
         self._reader = make_stream(device, high_priority=True)
-        self._taken = Fence(device)
-        """All that was launched to the reader, the only stream that moves keys; feeders wait for it."""
+        self._taken = Fence(device)  # of the reader, the only stream that moves keys; feeders wait for it
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
             pixel_count=width * height,
@@ -139,6 +137,7 @@ class EventCamera:
             time_shift=self._time_shift,
             device=self.device,
             on_host=self._on_host,
+            labels=labels,
         )
         # a scan that nothing is cut beside writes its keys to where they stay
         self._in_place = scan_count_max == 1 and self._pixels.chunk_count == 1
@@ -157,6 +156,11 @@ class EventCamera:
             )
         wp.load_module(event_cut, device=self.device)
 
+        size: dict[str, Any] = {"width": width, "height": height, "device": device}
+        new_stepper = functools.partial(EventCameraBatch, config, count=1, sensor=sensor, seed=seed, **size)
+        self._make_stepper = functools.cache(new_stepper)
+        self._stepper: EventCameraBatch | None = None
+        """Has the pixels since the reset, if they step."""
         self._now_ns: int | None = None
         self._fed_ns = 0
         self._window_start_ns = 0
@@ -165,11 +169,7 @@ class EventCamera:
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the last frame that was waited for [ns].
-
-        Raises:
-            RuntimeError: If the camera was not reset.
-        """
+        """Time of the last frame that was waited for [ns]; there is none before a reset."""
         return self._require_reset()
 
     @property
@@ -194,18 +194,15 @@ class EventCamera:
         Raises:
             ValueError: If shape or dtype is wrong, or a value is not finite or beyond +-1000.
         """
-        frame = as_frames(log_radiance, (self.height, self.width), self.device)
-        values = frame.numpy()
-        valid = np.abs(values) <= LOG_RADIANCE_MAX
-        if not valid.all():
-            row, col = (int(index) for index in np.argwhere(~valid)[0])
-            raise ValueError(invalid_message(int((~valid).sum()), f"[{row}, {col}]"))
+        frame = event_input.as_frames(log_radiance, (self.height, self.width), self.device)
+        event_input.check_reference(frame.numpy())
         for scan in (*self._idle, *self._under_way):
             scan.done.wait()  # it writes states, and reads what the host writes next
         self._pixels.reset(frame, int(stamp_ns))
         if self._readout is not None:
             self._readout.reset(int(stamp_ns))
-        self._now_ns = self._fed_ns = int(stamp_ns)
+        self._now_ns = self._fed_ns = self._reset_ns = int(stamp_ns)
+        self._stepper = None
         self._forget()
         self._sequence = sequence
 
@@ -226,21 +223,34 @@ class EventCamera:
             ValueError: If shape, dtype or stamps are wrong; also if a value is not finite or beyond +-1000,
                 in which case the camera must be reset.
         """
-        stamps = as_stamps(stamps_ns)
-        frames = as_frames(log_radiance, (len(stamps), self.height, self.width), self.device)
+        stamps = event_input.as_stamps(stamps_ns)
+        frames = event_input.as_frames(log_radiance, (len(stamps), self.height, self.width), self.device)
         if len(stamps) > 0:
             scan = self._plan_scan(frames, stamps)
             self._pixels.launch(scan)
             self._note_launched(scan)
         return self.collect()
 
+    def step(self, log_radiance: Any, stamp_ns: int) -> FrameEvents:
+        """Return the events of one frame as soon as they are counted; see `EventCameraBatch.step`.
+
+        Raises:
+            RuntimeError: If the camera was not reset, or was fed in another way since.
+        """
+        if self._stepper is None:
+            if not self._require_reset() == self._fed_ns == self._reset_ns:
+                raise RuntimeError(_MIXED)
+            stepper = self._make_stepper()
+            stepper.reset(self._pixels.base.reshape((self.height, self.width)), self._reset_ns)
+            self._stepper = stepper
+        return self._stepper.step(log_radiance, stamp_ns)
+
     def feed_device(self, log_radiance: wp.array3d[wp.float32], stamps_ns: Any) -> None:
         """Launch the scan of a stack of frames, without waiting for it.
 
         Nothing is allocated unless the stack is longer than any before, or there is no room for one event
-        more. After `scan_count_max` calls
-        `collect` or `collect_windows` comes next; until then `log_radiance` must stay as it is. All calls
-        must be on one stream.
+        more. After `scan_count_max` calls `collect` or `collect_windows` comes next; until then
+        `log_radiance` must stay as it is. All calls must be on one stream.
 
         Args:
             log_radiance: Frames on the camera's device, float32, contiguous, shape [K_max, H, W].
@@ -252,7 +262,7 @@ class EventCamera:
             ValueError: If shape, dtype, device or stamps are wrong, or the stamps are too far from the last
                 window collected.
         """
-        scan = self._plan_scan(log_radiance, as_stamps(stamps_ns))
+        scan = self._plan_scan(log_radiance, event_input.as_stamps(stamps_ns))
         self._graphs.run(self._pixels.launch_key(scan), lambda: self._pixels.launch(scan))
         self._note_launched(scan)
 
@@ -292,9 +302,13 @@ class EventCamera:
 
     def _check_feed(self, log_radiance: wp.array3d[wp.float32], stamps: NDArray[np.int64]) -> None:
         self._require_reset()
+        if self._stepper is not None:
+            raise RuntimeError(_MIXED)
         if len(self._under_way) >= self._scan_count_max:
             raise RuntimeError(f"collect() must be called after {len(self._under_way)} feed_device()")
-        check_stack(log_radiance, stamps, (self.height, self.width), self.device, after_ns=self._fed_ns)
+        event_input.check_stack(
+            log_radiance, stamps, (self.height, self.width), self.device, after_ns=self._fed_ns
+        )
         span_us = int(stamps[-1]) // NS_PER_US - self._keys.origin_us
         if span_us * NS_PER_US >= self.span_max_ns:
             limit_s = self.span_max_ns / 1e9
@@ -352,7 +366,7 @@ class EventCamera:
             now_ns = self._require_reset()
             if not ends:
                 return []
-            if not are_ends(ends, self._window_start_ns, now_ns):
+            if not event_input.are_ends(ends, self._window_start_ns, now_ns):
                 raise ValueError(
                     f"ends_ns must increase by at least 1000 from {self._window_start_ns}"
                     f" and not pass {now_ns}, got {ends}"
@@ -366,8 +380,7 @@ class EventCamera:
         self._idle = deque(sorted(scans, key=lambda scan: scan.number))  # as at the first time: same graphs
         self._under_way.clear()
         self._state = 0
-        self._dropped: list[tuple[int, int]] = []
-        self._drop_reported = False
+        self._lost = LostEvents(self.sensor, self.config.event_count_max)
         self._sequence = 0
         self._window_start_ns = self._now_ns or 0
         self._keys.clear(self._window_start_ns // NS_PER_US)
@@ -428,7 +441,7 @@ class EventCamera:
             self._now_ns = None
             self._idle += self._under_way
             self._under_way.clear()
-            raise ValueError(invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
+            raise ValueError(event_input.invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
         return [end - chunk.first_key for (end, _, _), chunk in zip(counters, scan.chunks, strict=True)]
 
     def _limit_rows(self, scan: Scan) -> bool:
@@ -436,22 +449,12 @@ class EventCamera:
         stamps = scan.stamps_ns
         total = np.cumsum(self._pixels.count_by_row(scan), axis=1, dtype=np.int64)
         rows = (total <= self.config.event_count_max).sum(axis=1)
-        for frame in np.flatnonzero(rows < self.height):
+        short = np.flatnonzero(rows < self.height)
+        for frame in short:
             kept = int(total[frame, rows[frame] - 1]) if rows[frame] > 0 else 0
-            self._dropped.append((int(stamps[frame]), int(total[frame, -1]) - kept))
-        if not (rows < self.height).any():
+            self._lost.add(int(stamps[frame]), int(total[frame, -1]) - kept)
+        if len(short) == 0:
             return False
-        if not self._drop_reported:
-            stamp_ns, dropped = self._dropped[-1]
-            _log.warning(
-                "%s: more than event_count_max = %d events between two frames, %d dropped before %d ns;"
-                " further losses are only counted in Events.dropped_count",
-                self.sensor or "event camera",
-                self.config.event_count_max,
-                dropped,
-                stamp_ns,
-            )
-            self._drop_reported = True
         wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
         self._scan_again(scan)
         return True
@@ -472,22 +475,16 @@ class EventCamera:
         """Return the packets of windows, each of which ends at a place in the columns."""
         packets = []
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
-            dropped = sum(lost for stamp_ns, lost in self._dropped if stamp_ns <= end_ns)
-            self._dropped = [(stamp_ns, lost) for stamp_ns, lost in self._dropped if stamp_ns > end_ns]
+            dropped = self._lost.take(end_ns)
             if self._readout is not None:
                 dropped += self._readout.take_dropped(end_ns)
-            t, x, y, polarity = (
-                [column[start:cut] for column in columns] if cut > start else self._keys.no_events()
-            )
+            found = [column[start:cut] for column in columns] if cut > start else self._keys.no_events()
             packets.append(
                 Events(
                     stamp_ns=end_ns,
                     sequence=self._sequence,
                     sensor=self.sensor,
-                    t=t,
-                    x=x,
-                    y=y,
-                    polarity=polarity,
+                    **dict(zip(("t", "x", "y", "polarity"), found, strict=True)),
                     width=self.width,
                     height=self.height,
                     start_ns=self._window_start_ns,

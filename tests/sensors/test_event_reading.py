@@ -14,10 +14,10 @@ from late_device import LateDevice, install
 
 from neurosim_core.packets import Events
 from neurosim_core.runtime import cuda
-from neurosim_core.sensors.event_config import ShotNoiseConfig
+from neurosim_core.sensors.event_config import EventCameraConfig, ShotNoiseConfig
 from neurosim_core.sensors.event_keys import EventKeys
 from neurosim_core.sensors.event_pixels import Pixels
-from neurosim_core.sensors.events import EventCamera, EventCameraConfig
+from neurosim_core.sensors.events import EventCamera
 
 WIDTH, HEIGHT = 9, 7
 FRAME_NS = 1_700

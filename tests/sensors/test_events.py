@@ -13,7 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.packets import Events
-from neurosim_core.sensors.events import EventCamera, EventCameraConfig
+from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.events import EventCamera
 
 MS = 1_000_000
 

@@ -1,14 +1,16 @@
 """A controller as a foreign node: it speaks DDS by public functions of cyclonedds, with types of its own.
 
-Its arguments are the DDS domain, lockstep or streaming, and modes of commands. It flies the figure eight with
-one mode after the other, asks for a reset after each, and prints a line of JSON for each flight. It knows
-nothing of Cortex and of the bridge.
+Its arguments are the DDS domain and modes of commands. It flies the figure eight with one mode after the
+other, asks for a reset after each, and prints a line of JSON for each flight. It knows nothing of Cortex and
+of the bridge. `test_bridge_flight` flies the same law without any of it.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,8 +24,26 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from neurosim_core.bench.bridge_laws import DURATION_S, MAX_THRUST_N, Errors, flight_config, make_law
+from neurosim_core import SimulationConfig, load_config
+from neurosim_core.control import PathFollower
 from neurosim_core.sim.model import plan_paths
+from neurosim_core.trajectory import Path
+from neurosim_core.trajectory.path import PathCursor
+
+MAX_THRUST_N = 20.0
+DURATION_S = 4.0
+SETTINGS: dict[str, Any] = {
+    "duration_s": DURATION_S,
+    "device": "cpu",
+    "scene": {"kind": "apartment", "rooms": 2},
+    "vehicle": {"on_collision": "report"},
+    "path": {"kind": "figure_eight", "speed_max_m_s": 2.5, "ramp_s": 1.0, "center_m": [0.0, 0.0, 1.2]},
+    "control": {"rate_hz": 100},
+    "sensors": {"imu": {"kind": "imu", "rate_hz": 100}},
+    "live": {"mode": "lockstep", "command_deadline_s": 60.0, "command_timeout_s": 5.0},
+}
+
+Law = Callable[..., np.ndarray]
 
 
 def struct(name: str, **fields: Any) -> Any:
@@ -83,6 +103,53 @@ def qos(depth: int) -> Qos:
     )
 
 
+def make_law(mode: str, settings: SimulationConfig, path: Path) -> Law:
+    """Return a function of a state, by names; position and velocity in W, xyzw, rates in B.
+
+    motor_speeds: the geometric controller of `neurosim_core.control`. attitude: its outer loop, in Python.
+    """
+    airframe = settings.vehicle.airframe()
+    if mode == "motor_speeds":
+        return PathFollower(path, airframe, settings.control.gains, mode="motor_speeds").command
+    gains, cursor = settings.control.gains, PathCursor(path)
+
+    def attitude(*, stamp_ns: int, position: Any, velocity: Any, orientation: Any, **_: Any) -> np.ndarray:
+        point = cursor.at(stamp_ns)
+        force = point["acceleration"] + np.array([0.0, 0.0, 9.81])
+        force = force + gains.position_gain_per_s2 * (point["position"] - position)
+        force = force + gains.velocity_gain_per_s * (point["velocity"] - velocity)
+        x, y, z, w = orientation
+        up = np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
+        thrust_n = float(np.clip(airframe.mass_kg * force @ up, 0.0, MAX_THRUST_N))
+        # The shortest turn from the vertical to the force, after one about the vertical.
+        axis = force / np.linalg.norm(force)
+        tilt = np.array([-axis[1], axis[0], 0.0, 1.0 + axis[2]])
+        tilt /= np.linalg.norm(tilt)
+        half = 0.5 * float(point["yaw"])
+        s, c = math.sin(half), math.cos(half)
+        a, b, _, d = tilt
+        return np.array([thrust_n, a * c + b * s, b * c - a * s, d * s, d * c])
+
+    return attitude
+
+
+class Errors:
+    """Distance from a path, over a flight."""
+
+    def __init__(self, path: Path) -> None:
+        self._cursor = PathCursor(path)
+        self.squares: list[float] = []
+
+    def add(self, stamp_ns: int, position: Any) -> None:
+        """Take in where the vehicle was."""
+        self.squares.append(float(np.sum((self._cursor.at(stamp_ns)["position"] - position) ** 2)))
+
+    @property
+    def rms_m(self) -> float:
+        """Root of the mean square [m]."""
+        return math.sqrt(sum(self.squares) / len(self.squares))
+
+
 class Ear:
     """Receives from a topic."""
 
@@ -120,8 +187,8 @@ def numbers(*parts: Any) -> np.ndarray:
 class Pilot:
     """One flight after the other."""
 
-    def __init__(self, domain: int, live_mode: str) -> None:
-        self.settings = flight_config(live_mode)
+    def __init__(self, domain: int) -> None:
+        self.settings = load_config(SETTINGS)
         (self.path,) = plan_paths(self.settings).values()
         participant = DomainParticipant(domain)
         self.odometry = Ear(participant, "rt/sim/drone/odometry", Odometry)
@@ -195,8 +262,8 @@ class Pilot:
 def main() -> None:
     """Fly."""
     wp.config.log_level = wp.LOG_WARNING
-    pilot = Pilot(int(sys.argv[1]), sys.argv[2])
-    for mode in sys.argv[3:]:
+    pilot = Pilot(int(sys.argv[1]))
+    for mode in sys.argv[2:]:
         print(json.dumps(pilot.fly(mode)), flush=True)
         pilot.reset()
 
