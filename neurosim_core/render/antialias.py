@@ -8,11 +8,11 @@
    through different points of their pixels: a bar as thin as a quarter of a pixel is hit in one of four
    adjacent rows or columns.
 2. A block of 4 x 4 pixels may show the faces that the first rays hit in it and in a ring of one pixel around
-   it, and those beyond their edges that cross the block. Each of SAMPLE_COUNT points of a pixel shows the
-   nearest of them. That takes products and sums: no ray is cast. A plane surface is shaded once per pixel, at
-   the middle of the points that show it.
+   it, and, step by step, those beyond their edges that cross the block. Each of SAMPLE_COUNT points of a
+   pixel shows the nearest of them. That takes products and sums: no ray is cast. A plane surface is shaded
+   once per pixel, at the middle of the points that show it.
 3. Blocks with more than FACE_COUNT_MAX faces or with moving bodies, and pixels that show for the most part
-   none of the faces, are the mean of SAMPLE_COUNT rays.
+   none of the faces, are the mean of RAY_COUNT rays, through every other point.
 
 Faces are those of the scene before they are cut for baked light, which makes many of one.
 
@@ -33,8 +33,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.antialias_groups import group_kernel
+from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.coverage import (
     FACE_COUNT_MAX,

@@ -15,7 +15,14 @@ import warp as wp
 
 from neurosim_core.native_code import read_native
 from neurosim_core.render.body_arrays import BodyData
-from neurosim_core.render.coverage import FACE_COUNT_MAX, RAY_COUNT, RAY_WIDTH, SAMPLE_COUNT, SHARPNESS, ray_point
+from neurosim_core.render.coverage import (
+    FACE_COUNT_MAX,
+    RAY_COUNT,
+    RAY_WIDTH,
+    SAMPLE_COUNT,
+    SHARPNESS,
+    ray_point,
+)
 from neurosim_core.render.outputs import RenderOutputs, radiance_writer, requested_outputs
 from neurosim_core.render.ray_intersection import UNFUSED, Hit, intersect_bodies, intersect_scene
 from neurosim_core.render.render_terms import RenderTerms
@@ -54,7 +61,7 @@ def _cover_group(
 
 @wp.func_native(read_native(__file__, "samples_of_layer", SAMPLES=SAMPLE_COUNT))
 def _samples_of_layer(coverage: Coverage, left: int) -> Shown:
-    """Return the layer of the first point in `left`; bits and number of the points that show it; their mean."""
+    """Return the layer of the first point in `left`, and of its points: bits, number, mean."""
     ...
 
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="empty-body,untyped-decorator"
+# mypy: disable-error-code="empty-body,untyped-decorator,no-any-return"
 # mypy: allow-untyped-calls
 """The points of a pixel that antialiasing tests; see `antialias.py`."""
 
@@ -26,5 +26,5 @@ def sample_point(sample: int) -> wp.vec2:
 
 @wp.func
 def ray_point(ray: int) -> wp.vec2:
-    """Return the point of a pixel that one of its rays goes through, from its centre [px]: every other one."""
+    """Return the point of a pixel that a ray goes through, from its centre [px]."""
     return sample_point(2 * ray + (ray + ray // 2 + ray // 4) % 2)
