@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -56,7 +57,7 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
         if poses:
             panels.append(way.drawn(int(np.searchsorted([p.stamp_ns for p in poses], stamp_ns))))
         frames.append(_beside(panels))
-    options = {"quality": 60, "method": 6} if out.suffix == ".webp" else {}
+    options: dict[str, Any] = {"quality": 60, "method": 6} if out.suffix == ".webp" else {}
     frames[0].save(
         out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
     )
