@@ -334,6 +334,7 @@ def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
     return {
         "device": device,
         "control": {"rate_hz": task.rate_hz},
+        "render": {"samples_per_pixel": task.rays_per_pixel},
         "path": {"kind": "hover"},
         "vehicle": {"on_collision": "end", "max_step_s": 0.004, **task.vehicle},
         "sensors": {CAMERA: camera} if sees else {},
