@@ -143,6 +143,7 @@ def pilot_settings(card: Mapping[str, Any]) -> dict[str, Any]:
         "control": {"rate_hz": rate_hz},
         "vehicle": dict(card["vehicle"]),
         "path": {"kind": "hover"},
+        "render": {"samples_per_pixel": card["rays_per_pixel"]},
         "sensors": {
             CAMERA: {
                 "kind": "event_camera",

@@ -57,6 +57,7 @@ def policy(tmp_path_factory):
         "camera": {"width": 8, "height": 8, "horizontal_fov_rad": 1.5},
         "threshold": 0.1,
         "renders_per_step": 1,
+        "rays_per_pixel": 1,
         "surface": {"kind": "TimeSurface", "tau_s": [0.05]},
         "hover_thrust_n": 4.905,
         "thrust_span": 0.4,
