@@ -42,6 +42,8 @@ class TrainConfig:
     seed: int = 0
     teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
     student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    pixels: int | None = None
+    """Width and height of the event camera [px]; None: as the task says."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
@@ -77,7 +79,12 @@ class Training:
         self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
         self.env = make_env(
-            config.task, worlds=config.student.worlds, device=config.device, models=models, seed=config.seed
+            config.task,
+            worlds=config.student.worlds,
+            device=config.device,
+            models=models,
+            pixels=config.pixels,
+            seed=config.seed,
         )
         device = self.env.device
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
@@ -226,7 +233,9 @@ def evaluate_run(
     """
     config = read_config(folder)
     worlds = worlds or config.evaluation_worlds
-    env = make_env(config.task, worlds=worlds, device=device or config.device, scenes=scenes)
+    env = make_env(
+        config.task, worlds=worlds, device=device or config.device, scenes=scenes, pixels=config.pixels
+    )
     policy = load_student(folder, env.device)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
