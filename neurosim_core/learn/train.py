@@ -25,7 +25,7 @@ from neurosim_core.learn.env import Env, make_env
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
-from neurosim_core.sim.model import Model
+from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
 
@@ -184,6 +184,19 @@ class Training:
         """Return how the teacher does in the scenes of the training, without noise on its actions."""
         env = self._teacher.env
         return evaluate(env, teacher_actor(self.teacher, env))
+
+
+def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
+    """Return how a task is trained: with many worlds and larger pictures on a GPU, and longer."""
+    config = TrainConfig(task=task, device=device, seed=seed)
+    if not find_device(device).startswith("cuda"):
+        return config
+    return dataclasses.replace(
+        config,
+        teacher=PpoConfig(worlds=512),
+        student=DaggerConfig(worlds=2048, iterations=300, horizon=25, minibatches=6),
+        pixels=48,
+    )
 
 
 def read_config(folder: Path) -> TrainConfig:
