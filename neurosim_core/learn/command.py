@@ -25,7 +25,7 @@ def add_parsers(commands: _Commands) -> None:
     )
     learn.add_argument("--worlds", type=int, metavar="N", help="worlds of the student, or of `eval`")
     learn.add_argument(
-        "--pixels", type=int, metavar="N", help="width and height of the camera (default: 32; on a GPU 48)"
+        "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
     )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")

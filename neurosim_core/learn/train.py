@@ -29,7 +29,7 @@ from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
 
-_BLOCK = 20
+_BLOCK = 100
 _SEEDS_APART = 1 << 20
 
 
@@ -187,15 +187,14 @@ class Training:
 
 
 def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
-    """Return how a task is trained: with many worlds and larger pictures on a GPU, and longer."""
+    """Return how a task is trained: with more worlds on a GPU, and for longer."""
     config = TrainConfig(task=task, device=device, seed=seed)
     if not find_device(device).startswith("cuda"):
         return config
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(worlds=512),
-        student=DaggerConfig(worlds=2048, iterations=300, horizon=25, minibatches=6),
-        pixels=48,
+        teacher=PpoConfig(worlds=512, iterations=60),
+        student=DaggerConfig(worlds=1024, iterations=400, horizon=32),
     )
 
 
