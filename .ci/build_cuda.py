@@ -27,7 +27,6 @@ from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.sensors.displacement_kernels import rule_kernels
-from neurosim_core.sensors.event_noise import make_scan
 from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
@@ -91,8 +90,6 @@ def make_kernels() -> None:
     for moving in (False, True):
         rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
-        make_scan(frozenset(pixel))
-    for pixel in (TERMS[:-1], TERMS):
         make_noisy_scan(frozenset(pixel))
     for errors in ((), IMU_TERMS):
         make_imu(frozenset(errors), own_seeds=True)

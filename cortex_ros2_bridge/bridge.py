@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from cortex import Node, Publisher
 from cortex_ros2_bridge import cdr, convert, diagnostics
@@ -45,6 +45,7 @@ LOOK_INTERVAL_S = 0.05
 DIAGNOSTICS_INTERVAL_S = 1.0
 GONE_S = 10.0
 """For so long a route outlives its Cortex topic, so that a simulator that is restarted finds it open [s]."""
+GONE = "its Cortex topic has gone"
 RETRY_S = 1.0
 """When a route is tried again that the backend could not open [s]."""
 UNFIT_S = 5.0
@@ -55,11 +56,7 @@ TWICE_S = 12.0
 Key = tuple[str, str, str, str]
 
 
-class _Closable(Protocol):
-    def close(self) -> None: ...
-
-
-V = TypeVar("V", bound=_Closable)
+V = TypeVar("V", bound=Any)
 
 
 class Shared(Generic[V]):
@@ -379,17 +376,11 @@ class Bridge:
         topics = () if self._seen is None else self._seen.topics
         latched = any(t.topic == topic and t.latched for t in topics)
         return self._feeds.take(
-            stack,
-            (topic, type_name),
-            lambda: Feed(self._node, topic, kind_of(type_name), latched=latched),
+            stack, (topic, type_name), lambda: Feed(self._node, topic, kind_of(type_name), latched=latched)
         )
 
     def _tap(
-        self,
-        feed: Feed,
-        tap: Callable[[Any], None],
-        wants: Callable[[], bool],
-        stack: contextlib.ExitStack,
+        self, feed: Feed, tap: Callable[[Any], None], wants: Callable[[], bool], stack: contextlib.ExitStack
     ) -> None:
         feed.tap(tap, wants)
         stack.callback(feed.untap, tap)
@@ -551,11 +542,8 @@ class Bridge:
         for link in self._links.values():
             now = link.tally.totals()
             if link in gone:
-                statuses.append(
-                    diagnostics.Status(
-                        name=str(link.route), level=diagnostics.STALE, message="its Cortex topic has gone"
-                    )
-                )
+                stale = diagnostics.Status(name=str(link.route), level=diagnostics.STALE, message=GONE)
+                statuses.append(stale)
                 continue
             statuses.append(
                 diagnostics.route_status(

@@ -28,12 +28,7 @@ _DVS_SPAN_US = 2**32 - 10**6
 
 
 def encode_mono(
-    events: EventColumns,
-    *,
-    width: int,
-    height: int,
-    base_us: int,
-    allocate: Allocate | None = None,
+    events: EventColumns, *, width: int, height: int, base_us: int, allocate: Allocate | None = None
 ) -> Bytes:
     """Return events as words of 64 bits: polarity, row (15), column (16), nanoseconds after `base_us` (32).
 
@@ -103,13 +98,7 @@ def dvs_size(count: int) -> int:
     return 16 * count - 3 if count else 0
 
 
-def write_dvs(
-    out: Bytes,
-    events: EventColumns,
-    *,
-    width: int,
-    height: int,
-) -> None:
+def write_dvs(out: Bytes, events: EventColumns, *, width: int, height: int) -> None:
     """Write events as the records of a dvs_msgs/EventArray.
 
     Args:

@@ -11,15 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from cortex import (
-    Closed,
-    Node,
-    Publisher,
-    ServiceFailed,
-    ServiceTimeout,
-    ServiceUnavailable,
-    TypeMismatch,
-)
+from cortex import Closed, Node, Publisher, ServiceFailed, ServiceTimeout, ServiceUnavailable, TypeMismatch
 from cortex.messages import SimulatorReply
 from cortex.service import Client
 from cortex_ros2_bridge import cdr

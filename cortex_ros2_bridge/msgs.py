@@ -226,6 +226,7 @@ def _field(name: str, desc: Any) -> Field:
             dtype = np.dtype("uint8" if base == "char" else base)
             check = _fixed(name, base, dtype, size)
             default = functools.partial(np.zeros, size, dtype)
+            convert = functools.partial(np.array, dtype=dtype)
         elif base in TYPE_CODES:
             check = _sequence(name, base, size)
             default = functools.partial(array.array, TYPE_CODES[base])

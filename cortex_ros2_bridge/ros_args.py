@@ -9,7 +9,6 @@ Reference: design.ros2.org, "Topic and Service name mapping to DDS", "Remapping 
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,24 +19,11 @@ import yaml
 
 from cortex_ros2_bridge.backend.names import check_node_name
 
-LOG_LEVELS: Mapping[str, int] = {
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warn": logging.WARNING,
-    "error": logging.ERROR,
-    "fatal": logging.CRITICAL,
-}
+LOG_LEVELS: Mapping[str, int] = {"debug": 10, "info": 20, "warn": 30, "error": 40, "fatal": 50}
 """Levels by their names in ROS."""
 _TWO = (
-    "-r",
-    "--remap",
-    "-p",
-    "--param",
-    "--params-file",
-    "--log-level",
-    "--log-config-file",
-    "-e",
-    "--enclave",
+    *("-r", "--remap", "-p", "--param", "--params-file"),
+    *("--log-level", "--log-config-file", "-e", "--enclave"),
 )
 _IGNORED = re.compile(r"--(en|dis)able-(rosout|stdout|external-lib)-logs?")
 _SCHEME = re.compile(r"ros(topic|service)://")

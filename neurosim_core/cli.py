@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
-from neurosim_core import __version__
+from neurosim_core import __version__, docs
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
@@ -87,13 +87,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
+    parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
     others = (
+        _add_gallery,
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
         bench.add_parser,
         learn.add_parsers,
+        docs.add_parser,
     )
     for add in (*parsers, *others):
         add(commands)
@@ -176,6 +178,17 @@ def _add_call(commands: _Commands) -> None:
     call.set_defaults(command=_call)
 
 
+def _add_top(commands: _Commands) -> None:
+    top = commands.add_parser(
+        "top", help="watch a running simulator: real-time factor, rates, losses, latency"
+    )
+    top.add_argument("--once", action="store_true", help="print it once, and stop")
+    top.add_argument(
+        "--timeout", type=float, default=10.0, metavar="S", help="wait for a simulator at most [s]"
+    )
+    top.set_defaults(command=_top)
+
+
 def _add_scene(commands: _Commands) -> None:
     scene = commands.add_parser("scene", help="say what is in a scene file, and draw it")
     scene.add_argument("file", type=Path, help="glTF, GLB, OBJ, PLY or STL")
@@ -213,6 +226,18 @@ def _add_view(commands: _Commands) -> None:
     view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
     view.add_argument("--no-browser", action="store_true", help="--web: print the address only")
     view.set_defaults(command=_view)
+
+
+def _add_gallery(commands: _Commands) -> None:
+    gallery = commands.add_parser(
+        "gallery", help="draw every sensor, pixel preset, lens and scene on one page"
+    )
+    gallery.add_argument(
+        "--out", type=Path, default=Path("gallery.html"), metavar="HTML", help="default: gallery.html"
+    )
+    gallery.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
+    gallery.add_argument("--only", metavar="SECTION", help="sensors, pixels, lenses or scenes (default: all)")
+    gallery.set_defaults(command=_gallery)
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -333,6 +358,13 @@ def _call(arguments: argparse.Namespace) -> int:
         return call(arguments)
 
 
+def _top(arguments: argparse.Namespace) -> int:
+    from neurosim_core.live.top import top
+
+    with handle_signals(signal.default_int_handler):
+        return top(once=arguments.once, timeout_s=arguments.timeout)
+
+
 def _scene(arguments: argparse.Namespace) -> int:
     from neurosim_core.scene.report import report_scene
 
@@ -362,3 +394,14 @@ def _view(arguments: argparse.Namespace) -> int:
     from neurosim_core.view.rerun_viewer import show_file
 
     return show_file(file, web=arguments.web, port=arguments.port, open_browser=not arguments.no_browser)
+
+
+def _gallery(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    with Console(stderr=True).status("drawing"):
+        from neurosim_core.view.gallery import save_gallery
+
+        save_gallery(arguments.out, device=arguments.device, only=arguments.only)
+    print(f"wrote {arguments.out}")
+    return 0

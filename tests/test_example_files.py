@@ -35,6 +35,32 @@ def test_a_sensor_of_an_outside_package_is_flown_recorded_and_shown(tmp_path):
     assert (tmp_path / "flight.rrd").stat().st_size > 10_000
 
 
+NUMBERS = {
+    "first_events": lambda events: events > 10_000,
+    "own_scene": lambda distance_m: distance_m == pytest.approx(3.9, abs=1e-4),  # 4 m less the mount of 0.1 m
+    "own_controller": lambda error_m: error_m < 0.01,
+    "many_worlds": lambda counts: counts == sorted(counts, reverse=True) and counts[-1] > 1000,
+    "training_windows": lambda windows: windows[0] == 10 and windows[1] > 10_000,
+    "frames_to_events": lambda events: events == 32 * 48 * 6,
+    "imu_dead_reckoning": lambda error_m_s: 0.0 < error_m_s < 0.02,
+    "lidar_cloud": lambda height_m: height_m == pytest.approx(-0.656, abs=0.005),  # mount 0.056 m above B
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_an_example_ends_on_its_number(name, capsys):
+    assert NUMBERS[name](load(name).main())
+    assert capsys.readouterr().out
+
+
+def test_examples_are_short_and_tested():
+    names = {file.stem for file in EXAMPLES.glob("*.py")}
+    assert len(names) >= 10
+    for name in NUMBERS:
+        assert len((EXAMPLES / f"{name}.py").read_text(encoding="utf-8").splitlines()) <= 80
+    assert set(NUMBERS) <= names
+
+
 def test_a_kind_that_is_taken_is_refused():
     import neurosim_core as ns
     from neurosim_core.sensors.base import StateSensorConfig

@@ -72,12 +72,7 @@ class Graph:
     """Follows discovery on a thread of its own, and announces a node once it knows how."""
 
     def __init__(
-        self,
-        participant: DomainParticipant,
-        *,
-        node_name: str,
-        namespace: str,
-        distro: str | None,
+        self, participant: DomainParticipant, *, node_name: str, namespace: str, distro: str | None
     ) -> None:
         """Begin to follow discovery.
 

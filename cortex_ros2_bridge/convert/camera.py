@@ -126,9 +126,7 @@ def point_cloud(message: messages.PointCloud, context: Context) -> Any:
     ]
     return record("sensor_msgs/msg/PointCloud2")(
         header(
-            message.start_ns if is_timed else message.stamp_ns,
-            message.frame_id or context.frame_id,
-            context,
+            message.start_ns if is_timed else message.stamp_ns, message.frame_id or context.frame_id, context
         ),
         1,
         count,

@@ -89,7 +89,8 @@ class Context:
         if what in _VECTORS:
             largest = float(np.abs(value).max())
             direction = value / largest  # the length itself may be beyond float64
-            return np.asarray(direction * (highest / math.hypot(*direction.tolist())))
+            size = math.hypot(*direction.tolist()) * (1.0 + 1e-14)  # not beyond by a rounding
+            return np.asarray(direction * (highest / size))
         return np.asarray(np.clip(value, -highest, highest))
 
     def remembered(self, name: str, make: Callable[[], Any]) -> Any:

@@ -65,22 +65,19 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     errors = {row["method"]: cell(_error_m(row)) for row in _at_one_ms(samples, "figure eight")}
     sampled = (
         "Largest errors over the ends of all holds of 10 ms. CPU is that of the launches per simulated "
-        "second "
-        "and vehicle; methods without one are NumPy code of this study, here for their errors."
+        "second and vehicle; methods without one are NumPy code of this study, here for their errors."
     )
     hard = (
         "Position errors [m] after steps of 1 ms, or at rtol 1e-6. RKMK4 (ours) is the vehicle as it is: "
-        "holds "
-        "in which its guard trips are flown again by Dormand-Prince. Not finite: NaN, or 1000 km off."
+        "holds in which its guard trips are flown again by Dormand-Prince. Not finite: NaN, or 1000 km off."
     )
     return Chapter(
         name="dynamics",
         title="Dynamics: error against run time, stiff and extreme flights",
         summary="At steps of 1 ms 5 s of a figure eight at 9 m/s end with position errors of "
         + ", ".join(f"{error} m by {method}" for method, error in errors.items())
-        + f". Called alike from Python, against RotorPy's RK45: {claims[-1].measured}.\n\nExtreme flights "
-        "(3 mg "
-        f"in a storm, a millionth of the inertia, 200 rad/s): {claims[-3].measured}.",
+        + f". Called alike from Python, against RotorPy's RK45: {claims[-1].measured}.\n\nExtreme flights (3 "
+        f"mg in a storm, a millionth of the inertia, 200 rad/s): {claims[-3].measured}.",
         claims=claims,
         tables=[
             Table("dynamics-1-ms", "Error at steps of 1 ms, or at rtol 1e-6", _at_one_ms(samples), sampled),

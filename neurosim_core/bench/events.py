@@ -6,8 +6,7 @@ sampling asks for. A naive camera sees the former as well.
 
 *In space*: a camera turns on the spot, and flies along a planned path, rendered at 500 Hz with several
 numbers of rays per pixel; the events of 64 rays are the reference. Another pattern of 64 rays shows how well
-that is
-known: no other picture can be nearer.
+that is known: no other picture can be nearer.
 
 In time, events are matched by the alignment behind the distance of Victor and Purpura; in space, as many as
 possible within a window; see `matching`.
@@ -294,17 +293,11 @@ def _sample_in_space(
                 window: match(truth, events, width=lens.width, window_us=1e3 * window)
                 for window in WINDOWS_MS
             }
-            row |= {
-                "events / reference": len(events.t) / max(len(truth.t), 1),
-                **{
-                    f"spurious, {w:g} ms [%]": 100.0 * a.spurious_count / max(len(events.t), 1)
-                    for w, a in windows.items()
-                },
-                **{
-                    f"missed, {w:g} ms [%]": 100.0 * a.missing_count / max(len(truth.t), 1)
-                    for w, a in windows.items()
-                },
-            }
+            row["events / reference"] = len(events.t) / max(len(truth.t), 1)
+            for w, found in windows.items():
+                row[f"spurious, {w:g} ms [%]"] = 100.0 * found.spurious_count / max(len(events.t), 1)
+            for w, found in windows.items():
+                row[f"missed, {w:g} ms [%]"] = 100.0 * found.missing_count / max(len(truth.t), 1)
             case = {"scene": shown.name, "motion": motion, "pixels": f"{lens.width}x{lens.height}"}
             rows.append({**case, **row})
     return rows
@@ -331,12 +324,12 @@ def _space_row(scene: Scene, lens: Any, poses: Poses, device: str, count: int) -
         begin_s = busy_s(device)
     events = join_events(parts)
     default = count == RenderConfig().samples_per_pixel
-    row: Row = {"rays per pixel": f"{count} (default)" if default else str(count)}
-    return {
-        **row,
+    row: Row = {
+        "rays per pixel": f"{count} (default)" if default else str(count),
         "time of a picture [ms]": 1e3 * spent_s / (len(poses[0]) - 1),
         "events": len(events.t),
-    }, events
+    }
+    return row, events
 
 
 # The chapter
@@ -345,30 +338,25 @@ def _space_row(scene: Scene, lens: Any, poses: Poses, device: str, count: int) -
 def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapter:
     fewer, faster = saving(time_rows, "renders"), saving(time_rows, "both [s]")
     said = [
-        f"In time: a vehicle creeps, dodges with a roll of 640 degrees a second, and recovers; "
-        f"{time_rows[0]['events of the reference']:,} events at the highest rate are the reference. For "
-        "the same "
-        f"spike-train distance adaptive sampling needs {_span(fewer)} times fewer renders than a fixed "
-        "rate, and "
-        f"{_span(faster)} times less time to choose and render them."
+        "In time: a vehicle creeps, dodges with a roll of 640 degrees a second, and recovers; "
+        f"{time_rows[0]['events of the reference']:,} events at the highest rate are the reference. For the "
+        f"same spike-train distance adaptive sampling needs {_span(fewer)} times fewer renders than a fixed "
+        f"rate, and {_span(faster)} times less time to choose and render them."
     ]
     for row in (row for row in space_rows if row["rays per pixel"].endswith("(default)")):
         said.append(
             f"In space, {row['scene']}, {row['motion']}, {row['pixels']}: by default "
-            f"{row['spurious, 20 ms [%]']:.0f} % "
-            f"of the events are spurious and {row['missed, 20 ms [%]']:.0f} % are missed within 20 ms, "
-            "against "
-            f"{REFERENCE_SAMPLES} rays per pixel."
+            f"{row['spurious, 20 ms [%]']:.0f} % of the events are spurious and "
+            f"{row['missed, 20 ms [%]']:.0f} % are missed within 20 ms, against {REFERENCE_SAMPLES} rays per "
+            "pixel."
         )
     time_note = (
         "Matched within 10 ms (Victor and Purpura, q = 200/s). Seconds are CPU time of all threads, or "
-        "wall-clock "
-        "time on CUDA. Adaptive sampling also renders the ends of packets, 100 a second."
+        "wall-clock time on CUDA. Adaptive sampling also renders the ends of packets, 100 a second."
     )
     space_note = (
-        "Spurious events are a share of those of the row, missed ones of those of the reference. Rendered "
-        "at 500 Hz, "
-        "in light without shadows. The row with another pattern is the floor."
+        "Spurious events are a share of those of the row, missed ones of those of the reference. Rendered at "
+        "500 Hz, in light without shadows. The row with another pattern is the floor."
     )
     return Chapter(
         name="events",
@@ -391,13 +379,11 @@ def _chapter(time_rows: list[Row], space_rows: list[Row], quick: bool) -> Chapte
 def _time_claims(rows: Sequence[Row], fewer: dict[float, float], quick: bool) -> list[Claim]:
     reference = "Victor, Purpura (1996), against renders at 100 kHz"
     small, median = " (quick: too small to judge)" if quick else "", "timing error, median [us]"
+    rows = sorted(rows, key=lambda r: r["renders"])
     curves = {scheme: [r for r in rows if r["scheme"] == scheme] for scheme in ("fixed", "adaptive", "naive")}
-    curves = {scheme: sorted(mine, key=lambda r: r["renders"]) for scheme, mine in curves.items()}
     ours = curves["adaptive"]
-    renders, errors = (
-        np.log([row["renders"] for row in ours]),
-        np.log([max(row[median], 1.0) for row in ours]),
-    )
+    renders = np.log([row["renders"] for row in ours])
+    errors = np.log([max(row[median], 1.0) for row in ours])
     gains = {
         row["Hz or px"]: row[median] / math.exp(np.interp(math.log(row["renders"]), renders, errors))
         for row in curves["naive"]
@@ -438,8 +424,9 @@ def _space_claims(rows: Sequence[Row]) -> list[Claim]:
         floor = next(
             r for r in rows if "pattern" in r["rays per pixel"] and (r["scene"], r["motion"]) == case
         )
-        small = int(row["pixels"].partition("x")[0]) < 346
-        limits = {20.0: 12.0 if small else 5.0, 5.0: 12.0 if small else 8.0}
+        limits = {20.0: 5.0, 5.0: 8.0}
+        if int(row["pixels"].partition("x")[0]) < 346:
+            limits = dict.fromkeys(limits, 12.0)
         shares = {(kind, w): f"{kind}, {w:g} ms [%]" for kind in ("spurious", "missed") for w in limits}
         claims.append(
             Claim(

@@ -225,10 +225,9 @@ def _chapter(rows: list[Row], differences: list[Row]) -> Chapter:
     return Chapter(
         name="leave-out",
         title="What a scene does not need is left out",
-        summary=f"A flight with an IMU alone takes {least[cpu]:,.0f} ms of CPU time for a simulated "
-        "second, one with "
-        f"every sensor and term {most[cpu]:,.0f} ms; set-up takes {least[setup]:.1f} and {most[setup]:.1f} "
-        "s.",
+        summary=f"A flight with an IMU alone takes {least[cpu]:,.0f} ms of CPU time for a simulated second, "
+        f"one with every sensor and term {most[cpu]:,.0f} ms; set-up takes {least[setup]:.1f} and "
+        f"{most[setup]:.1f} s.",
         claims=[
             Claim(
                 "a run with an IMU only allocates no picture",

@@ -61,16 +61,14 @@ def measure(options: Options, progress: Progress = silent) -> Chapter:
     met = sum(claim.met is True for claim in claims)
     note = (
         "C is the threshold in natural log radiance, from the intervals on a ramp: mean and standard "
-        "deviation over "
-        "the pixels. Noise: events a second and pixel of a still scene at a tenth of white."
+        "deviation over the pixels. Noise: events a second and pixel of a still scene at a tenth of white."
     )
     worst = "The largest of the points, and in standard deviations where chance has a part."
     return Chapter(
         name="pixel",
         title="A test bench for event pixels",
         summary=f"Patterns of light as in a laboratory, shown to pixels on {device_title(bench.device)}; "
-        f"{met} of "
-        f"{len(claims)} closed forms are met. Marks are measured, lines are the closed form.",
+        f"{met} of {len(claims)} closed forms are met. Marks are measured, lines are the closed form.",
         claims=claims,
         tables=[
             Table("pixel-presets", "Presets on the bench", presets, note),

@@ -213,10 +213,9 @@ def _chapter(rows: list[Row], pan: list[Row], pictures: list[Picture], device: s
         best = min(mine, key=lambda row: row["RMS error"])
         said.append(
             f"{scene}: {one['RMS error']:.3f} with one ray and the default filter, "
-            f"{nearest['RMS error']:.3f} by "
-            f"point sampling, {best['RMS error']:.3f} at best ({best['filter']}, {best['rays per pixel']} "
-            "rays) in "
-            f"{best[TIME_MS] / one[TIME_MS]:.1f} times the time."
+            f"{nearest['RMS error']:.3f} by point sampling, {best['RMS error']:.3f} at best "
+            f"({best['filter']}, {best['rays per pixel']} rays) in {best[TIME_MS] / one[TIME_MS]:.1f} times "
+            "the time."
         )
         panels.append(
             Panel(
@@ -242,8 +241,7 @@ def _chapter(rows: list[Row], pan: list[Row], pictures: list[Picture], device: s
         name="render",
         title="Rendering: error against run time, and false events from aliasing",
         summary=f"RMS errors of log radiance against {REFERENCE_SAMPLES} rays per pixel, on "
-        f"{device_title(device)}; "
-        f"an event is {threshold:g}.\n\n"
+        f"{device_title(device)}; an event is {threshold:g}.\n\n"
         + "\n\n".join(said)
         + f"\n\nA pan at {_SPEED_PX_S:g} px/s over squares of at most {CHECK_PX:g} px: of "
         f"{point['of the reference']:,} true events the default misses {default['missing']:,} and adds "
@@ -252,8 +250,7 @@ def _chapter(rows: list[Row], pan: list[Row], pictures: list[Picture], device: s
         claims=[
             Claim(
                 "with one ray per pixel the default filter gives at least 10 times fewer false events than "
-                "point "
-                "sampling, on a slow pan over a fine checkerboard",
+                "point sampling, on a slow pan over a fine checkerboard",
                 "mip-mapping (Williams 1983) against point sampling; truth: 64 rays per pixel",
                 f"{point['false'] / max(default['false'], 1):,.0f} times: {default['false']:,} against "
                 f"{point['false']:,}",

@@ -147,9 +147,8 @@ def summarise(trace: Any, rate_hz: float, pixels: str) -> Chapter:
         name="streaming",
         title="A flight in real time between processes",
         summary=f"IMU at 1 kHz beside an event camera of {pixels}, rendered at {rate_hz:g} Hz: real-time "
-        "factor "
-        f"{figures['real-time factor']:.5f} over {elapsed_s:.0f} s; 99 % of the IMU's samples are at most "
-        f"{late:.3f} ms early or late.",
+        f"factor {figures['real-time factor']:.5f} over {elapsed_s:.0f} s; 99 % of the IMU's samples are at "
+        f"most {late:.3f} ms early or late.",
         claims=[
             Claim(
                 "99 % of the IMU's samples are less than a period early or late",

@@ -140,8 +140,7 @@ def _chapter(rows: list[Row], base: Model, device: str) -> Chapter:
     )
     note = (
         f"All rates are of all worlds together; a step is 10 ms of flight with {RENDERS_PER_STEP} renders. "
-        "Best "
-        "of three rounds, by turns with single simulations."
+        "Best of three rounds, by turns with single simulations."
     )
     return Chapter(
         name="worlds",

@@ -323,9 +323,8 @@ class Simulator:
         self._reason = ""
         if command is None and deadline_s is not None and time.monotonic() >= deadline_s:
             self._end(
-                f"no command for {vehicle.name} within live.command_deadline_s = "
-                f"{live.command_deadline_s:g} s at control period {self._tick}: "
-                f"{vehicle.describe_missing_command()}"
+                f"no command for {vehicle.name} within live.command_deadline_s = {live.command_deadline_s:g} "
+                f"s at control period {self._tick}: {vehicle.describe_missing_command()}"
             )
             self._exit = 1
         return command

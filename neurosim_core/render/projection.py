@@ -9,13 +9,22 @@ import math
 from functools import cache
 from typing import Any
 
+import numpy as np
 import warp as wp
+from scipy.spatial import KDTree
 
 from neurosim_core.render.camera import Lens, PinholeConfig
-from neurosim_core.render.lenses import DoubleSphereConfig, EquidistantConfig, RadtanConfig, RationalConfig
+from neurosim_core.render.lenses import (
+    DoubleSphereConfig,
+    EquidistantConfig,
+    RadtanConfig,
+    RationalConfig,
+    RayTableConfig,
+)
 
-PROJECTED = ("pinhole", "radtan", "rational", "equidistant", "double_sphere")
-"""Kinds of lenses that project points."""
+_GUESSES = wp.constant(64)
+"""Directions along each axis for which the pixel is known where the search in a table of rays begins."""
+_SEARCH_STEPS = wp.constant(20)
 
 _STEP = wp.constant(wp.float64(1.0e-4))
 _coefficients = wp.types.vector(length=8, dtype=wp.float64)
@@ -33,20 +42,29 @@ class LensData:
     """Polynomials: k1, k2, p1, p2, k3, k4, k5, k6; equidistant: k1 to k4; double sphere: xi, alpha, w2."""
     limit: wp.float64
     """Polynomials: largest sqrt(x^2 + y^2) / z; else the largest angle from the axis [rad]."""
+    table: wp.array2d[wp.vec3d]
+    """Of a ray table: the unit rays of the pixels; nan: none."""
+    guess: wp.array2d[wp.vec2]
+    """Of a ray table: column and row of the pixel that looks about where a direction does [px]."""
 
 
-def make_lens_data(lens: Lens) -> Any:
+def make_lens_data(lens: Lens, device: Any = "cpu") -> Any:
     """Return a lens for the function that `projector` makes of its kind.
 
+    Args:
+        lens: One of the kinds of `lenses.AnyLens`.
+        device: Where a table of rays goes.
+
     Raises:
-        ValueError: The lens is a table of rays: it does not say where points are.
+        ValueError: The lens does not say where points are.
     """
     data = LensData()
+    if isinstance(lens, RayTableConfig):
+        return _make_table(data, lens, device)
     if not isinstance(
         lens, PinholeConfig | RadtanConfig | RationalConfig | EquidistantConfig | DoubleSphereConfig
     ):
-        kind = getattr(lens, "kind", type(lens).__name__)
-        raise ValueError(f"a lens of kind {kind} does not project points: take one of {', '.join(PROJECTED)}")
+        raise ValueError(f"a lens of type {type(lens).__name__} does not project points")
     data.fx, data.fy, data.cx, data.cy = lens.intrinsics()
     given = list(lens.distortion_coefficients)
     data.limit = math.inf
@@ -62,6 +80,27 @@ def make_lens_data(lens: Lens) -> Any:
     return data
 
 
+def _make_table(data: Any, lens: RayTableConfig, device: Any) -> Any:
+    """Set the rays of a table, and for directions evenly around the axis the pixel that is next to each."""
+    if min(lens.width, lens.height) < 2:
+        raise ValueError(f"a ray_table of {lens.width} x {lens.height} rays does not project points")
+    rays = lens.directions()
+    row, col = np.nonzero(np.isfinite(rays).all(axis=-1))
+    known = rays[row, col]
+    angle = np.arctan2(np.hypot(known[:, 0], known[:, 1]), known[:, 2])
+    data.fx = data.fy = 1.0
+    data.limit = min(math.pi, 1.05 * float(angle.max()) + 1e-3)
+    a = np.linspace(-data.limit, data.limit, int(_GUESSES))
+    x, y = np.meshgrid(a, a)
+    size = np.hypot(x, y)
+    scale = np.sin(size) / np.where(size > 0.0, size, 1.0)
+    _, nearest = KDTree(known).query(np.stack([x * scale, y * scale, np.cos(size)], axis=-1))
+    places = np.stack([col[nearest], row[nearest]], axis=-1) + 0.5
+    data.table = wp.array(rays, dtype=wp.vec3d, device=device)
+    data.guess = wp.array(places.astype(np.float32), dtype=wp.vec2, device=device)
+    return data
+
+
 @cache
 def projector(kind: str) -> wp.Function:
     """Return the function that projects a point in C: (column, row) [px] and 1; zeros: it is not seen.
@@ -74,6 +113,7 @@ def projector(kind: str) -> wp.Function:
         "rational": _polynomial,
         "equidistant": _equidistant,
         "double_sphere": _double_sphere,
+        "ray_table": _look_up,
     }[kind]
 
     @wp.func
@@ -162,3 +202,61 @@ def _double_sphere(lens: LensData, p: wp.vec3d) -> wp.vec3d:
     shifted = xi * d1 + p[2]
     scale = alpha * wp.sqrt(beside + shifted * shifted) + (wp.float64(1.0) - alpha) * shifted
     return wp.vec3d(p[0] / scale, p[1] / scale, wp.float64(1.0))
+
+
+@wp.func
+def _look_up(lens: LensData, p: wp.vec3d) -> wp.vec3d:
+    """Find the point of the picture whose interpolated ray goes to a point, by Newton's method.
+
+    Rays are interpolated between centres as `RayTableConfig.rays` does it. What is more than a pixel outside
+    the picture is not found.
+    """
+    d = wp.normalize(p)
+    angle = wp.atan2(wp.sqrt(d[0] * d[0] + d[1] * d[1]), d[2])
+    if not (angle <= lens.limit):
+        return wp.vec3d()
+    scale = angle / wp.max(wp.sin(angle), wp.float64(1.0e-12))
+    cells = wp.float64(_GUESSES - 1) / (wp.float64(2.0) * lens.limit)
+    across = int(wp.rint((scale * d[0] + lens.limit) * cells))
+    down = int(wp.rint((scale * d[1] + lens.limit) * cells))
+    begin = lens.guess[wp.clamp(down, 0, _GUESSES - 1), wp.clamp(across, 0, _GUESSES - 1)]
+    u = wp.float64(begin[0])
+    v = wp.float64(begin[1])
+    e1 = wp.vec3d(-d[2], wp.float64(0.0), d[0])
+    if wp.abs(d[1]) > wp.float64(0.9):
+        e1 = wp.vec3d(wp.float64(0.0), d[2], -d[1])
+    e1 = wp.normalize(e1)
+    e2 = wp.cross(d, e1)
+    width = lens.table.shape[1]
+    height = lens.table.shape[0]
+    half = wp.float64(0.5)
+    one = wp.float64(1.0)
+    for _ in range(_SEARCH_STEPS):
+        col = wp.clamp(int(wp.floor(u - half)), 0, width - 2)
+        row = wp.clamp(int(wp.floor(v - half)), 0, height - 2)
+        x = u - half - wp.float64(col)
+        y = v - half - wp.float64(row)
+        a = lens.table[row, col]
+        right = lens.table[row, col + 1] - a
+        below = lens.table[row + 1, col] - a
+        bent = lens.table[row + 1, col + 1] - a - right - below
+        ray = a + x * right + y * below + (x * y) * bent
+        du = right + y * bent
+        dv = below + x * bent
+        # the ray is along d where it has no part along e1 and e2
+        f1 = wp.dot(ray, e1)
+        f2 = wp.dot(ray, e2)
+        j11 = wp.dot(du, e1)
+        j12 = wp.dot(dv, e1)
+        j21 = wp.dot(du, e2)
+        j22 = wp.dot(dv, e2)
+        det = j11 * j22 - j12 * j21
+        step_u = (j22 * f1 - j12 * f2) / det
+        step_v = (j11 * f2 - j21 * f1) / det
+        u = wp.clamp(u - step_u, -one, wp.float64(width) + one)
+        v = wp.clamp(v - step_v, -one, wp.float64(height) + one)
+        if wp.abs(step_u) + wp.abs(step_v) < wp.float64(1.0e-9):
+            if wp.dot(ray, d) > wp.float64(0.0):
+                return wp.vec3d(u, v, one)
+            return wp.vec3d()
+    return wp.vec3d()

@@ -153,7 +153,7 @@ class RecordedLaunch:
     It is recorded, since to check and pack the arguments takes Warp longer than most kernels run.
 
     Args:
-        kernel: Of one dimension; its parameters are numbers and arrays.
+        kernel: Its parameters are numbers, arrays and structs.
         device: Where to launch.
     """
 
@@ -161,10 +161,10 @@ class RecordedLaunch:
         self._kernel = kernel
         self._device = wp.get_device(device)
         self._recorded: Any = None
-        self._dim = 0
+        self._dim: int | tuple[int, ...] = 0
         self._arguments: Sequence[Any] = ()
 
-    def launch(self, dim: int, arguments: Sequence[Any]) -> None:
+    def launch(self, dim: int | tuple[int, ...], arguments: Sequence[Any]) -> None:
         """Launch `dim` threads, at least one, with all arguments of the kernel.
 
         What is as it was the last time costs nothing: pass the same arrays, and round `dim` up.

@@ -139,20 +139,23 @@ def _gap(full: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _steps_by_air(free: NDArray[np.bool_], start: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the number of steps from `start` to each cell through free cells, inf where there is no way.
 
-    Steps go alternately to 6 and to 26 neighbours, whose balls are close to round.
+    Steps go alternately to 6 and to 26 neighbours, whose balls are close to round. A cell is done with
+    once a step went to 26.
     """
-    reached = np.zeros(free.shape, dtype=bool)
-    reached[tuple(start)] = True
-    steps = np.full(free.shape, np.inf)
-    steps[tuple(start)] = 0.0
-    near, wide = ndimage.generate_binary_structure(3, 1), ndimage.generate_binary_structure(3, 3)
+    padded = np.pad(free, 1)
+    unseen = padded.ravel()
+    steps = np.full(unseen.shape, np.inf)
+    around = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    _, depth, height = padded.shape
+    wide = around @ (depth * height, height, 1)
+    near = wide[np.abs(around).sum(axis=1) == 1]
+    before, last = wide[:0], np.array([(start + 1) @ (depth * height, height, 1)])
+    steps[last], unseen[last] = 0.0, False
     for step in range(1, sum(free.shape) * 2):
-        grown = ndimage.binary_dilation(reached, near if step % 2 else wide, mask=free)
-        front = grown & ~reached
-        if not front.any():
-            if step % 2 == 0:
-                break
-            continue
-        steps[front] = step
-        reached = grown
-    return steps
+        leaving = last[:, None] + near if step % 2 else np.concatenate([before, last])[:, None] + wide
+        found = np.unique(leaving[unseen[leaving]])
+        if step % 2 == 0 and len(found) == 0:
+            break
+        steps[found], unseen[found] = step, False
+        before, last = last, found
+    return steps.reshape(padded.shape)[1:-1, 1:-1, 1:-1]

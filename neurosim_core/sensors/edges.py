@@ -18,6 +18,7 @@ from neurosim_core.registry import register
 from neurosim_core.render.launch import launch_split
 from neurosim_core.sensors.base import ImageSensorConfig, PictureContext, PictureViews
 from neurosim_core.sensors.instance import LabelImage
+from neurosim_core.settings import Settings
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,8 +26,22 @@ KINDS = ("none", "depth", "object", "crease")
 """What the labels 0 to 3 mean."""
 
 
+class EdgeLimits(Settings):
+    """What is an edge, and what is rendered to find it."""
+
+    jump_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
+    """Distance between two surfaces that is an edge, as a part of the range."""
+    crease_rad: Annotated[float, Field(gt=0.0, lt=3.2)] = 0.5
+    """Angle between two normals that is an edge [rad]."""
+
+    @property
+    def outputs(self) -> frozenset[str]:
+        """Ranges, normals and objects."""
+        return frozenset(["range", "normal", "instance"])
+
+
 @register("sensor", "edges")
-class EdgesConfig(ImageSensorConfig):
+class EdgesConfig(EdgeLimits, ImageSensorConfig):
     """A camera that sees edges of the geometry: int32 [H, W], 0 none, 1 depth, 2 object, 3 crease.
 
     A pixel is an edge if it differs from the one to its right or below it: by more than `jump_ratio` of the
@@ -35,19 +50,10 @@ class EdgesConfig(ImageSensorConfig):
     """
 
     kind: Literal["edges"] = "edges"
-    jump_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
-    """Distance between two surfaces that is an edge, as a part of the range."""
-    crease_rad: Annotated[float, Field(gt=0.0, lt=3.2)] = 0.5
-    """Angle between two normals that is an edge [rad]."""
 
     packet_type = LabelImage
     output = "instance"
     encoding = "32SC1"
-
-    @property
-    def outputs(self) -> frozenset[str]:
-        """Ranges, normals and objects."""
-        return frozenset(["range", "normal", "instance"])
 
     def constants(self, context: PictureContext) -> Mapping[str, Any]:
         """Return what labels mean."""
@@ -171,16 +177,16 @@ class EdgesProcess:
 
     terms: tuple[str, ...] = ()
 
-    def __init__(self, config: EdgesConfig, context: PictureContext) -> None:
+    def __init__(self, config: EdgeLimits, context: PictureContext) -> None:
         self._context = context
-        self._limits = [config.jump_ratio, float(np.cos(config.crease_rad))]
+        limits = [config.jump_ratio, float(np.cos(config.crease_rad))]
         self._device = device = context.source.device
         parts = 1 if context.times is None else len(context.times.offsets_ns)
         rays: Any = wp.array(
             np.stack([lens.ray_table() for lens in context.lenses]), dtype=wp.vec3, device=device
         )
         lens_of_world: Any = wp.array(list(context.lens_of_world), dtype=int, device=device)
-        self._model = [*self._limits, context.stride, parts, rays, lens_of_world]
+        self._model = [*limits, context.stride, parts, rays, lens_of_world]
         self.picture: Any = wp.zeros(context.source.shape, dtype=int, device=device)
 
     def launch(self, views: PictureViews) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import EventArrays
-from neurosim_core.runtime.cuda import RecordedLaunch
+from neurosim_core.runtime.cuda import HostInput, RecordedLaunch
 from neurosim_core.sensors import event_worlds_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_input import as_frames, invalid_message
@@ -26,6 +26,9 @@ from neurosim_core.sensors.event_worlds import WorldEventCamera
 _ROOM_MIN = 1024
 _PIXELS_PER_EVENT = 2
 """Pixels for each event for which there is room in a call before any have come."""
+_COLUMNS = ((wp.int64, 0), (wp.uint16, 8), (wp.uint16, 10), (wp.uint8, 12))
+"""Types of time, column, row and polarity, and where they begin in a block with room for one event."""
+_EVENT_BYTES = 13
 _LANES = 1 << 16
 """Threads that take the events of all cameras apart, on CUDA."""
 
@@ -142,6 +145,8 @@ class EventCameraBatch:
         """Of the recorded launches' parameters: where they read frames."""
         self._begin = RecordedLaunch(event_worlds_scan.begin_frame, self.device)
         self._hand_over = RecordedLaunch(event_worlds_scan.hand_over_counters, self.device)
+        self._decode = RecordedLaunch(event_worlds_scan.decode, self.device)
+        self._offsets = HostInput(wp.zeros(count + 1, dtype=wp.int32, device=self.device))
         self._scans = [self._cameras.record_scan(parity) for parity in (0, 1)] if self.device.is_cuda else []
         self._readable: Any = None
         """Shape, type and device of the last array that was read where it is."""
@@ -149,6 +154,8 @@ class EventCameraBatch:
         self._timing = (-1, -1)
         self._stamp_ns: int | None = None
         self._epoch_us = 0
+        self._origin_us = 0
+        """Where the device believes the present frame to begin: time goes on, and it is told of changes."""
         self.frame_number = 0
         """Of the last frame, so that nobody reads the events of another."""
 
@@ -219,30 +226,24 @@ class EventCameraBatch:
     def take_apart(self, events: FrameEvents) -> Sequence[Any]:
         """Return time, column, row and polarity of the events of the last frame, in arrays of their own."""
         room = len(events)
-        columns = tuple(
-            wp.empty(room, dtype=dtype, device=self.device)
-            for dtype in (wp.int64, wp.uint16, wp.uint16, wp.uint8)
-        )
+        spaced = room + room % 2  # columns in a block begin where they may
+        block: Any = wp.empty(_EVENT_BYTES * max(spaced, 2), dtype=wp.uint8, device=self.device)
+        columns: list[Any] = []
+        for dtype, offset in _COLUMNS:
+            column: Any = wp.array(
+                ptr=block.ptr + offset * spaced, dtype=dtype, shape=(room,), device=self.device
+            )
+            column.block = block  # lives as long as they
+            columns.append(column)
         if room == 0:
             return columns
-        count = self._shape[0]
-        lanes = max(1, _LANES // count) if self.device.is_cuda else 1
-        stack = self._cameras.stack
-        stack.origin_us.fill_(events.start_ns // NS_PER_US)
-        self._timing = (-1, -1)
-        wp.launch(
-            event_worlds_scan.decode,
-            dim=(count, lanes),
-            inputs=[
-                self._cameras.row_shift,
-                self._cameras.time_shift,
-                lanes,
-                stack,
-                wp.array(events.offsets, dtype=wp.int32, device=self.device),
-            ],
-            outputs=columns,
-            device=self.device,
-        )
+        self._offsets.rows[:] = events.offsets
+        self._offsets.upload()
+        shifts = (self._cameras.row_shift, self._cameras.time_shift)
+        lanes = max(1, _LANES // self._shape[0]) if self.device.is_cuda else 1
+        origin_us = events.start_ns // NS_PER_US - self._origin_us
+        arguments = (*shifts, lanes, origin_us, self._cameras.stack, self._offsets.array, *columns)
+        self._decode.launch((self._shape[0], lanes), arguments)
         return columns
 
     def _begin_frame(self, start_ns: int, stamp_ns: int) -> None:
@@ -253,6 +254,7 @@ class EventCameraBatch:
             arguments = [start_ns - epoch_ns, stamp_ns - epoch_ns, self._cameras.stack]
             self._begin.launch(self._shape[0], arguments)
             self._timing = timing
+            self._origin_us = (start_ns - epoch_ns) // NS_PER_US
 
     def _read_counters(self) -> list[int]:
         """Wait for a scan and return how many events each camera has."""

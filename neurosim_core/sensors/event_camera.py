@@ -13,7 +13,6 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Packet
 from neurosim_core.registry import register
-from neurosim_core.render.projection import make_lens_data
 from neurosim_core.sensors.base import (
     FrameContext,
     FrameSensorConfig,
@@ -130,8 +129,6 @@ class EventSensorConfig(FrameSensorConfig):
     def _labels_can_be_had(self) -> EventSensorConfig:
         if "cause" in self.labels and self.lens.width > 1 << (16 - CAUSE_BITS):
             raise ValueError(f"the cause of events needs a width of at most {1 << (16 - CAUSE_BITS)} px")
-        if "flow" in self.labels:
-            make_lens_data(self.lens)
         return self
 
     @model_validator(mode="after")
@@ -156,8 +153,12 @@ class EventChannel:
 
     def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
         terms = terms_of(config.pixel)
-        self._has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
-        self._labels = EventLabels(config.labels, config.classes, context) if config.labels else None
+        has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
+        self._labels = (
+            EventLabels(config.labels, config.classes, context, has_cause=has_cause)
+            if config.labels
+            else None
+        )
         self.camera = EventCamera(
             config.pixel,
             width=context.width,
@@ -167,7 +168,8 @@ class EventChannel:
             seed=context.seed,
             scan_count_max=context.in_flight,
             on_host=True,
-            terms=(*terms, CAUSE) if self._has_cause else None,
+            terms=(*terms, CAUSE) if has_cause else None,
+            labels=self._labels,
         )
         self.terms = (
             *self.camera.terms,
@@ -180,6 +182,8 @@ class EventChannel:
 
     def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
         """Launch the scan of the instants of a batch; the first that it sees is its reference."""
+        if self._labels is not None:
+            self._labels.note_flown()
         first = 0
         if not self.watching:
             self.camera.reset(frames[0], stamps_ns[0], sequence=self._sequence)
@@ -212,4 +216,4 @@ class EventChannel:
     def _labelled(self, packets: list[Events]) -> list[Packet]:
         if self._labels is None:
             return [*packets]
-        return [self._labels.add(packet, has_cause=self._has_cause) for packet in packets]
+        return [self._labels.add(packet) for packet in packets]

@@ -57,9 +57,8 @@ def check_stack(
     fits = log_radiance.ndim == 3 and log_radiance.shape[1:] == shape
     if not (fits and 1 <= count <= log_radiance.shape[0] and log_radiance.is_contiguous):
         raise ValueError(
-            f"log_radiance must be contiguous of shape [>= {count}, {shape[0]}, {shape[1]}]"
-            f" for {count} >= 1 stamps, got {list(log_radiance.shape)}"
-            f" with strides {list(log_radiance.strides)}"
+            f"log_radiance must be contiguous of shape [>= {count}, {shape[0]}, {shape[1]}] for {count} >= 1 "
+            f"stamps, got {list(log_radiance.shape)} with strides {list(log_radiance.strides)}"
         )
     if log_radiance.dtype != wp.float32 or log_radiance.device != device:
         raise ValueError(

@@ -5,7 +5,7 @@ Keys are as in `event_levels`. What no window has taken yet stays, and its time 
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -57,6 +57,13 @@ def roomy_keys(count: int, touched_count: int) -> wp.array[wp.int64]:
     return keys
 
 
+class Labeller(Protocol):
+    """Is told of events while their columns are on the device."""
+
+    def launch(self, count: int, t: Any, x: Any, y: Any, *, first_x: int = 0, first_y: int = 0) -> None:
+        """Launch what is done with them: their times, and columns and rows from a place on in an array."""
+
+
 class EventKeys:
     """The keys of one camera, of all that has been read from its scans.
 
@@ -66,6 +73,7 @@ class EventKeys:
         time_shift: Bits of a key below its microseconds.
         device: Where they are.
         on_host: Take events apart for the host.
+        labels: Is told of the events of each cut; None: nobody is.
 
     Attributes:
         keys: The first `count` of them are keys, in any order; its room is at least that.
@@ -74,12 +82,20 @@ class EventKeys:
     """
 
     def __init__(
-        self, *, pixel_count: int, row_shift: int, time_shift: int, device: Any, on_host: bool
+        self,
+        *,
+        pixel_count: int,
+        row_shift: int,
+        time_shift: int,
+        device: Any,
+        on_host: bool,
+        labels: Labeller | None = None,
     ) -> None:
         self._pixel_count = pixel_count
         self._row_shift, self._time_shift = row_shift, time_shift
         self._device = device
         self._on_host = on_host
+        self._labels = labels
         self.keys = self._buffer(0)
         self.count = 0
         self.origin_us = 0
@@ -206,6 +222,8 @@ class EventKeys:
         columns = [self._empty(count, dtype) for dtype in _COLUMN_TYPES]
         decoded = [self.keys, self.origin_us, self._row_shift, self._time_shift]
         self._launch(event_cut.decode, count, decoded, columns)
+        if self._labels is not None:
+            self._labels.launch(count, *columns[:3])
         self._read.set()
         self._read.wait()
         if self._on_host:
@@ -234,6 +252,9 @@ class EventKeys:
             self._graphs.run((room, window_count, end_bit, self.keys.ptr), launch)
         else:
             launch()
+        if self._labels is not None:
+            t, both = self._columns[:2]
+            self._labels.launch(count, t, both, both, first_x=4 * copied, first_y=5 * copied)
         block = blocks.acquire(_EVENT_BYTES * copied)
         wp.copy(block.array, self._columns[-1], count=_EVENT_BYTES * copied)
         self._read.set()

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from neurosim_core.packets import Events, FieldSpec, as_numpy
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.projection import LensData, make_lens_data, velocity_projector
+from neurosim_core.runtime.cuda import BufferPool, PooledBuffer, size_class
 from neurosim_core.scene.bodies import Motion, body_orientation, body_position, body_velocity
 from neurosim_core.scene.labels import label_scenes
 from neurosim_core.sensors.base import FrameContext
@@ -35,6 +36,8 @@ from neurosim_core.vehicle.history import History, motion_at
 
 EventLabel = Literal["depth", "flow", "instance", "semantic", "cause"]
 _FAR_M = wp.constant(1.0e9)
+_WORDS = 5
+"""Numbers of 32 bits that the labels of an event take."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,7 +59,19 @@ class LabelledEvents(Events):
 
 
 @wp.struct
+class _Labels:
+    """Where labels go: one block of memory, given as three types; the columns in it one after the other."""
+
+    pairs: wp.array[wp.vec2]
+    numbers: wp.array[float]
+    labels: wp.array[int]
+    room: int
+    """Events for which columns have room: flow is at 0, depth at 2, instance at 3, class at 4 times it."""
+
+
+@wp.struct
 class _Model:
+    column_shift: int
     lens: LensData
     rays: wp.array2d[wp.vec3]
     p_BC: wp.vec3d
@@ -82,21 +97,22 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
         model: _Model,
         # In:
         history: History,
+        flown: wp.array[wp.int64],
         t_us: wp.array[wp.int64],
         x: wp.array[wp.uint16],
+        first_x: int,
         y: wp.array[wp.uint16],
+        first_y: int,
         # Out:
-        depth_out: wp.array[float],
-        flow_out: wp.array[wp.vec2],
-        instance_out: wp.array[int],
-        class_out: wp.array[int],
+        out: _Labels,
     ):
         event = first + wp.tid()
         stamp_ns = wp.int64(1000) * t_us[event]
-        at = motion_at(history, 0, history.count[0] - wp.int64(1), stamp_ns)
+        at = motion_at(history, 0, flown[0] - wp.int64(1), stamp_ns)
         p_WC = at.position + wp.quat_rotate(at.orientation, model.p_BC)
         q_WC = at.orientation * model.q_BC
-        ray_C = wp.normalize(wp.vec3d(model.rays[int(y[event]), int(x[event])]))
+        col = int(x[first_x + event]) >> model.column_shift
+        ray_C = wp.normalize(wp.vec3d(model.rays[int(y[first_y + event]), col]))
         ray_W = wp.quat_rotate(q_WC, ray_C)
         face = int(-1)
         body = int(-1)
@@ -122,7 +138,7 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                         r = met.t
                         body = index
         if wp.static("depth" in labels):
-            depth_out[event] = wp.where(face >= 0, r * float(ray_C[2]), wp.inf)
+            out.numbers[2 * out.room + event] = wp.where(face >= 0, r * float(ray_C[2]), wp.inf)
         if wp.static("instance" in labels or "semantic" in labels):
             number = int(-1)
             label = int(-1)
@@ -131,9 +147,9 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                 if wp.static("semantic" in labels):
                     label = model.class_of[number]
             if wp.static("instance" in labels):
-                instance_out[event] = number
+                out.labels[3 * out.room + event] = number
             if wp.static("semantic" in labels):
-                class_out[event] = label
+                out.labels[4 * out.room + event] = label
         if wp.static("flow" in labels):
             w_C = wp.quat_rotate_inv(model.q_BC, at.body_rate)
             p_C = ray_C
@@ -151,90 +167,144 @@ def _make_kernel(lens_kind: str, labels: frozenset[str], has_bodies: bool) -> An
                         v_W += body_velocity(model.motions[body], stamp_ns) + turning
                 v_C = wp.quat_rotate_inv(q_WC, v_W) - wp.cross(w_C, p_C)
             rate = project_velocity(model.lens, p_C, v_C)
-            flow_out[event] = wp.vec2(float(rate[0]), float(rate[1]))
+            out.pairs[event] = wp.vec2(float(rate[0]), float(rate[1]))
             if rate[2] == wp.float64(0.0):
-                flow_out[event] = wp.vec2(wp.nan, wp.nan)
+                out.pairs[event] = wp.vec2(wp.nan, wp.nan)
 
     return label_events
 
 
 class EventLabels:
-    """Adds the truth to events of one camera.
+    """Adds the truth to events of one camera: `launch` with all of a cut, then `add` to packet after packet.
 
     Args:
         labels: What to add.
         classes: As of `SemanticSensorConfig`.
         context: The camera; its history goes back as far as a packet does.
+        has_cause: Columns are eight times the column plus the cause.
     """
 
     def __init__(
-        self, labels: Sequence[EventLabel], classes: Mapping[str, Sequence[str]] | None, context: FrameContext
+        self,
+        labels: Sequence[EventLabel],
+        classes: Mapping[str, Sequence[str]] | None,
+        context: FrameContext,
+        *,
+        has_cause: bool,
     ) -> None:
         self._labels = frozenset(labels)
         self._geometry = self._labels - {"cause"}
-        self._device = device = context.device
+        self._has_cause = has_cause
+        self._device: Any = wp.get_device(context.device)
         self._history = context.history
-        scene = context.scene
         meaning: dict[str, Any] = {"causes": CAUSES} if "cause" in labels else {}
-        self._model = model = _Model()
         if self._geometry:
-            if not hasattr(scene, "mesh_id"):
-                raise ValueError(f"labels of {context.name}: only the renderer 'warp' has them")
-            lens = context.lens
-            model.rays = wp.array(lens.ray_table(), dtype=wp.vec3, device=device)
-            if "flow" in labels:
-                model.lens = make_lens_data(lens)
-            model.p_BC, model.q_BC = context.p_BC, context.q_BC
-            model.mesh, model.face_instance = scene.mesh_id, scene.data.face_instance
-            has_bodies = scene.bodies is not None
-            if has_bodies:
-                bodies = scene.bodies
-                model.motions, model.body_mesh = context.motions, bodies.mesh
-                model.body_sphere, model.body_face = bodies.sphere, bodies.first_face
-            if {"instance", "semantic"} & self._geometry:
-                known = label_scenes([scene], classes)
-                numbers = np.array([number for _, number in known.instances[0]], np.int32)
-                model.class_of = wp.array(numbers, dtype=int, device=device)
-                meaning |= {"instances": known.instances[0], "classes": known.classes}
-            self._kernel = _make_kernel(getattr(lens, "kind", ""), self._geometry, has_bodies)
+            self._kernel = self._make_model(classes, context, meaning)
+            self._flown: Any = wp.zeros(1, dtype=wp.int64, device=self._device)
+            self._pool = BufferPool(self._device) if self._device.is_cuda else None
+            self._out = _Labels()
+            self._block: PooledBuffer | None = None
+        self._rows = np.zeros(0, np.float32)
+        self._room = self._taken = self._capacity = 0
         self._meaning = json.dumps(meaning, separators=(",", ":"))
 
-    def add(self, events: Events, *, has_cause: bool) -> LabelledEvents:
-        """Return events with their truth.
+    def _make_model(
+        self, classes: Mapping[str, Sequence[str]] | None, context: FrameContext, meaning: dict[str, Any]
+    ) -> Any:
+        """Set what the kernel reads, add what labels mean, and return the kernel."""
+        scene, lens, device = context.scene, context.lens, self._device
+        if not hasattr(scene, "mesh_id"):
+            raise ValueError(f"labels of {context.name}: only the renderer 'warp' has them")
+        model = self._model = _Model()
+        model.column_shift = CAUSE_BITS if self._has_cause else 0
+        model.rays = wp.array(lens.ray_table(), dtype=wp.vec3, device=device)
+        if "flow" in self._labels:
+            model.lens = make_lens_data(lens, device)
+        model.p_BC, model.q_BC = context.p_BC, context.q_BC
+        model.mesh, model.face_instance = scene.mesh_id, scene.data.face_instance
+        if scene.bodies is not None:
+            bodies = scene.bodies
+            model.motions, model.body_mesh = context.motions, bodies.mesh
+            model.body_sphere, model.body_face = bodies.sphere, bodies.first_face
+        if {"instance", "semantic"} & self._geometry:
+            known = label_scenes([scene], classes)
+            numbers = np.array([number for _, number in known.instances[0]], np.int32)
+            model.class_of = wp.array(numbers, dtype=int, device=device)
+            meaning |= {"instances": known.instances[0], "classes": known.classes}
+        return _make_kernel(getattr(lens, "kind", ""), self._geometry, scene.bodies is not None)
+
+    def note_flown(self) -> None:
+        """Note how far the flight is known; launches only.
+
+        The vehicle may be ahead, and go on while `launch` looks back.
+        """
+        if self._geometry:
+            wp.copy(self._flown, self._history.count)
+
+    def launch(self, count: int, t: Any, x: Any, y: Any, *, first_x: int = 0, first_y: int = 0) -> None:
+        """Launch the search for the truth of events, and its copy to the host.
 
         Args:
-            events: What the camera found.
-            has_cause: Columns are eight times the column plus the cause.
+            count: How many there are.
+            t: Their times [us], int64.
+            x: In it are their columns, uint16.
+            y: In it are their rows, uint16.
+            first_x: Where the columns begin.
+            first_y: Where the rows begin.
         """
+        self._room, self._taken = count + count % 2, 0  # pairs and numbers begin where they may
+        if not self._geometry:
+            return
+        if self._pool is None or self._capacity < self._room:
+            self._make_room(self._room if self._pool is None else size_class(2 * self._room))
+        self._out.room = self._room
+        launch_split(
+            self._kernel,
+            dim=count,
+            inputs=[self._model, self._history, self._flown, t, x, first_x, y, first_y],
+            outputs=[self._out],
+            device=self._device,
+        )
+        if self._pool is not None:
+            self._block = self._pool.acquire(4 * _WORDS * self._room)
+            wp.copy(self._block.array, self._bytes, count=4 * _WORDS * self._room)
+
+    def _make_room(self, room: int) -> None:
+        block: Any = wp.empty(_WORDS * room, dtype=float, device=self._device)
+        for name, dtype, size in (("pairs", wp.vec2, 8), ("numbers", float, 4), ("labels", int, 4)):
+            shape = 4 * _WORDS * room // size
+            setattr(self._out, name, wp.array(ptr=block.ptr, dtype=dtype, shape=shape, device=self._device))
+        self._bytes: Any = wp.array(
+            ptr=block.ptr, dtype=wp.uint8, shape=4 * _WORDS * room, device=self._device
+        )
+        self._memory, self._capacity = block, room
+        if self._pool is None:
+            self._rows = block.numpy()
+
+    def add(self, events: Events) -> LabelledEvents:
+        """Return the next of the events that were launched with their truth; the device has finished."""
+        if self._geometry and self._block is not None and self._pool is not None:
+            self._rows = self._pool.hand_out(self._block, 4 * _WORDS * self._room).view(np.float32)
+            self._block = None
+        first, end, room = self._taken, self._taken + len(events), self._room
+        self._taken = end
+
+        def column(name: str, place: int, dtype: Any = np.float32) -> NDArray[Any]:
+            rows = self._rows[place * room :].view(dtype)
+            return rows[first:end] if name in self._labels else np.zeros(0, dtype)
+
         values = {field.name: getattr(events, field.name) for field in fields(events)}
         causes = np.zeros(len(events) if "cause" in self._labels else 0, np.uint8)
-        if has_cause:
+        if self._has_cause:
             causes = (as_numpy(events.x) & ((1 << CAUSE_BITS) - 1)).astype(np.uint8)
             values["x"] = as_numpy(events.x) >> CAUSE_BITS
-        count = {name: len(events) if name in self._labels else 0 for name in ("depth", "flow", "instance")}
-        count["semantic"] = len(events) if "semantic" in self._labels else 0
-        device = self._device
-        depth: Any = wp.zeros(count["depth"], dtype=float, device=device)
-        flow: Any = wp.zeros(count["flow"], dtype=wp.vec2, device=device)
-        instance, semantic = (wp.zeros(count[n], dtype=int, device=device) for n in ("instance", "semantic"))
-        if self._geometry and len(events):
-            columns: list[Any] = [
-                wp.array(as_numpy(values[name]), dtype=dtype, device=device)
-                for name, dtype in (("t", wp.int64), ("x", wp.uint16), ("y", wp.uint16))
-            ]
-            launch_split(
-                self._kernel,
-                dim=len(events),
-                inputs=[self._model, self._history, *columns],
-                outputs=[depth, flow, instance, semantic],
-                device=device,
-            )
+        flow = self._rows[: 2 * room].reshape(-1, 2)[first:end]
         return LabelledEvents(
             **values,
-            depth=depth.numpy(),
-            flow=flow.numpy().reshape(-1, 2),
-            instance=instance.numpy(),
-            semantic=semantic.numpy(),
+            depth=column("depth", 2),
+            flow=flow if "flow" in self._labels else np.zeros((0, 2), np.float32),
+            instance=column("instance", 3, np.int32),
+            semantic=column("semantic", 4, np.int32),
             cause=causes,
             labels=self._meaning,
         )

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,arg-type,no-any-return,no-untyped-call,call-overload,untyped-decorator"
 # mypy: disable-error-code="assignment,no-untyped-def"
-"""The pixels of an event camera that are not ideal: their parameters as drawn, their states, their kernel.
+"""The pixels of an event camera that are not ideal: their parameters as drawn, and their states.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
 
@@ -9,7 +9,6 @@ frame; numbers in time also by the stamp of the reset, so that noise does not co
 depends on how frames are split into calls, nor on threads.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -19,83 +18,11 @@ import warp as wp
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
-from neurosim_core.sensors.event_noise_scan import begin_pixel, make_pixel_scan
-from neurosim_core.sensors.event_scan import CLOSE, OPEN, write_key
+from neurosim_core.sensors.event_noise_scan import begin_pixel
 
 wp.set_module_options({"enable_backward": False})
 
 _ZERO = wp.constant(wp.float64(0.0))
-
-
-@functools.cache
-def make_scan(terms: frozenset[str]) -> Any:
-    """Return the kernel that scans pixels with only the given `TERMS`."""
-    scan_pixel = make_pixel_scan(terms)
-
-    @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.event_noise." + ("_".join(sorted(terms)) or "ideal")),
-        enable_backward=False,
-    )
-    def scan(
-        # Model:
-        model: PixelModel,
-        width: wp.int32,
-        row_shift: wp.int32,
-        time_shift: wp.int32,
-        # In:
-        first_pixel: wp.int32,
-        end_pixel: wp.int32,
-        log_radiance: wp.array2d[wp.float32],
-        stamps: wp.array[wp.int64],
-        since_reset_ns: wp.array[wp.int64],
-        frame_count: wp.int32,
-        row_limit: wp.array[wp.int32],
-        base: wp.array[wp.float32],
-        last: wp.array[wp.float32],
-        crossed: wp.array[wp.vec2i],
-        before: Memory,
-        tabulate: wp.bool,
-        # Out:
-        last_out: wp.array[wp.float32],
-        crossed_out: wp.array[wp.vec2i],
-        after: Memory,
-        keys_out: wp.array[wp.int64],
-        counters_out: wp.array[wp.int64],
-        table_out: wp.array2d[wp.int32],
-    ):
-        """Take the pixels [first_pixel, end_pixel) over `frame_count` frames, like `event_scan.scan`.
-
-        The origin of the stamps is `since_reset_ns[0]` after the reset: an array that a graph can hold.
-        """
-        pixel = first_pixel + wp.tid()
-        write_key(OPEN, wp.int64(0), keys_out, counters_out)
-        if pixel < end_pixel:
-            scan_pixel(
-                model,
-                width,
-                row_shift,
-                time_shift,
-                pixel,
-                log_radiance,
-                stamps,
-                since_reset_ns[0],
-                frame_count,
-                row_limit,
-                base,
-                last,
-                crossed,
-                before,
-                tabulate,
-                last_out,
-                crossed_out,
-                after,
-                keys_out,
-                counters_out,
-                table_out,
-            )
-        write_key(CLOSE, wp.int64(0), keys_out, counters_out)
-
-    return scan
 
 
 @wp.kernel
@@ -220,8 +147,6 @@ class PixelNoise:
         self._model = self._make_model()
         self.thresholds = self._model.thresholds
         self._reset_ns = 0
-        self.scan = make_scan(frozenset(self.terms))
-        wp.load_module(self.scan.module, device=self._device)
 
     def reset(self, base: wp.array[wp.float32], stamp_ns: int) -> None:
         """Begin anew in slot 0 of the ring, at what the pixels see at a stamp, shape [pixel]."""
@@ -252,10 +177,6 @@ class PixelNoise:
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset an origin of time lies [ns]."""
         return origin_ns - self._reset_ns
-
-    def inputs(self) -> list[Any]:
-        """Return the first parameters of the scan."""
-        return [self._model]
 
     def memory(self, slot: int) -> Any:
         """Return the state in a slot of the ring."""

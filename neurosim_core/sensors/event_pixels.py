@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from neurosim_core.render.launch import core_count
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
-from neurosim_core.sensors import event_scan
+from neurosim_core.sensors import event_worlds_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import ROOM_PER_PIXEL, TOUCHED_COUNT_MAX, roomy_keys
 from neurosim_core.sensors.event_noise import PixelNoise
+from neurosim_core.sensors.event_noise_model import Memory, PixelModel
 from neurosim_core.sensors.event_scan import BLOCK_SIZE, TILE_SIZE
 from neurosim_core.warp_start import refuse_forked_process
 
@@ -155,15 +156,18 @@ class Pixels:
         seed: int,
         terms: Sequence[str],
     ) -> None:
-        self._thresholds = [config.threshold_on, config.threshold_off]
+        self._thresholds: Any = wp.array(
+            [(config.threshold_on, config.threshold_off)], dtype=wp.vec2d, device=device
+        )
         self._width, self._height = width, height
         self._row_shift, self._time_shift = row_shift, time_shift
         self._device = device
         pixel_count = width * height
         self.base = self._empty(pixel_count, wp.float32)
-        self._last = [self._empty(pixel_count, wp.float32) for _ in range(ring_size)]
-        self._crossed = [self._empty(pixel_count, wp.vec2i) for _ in range(ring_size)]
-        self._lead = wp.zeros(pixel_count, dtype=wp.int32, device=device)
+        self._last = [self._empty((1, pixel_count), wp.float32) for _ in range(ring_size)]
+        self._crossed = [self._empty((1, pixel_count), wp.vec2i) for _ in range(ring_size)]
+        self._lead = wp.zeros((1, pixel_count), dtype=wp.int32, device=device)
+        self._scan: Any = event_worlds_scan.scan
         self.noise: PixelNoise | None = None
         if terms:
             self.noise = PixelNoise(
@@ -175,23 +179,31 @@ class Pixels:
                 device=device,
                 terms=terms,
             )
+            self._scan = event_worlds_scan.make_noisy_scan(frozenset(terms))
+            self._models: Any = wp.array([self.noise.model], dtype=PixelModel, device=device)
+            self._memories: list[Any] = [
+                wp.array([self.noise.memory(slot)], dtype=Memory, device=device) for slot in range(ring_size)
+            ]
         self.screened = device.is_cpu and self.noise is None
         scratch = pixel_count if self.screened else 0
-        self._quiet_range = [self._empty(scratch, wp.float32) for _ in range(2)]
-        self._table = self._empty((1, height), wp.int32)
+        self._quiet_range = [self._empty((1, scratch), wp.float32) for _ in range(2)]
+        self._table = self._empty((1, 1, height), wp.int32)
+        self._overflow = wp.ones(1, dtype=wp.int32, device=device)
         self._bounds = self._chunk_bounds()
         self._key_room = _KEYS_PER_PIXEL * pixel_count
         self._scan_number = itertools.count()
         self._pool: ThreadPoolExecutor | None = None
-        wp.load_module(event_scan, device=device)
+        for module in (event_worlds_scan, self._scan.module):
+            wp.load_module(module, device=device)
 
     def reset(self, log_radiance: wp.array2d[wp.float32], stamp_ns: int) -> None:
         """Make a frame every pixel's reference; the first state of the ring is the one that follows."""
         wp.copy(self.base, log_radiance.flatten())
-        wp.copy(self._last[0], self.base)
+        wp.copy(self._last[0].flatten(), self.base)
         self._crossed[0].zero_()
         if self.noise is not None:
             self.noise.reset(self.base, stamp_ns)
+            wp.copy(self._models, wp.array([self.noise.model], dtype=PixelModel, device=self._device))
 
     def since_reset_ns(self, origin_ns: int) -> int:
         """Return how long after the reset a stamp is [ns]; 0 where no pixel asks for it."""
@@ -256,14 +268,14 @@ class Pixels:
         """Return the key of the launches of a scan: same key, same launches (`streams.GraphCache`)."""
         keys = tuple((chunk.keys.ptr, chunk.keys.shape[0]) for chunk in scan.chunks)
         frames = scan.frames.ptr, len(scan.stamps_ns)
-        return scan.number, scan.state, *frames, keys, self.since_reset_ns(0)
+        return scan.number, scan.state, *frames, keys
 
     def count_by_row(self, scan: Scan) -> NDArray[np.int32]:
         """Return how many events each frame and row of a stack has, shape [frame, row]; waits for it."""
-        self._table = wp.zeros((len(scan.stamps_ns), self._height), dtype=wp.int32, device=self._device)
+        self._table = wp.zeros((1, len(scan.stamps_ns), self._height), dtype=wp.int32, device=self._device)
         self.launch(scan, tabulate=True)
-        counts: NDArray[np.int32] = self._table.numpy()
-        self._table = self._empty((1, self._height), wp.int32)
+        counts: NDArray[np.int32] = self._table.numpy()[0]
+        self._table = self._empty((1, 1, self._height), wp.int32)
         return counts
 
     def launch(self, scan: Scan, *, tabulate: bool = False) -> None:
@@ -275,59 +287,61 @@ class Pixels:
 
         def launch(chunk: Chunk) -> None:
             scan.inputs.upload()
-            thresholds = self._thresholds
-            stack = scan.frames.reshape((scan.frames.shape[0], self._width * self._height))
-            extent = [chunk.first_pixel, chunk.end_pixel, stack]
-            frame_count = len(scan.stamps_ns)
+            stack = self._stack(scan, chunk)
+            extent = [0, chunk.first_pixel, chunk.end_pixel, len(scan.stamps_ns)]
+            pixel_count = chunk.end_pixel - chunk.first_pixel
+            base = self.base.reshape((1, -1))
             if self.screened:
                 wp.launch(
-                    event_scan.screen,
-                    dim=-(-(chunk.end_pixel - chunk.first_pixel) // TILE_SIZE),
-                    inputs=[*thresholds, *extent, frame_count, self.base, self._crossed[before]],
+                    event_worlds_scan.screen,
+                    dim=(1, -(-pixel_count // TILE_SIZE)),
+                    inputs=[self._thresholds, *extent, stack, base, self._crossed[before]],
                     outputs=[*self._quiet_range, self._lead],
                     device=self._device,
                 )
             block = BLOCK_SIZE if self._device.is_cuda else 1
-            blocks = -(-(chunk.end_pixel - chunk.first_pixel) // block)
-            noise = self.noise
-            own = [*thresholds] if noise is None else noise.inputs()
-            frames = [self._lead] if noise is None else []
-            since = [] if noise is None else [scan.since_reset_ns]
-            memory = [[] if noise is None else [noise.memory(slot)] for slot in (before, after)]
+            ideal = self.noise is None
+            memory = [[] if ideal else [self._memories[slot]] for slot in (before, after)]
             wp.launch(
-                event_scan.scan if noise is None else noise.scan,
-                dim=blocks * block,  # whole blocks: their threads reserve slots together
+                self._scan,
+                dim=(
+                    1,
+                    -(-pixel_count // block) * block,
+                ),  # whole blocks: their threads reserve slots together
                 block_dim=BLOCK_SIZE,
                 inputs=[
-                    *own,
+                    self._thresholds if ideal else self._models,
                     self._width,
                     self._row_shift,
                     self._time_shift,
                     *extent,
-                    scan.stamps,
-                    *since,
-                    frame_count,
-                    *frames,
-                    scan.row_limit,
-                    self.base,
+                    event_worlds_scan.COUNT if tabulate else event_worlds_scan.ALL,
+                    *([self._lead] if ideal else []),
+                    base,
                     self._last[before],
                     self._crossed[before],
                     *memory[0],
-                    tabulate,
+                    stack,
                 ],
-                outputs=[
-                    self._last[after],
-                    self._crossed[after],
-                    *memory[1],
-                    chunk.keys,
-                    chunk.counters,
-                    self._table,
-                ],
+                outputs=[self._last[after], self._crossed[after], *memory[1]],
                 device=self._device,
             )
             chunk.counters_on_host.fetch(0, _COUNTERS)
 
         self._share(launch, scan.chunks)
+
+    def _stack(self, scan: Scan, chunk: Chunk) -> Any:
+        """Return what the kernels take for a chunk of a scan: the arrays of one world."""
+        stack = event_worlds_scan.Stack()
+        stack.log_radiance = scan.frames.reshape((1, scan.frames.shape[0], self._width * self._height))
+        stack.stamps = scan.stamps.reshape((1, -1))
+        stack.since_reset_ns = scan.since_reset_ns
+        stack.row_limit = scan.row_limit.reshape((1, -1))
+        stack.overflow = self._overflow
+        stack.table = self._table
+        stack.keys = chunk.keys.reshape((1, -1))
+        stack.counters = chunk.counters.reshape((1, -1))
+        return stack
 
     def _share(self, launch: Callable[[Chunk], None], chunks: list[Chunk]) -> None:
         """Launch for all chunks; there are several on a CPU, which go to its cores."""
@@ -347,5 +361,5 @@ class Pixels:
         rows = [self._height * chunk // chunk_count for chunk in range(chunk_count + 1)]
         return [(a * self._width, b * self._width) for a, b in itertools.pairwise(rows)]
 
-    def _empty(self, shape: int | tuple[int, int], dtype: Any) -> Any:
+    def _empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         return wp.empty(shape, dtype=dtype, device=self._device)

@@ -1,9 +1,10 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
 # mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment"
-"""Kernels of the event camera: the pixels' scan over a stack of frames, which writes the keys of events.
+"""The scan of an ideal pixel over a stack of frames, which writes the keys of its events.
 
 What a pixel does with its samples is in `scan_pixel`, once; levels, the tie rule and keys are in
-`event_levels`. Between stacks a pixel holds its last sample and how many levels it has crossed.
+`event_levels`. Between stacks a pixel holds its last sample and how many levels it has crossed. The kernels
+are in `event_worlds_scan`.
 
 Pixels that are not ideal have a scan of their own, made to measure, in `event_noise_scan`.
 """
@@ -193,9 +194,35 @@ def scan_pixel(
     counters_out: wp.array[wp.int64],
     table_out: wp.array2d[wp.int32],
 ) -> None:
-    """Take one pixel from its state before a stack to that after it; parameters as for `scan`.
+    """Take one pixel from its state before a stack to that after it.
 
-    All threads of a block come here together, also those whose pixel is past the end. `lane` is their number.
+    All threads of a block come here together, also those whose pixel is past the end.
+
+    Args:
+        threshold_on: Step of log radiance upwards.
+        threshold_off: Step of log radiance downwards.
+        width: Pixels per row.
+        row_shift: Bits of a key below its row.
+        time_shift: Bits of a key below its microseconds.
+        pixel: Which.
+        end_pixel: End of the pixels.
+        lane: Number of the thread in its block.
+        log_radiance: Frames, shape [frame, pixel], contiguous.
+        stamps: Of the state and of each frame, from the origin [ns].
+        frame_count: Frames to scan.
+        lead: Frames at the start that are known to be quiet, shape [pixel].
+        row_limit: Rows whose events are kept, shape [frame].
+        base: Log radiance of the reset, shape [pixel].
+        last: Last sample, shape [pixel].
+        crossed: Levels crossed upwards and downwards, shape [pixel].
+        tabulate: Only count events, by frame and row.
+        last_out: `last` after the stack.
+        crossed_out: `crossed` after the stack.
+        keys_out: Where keys go, as many as there is room for.
+        counters_out: Where the next key goes, which counts events kept (written or not); invalid samples; and
+            the flat index of the first of these in the stack, as frame_count * pixel_count minus it: zero
+            both before.
+        table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
     """
     alive = pixel < end_pixel
     base_32 = wp.float32(0.0)
@@ -319,142 +346,14 @@ def screen_tile(
     high_out: wp.array[wp.float32],
     lead_out: wp.array[wp.int32],
 ) -> None:
-    """Count the leading quiet frames of the pixels [begin, end), at most 256; parameters as for `screen`."""
+    """Count the frames of the pixels [begin, end), at most 256, before the first that may fire.
+
+    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
+    event. The quiet range of each pixel is left in `low_out` and `high_out`.
+    """
     for pixel in range(begin, end):
         before = crossed[pixel]
         quiet = quiet_range(wp.float64(base[pixel]), before[0], before[1], threshold_on, threshold_off)
         low_out[pixel] = quiet[0]
         high_out[pixel] = quiet[1]
     _count_lead(begin, end, log_radiance, frame_count, low_out, high_out, lead_out)
-
-
-@wp.kernel
-def screen(
-    # Model:
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    # In:
-    first_pixel: wp.int32,
-    end_pixel: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    frame_count: wp.int32,
-    base: wp.array[wp.float32],
-    crossed: wp.array[wp.vec2i],
-    # Out:
-    low_out: wp.array[wp.float32],
-    high_out: wp.array[wp.float32],
-    lead_out: wp.array[wp.int32],
-) -> None:
-    """Count the frames of each pixel before the first that may fire; one thread takes TILE_SIZE pixels.
-
-    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
-    event.
-
-    Args:
-        threshold_on: Step of log radiance upwards.
-        threshold_off: Step of log radiance downwards.
-        first_pixel: First pixel of thread 0.
-        end_pixel: End of the last thread's pixels.
-        log_radiance: Frames, shape [frame, pixel], contiguous.
-        frame_count: Frames to look at.
-        base: Log radiance of the reset, shape [pixel].
-        crossed: Levels crossed upwards and downwards, shape [pixel].
-        low_out: Lower end of the quiet range, shape [pixel].
-        high_out: Upper end of the quiet range, shape [pixel].
-        lead_out: Quiet frames, shape [pixel].
-    """
-    begin = first_pixel + wp.tid() * TILE_SIZE
-    screen_tile(
-        threshold_on,
-        threshold_off,
-        begin,
-        wp.min(begin + TILE_SIZE, end_pixel),
-        log_radiance,
-        frame_count,
-        base,
-        crossed,
-        low_out,
-        high_out,
-        lead_out,
-    )
-
-
-@wp.kernel(launch_bounds=(BLOCK_SIZE, 3))  # blocks of a multiprocessor: fastest on an H200
-def scan(
-    # Model:
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    width: wp.int32,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    # In:
-    first_pixel: wp.int32,
-    end_pixel: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    stamps: wp.array[wp.int64],
-    frame_count: wp.int32,
-    lead: wp.array[wp.int32],
-    row_limit: wp.array[wp.int32],
-    base: wp.array[wp.float32],
-    last: wp.array[wp.float32],
-    crossed: wp.array[wp.vec2i],
-    tabulate: wp.bool,
-    # Out:
-    last_out: wp.array[wp.float32],
-    crossed_out: wp.array[wp.vec2i],
-    keys_out: wp.array[wp.int64],
-    counters_out: wp.array[wp.int64],
-    table_out: wp.array2d[wp.int32],
-) -> None:
-    """Take the pixels [first_pixel, end_pixel) over `frame_count` frames.
-
-    Args:
-        threshold_on: Step of log radiance upwards.
-        threshold_off: Step of log radiance downwards.
-        width: Pixels per row.
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        first_pixel: Pixel of thread 0.
-        end_pixel: Threads at or past it (they fill the last CUDA block) have no pixel.
-        log_radiance: Frames, shape [frame, pixel].
-        stamps: Stamp of the state, then of each frame, from the keys' time origin [ns], shape [frame + 1].
-        frame_count: Frames to scan.
-        lead: Frames at the start that `screen` found quiet, or 0, shape [pixel].
-        row_limit: Rows whose events are kept, for each frame, shape [frame].
-        base: Log radiance of the reset, shape [pixel].
-        last: Last sample, shape [pixel].
-        crossed: Levels crossed upwards and downwards, shape [pixel].
-        tabulate: Only add the number of events to `table_out`, and change nothing else.
-        last_out: `last` after the scan.
-        crossed_out: `crossed` after the scan.
-        keys_out: Keys of the events, in no defined order; those past its end are not written.
-        counters_out: Where the next key goes, which counts events kept (written or not); invalid samples; and
-            the flat index of the first of these in the stack, as frame_count * pixel_count minus it: zero
-            both before.
-        table_out: Events by frame and row, shape [frame, row], zeros before; used when `tabulate`.
-    """
-    thread = wp.tid()
-    scan_pixel(
-        threshold_on,
-        threshold_off,
-        width,
-        row_shift,
-        time_shift,
-        first_pixel + thread,
-        end_pixel,
-        thread % BLOCK_SIZE,
-        log_radiance,
-        stamps,
-        frame_count,
-        lead,
-        row_limit,
-        base,
-        last,
-        crossed,
-        tabulate,
-        last_out,
-        crossed_out,
-        keys_out,
-        counters_out,
-        table_out,
-    )

@@ -15,6 +15,7 @@ import warp as wp
 from neurosim_core.render.launch import core_count
 from neurosim_core.sensors import event_worlds_scan as scan
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise import PixelNoise
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel, terms_of
@@ -283,7 +284,7 @@ class WorldEventCamera:
             scan.decode,
             dim=(world_count, lanes),
             block_dim=BLOCK_SIZE,
-            inputs=[self.row_shift, self.time_shift, lanes, self.stack, events.offsets],
+            inputs=[self.row_shift, self.time_shift, lanes, 0, self.stack, events.offsets],
             outputs=[events.t, events.x, events.y, events.polarity],
             device=self.device,
         )
@@ -320,6 +321,8 @@ class WorldEventCamera:
                     inputs=[
                         self._thresholds,
                         first,
+                        0,
+                        self._base.shape[1],
                         frame_count,
                         self.stack,
                         self._base,
@@ -334,7 +337,20 @@ class WorldEventCamera:
 
     def record_scan(self, parity: int) -> Any:
         """Return the launch of the scan of one frame of all worlds, on CUDA; `stack` may change meanwhile."""
-        return self._launch_scan(0, self._base.shape[0], 1, scan.ALL, parity, record_cmd=True)
+        world_count, pixel_count = self._base.shape
+        if self.terms:
+            return self._launch_scan(0, world_count, 1, scan.ALL, parity, record_cmd=True)
+        blocks = -(-pixel_count // (BLOCK_SIZE * PIXELS_PER_THREAD))
+        states = [self._base, self._last[parity], self._crossed[parity]]
+        return wp.launch(
+            scan_frame,
+            dim=(world_count, blocks * BLOCK_SIZE),
+            block_dim=BLOCK_SIZE,
+            inputs=[self._thresholds, self._width, self.row_shift, self.time_shift, *states, self.stack],
+            outputs=[self._last[1 - parity], self._crossed[1 - parity]],
+            device=self.device,
+            record_cmd=True,
+        )
 
     def _launch_scan(
         self, first: int, end: int, frame_count: int, part: int, parity: int, *, record_cmd: bool = False
@@ -353,6 +369,8 @@ class WorldEventCamera:
                 self.row_shift,
                 self.time_shift,
                 first,
+                0,
+                self._base.shape[1],
                 frame_count,
                 part,
                 *lead,
@@ -390,6 +408,7 @@ class WorldEventCamera:
         stack.log_radiance = frames
         stack.stamps = self._zeros((world_count, frame_count + 1), wp.int64)
         stack.origin_us = self._zeros(world_count, wp.int64)
+        stack.since_reset_ns = self._zeros(world_count, wp.int64)
         stack.row_limit = wp.full(
             (world_count, frame_count), self._height, dtype=wp.int32, device=self.device
         )

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,no-untyped-call"
 # mypy: disable-error-code="call-overload,untyped-decorator,empty-body,assignment,no-untyped-def,valid-type"
-"""Kernels of the events of many worlds: the scan of all their pixels, and their keys in order.
+"""Kernels of event cameras in one world or many: the scan of all pixels, and keys in order.
 
 The law of a pixel is that of `sensors.event_scan` and `sensors.event_noise_scan`: their functions get the
 arrays of one world. Every world has keys and counters of its own, and no block of threads takes pixels of
@@ -55,6 +55,8 @@ class Stack:
     """Of the state and of each frame, from the origin [ns], [world, frame + 1]."""
     origin_us: wp.array[wp.int64]
     """Origin of the keys' time since the reset of the world [us]."""
+    since_reset_ns: wp.array[wp.int64]
+    """The same from the reset of the pixels on, which noise counts from [ns]."""
     row_limit: wp.array2d[wp.int32]
     """Rows whose events are kept, [world, frame]."""
     overflow: wp.array[wp.int32]
@@ -64,7 +66,7 @@ class Stack:
     keys: wp.array2d[wp.int64]
     """[world, capacity]"""
     counters: wp.array2d[wp.int64]
-    """As in `event_scan.scan`, [world, 3]."""
+    """As in `event_scan.scan_pixel`, [world, 3]."""
     dropped: wp.array[wp.int32]
     """Events that were lost in the step."""
 
@@ -87,6 +89,7 @@ def begin_step(
     world = wp.tid()
     origin_us = (clock_ns[world] + offsets_ns[0]) // _US
     stack.origin_us[world] = origin_us
+    stack.since_reset_ns[world] = origin_us * _US
     for frame in range(offsets_ns.shape[0]):
         stack.stamps[world, frame] = clock_ns[world] + offsets_ns[frame] - origin_us * _US
     for counter in range(3):
@@ -110,6 +113,7 @@ def begin_frame(
     world = wp.tid()
     origin_us = start_ns // _US
     stack.origin_us[world] = origin_us
+    stack.since_reset_ns[world] = origin_us * _US
     stack.stamps[world, 0] = start_ns - origin_us * _US
     stack.stamps[world, 1] = stamp_ns - origin_us * _US
 
@@ -134,6 +138,8 @@ def screen(
     thresholds: wp.array[wp.vec2d],
     # In:
     first_world: wp.int32,
+    first_pixel: wp.int32,
+    end_pixel: wp.int32,
     frame_count: wp.int32,
     stack: Stack,
     base: wp.array2d[wp.float32],
@@ -146,12 +152,12 @@ def screen(
     """Count the quiet frames at the start of each pixel; threads are [world, tile], see `event_scan`."""
     index, tile = wp.tid()
     world = first_world + index
-    begin = tile * TILE_SIZE
+    begin = first_pixel + tile * TILE_SIZE
     screen_tile(
         thresholds[world][0],
         thresholds[world][1],
         begin,
-        wp.min(begin + TILE_SIZE, base.shape[1]),
+        wp.min(begin + TILE_SIZE, end_pixel),
         stack.log_radiance[world],
         frame_count,
         base[world],
@@ -162,7 +168,7 @@ def screen(
     )
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 3))  # blocks of a multiprocessor: fastest on an H200
 def scan(
     # Model:
     thresholds: wp.array[wp.vec2d],
@@ -171,6 +177,8 @@ def scan(
     time_shift: wp.int32,
     # In:
     first_world: wp.int32,
+    first_pixel: wp.int32,
+    end_pixel: wp.int32,
     frame_count: wp.int32,
     part: wp.int32,
     lead: wp.array2d[wp.int32],
@@ -191,6 +199,8 @@ def scan(
         row_shift: Bits of a key below its row.
         time_shift: Bits of a key below its microseconds.
         first_world: World of the first threads.
+        first_pixel: Pixel of the first threads of each world.
+        end_pixel: Threads at or past it (they fill the last CUDA block) have no pixel.
         frame_count: Frames to scan.
         part: ALL, COUNT or AGAIN.
         lead: Frames at the start that are known to be quiet, [world, pixel].
@@ -201,7 +211,7 @@ def scan(
         last_out: `last` after the step.
         crossed_out: `crossed` after the step.
     """
-    index, pixel = wp.tid()
+    index, thread = wp.tid()
     world = first_world + index
     if part != ALL and stack.overflow[world] == 0:
         return
@@ -211,9 +221,9 @@ def scan(
         width,
         row_shift,
         time_shift,
-        pixel,
-        base.shape[1],
-        pixel % BLOCK_SIZE,
+        first_pixel + thread,
+        end_pixel,
+        thread % BLOCK_SIZE,
         stack.log_radiance[world],
         stack.stamps[world],
         frame_count,
@@ -240,7 +250,9 @@ def make_noisy_scan(terms: frozenset[str]) -> Any:
     scan_noisy = make_pixel_scan(terms)
 
     @wp.kernel(
-        module=wp.get_module("neurosim_core.sensors.event_worlds_scan." + "_".join(sorted(terms))),
+        module=wp.get_module(
+            "neurosim_core.sensors.event_worlds_scan." + ("_".join(sorted(terms)) or "ideal")
+        ),
         enable_backward=False,
     )
     def scan(
@@ -251,6 +263,8 @@ def make_noisy_scan(terms: frozenset[str]) -> Any:
         time_shift: wp.int32,
         # In:
         first_world: wp.int32,
+        first_pixel: wp.int32,
+        end_pixel: wp.int32,
         frame_count: wp.int32,
         part: wp.int32,
         base: wp.array2d[wp.float32],
@@ -264,14 +278,15 @@ def make_noisy_scan(terms: frozenset[str]) -> Any:
         crossed_out: wp.array2d[wp.vec2i],
         after: wp.array[Memory],
     ):
-        index, pixel = wp.tid()
+        index, thread = wp.tid()
         world = first_world + index
+        pixel = first_pixel + thread
         if part != ALL and stack.overflow[world] == 0:
             return
         keys = stack.keys[world]
         counters = stack.counters[world]
         write_key(OPEN, wp.int64(0), keys, counters)
-        if pixel < base.shape[1]:
+        if pixel < end_pixel:
             scan_noisy(
                 models[world],
                 width,
@@ -280,7 +295,7 @@ def make_noisy_scan(terms: frozenset[str]) -> Any:
                 pixel,
                 stack.log_radiance[world],
                 stack.stamps[world],
-                stack.origin_us[world] * wp.int64(1000),
+                stack.since_reset_ns[world],
                 frame_count,
                 stack.row_limit[world],
                 base[world],
@@ -457,6 +472,7 @@ def decode(
     time_shift: wp.int32,
     lane_count: wp.int32,
     # In:
+    origin_us: wp.int64,
     stack: Stack,
     offsets: wp.array[wp.int32],
     # Out:
@@ -465,13 +481,16 @@ def decode(
     y_out: wp.array[wp.uint16],
     polarity_out: wp.array[wp.uint8],
 ) -> None:
-    """Take the keys of all worlds apart, world after world; threads are [world, lane]."""
+    """Take the keys of all worlds apart, world after world; threads are [world, lane].
+
+    Times are from `origin_us` before the origins of the worlds.
+    """
     world, lane = wp.tid()
     first = offsets[world]
     for index in range(lane, offsets[world + 1] - first, lane_count):
         event = first + index
         found = take_apart(stack.keys[world, index], row_shift, time_shift)
-        t_out[event] = stack.origin_us[world] + found.time_us
+        t_out[event] = origin_us + stack.origin_us[world] + found.time_us
         x_out[event] = found.x
         y_out[event] = found.y
         polarity_out[event] = found.polarity

@@ -25,7 +25,7 @@ from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_strea
 from neurosim_core.sensors import event_cut, event_input
 from neurosim_core.sensors.event_batch import EventCameraBatch, FrameEvents
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_keys import EventKeys
+from neurosim_core.sensors.event_keys import EventKeys, Labeller
 from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_pixels import LostEvents, Pixels, Scan
@@ -59,8 +59,7 @@ class EventCamera:
     At other levels an event may be early by the time that the signal takes to change by these roundings,
     about one ulp (5e-7 at 5). A crossing found so is stamped at the sample.
 
-    With a readout, events are stamped when they are read: those of a window may have happened before it, and
-    those that wait at its end come later.
+    With a readout, events are stamped when they are read, and may have happened before their window.
 
     Args:
         config: Thresholds, limits, and what is not ideal.
@@ -70,10 +69,10 @@ class EventCamera:
         sensor: Name of the sensor in the packets; cameras with different names have independent noise.
         seed: Seed of the run for all noise, 0 <= seed < 2^64.
         scan_count_max: How many stacks may be fed before the first of them is collected.
-        on_host: Hand events out as NumPy arrays also on a CUDA device. That is faster than to copy them
-            later: nothing is allocated on the device, and nothing that was launched since is waited for.
+        on_host: Hand events out as NumPy arrays also on a CUDA device: faster than to copy them later.
         terms: What is compiled in beyond ideal pixels, some of `event_noise_model.TERMS`; by default what the
             configuration asks for. With `CAUSE` besides, x is eight times the column plus the cause.
+        labels: Is told of all events, sorted, while they are on the device.
 
     Attributes:
         terms: What is computed beyond ideal pixels: some of `event_noise_model.TERMS`, and "readout".
@@ -94,6 +93,7 @@ class EventCamera:
         scan_count_max: int = 1,
         on_host: bool = False,
         terms: Sequence[str] | None = None,
+        labels: Labeller | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -129,8 +129,7 @@ class EventCamera:
         self._scan_count_max = scan_count_max
         self._graphs = GraphCache(device)
         self._reader = make_stream(device, high_priority=True)
-        self._taken = Fence(device)
-        """All that was launched to the reader, the only stream that moves keys; feeders wait for it."""
+        self._taken = Fence(device)  # of the reader, the only stream that moves keys; feeders wait for it
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
             pixel_count=width * height,
@@ -138,6 +137,7 @@ class EventCamera:
             time_shift=self._time_shift,
             device=self.device,
             on_host=self._on_host,
+            labels=labels,
         )
         # a scan that nothing is cut beside writes its keys to where they stay
         self._in_place = scan_count_max == 1 and self._pixels.chunk_count == 1
@@ -169,11 +169,7 @@ class EventCamera:
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the last frame that was waited for [ns].
-
-        Raises:
-            RuntimeError: If the camera was not reset.
-        """
+        """Time of the last frame that was waited for [ns]; there is none before a reset."""
         return self._require_reset()
 
     @property
@@ -253,9 +249,8 @@ class EventCamera:
         """Launch the scan of a stack of frames, without waiting for it.
 
         Nothing is allocated unless the stack is longer than any before, or there is no room for one event
-        more. After `scan_count_max` calls
-        `collect` or `collect_windows` comes next; until then `log_radiance` must stay as it is. All calls
-        must be on one stream.
+        more. After `scan_count_max` calls `collect` or `collect_windows` comes next; until then
+        `log_radiance` must stay as it is. All calls must be on one stream.
 
         Args:
             log_radiance: Frames on the camera's device, float32, contiguous, shape [K_max, H, W].

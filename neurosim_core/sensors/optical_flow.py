@@ -19,7 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from neurosim_core.clock import to_ns
 from neurosim_core.packets import FieldSpec, Packet
@@ -91,11 +91,6 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
     packet_type = OpticalFlow
     output: ClassVar[str] = "range"
 
-    @model_validator(mode="after")
-    def _lens_projects(self) -> "OpticalFlowConfig":
-        make_lens_data(self.lens)
-        return self
-
     @property
     def window_ns(self) -> int:
         """Time between the two pictures [ns]."""
@@ -155,7 +150,7 @@ class _Model:
 
 
 @wp.struct
-class _Views:
+class Views:
     """`PictureViews` at one time."""
 
     p_WC: wp.array[wp.vec3]
@@ -166,10 +161,10 @@ class _Views:
 
 
 @wp.func
-def _is_hidden(
+def is_hidden(
     mesh: wp.uint64,
     bodies: wp.array[wp.uint64],
-    views: _Views,
+    views: Views,
     view: int,
     p_W: wp.vec3d,
     ray_W: wp.vec3d,
@@ -187,11 +182,37 @@ def _is_hidden(
     return False
 
 
+def views_at(views: PictureViews, device: Any) -> Any:
+    """Return the poses of one time for a kernel."""
+    bodies = views.bodies or _no_bodies(str(device))
+    at = Views()
+    at.p_WC, at.q_WC, at.stamps = views.p_WC, views.q_WC, views.stamps
+    at.p_WO, at.q_WO = bodies.p_WO, bodies.q_WO
+    return at
+
+
 @functools.cache
-def _make_kernel(lens_kind: str, terms: tuple[str, ...]) -> Any:
-    project = projector(lens_kind)
-    project_velocity = velocity_projector(lens_kind)
-    name = "_".join((lens_kind, *terms)).replace(" ", "_")
+def _no_bodies(device: str) -> Any:
+    return make_body_poses(0, 0, device)
+
+
+def lens_kind(context: PictureContext) -> str:
+    """Return the kind of the lenses of all worlds.
+
+    Raises:
+        ValueError: There are several.
+    """
+    kinds = {getattr(lens, "kind", "") for lens in context.lenses}
+    if len(kinds) > 1:
+        raise ValueError(f"{context.name}: worlds have lenses of several kinds, {sorted(kinds)}")
+    return str(kinds.pop())
+
+
+@functools.cache
+def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
+    project = projector(kind)
+    project_velocity = velocity_projector(kind)
+    name = "_".join((kind, *terms)).replace(" ", "_")
 
     @wp.kernel(module=wp.get_module("neurosim_core.sensors.optical_flow." + name), enable_backward=False)
     def measure_flow(
@@ -202,8 +223,8 @@ def _make_kernel(lens_kind: str, terms: tuple[str, ...]) -> Any:
         instant_count: int,
         image_slot: wp.array[int],
         active: wp.array[int],
-        here: _Views,
-        there: _Views,
+        here: Views,
+        there: Views,
         twist: wp.array[wp.spatial_vectord],
         ranges: wp.array3d[float],
         instance: wp.array3d[int],
@@ -279,7 +300,7 @@ def _make_kernel(lens_kind: str, terms: tuple[str, ...]) -> Any:
             if found:
                 far = _NEAR_RATIO * float(wp.length(d_W))
             mesh = model.mesh[model.scene_of_world[world]]
-            if _is_hidden(mesh, model.body_mesh, there, view, p_WT, wp.normalize(d_W), far):
+            if is_hidden(mesh, model.body_mesh, there, view, p_WT, wp.normalize(d_W), far):
                 mask = 1.0
         flow_out[slot, row, col] = wp.vec3(u, v, mask)
 
@@ -296,9 +317,6 @@ class FlowProcess:
 
     def __init__(self, config: OpticalFlowConfig, context: PictureContext) -> None:
         source, lenses = context.source, context.lenses
-        kinds = {getattr(lens, "kind", "") for lens in lenses}
-        if len(kinds) > 1:
-            raise ValueError(f"{context.name}: worlds have lenses of several kinds, {sorted(kinds)}")
         present = {
             "bodies": context.motions is not None,
             "velocity": not config.window_ns,
@@ -314,7 +332,8 @@ class FlowProcess:
         model.stride = context.stride
         rays = np.stack([lens.ray_table().reshape(-1, 3) for lens in lenses])
         model.rays = wp.array(rays, dtype=wp.vec3, device=device)
-        model.lenses = wp.array([make_lens_data(lens) for lens in lenses], dtype=LensData, device=device)
+        self._lenses = [make_lens_data(lens, device) for lens in lenses]
+        model.lenses = wp.array(self._lenses, dtype=LensData, device=device)
         model.lens_of_world = wp.array(list(context.lens_of_world), dtype=int, device=device)
         mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
         model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
@@ -323,8 +342,7 @@ class FlowProcess:
             scene = context.scenes[0]
             model.scene_instances = len(scene.scene.instance_names)
             model.motions, model.body_mesh = context.motions, scene.bodies.mesh
-        self._kernel = _make_kernel(kinds.pop(), self.terms)
-        self._no_bodies = make_body_poses(0, 0, device)
+        self._kernel = _make_kernel(lens_kind(context), self.terms)
 
     def launch(self, views: PictureViews) -> None:
         """Make the flow of the pictures of a batch; launches only."""
@@ -338,8 +356,8 @@ class FlowProcess:
                 views.instant_count,
                 views.image_slot,
                 views.active,
-                self._at(views),
-                self._at(views.then or views),
+                views_at(views, self._device),
+                views_at(views.then or views, self._device),
                 views.twist,
                 sources["range"],
                 sources["instance"],
@@ -347,11 +365,3 @@ class FlowProcess:
             outputs=[self.picture],
             device=self._device,
         )
-
-    def _at(self, views: PictureViews) -> Any:
-        """Return the poses of one time for the kernel."""
-        bodies = views.bodies or self._no_bodies
-        at = _Views()
-        at.p_WC, at.q_WC, at.stamps = views.p_WC, views.q_WC, views.stamps
-        at.p_WO, at.q_WO = bodies.p_WO, bodies.q_WO
-        return at

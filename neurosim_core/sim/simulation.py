@@ -224,9 +224,7 @@ class Simulation:
             self._check_partial()
         seeds = None if seed is None else self._checked_seeds(seed)
         chosen = None if mask is None else self._checked_mask(mask)
-        start = self._checked_start(
-            position=position, velocity=velocity, orientation=orientation, body_rate=body_rate
-        )
+        start = self._checked_start(**given)
         self._take_mask(chosen)  # all is checked: nothing is half done
         if seeds is not None:
             self._reseed(seeds)
@@ -285,9 +283,7 @@ class Simulation:
         self._require_reset()
         if periods < 1:
             raise ValueError(f"periods must be 1 at least, got {periods}")
-        if not isinstance(
-            self._state.vehicle, Carrier
-        ):  # worlds that were reset, or stepped, have no command of it
+        if not isinstance(self._state.vehicle, Carrier):  # after a reset or a step there is no command of it
             self._state.path_controller.update(self._state.vehicle.arrays)
         for _ in range(periods):
             observation = self._advance(closed_loop=True)

@@ -192,8 +192,11 @@ def _draw_sensor(page: _Page, place: tuple[float, float], name: str, snapshot: S
     axes.spines[["top", "right"]].set_visible(False)
     if schema.display == "points":
         points = as_numpy(getattr(packet, next(f.name for f in varying if f.shape[1:] == (3,))))
-        axes.scatter(points[:, 0], points[:, 1], c=points[:, 2], s=3.0, cmap="viridis", linewidths=0)
+        seen = points if varying[0].unit != "px" else as_numpy(getattr(packet, varying[0].name))
+        axes.scatter(seen[:, 0], seen[:, 1], c=points[:, 2], s=3.0, cmap="viridis", linewidths=0)
         axes.set_aspect("equal", adjustable="datalim")
+        if seen is not points:  # rows go down
+            axes.invert_yaxis()
     else:
         axes.plot(as_numpy(getattr(packet, varying[0].name)), color=_XYZ[2], linewidth=1.4)
         axes.margins(x=0.0)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import json
 import sys
 import threading
@@ -92,13 +93,17 @@ class Peer:
         self.node.destroy_publisher(publisher)
         return str(getattr(found[0], "topic_type_hash", None))  # Humble has none
 
-    def call(self, name: str, type_name: str = "std_srvs/srv/Trigger") -> Any:
-        """Call a service with an empty request; return the fields of its response, as text where nested."""
+    def has(self, package: str) -> bool:
+        """Return whether a ROS package is installed."""
+        return importlib.util.find_spec(package) is not None
+
+    def call(self, name: str, type_name: str = "std_srvs/srv/Trigger", **fields: Any) -> Any:
+        """Call a service; return the fields of its response, as text where nested."""
         kind = _class(type_name)
         client = self.node.create_client(kind, name)
         if not client.wait_for_service(SOON_S):
             return None
-        future = client.call_async(kind.Request())
+        future = client.call_async(kind.Request(**fields))
         deadline = time.monotonic() + SOON_S
         while not future.done() and time.monotonic() < deadline:
             time.sleep(0.01)

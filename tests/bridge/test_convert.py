@@ -1363,3 +1363,11 @@ if __name__ == "__main__":
     (GOLDEN / "static_transforms.cdr").write_bytes(
         static_transforms([tf_static], ["a", "b"], FrameNames(map="earth"))
     )
+
+
+def test_a_clamped_vector_is_not_beyond_its_limit_by_a_rounding():
+    """Else the simulator, which has the same limit, clamps it again."""
+    context = Context(options={"max_speed_m_s": 51.3838})
+    rng = np.random.default_rng(1)
+    for vector in rng.normal(size=(2000, 3)) * 10.0 ** rng.uniform(2, 300, (2000, 1)):
+        assert np.linalg.norm(context.within("velocity", vector, "max_speed_m_s", "m/s")) <= 51.3838

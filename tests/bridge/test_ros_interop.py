@@ -31,6 +31,7 @@ from runtime_directory import own_directory
 
 from cortex import Node
 from cortex import messages as msg
+from cortex_ros2_bridge.simulation import SERVED
 from cortex_ros2_bridge.typestore import DEFAULT_DISTRO, DISTROS
 
 INSTALL = "no rclpy: source a ROS installation, or name a Python that has it in NEUROSIM_ROS_PYTHON"
@@ -171,3 +172,30 @@ def test_services_of_a_real_node(bridge: BridgeProcess, ros_node: RosNode) -> No
             "call", name="/cortex_bridge/list_parameters", type_name="rcl_interfaces/srv/ListParameters"
         )
         assert "'frames.map'" in listed
+
+
+def test_simulation_interfaces_of_a_real_node(bridge: BridgeProcess, ros_node: RosNode) -> None:
+    """Through DDS where the other nodes are on Cyclone DDS too; the package has to be installed."""
+    package = "simulation_interfaces"
+    if not ros_node.do("has", package=package):
+        pytest.skip(f"the ROS package {package} is not installed")
+    if bridge.backend == "dds" and os.environ.get("RMW_IMPLEMENTATION") != "rmw_cyclonedds_cpp":
+        pytest.skip("services through DDS need RMW_IMPLEMENTATION=rmw_cyclonedds_cpp")
+    asked = []
+
+    def answer(request: Any) -> msg.SimulatorReply:
+        asked.append(request)
+        return msg.SimulatorReply(True, "", 0, "paused")
+
+    with Node("simulator") as simulator:
+        for name, kind in SERVED.items():
+            simulator.service(name, kind, msg.SimulatorReply, answer)
+        (features,) = ros_node.do(
+            "call", name="/get_simulator_features", type_name=f"{package}/srv/GetSimulatorFeatures"
+        )
+        assert "SetEntityState while the simulation is stopped" in features
+        (result,) = ros_node.do(
+            "call", name="/step_simulation", type_name=f"{package}/srv/StepSimulation", steps=7
+        )
+        assert "result=1" in result
+        assert asked == [msg.Step(7)]

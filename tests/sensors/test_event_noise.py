@@ -13,8 +13,9 @@ from scipy import integrate, optimize, stats
 
 from neurosim_core.config import load_config
 from neurosim_core.packets import EventArrays, Events
-from neurosim_core.sensors import event_noise, event_pixels
+from neurosim_core.sensors import event_pixels
 from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_worlds_scan import make_noisy_scan
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sim import run
 
@@ -120,7 +121,7 @@ def test_terms_with_zero_coefficients_change_no_bit(terms, device):
 
 def test_unknown_terms_are_refused():
     with pytest.raises(ValueError, match=r"unknown terms \['flicker'\], known: spread"):
-        event_noise.make_scan(frozenset({"flicker"}))
+        make_noisy_scan(frozenset({"flicker"}))
 
 
 # ---- mismatch

@@ -147,13 +147,29 @@ def truth(lens_settings, stamp_ns, body, pixels, ranges, odometry, to_ns):
     p_C = (Rotation.from_quat(there.orientation) * R_BC).inv().apply(points - there.position)
     if hasattr(lens, "project"):
         return lens.project(p_C)
+    if lens.kind == "ray_table":  # where the interpolated ray is the direction
+        fisheye = OpticalFlowConfig(lens=LENSES["equidistant"]).lens
+        at = goal = fisheye.project(p_C)
+        for _ in range(8):  # the two differ by 1e-2 px
+            at = at + goal - fisheye.project(lens.rays(*np.clip(np.nan_to_num(at), 0, (W, H)).T))
+        inside = ((at > 1) & (at < (W - 1, H - 1))).all(axis=1)
+        return np.where(inside[:, None], at, np.nan)
     return p_C[:, :2] / p_C[:, 2:] * F + (W / 2, H / 2)
 
 
-@pytest.mark.parametrize("kind", LENSES)
-def test_flow_is_that_of_the_points_through_any_lens_on_moving_bodies(room, kind):
+@pytest.fixture(params=[*LENSES, "ray_table"])
+def lens(request, tmp_path):
+    """A lens of each kind; the table has the rays of a fisheye, some of which are missing."""
+    if request.param != "ray_table":
+        return LENSES[request.param]
+    rays = OpticalFlowConfig(lens=LENSES["equidistant"]).lens.ray_table().astype(np.float64)
+    rays[:3, :5] = np.nan
+    np.save(tmp_path / "rays.npy", rays)
+    return {"kind": "ray_table", "width": W, "height": H, "file": str(tmp_path / "rays.npy")}
+
+
+def test_flow_is_that_of_the_points_through_any_lens_on_moving_bodies(room, lens):
     """Against the poses at both times in NumPy; an agile flight, a ball that turns and orbits."""
-    lens = LENSES[kind]
     common = {"lens": lens, "rate_hz": 20, "mount": {"position_m": [0, 0, 0]}}
     sensors = {
         "flow": flow(lens=lens, window_s=0.05),
@@ -178,7 +194,7 @@ def test_flow_is_that_of_the_points_through_any_lens_on_moving_bodies(room, kind
         assert np.nanmax(np.abs(measured[pixels] - expected)) < 1e-3  # float32 poses and ranges
         slope = truth(*args, stamp_ns + step_ns) - truth(*args, stamp_ns - step_ns)
         slope /= 2e-9 * step_ns
-        assert np.nanmax(np.abs(velocity[pixels] - slope)) < 1e-3 * np.abs(slope).max()
+        assert np.nanmax(np.abs(velocity[pixels] - slope)) < 1e-3 * np.nanmax(np.abs(slope))
 
 
 def test_velocities_in_64_steps_lead_where_flow_leads(room):
@@ -187,7 +203,7 @@ def test_velocities_in_64_steps_lead_where_flow_leads(room):
     sensors = {
         "flow": flow(lens=lens, window_s=0.05),
         "velocity": flow(lens=lens, window_s=0, rate_hz=1280),
-        "instance": {**flow(lens=lens, rate_hz=1280), "kind": "instance"},
+        "normal": {**flow(lens=lens, rate_hz=1280), "kind": "normal"},
     }
     frames = [{**frame, "position_m": [2.5, 0.0, 1.5]} for frame in AGILE]
     found = packets(settings(room, sensors, frames))
@@ -195,10 +211,15 @@ def test_velocities_in_64_steps_lead_where_flow_leads(room):
     assert len(stamps) == 65
     where = np.stack([COLUMNS, ROWS], axis=-1).reshape(-1, 2)
     start = where.copy()
+    crossed = np.zeros(len(where), bool)
+    # between pixels that see two planes a velocity is not that between theirs
 
     def read(stamp_ns, at):
         x, y = (at - 0.5).T
         col, row = np.clip(x.astype(int), 0, W - 2), np.clip(y.astype(int), 0, H - 2)
+        normal = found["normal"][stamp_ns].data
+        for r, c in ((0, 1), (1, 0), (1, 1)):
+            crossed[np.abs(normal[row + r, col + c] - normal[row, col]).max(axis=1) > 1e-3] = True
         a, b = (x - col)[:, None], (y - row)[:, None]
         data = found["velocity"][stamp_ns].data.astype(np.float64)
         top = (1 - a) * data[row, col] + a * data[row, col + 1]
@@ -208,13 +229,13 @@ def test_velocities_in_64_steps_lead_where_flow_leads(room):
         step_s = 1e-9 * (there_ns - here_ns)
         v = read(here_ns, where)
         where = where + 0.5 * step_s * (v + read(there_ns, where + step_s * v))
-    inside = ((where > 2) & (where < (W - 2, H - 2))).all(axis=-1)
-    assert inside.mean() > 0.3
+    inside = ((where > 2) & (where < (W - 2, H - 2))).all(axis=-1) & ~crossed
+    assert inside.mean() > 0.2
     measured = found["flow"][200_000_000].data.reshape(-1, 2)[inside]
     moved = (where - start)[inside]
     assert np.abs(moved).max() > 5.0
     error = np.abs(measured - moved).max(axis=-1)
-    assert np.quantile(error, 0.8) < 0.01  # the others have met an edge between walls
+    assert error.max() < 0.01
 
 
 @pytest.mark.parametrize("direction", ["backward", "forward"])
@@ -278,10 +299,10 @@ def test_worlds_have_the_flow_of_single_runs(room):
 
 
 def test_what_cannot_be_done_is_refused(tmp_path, room):
-    np.save(tmp_path / "rays.npy", np.ones((4, 4, 3)))
-    lens = {"kind": "ray_table", "width": 4, "height": 4, "file": str(tmp_path / "rays.npy")}
-    with pytest.raises(ValueError, match="a lens of kind ray_table does not project points"):
-        OpticalFlowConfig(lens=lens)
+    np.save(tmp_path / "rays.npy", np.ones((4, 1, 3)))
+    lens = {"kind": "ray_table", "width": 1, "height": 4, "file": str(tmp_path / "rays.npy")}
+    with pytest.raises(ValueError, match="a ray_table of 1 x 4 rays does not project points"):
+        next(iter(ns.run(settings(room, {"flow": flow(lens=lens)}))))
     config = settings(room, {"flow": flow()}, renderer="synthetic")
     with pytest.raises(ValueError, match="use renderer: warp"):
         next(iter(ns.run(config)))

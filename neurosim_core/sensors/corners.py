@@ -1,0 +1,231 @@
+# mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,no-any-return,untyped-decorator"
+# ruff: noqa: SIM102, UP018, RUF046  (a short circuit, typed literals: they have a meaning in kernels)
+"""Corners of the geometry as a list: where they are in the picture, exactly, under numbers that stay.
+
+The corners are those of the meshes of the scene and of moving bodies (`scene.corners`), found once. Each is
+projected through the lens and is seen unless a ray to it hits something before. So positions have no
+resolution, a corner has the same number in all pictures, runs and worlds of a scene, and what looks like a
+corner because one thing ends behind another is none.
+"""
+
+# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+
+import functools
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from pydantic import Field
+
+from neurosim_core.packets import FieldSpec, Packet
+from neurosim_core.registry import register
+from neurosim_core.render.launch import launch_split
+from neurosim_core.render.projection import LensData, make_lens_data, projector
+from neurosim_core.scene.corners import find_corners
+from neurosim_core.sensors.base import CameraConfig, PictureContext, PictureSensorConfig, PictureViews
+from neurosim_core.sensors.edges import EdgeLimits, EdgesProcess
+from neurosim_core.sensors.optical_flow import Views, is_hidden, lens_kind, views_at
+
+_NEAR_RATIO = wp.constant(1.0 - 3.0e-4)
+"""What hides a corner is nearer than it by this ratio: rays and points are float32."""
+_COLUMNS = 6
+"""Numbers of a corner: column, row, position in C, edge."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Corners(Packet):
+    """The corners that a camera sees, in the order of their numbers."""
+
+    pixels: Annotated[NDArray[np.float32], FieldSpec("corner", 2, unit="px")]
+    """Column and row [px], shape [n, 2]; the centre of the first pixel is at 0.5."""
+    points: Annotated[NDArray[np.float32], FieldSpec("corner", 3, unit="m", frame="sensor")]
+    """Positions in C (x right, y down, z forward) [m], shape [n, 3]."""
+    id: Annotated[NDArray[np.int32], FieldSpec("corner")]
+    """Number of each corner, the same in all pictures, shape [n]."""
+    edge: Annotated[NDArray[np.uint8], FieldSpec("corner")]
+    """The foremost label that an `edges` camera gives pixels around it, 1: depth, 2: object, 3: crease; 0: no
+    edge there is large enough for the pixels; shape [n]."""
+
+
+@register("sensor", "corners")
+class CornersConfig(EdgeLimits, CameraConfig, PictureSensorConfig):
+    """A camera that finds corners of the geometry: a list with sub-pixel positions and lasting numbers."""
+
+    kind: Literal["corners"] = "corners"
+    turn_rad: Annotated[float, Field(gt=0.0, lt=1.5)] = 0.5
+    """Angle between two edges, or between one and the continuation of the other, that is a corner [rad]."""
+
+    packet_type = Corners
+    output: ClassVar[str] = "instance"
+
+    def make_process(self, context: PictureContext) -> "CornersProcess":
+        """Return what finds corners."""
+        return CornersProcess(self, context)
+
+    def packet(self, picture: NDArray[Any], **header: Any) -> Corners:
+        """Return the corners that are seen; the picture has all there are, shape [C, 6]."""
+        seen = np.flatnonzero(np.isfinite(picture[:, 0]))
+        rows = picture[seen]
+        return Corners(
+            pixels=np.ascontiguousarray(rows[:, :2]),
+            points=np.ascontiguousarray(rows[:, 2:5]),
+            edge=rows[:, 5].astype(np.uint8),
+            id=seen.astype(np.int32),
+            **header,
+        )
+
+
+@wp.struct
+class _Model:
+    width: int
+    height: int
+    stride: int
+    lenses: wp.array[LensData]
+    lens_of_world: wp.array[int]
+    mesh: wp.array[wp.uint64]
+    scene_of_world: wp.array[int]
+    body_mesh: wp.array[wp.uint64]
+    corners: wp.array2d[wp.vec3]  # of each scene, in W; then of all bodies, each in its O; nan: none
+    first_of_bodies: int
+    body: wp.array[int]  # of each corner from there on
+
+
+@functools.cache
+def _make_kernel(kind: str) -> Any:
+    project = projector(kind)
+
+    @wp.kernel(module=wp.get_module("neurosim_core.sensors.corners." + kind), enable_backward=False)
+    def find_seen_corners(
+        first: int,
+        # Model:
+        model: _Model,
+        # In:
+        instant_count: int,
+        image_slot: wp.array[int],
+        active: wp.array[int],
+        here: Views,
+        edges: wp.array3d[int],
+        # Out:
+        corner_out: wp.array3d[float],
+    ):
+        index = first + wp.tid()
+        corner = index % model.corners.shape[1]
+        view = index // model.corners.shape[1]
+        world = view // instant_count
+        view = world * model.stride + view % instant_count
+        slot = image_slot[view]
+        if slot < 0:
+            return
+        if active.shape[0] > 0:
+            if active[world] == 0:
+                return
+        corner_out[slot, corner, 0] = wp.nan
+        scene = model.scene_of_world[world]
+        p_W = wp.vec3d(model.corners[scene, corner])
+        if corner >= model.first_of_bodies:
+            body = model.body[corner - model.first_of_bodies]
+            p_W = here.p_WO[view, body] + wp.quat_rotate(here.q_WO[view, body], p_W)
+        p_WC = wp.vec3d(here.p_WC[view])
+        q_WC = wp.normalize(wp.quatd(here.q_WC[view]))
+        way = p_W - p_WC
+        p_C = wp.quat_rotate_inv(q_WC, way)
+        seen = project(model.lenses[model.lens_of_world[world]], p_C)
+        u = float(seen[0])
+        v = float(seen[1])
+        if not (seen[2] != wp.float64(0.0) and u >= 0.0 and u < float(model.width)):
+            return  # of no corner p_C is nan
+        if not (v >= 0.0 and v < float(model.height)):
+            return
+        far = _NEAR_RATIO * float(wp.length(way))
+        if is_hidden(model.mesh[scene], model.body_mesh, here, view, p_WC, wp.normalize(way), far):
+            return
+        label = int(0)
+        for row in range(wp.max(int(v) - 1, 0), wp.min(int(v) + 2, model.height)):
+            for col in range(wp.max(int(u) - 1, 0), wp.min(int(u) + 2, model.width)):
+                found = edges[slot, row, col]
+                if found > 0 and (label == 0 or found < label):
+                    label = found
+        corner_out[slot, corner, 0] = u
+        corner_out[slot, corner, 1] = v
+        for axis in range(3):
+            corner_out[slot, corner, 2 + axis] = float(p_C[axis])
+        corner_out[slot, corner, 5] = float(label)
+
+    return find_seen_corners
+
+
+class CornersProcess:
+    """Finds which corners are seen, and where.
+
+    Attributes:
+        picture: Column, row, position in C and edge of each corner, float32, shape [M, C, 6]; the column is
+            nan where it is not seen.
+        terms: What is computed.
+    """
+
+    terms: tuple[str, ...] = ()
+
+    def __init__(self, config: CornersConfig, context: PictureContext) -> None:
+        source, lenses = context.source, context.lenses
+        self._context = context
+        self._edges = EdgesProcess(config, context)
+        self._device = device = source.device
+        self._kernel = _make_kernel(lens_kind(context))
+        model = self._model = _Model()
+        model.height, model.width = source.shape[1:]
+        model.stride = context.stride
+        self._lenses = [make_lens_data(lens, device) for lens in lenses]
+        model.lenses = wp.array(self._lenses, dtype=LensData, device=device)
+        model.lens_of_world = wp.array(list(context.lens_of_world), dtype=int, device=device)
+        mesh = np.array([scene.mesh_id for scene in context.scenes], np.uint64)
+        model.mesh = wp.array(mesh, dtype=wp.uint64, device=device)
+        model.scene_of_world = context.scene_of_world
+        scenes = [_corners_of(scene.scene, config.crease_rad, config.turn_rad) for scene in context.scenes]
+        moving: list[NDArray[np.float32]] = []
+        if context.motions is not None:
+            model.body_mesh = context.scenes[0].bodies.mesh
+            moving = [
+                _corners_of(body.solid, config.crease_rad, config.turn_rad)
+                for body in context.scenes[0].bodies.bodies
+            ]
+        model.first_of_bodies = max(map(len, scenes))
+        model.body = wp.array(
+            np.repeat(np.arange(len(moving)), list(map(len, moving))), dtype=int, device=device
+        )
+        table = np.full((len(scenes), max(1, model.first_of_bodies + sum(map(len, moving))), 3), np.nan)
+        for row, corners in zip(table, scenes, strict=True):
+            row[: len(corners)] = corners
+            if moving:
+                row[model.first_of_bodies :] = np.concatenate(moving)
+        model.corners = wp.array(table, dtype=wp.vec3, device=device)
+        shape = (source.shape[0], table.shape[1], _COLUMNS)
+        self.picture: Any = wp.zeros(shape, dtype=float, device=device)
+
+    def launch(self, views: PictureViews) -> None:
+        """Find the corners of the pictures of a batch; launches only."""
+        self._edges.launch(views)
+        world_count = views.image_slot.shape[0] // self._context.stride
+        launch_split(
+            self._kernel,
+            dim=world_count * views.instant_count * self._model.corners.shape[1],
+            inputs=[
+                self._model,
+                views.instant_count,
+                views.image_slot,
+                views.active,
+                views_at(views, self._device),
+                self._edges.picture,
+            ],
+            outputs=[self.picture],
+            device=self._device,
+        )
+
+
+@functools.lru_cache(maxsize=16)
+def _corners_of(mesh: Any, crease_rad: float, turn_rad: float) -> NDArray[np.float32]:
+    """Return the corners of a scene or of the solid of a body [m], shape [C, 3]."""
+    groups = getattr(mesh, "face_instance", None)
+    return find_corners(mesh.vertices, mesh.faces, groups, crease_rad=crease_rad, turn_rad=turn_rad)
