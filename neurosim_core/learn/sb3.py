@@ -67,5 +67,4 @@ class Sb3Env(VecEnv):  # type: ignore[misc]
         return [False] * len(self._worlds(indices))
 
     def _worlds(self, indices: Any) -> Sequence[int]:
-        worlds: Sequence[int] = self._get_indices(indices)
-        return worlds
+        return list(self._get_indices(indices))

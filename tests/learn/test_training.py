@@ -176,3 +176,31 @@ def test_the_policy_that_comes_with_the_package_stops_in_a_room_it_has_not_seen(
     assert shipped_policy("hover").stat().st_size < 1_000_000
     room = {"device": "cpu", "scene.kind": "apartment", "scene.rooms": 1, "scene.seed": 101}
     assert fly_policy("hover", overrides=room, say=lambda line: None) < 0.2
+
+
+def test_a_flight_in_a_mirror_is_a_flight(hall):
+    """Two vehicles that begin and act as mirror images stay so: the signs are those of physics."""
+    from neurosim_core.learn.task import MIRROR_ACTION
+
+    sim = ns.Simulation(hall.config, worlds=2, models=[hall])
+    sign = np.array([1.0, -1.0, 1.0])
+    signs = np.array(Hover.mirror["proprioception"])
+    np.testing.assert_array_equal(signs[:3], sign)  # gravity is a vector,
+    np.testing.assert_array_equal(signs[3:6], -sign)  # the gyroscope's is an axial one
+    np.testing.assert_array_equal(Hover.mirror["velocity"], sign)
+    velocity, rate, turn = np.array([0.4, 0.3, -0.2]), np.array([0.5, -0.4, 0.3]), np.array([0.1, 0.2, -0.3])
+    q = np.array([*turn, np.sqrt(1.0 - turn @ turn)])
+    sim.reset(
+        position=[0.0, 0.0, 2.0],
+        velocity=np.stack([velocity, sign * velocity]),
+        orientation=np.stack([q, q * [-1.0, 1.0, -1.0, 1.0]]),
+        body_rate=np.stack([rate, -sign * rate]),
+    )
+    action = np.array([6.0, 0.8, -0.5, 0.4])
+    for _ in range(20):
+        seen = sim.step(np.stack([action, action * MIRROR_ACTION]).astype(np.float32), mode="rates")
+    state = seen.state
+    rates, speeds = state.body_rate.numpy(), state.velocity.numpy()
+    np.testing.assert_allclose(rates[1], -sign * rates[0], atol=1e-6)
+    np.testing.assert_allclose(speeds[1], sign * speeds[0], atol=1e-6)
+    assert np.abs(speeds[0] - velocity).min() > 0.01
