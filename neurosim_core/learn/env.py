@@ -300,7 +300,6 @@ class Env:
             scene_of_world=self.sim.scene_of_world,
             gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
             gravity_noise=self.randomisation.gravity_noise,
-            gravity_bias=self.randomisation.gravity_bias,
         )
         if self._status is None:  # the same array in each step
             self._status = wp.to_torch(observation.status)

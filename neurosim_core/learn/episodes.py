@@ -151,7 +151,6 @@ def _look(
     scene_of_world: wp.array[wp.int32],
     gyro_noise: wp.float32,
     gravity_noise: wp.float32,
-    gravity_bias: wp.float32,
     # In:
     seeds: wp.array[wp.uint64],
     position: wp.array[wp.vec3d],
@@ -172,7 +171,6 @@ def _look(
     stamp = clock_ns[world]
     n = normal4(random_bits(seeds[world], _NOISE, stamp, 0))
     m = normal4(random_bits(seeds[world], _NOISE, stamp, 1))
-    b = normal4(random_bits(seeds[world], _NOISE, wp.int64(0), 2))
     _write(rows_out, world, 0, p)
     _write(rows_out, world, 3, v)
     for part in range(4):
@@ -182,8 +180,7 @@ def _look(
     _write(rows_out, world, 16, down)
     _write(rows_out, world, 19, wp.quat_rotate_inv(q, goal[world] - p))
     _write(rows_out, world, 22, w + gyro_noise * wp.vec3(n[0], n[1], n[2]))
-    error = gravity_noise * wp.vec3(m[0], m[1], m[2]) + gravity_bias * wp.vec3(b[0], b[1], b[2])
-    _write(rows_out, world, 25, down + error)
+    _write(rows_out, world, 25, down + gravity_noise * wp.vec3(m[0], m[1], m[2]))
     rows_out[world, 28] = sample_distance(fields[scene_of_world[world]], p)[0]
 
 
@@ -293,7 +290,6 @@ def look_at_vehicles(
     scene_of_world: Any,
     gyro_noise_rad_s: float,
     gravity_noise: float,
-    gravity_bias: float,
 ) -> None:
     """Write what is known of the vehicles of all worlds, in float32; launches only.
 
@@ -305,7 +301,6 @@ def look_at_vehicles(
         scene_of_world: Index of the scene of each world.
         gyro_noise_rad_s: Standard deviation of the gyroscope [rad/s].
         gravity_noise: Standard deviation of each part of the measured direction of gravity.
-        gravity_bias: The same of an error that stays for an episode.
     """
     state = observation.state
     moving = [state.position, state.velocity, state.orientation, state.body_rate, observation.clock_ns]
@@ -317,7 +312,6 @@ def look_at_vehicles(
             scene_of_world,
             gyro_noise_rad_s,
             gravity_noise,
-            gravity_bias,
             episodes.seeds,
             *moving,
             episodes.goal,

@@ -32,8 +32,6 @@ class Randomisation:
     """Standard deviation of the gyroscope [rad/s]."""
     gravity_noise: float = 0.01
     """Standard deviation of each part of the measured direction of gravity."""
-    gravity_bias: float = 0.0
-    """The same of an error that stays for an episode."""
 
 
 NO_RANDOMISATION = Randomisation(

@@ -27,7 +27,7 @@ class Hover(Task):
 
     episode_s = 6.0
     start = StartConfig(clearance_m=0.9, speed_m_s=(0.3, 0.9), tilt_max_rad=0.15, rate_max_rad_s=0.2)
-    randomisation = Randomisation(thrust_factor=(0.97, 1.03), gravity_bias=0.02)
+    randomisation = Randomisation(thrust_factor=(0.98, 1.02))
     rate_max_rad_s = (2.0, 2.0, 1.0)
     thrust_span = 0.4
     groups: Mapping[str, Sequence[str]] = {
@@ -43,8 +43,8 @@ class Hover(Task):
     }
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
-        """Return settings of twelve apartments of one room to train in, or of four others."""
-        seeds = range(100, 104) if unseen else range(12)
+        """Return settings of sixteen apartments of one room to train in, or of four others."""
+        seeds = range(100, 104) if unseen else range(16)
         return [{"kind": "apartment", "rooms": 1, "seed": seed} for seed in seeds]
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
@@ -62,7 +62,7 @@ class Hover(Task):
         self._best_s = torch.maximum(self._best_s, self._held_s)
 
     def observe(self, view: View) -> Observations:
-        """Return state (18), proprioception (10) and events (surfaces)."""
+        """Return state (17), proprioception (10) and events (surfaces)."""
         seen = {
             "state": torch.cat(
                 [
@@ -71,7 +71,6 @@ class Hover(Task):
                     0.3 * view.body_rate,
                     view.action,
                     view.last_action,
-                    2.0 * view.draws[:, -1:] - 1.0,  # decides the thrust per command
                 ],
                 dim=1,
             ),
