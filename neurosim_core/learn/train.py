@@ -29,7 +29,7 @@ from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
 
-_BLOCK = 100
+_BLOCK = 60
 _SEEDS_APART = 1 << 20
 
 
@@ -193,8 +193,8 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
         return config
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(worlds=512, iterations=60),
-        student=DaggerConfig(worlds=1024, iterations=400, horizon=32),
+        teacher=PpoConfig(worlds=512),
+        student=DaggerConfig(worlds=2048, iterations=220, horizon=25, minibatches=6),
     )
 
 

@@ -43,8 +43,8 @@ class Hover(Task):
     }
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
-        """Return settings of sixteen apartments of one room to train in, or of four others."""
-        seeds = range(100, 104) if unseen else range(16)
+        """Return settings of twelve apartments of one room to train in, or of four others."""
+        seeds = range(100, 104) if unseen else range(12)
         return [{"kind": "apartment", "rooms": 1, "seed": seed} for seed in seeds]
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
