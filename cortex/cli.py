@@ -367,6 +367,9 @@ def _add_tools(commands: Any) -> None:
     cpp.add_argument(
         "--include-dir", action="store_true", help="print where the headers of Cortex are, and end"
     )
+    cpp.add_argument(
+        "--headers", type=Path, metavar="DIR", help="write there what the client includes besides, and end"
+    )
     commands.add_parser(
         "bench",
         help="measure Cortex beside its peers on this machine (its options: cortex bench --help)",

@@ -15,7 +15,6 @@ from cortex.checks import explain
 from cortex.decoder import Decoder, MalformedMessage
 from cortex.draft import Draft, Drafter
 from cortex.encoder import ENCODE_ERRORS, Encoder, join, write
-from cortex.fast import Layout, is_flat, make_decode, make_layout
 from cortex.layout import has_tail, record_dtype
 from cortex.native import make_coder
 from cortex.schema import schema_of
@@ -73,7 +72,6 @@ class Codec:
                 self.stamp_of = attrgetter("stamp_ns")
         encoder, decoder = self._encoder, Decoder(self.schema, message_type)
         self._decoder = decoder
-        self._layout: Layout = encoder.layout
         self.encode: Callable[[Any, int], bytes | None] = self._encode
         """Message and limit to the body, or None if it would be larger than `limit` bytes.
 
@@ -89,9 +87,6 @@ class Codec:
         Raises:
             MalformedMessage: The bytes are no body of the type.
         """
-        if is_flat(self.schema):
-            self._layout = make_layout(self.schema, message_type)
-            self.decode = make_decode(self.schema, message_type, decoder.decode)
         self._coder = make_coder(self.schema, message_type)
         if self._coder is not None:
             self.encode = _encode_natively(self._coder.encode, self._encode)
@@ -103,10 +98,6 @@ class Codec:
 
         The plan refers to the arrays of the message, which must not change until it is written.
         """
-        try:
-            return Plan(*self._layout(message))
-        except ENCODE_ERRORS:
-            pass
         try:
             return Plan(*self._encoder.layout(message))
         except ENCODE_ERRORS as error:

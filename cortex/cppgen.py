@@ -10,13 +10,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import cortex.messages
+from cortex import records
 from cortex.cppbody import BodyWriter, Code, is_large, literal, place
 from cortex.layout import (
     has_tail,
     measure,
     measure_fields,
 )
+from cortex.message import is_message
 from cortex.schema import (
     ANY_DTYPE,
     ArrayType,
@@ -127,6 +131,20 @@ class _Member:
     cpp: str
     field: Field
     offset: int
+
+
+def write_headers(folder: Path) -> None:
+    """Write what the C++ client includes besides its own headers: control messages, and the standard ones.
+
+    Args:
+        folder: For the compiler's search path; they lie in `cortex` within it.
+    """
+    control = [item for item in vars(records).values() if isinstance(item, type) and is_message(item)]
+    standard = [getattr(cortex.messages, name) for name in cortex.messages.__all__]
+    (folder / "cortex").mkdir(parents=True, exist_ok=True)
+    for name, types in (("records", control), ("messages", standard)):
+        text = generate(types, namespace=f"cortex::{name}")
+        (folder / f"cortex/{name}.hpp").write_text(text, encoding="utf-8")
 
 
 class _Generator:

@@ -87,8 +87,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_scene, _add_view)
+    parsers = (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view)
     others = (
+        _add_gallery,
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
@@ -177,6 +178,17 @@ def _add_call(commands: _Commands) -> None:
     call.set_defaults(command=_call)
 
 
+def _add_top(commands: _Commands) -> None:
+    top = commands.add_parser(
+        "top", help="watch a running simulator: real-time factor, rates, losses, latency"
+    )
+    top.add_argument("--once", action="store_true", help="print it once, and stop")
+    top.add_argument(
+        "--timeout", type=float, default=10.0, metavar="S", help="wait for a simulator at most [s]"
+    )
+    top.set_defaults(command=_top)
+
+
 def _add_scene(commands: _Commands) -> None:
     scene = commands.add_parser("scene", help="say what is in a scene file, and draw it")
     scene.add_argument("file", type=Path, help="glTF, GLB, OBJ, PLY or STL")
@@ -196,7 +208,10 @@ def _add_view(commands: _Commands) -> None:
     )
     view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(
-        "--save", type=Path, metavar="RRD", help="write a Rerun file instead of opening a window"
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="write a Rerun file (.rrd) instead of opening a window; of a flight also a film (.webp, .gif)",
     )
     view.add_argument(
         "--only", metavar="NAMES", help="live: show only these sensors, such as events,imu; others stay off"
@@ -214,6 +229,18 @@ def _add_view(commands: _Commands) -> None:
     view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
     view.add_argument("--no-browser", action="store_true", help="--web: print the address only")
     view.set_defaults(command=_view)
+
+
+def _add_gallery(commands: _Commands) -> None:
+    gallery = commands.add_parser(
+        "gallery", help="draw every sensor, pixel preset, lens and scene on one page"
+    )
+    gallery.add_argument(
+        "--out", type=Path, default=Path("gallery.html"), metavar="HTML", help="default: gallery.html"
+    )
+    gallery.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
+    gallery.add_argument("--only", metavar="SECTION", help="sensors, pixels, lenses or scenes (default: all)")
+    gallery.set_defaults(command=_gallery)
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -334,6 +361,13 @@ def _call(arguments: argparse.Namespace) -> int:
         return call(arguments)
 
 
+def _top(arguments: argparse.Namespace) -> int:
+    from neurosim_core.live.top import top
+
+    with handle_signals(signal.default_int_handler):
+        return top(once=arguments.once, timeout_s=arguments.timeout)
+
+
 def _scene(arguments: argparse.Namespace) -> int:
     from neurosim_core.scene.report import report_scene
 
@@ -355,7 +389,13 @@ def _view(arguments: argparse.Namespace) -> int:
             open_browser=not arguments.no_browser,
         )
     from neurosim_core.flight import rerun_file
+    from neurosim_core.view.film import SUFFIXES, save_film
 
+    if arguments.save is not None and arguments.save.suffix in SUFFIXES:
+        flight = arguments.flight
+        save_film(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
+        print(f"wrote {arguments.save}")
+        return 0
     file = rerun_file(arguments.flight, save=arguments.save)
     if arguments.save is not None:
         print(f"wrote {file}")
@@ -363,3 +403,14 @@ def _view(arguments: argparse.Namespace) -> int:
     from neurosim_core.view.rerun_viewer import show_file
 
     return show_file(file, web=arguments.web, port=arguments.port, open_browser=not arguments.no_browser)
+
+
+def _gallery(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    with Console(stderr=True).status("drawing"):
+        from neurosim_core.view.gallery import save_gallery
+
+        save_gallery(arguments.out, device=arguments.device, only=arguments.only)
+    print(f"wrote {arguments.out}")
+    return 0

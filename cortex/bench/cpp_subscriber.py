@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from cortex.bench.samples import Sample
-from cortex.cppgen import generate
+from cortex.cppgen import generate, write_headers
 
 _SOURCE = Path(__file__).with_name("subscriber.cpp")
 _INCLUDE = Path(__file__).parents[1] / "cpp" / "include"
@@ -35,6 +35,7 @@ def binary() -> Path:
 def build_error() -> str:
     """Generate the header and build the program; return the first complaint of either, or nothing."""
     folder = binary().parent
+    write_headers(folder)
     (folder / "sample.hpp").write_text(generate([Sample]))
     command = ["g++", "-std=c++17", "-O2", f"-I{_INCLUDE}", f"-I{folder}", str(_SOURCE)]
     command += ["-o", str(binary()), "-lzmq", "-pthread"]

@@ -11,7 +11,7 @@ from enum import Enum
 from pathlib import Path
 
 from cortex.commands.session import CommandError, UsageError, hint, look_around
-from cortex.cppgen import generate
+from cortex.cppgen import generate, write_headers
 from cortex.evolution import differences, is_evolved
 from cortex.message import is_message
 from cortex.schema import EnumType, FieldType, ListType, OptionalType, Schema, schema_of
@@ -78,8 +78,11 @@ def write_cpp(options: argparse.Namespace) -> int:
             raise UsageError(f"--include-dir takes no type, got {' '.join(options.type)}")
         print(Path(__file__).resolve().parents[1] / "cpp" / "include")
         return 0
+    if options.headers is not None:
+        write_headers(options.headers)
+        return 0
     if not options.type:
-        raise UsageError("name message types, like robot.messages:Scan, or give --include-dir")
+        raise UsageError("name message types, like robot.messages:Scan, or give --headers or --include-dir")
     sys.path.insert(0, os.getcwd())
     sys.stdout.write(generate([_find_type(name) for name in options.type], namespace=options.namespace))
     return 0

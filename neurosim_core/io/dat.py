@@ -14,7 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from neurosim_core.io.event_file import BLOCK_EVENTS, BlockChecker, EventFileError, find_size, split_blocks
+from neurosim_core.io.event_file import (
+    BLOCK_EVENTS,
+    BlockChecker,
+    EventFileError,
+    find_size,
+    read_header,
+    split_blocks,
+)
 from neurosim_core.packets import EventArrays
 
 _SIZE_MAX = 1 << 14
@@ -41,12 +48,10 @@ class DatReader:
         self.notes: list[str] = []
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
         try:
-            header: dict[str, str] = {}
-            while (line := self._file.readline(4096)).startswith(b"%"):
-                key, _, value = line[1:].decode("latin-1").strip().partition(" ")
-                header[key.lower()] = value.strip()
-            self._begin = self._file.tell() - len(line) + 2
-            if len(line) < 2 or line[0] not in _KINDS or line[1] != _RECORD.itemsize or not header:
+            header = read_header(self._file)
+            kind = self._file.read(2)
+            self._begin = self._file.tell()
+            if len(kind) < 2 or kind[0] not in _KINDS or kind[1] != _RECORD.itemsize or not header:
                 raise EventFileError(f"{path} is not a DAT file of change detection events")
             known = [header.get(key, "") for key in ("width", "height")]
             if size is None and all(re.fullmatch(r"\d+", value) for value in known):

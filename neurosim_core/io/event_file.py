@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from neurosim_core.packets import EventArrays
 
 BLOCK_EVENTS = 1_000_000
 """Events that are read, and held in memory, at a time."""
+_HEADER_LINE_MAX = 4096
 _DISORDER_MAX_US = 10_000
 """Cameras send events of neighbouring rows slightly out of order; what comes later than this is damage."""
 
@@ -97,6 +98,21 @@ class BlockChecker:
         self._last_us = int(events.t[-1])
         self._count += len(t)
         return events
+
+
+def read_header(file: BinaryIO) -> dict[str, str]:
+    """Return the lines that begin with %, by their first word in lower case; the file is behind them then."""
+    header: dict[str, str] = {}
+    while True:
+        begin = file.tell()
+        line = file.readline(_HEADER_LINE_MAX)
+        if not line.startswith(b"% ") or not line.endswith(b"\n"):
+            file.seek(begin)
+            return header
+        key, _, value = line[2:].decode("latin-1").strip().partition(" ")
+        if key == "end":
+            return header
+        header[key.lower()] = value.strip()
 
 
 def find_size(blocks: Iterator[EventArrays]) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from neurosim_core.io.event_file import (
     BlockChecker,
     EventFileError,
     find_size,
+    read_header,
     split_blocks,
 )
 from neurosim_core.io.evt2 import Evt2Decoder, Evt2Encoder
@@ -27,7 +28,6 @@ _BLOCK_BYTES = 4_000_000
 _SIZE_MAX = 2048
 _HOUR_US = 3_600_000_000
 _GAP_MAX_US = 48 * _HOUR_US
-_HEADER_LINE_MAX = 4096
 
 
 class RawReader:
@@ -48,7 +48,7 @@ class RawReader:
         self.notes: list[str] = []
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
         try:
-            header = _read_header(self._file)
+            header = read_header(self._file)
             self._begin = self._file.tell()
             self._encoding = _encoding(header, path)
             self._t0_us = int(header["t0"]) if re.fullmatch(r"\d+", header.get("t0", "")) else 0
@@ -159,21 +159,6 @@ class RawWriter:
         self._file.write("".join(f"% {line}\n" for line in [*lines, "end"]).encode())
         evt3 = self._encoding == "evt3"
         self._encoder = Evt3Encoder(begin_us=0, epochs_max=1 << 20) if evt3 else Evt2Encoder()
-
-
-def _read_header(file: BinaryIO) -> dict[str, str]:
-    """Return the lines that begin with %, by their first word, and leave the file behind them."""
-    header: dict[str, str] = {}
-    while True:
-        begin = file.tell()
-        line = file.readline(_HEADER_LINE_MAX)
-        if not line.startswith(b"% ") or not line.endswith(b"\n"):
-            file.seek(begin)
-            return header
-        key, _, value = line[2:].decode("latin-1").strip().partition(" ")
-        if key == "end":
-            return header
-        header[key] = value
 
 
 def _encoding(header: dict[str, str], path: Path) -> str:

@@ -17,19 +17,29 @@ if TYPE_CHECKING:
 def add_parsers(commands: _Commands) -> None:
     """Add both commands."""
     learn = commands.add_parser("learn", help="train a policy that flies from events, or evaluate one")
-    learn.add_argument("what", metavar="TASK", help="hover, avoid, or `eval`")
+    learn.add_argument("what", metavar="TASK", help="hover, avoid, depth, or `eval`")
     learn.add_argument("run", nargs="?", type=Path, metavar="RUN", help="folder of a run, for `eval`")
     learn.add_argument("--out", type=Path, metavar="DIR", help="where to leave the run (default: runs/TASK)")
     learn.add_argument(
         "--device", default=None, help="auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
     )
     learn.add_argument("--worlds", type=int, metavar="N", help="worlds of the student, or of `eval`")
+    learn.add_argument(
+        "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
+    )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
     learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
     learn.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     learn.add_argument("--scenes", choices=["seen", "unseen"], default="unseen", help="eval: where to fly")
     learn.add_argument("--blind", action="store_true", help="eval: without events as well")
+    learn.add_argument("--data", type=Path, metavar="DIR", help="depth: a data set to learn from")
+    learn.add_argument(
+        "--live", type=int, default=0, metavar="N", help="depth: or processes that fly meanwhile"
+    )
+    learn.add_argument("--test", type=Path, metavar="DIR", help="depth: a data set to test on")
+    learn.add_argument("--minutes", type=float, default=3.0, metavar="M", help="depth: how long (default: 3)")
+    learn.add_argument("--size", type=int, default=48, metavar="PX", help="depth: of flights (default: 48)")
     learn.set_defaults(command=_learn)
     deploy = commands.add_parser(
         "deploy", help="fly a simulator or a vehicle by a trained policy, over Cortex"
@@ -50,12 +60,16 @@ def _learn(arguments: argparse.Namespace) -> int:
     need("torch")
     if arguments.what == "eval":
         return _evaluate(arguments)
+    if arguments.what == "depth":
+        return _learn_depth(arguments)
     if arguments.run is not None:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
-    from neurosim_core.learn.train import TrainConfig, train
+    from neurosim_core.learn.train import default_config, train
 
-    config = TrainConfig(task=arguments.what, device=arguments.device or "auto", seed=arguments.seed)
+    config = default_config(arguments.what, device=arguments.device or "auto", seed=arguments.seed)
     student, teacher = config.student, config.teacher
+    if arguments.pixels is not None:
+        config = dataclasses.replace(config, pixels=arguments.pixels)
     if arguments.worlds is not None:
         student = dataclasses.replace(student, worlds=arguments.worlds)
     if arguments.student_iterations is not None:
@@ -68,6 +82,25 @@ def _learn(arguments: argparse.Namespace) -> int:
     config = dataclasses.replace(config, student=student, teacher=teacher)
     train(folder, config, resume=arguments.resume)
     print(f"wrote {folder}/policy.onnx and evaluation.json; tensorboard --logdir {folder}")
+    return 0
+
+
+def _learn_depth(arguments: argparse.Namespace) -> int:
+    import torch
+
+    from neurosim_core.learn.depth_train import DepthConfig, train_depth
+
+    device = arguments.device or "auto"
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    config = DepthConfig(
+        device=device, seed=arguments.seed, minutes=arguments.minutes, size_px=arguments.size
+    )
+    folder = arguments.out or Path("runs") / "depth"
+    errors = train_depth(folder, config, data=arguments.data, live=arguments.live, test=arguments.test)
+    for name, error in errors.items():
+        print(f"{name}: {error}")
+    print(f"wrote {folder}/depth.pt and depth.json")
     return 0
 
 

@@ -167,7 +167,7 @@ def _ask(service: str, request: Any, timeout_s: float) -> SimulatorReply:
                 "--timeout waits longer"
             ) from None
         except ServiceUnavailable:
-            raise RuntimeError(_no_simulator(timeout_s)) from None
+            raise RuntimeError(no_simulator(timeout_s)) from None
     return reply
 
 
@@ -177,10 +177,11 @@ def _status(timeout_s: float) -> SimulatorStatus:
         try:
             return statuses.recv(timeout_s)
         except TimeoutError:
-            raise RuntimeError(_no_simulator(timeout_s)) from None
+            raise RuntimeError(no_simulator(timeout_s)) from None
 
 
-def _no_simulator(timeout_s: float) -> str:
+def no_simulator(timeout_s: float) -> str:
+    """Return what to say where no simulator answers."""
     return f"no simulator answers (waited {timeout_s:g} s): start one with `neurosim serve`"
 
 

@@ -10,6 +10,7 @@ Reference: SciPy's `CubicSpline` (not-a-knot) and `RotationSpline`, whose coeffi
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -21,10 +22,11 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Q_FORWARD_OPTICAL, UNIT_TOLERANCE, Vector3
+from neurosim_core.install import install_hint
 from neurosim_core.settings import Settings
 from neurosim_core.trajectory.path import Attitude, Path
 
-PoseFormat = Literal["tum", "euroc", "csv", "npy"]
+PoseFormat = Literal["tum", "euroc", "csv", "npy", "bag"]
 """Names of file formats."""
 
 _FORMATS: dict[str, tuple[str, float, tuple[int, ...]]] = {
@@ -59,8 +61,11 @@ class PosesConfig(Settings):
     """File of poses."""
     format: PoseFormat = "tum"
     """`tum`: time_s x y z qx qy qz qw. `euroc`: time_ns,x,y,z,qw,qx,qy,qz,... `csv`:
-    time_s,x,y,z,qx,qy,qz,qw. `npy`: a NumPy array [n, 8] with the columns of csv. Lines that begin with #
-    are left out, and one line of names at the top of csv."""
+    time_s,x,y,z,qx,qy,qz,qw. `npy`: a NumPy array [n, 8] with the columns of csv. `bag`: a bag of ROS 1 or
+    ROS 2, with PoseStamped, TransformStamped or Odometry. Lines that begin with # are left out, and one line
+    of names at the top of csv."""
+    topic: str | None = None
+    """Of a bag: where its poses are; null: the only topic that has some."""
     keyframes: Annotated[tuple[KeyframeConfig, ...], Field(min_length=2)] | None = None
     """Poses in place of a file: [{time_s: 0, position_m: [0, 0, 1]}, ...]."""
     frame: Literal["body", "optical"] = "body"
@@ -100,7 +105,7 @@ def pose_path(config: PosesConfig) -> Path:
         poses = check_poses(times, rows, rotation.as_quat(), name=lambda row: f"path.keyframes[{row}]")
     else:
         assert config.file is not None
-        poses = read_poses(config.file, config.format)
+        poses = read_poses(config.file, config.format, topic=config.topic)
     orientation = Rotation.from_quat(poses.orientation)
     if config.frame == "optical":
         orientation = orientation * Rotation.from_quat(Q_FORWARD_OPTICAL).inv()
@@ -113,12 +118,20 @@ def pose_path(config: PosesConfig) -> Path:
     return spline_path(stamps_ns, poses.position, orientation)
 
 
-def read_poses(file: FilePath, kind: PoseFormat) -> Poses:
+def read_poses(file: FilePath, kind: PoseFormat, *, topic: str | None = None) -> Poses:
     """Read a file of poses; stamps count from the first.
+
+    Args:
+        file: Where they are.
+        kind: Format.
+        topic: Of a bag; None: the only one that has poses.
 
     Raises:
         ValueError: The file cannot be read, or a row is wrong; the message names file, row and value.
+        ImportError: The libraries that read bags are not installed.
     """
+    if kind == "bag":
+        return _read_bag(file.expanduser(), topic)
     description, unit_s, columns = _FORMATS[kind]
     try:
         if kind == "npy":
@@ -164,6 +177,47 @@ def _read_text(file: FilePath, kind: PoseFormat) -> tuple[NDArray[Any], list[int
         rows.append(row)
         lines.append(line)
     return np.array(rows).reshape(len(rows), -1 if rows else 8), lines
+
+
+_POSE_FIELDS = {
+    "PoseStamped": ("pose", "position", "orientation"),
+    "PoseWithCovarianceStamped": ("pose.pose", "position", "orientation"),
+    "Odometry": ("pose.pose", "position", "orientation"),
+    "TransformStamped": ("transform", "translation", "rotation"),
+}
+"""Where messages of ROS have a pose, and what its parts are called."""
+
+
+def _read_bag(file: FilePath, topic: str | None) -> Poses:
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(f"bags need rosbags: {install_hint('ros2')}") from error
+    rows: list[list[float]] = []
+    times: list[int] = []
+    try:
+        with AnyReader([file], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            has_poses = [c for c in reader.connections if c.msgtype.rpartition("/")[2] in _POSE_FIELDS]
+            chosen = [c for c in has_poses if topic in (None, c.topic)]
+            if len({c.topic for c in chosen}) != 1:
+                known = ", ".join(sorted({c.topic for c in has_poses})) or "none"
+                raise ValueError(
+                    f"{file}: say in path.topic which topic has the poses, {topic!r}; with poses: {known}"
+                )
+            for connection, _, data in reader.messages(chosen):
+                message: Any = reader.deserialize(data, connection.msgtype)
+                where, *parts = _POSE_FIELDS[connection.msgtype.rpartition("/")[2]]
+                place, turn = attrgetter(*parts)(attrgetter(where)(message))
+                rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+                times.append(message.header.stamp.sec * NS_PER_S + message.header.stamp.nanosec)
+    except (OSError, AnyReaderError) as error:
+        raise ValueError(f"cannot read {file}: {error}") from None
+    values = np.array(rows).reshape(-1, 7)
+    stamps_ns = np.array(times, np.int64) - min(times, default=0)
+    return check_poses(
+        stamps_ns, values[:, :3], values[:, 3:], name=lambda row: f"{file}, message {row}", unit_s=1e-9
+    )
 
 
 def check_poses(

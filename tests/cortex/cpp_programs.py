@@ -7,6 +7,7 @@ import fcntl
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -54,7 +55,10 @@ def _build(build: Path) -> None:
     (headers / "vectors.hpp").write_text(f"{generate(schemas)}\n#define CORTEX_TYPES(X) {table}\n")
     (headers / "peer_messages.hpp").write_text(generate([Rich, Picture, Scan]))
     for command in (
-        ["cmake", "-S", CPP, "-B", build, f"-DCORTEX_TEST_HEADERS={headers}", "-DCORTEX_EXAMPLES=ON"],
+        [
+            *("cmake", "-S", CPP, "-B", build, "-DCORTEX_EXAMPLES=ON"),
+            *(f"-DCORTEX_TEST_HEADERS={headers}", f"-DPython3_EXECUTABLE={sys.executable}"),
+        ],
         ["cmake", "--build", build, "-j2"],
         ["cmake", "--install", build, "--prefix", build / "installed"],
     ):

@@ -68,8 +68,6 @@ kinds: st.SearchStrategy[FieldType] = st.recursive(
 )
 schemas = messages(kinds, least=0)
 """Schemas of every kind."""
-flat_schemas = messages(st.one_of(scalars, arrays, enums))
-"""Schemas that the short cuts of the codec are for."""
 
 
 @st.composite

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import wire_oracle
 from hypothesis import given
-from random_schemas import any_message, flat_schemas, schemas, to_plain
+from random_schemas import any_message, schemas, to_plain
 
 from cortex.codec import Codec, MalformedMessage, Plan, codec_of
 from cortex.message import Array, Float32, Int8, UInt16, UInt64, message
@@ -119,11 +119,6 @@ def check_against_oracle(value: Any) -> None:
 
 @given(any_message())
 def test_bodies_are_those_of_the_oracle(value):
-    check_against_oracle(value)
-
-
-@given(any_message(flat_schemas))
-def test_bodies_of_flat_types_are_those_of_the_oracle(value):
     check_against_oracle(value)
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,11 +28,8 @@ from cpp_messages import OtherScan, Picture, Rich, Scan
 from cpp_programs import CPP, PATIENCE_S, needs_compiler, programs, short, start
 from processes import SOON_S, shared_mappings, wait_for
 
-import cortex.messages
-from cortex import records, wire
+from cortex import wire
 from cortex.codec import codec_of
-from cortex.cppgen import generate
-from cortex.message import is_message
 from cortex.node import Node
 from cortex.policy import keep_last, reliable
 from cortex.registry import ensure_registry
@@ -100,26 +95,9 @@ def test_nodes_between_threads(programs: Path, runtime: Path) -> None:
 
 def test_installed_package_has_all_headers(programs: Path) -> None:
     installed = {path.name for path in (programs / "installed/include/cortex").iterdir()}
-    assert installed == {path.name for path in (CPP / "include/cortex").iterdir()}
+    shipped = {path.name for path in (CPP / "include/cortex").iterdir()}
+    assert installed == shipped | {"messages.hpp", "records.hpp"}
     assert list((programs / "installed").glob("lib*/**/cortexConfig.cmake"))
-
-
-def test_shipped_headers_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The control messages, the standard and the example ones are as the generator writes them today."""
-    control = [item for item in vars(records).values() if isinstance(item, type) and is_message(item)]
-    shipped = CPP / "include/cortex"
-    assert (shipped / "records.hpp").read_text() == generate(control, namespace="cortex::records")
-    standard = [getattr(cortex.messages, name) for name in cortex.messages.__all__]
-    assert (CPP / "include/cortex/messages.hpp").read_text() == generate(
-        standard, namespace="cortex::messages"
-    )
-    spec = importlib.util.spec_from_file_location("example_scan", CPP / "examples/scan.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "example_scan", module)
-    spec.loader.exec_module(module)
-    assert (CPP / "examples/scan.hpp").read_text() == generate([module.Scan, module.Cmd])
 
 
 def test_messages_return_unchanged(start: Callable[..., Peer], make_node: Callable[..., Node]) -> None:

@@ -203,7 +203,7 @@ def test_velocities_in_64_steps_lead_where_flow_leads(room):
     sensors = {
         "flow": flow(lens=lens, window_s=0.05),
         "velocity": flow(lens=lens, window_s=0, rate_hz=1280),
-        "instance": {**flow(lens=lens, rate_hz=1280), "kind": "instance"},
+        "normal": {**flow(lens=lens, rate_hz=1280), "kind": "normal"},
     }
     frames = [{**frame, "position_m": [2.5, 0.0, 1.5]} for frame in AGILE]
     found = packets(settings(room, sensors, frames))
@@ -211,10 +211,15 @@ def test_velocities_in_64_steps_lead_where_flow_leads(room):
     assert len(stamps) == 65
     where = np.stack([COLUMNS, ROWS], axis=-1).reshape(-1, 2)
     start = where.copy()
+    crossed = np.zeros(len(where), bool)
+    # between pixels that see two planes a velocity is not that between theirs
 
     def read(stamp_ns, at):
         x, y = (at - 0.5).T
         col, row = np.clip(x.astype(int), 0, W - 2), np.clip(y.astype(int), 0, H - 2)
+        normal = found["normal"][stamp_ns].data
+        for r, c in ((0, 1), (1, 0), (1, 1)):
+            crossed[np.abs(normal[row + r, col + c] - normal[row, col]).max(axis=1) > 1e-3] = True
         a, b = (x - col)[:, None], (y - row)[:, None]
         data = found["velocity"][stamp_ns].data.astype(np.float64)
         top = (1 - a) * data[row, col] + a * data[row, col + 1]
@@ -224,13 +229,13 @@ def test_velocities_in_64_steps_lead_where_flow_leads(room):
         step_s = 1e-9 * (there_ns - here_ns)
         v = read(here_ns, where)
         where = where + 0.5 * step_s * (v + read(there_ns, where + step_s * v))
-    inside = ((where > 2) & (where < (W - 2, H - 2))).all(axis=-1)
-    assert inside.mean() > 0.3
+    inside = ((where > 2) & (where < (W - 2, H - 2))).all(axis=-1) & ~crossed
+    assert inside.mean() > 0.2
     measured = found["flow"][200_000_000].data.reshape(-1, 2)[inside]
     moved = (where - start)[inside]
     assert np.abs(moved).max() > 5.0
     error = np.abs(measured - moved).max(axis=-1)
-    assert np.quantile(error, 0.8) < 0.01  # the others have met an edge between walls
+    assert error.max() < 0.01
 
 
 @pytest.mark.parametrize("direction", ["backward", "forward"])

@@ -57,6 +57,60 @@ def test_files_of_all_formats_give_their_poses(tmp_path, kind):
     np.testing.assert_allclose(path.evaluate(path.knots_ns).position, POSITIONS, atol=1e-12)
 
 
+def write_bag(file, kinds):
+    """Write the poses to a bag of ROS 2, on a topic for each type of message."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    vector, point = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Point"]
+    turn = types["geometry_msgs/msg/Quaternion"]
+    with rosbag2.Writer(file, version=9) as writer:
+        for kind in kinds:
+            name = f"{'nav' if kind == 'Odometry' else 'geometry'}_msgs/msg/{kind}"
+            connection = writer.add_connection(f"/{kind.lower()}", name, typestore=store)
+            for time_s, p, q in zip(TIMES_S, POSITIONS, ROTATIONS.as_quat(), strict=True):
+                stamp_ns = round(time_s * 1e9)
+                stamp = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+                header = types["std_msgs/msg/Header"](stamp, "map")
+                pose = types["geometry_msgs/msg/Pose"](point(*p), turn(*q))
+                if kind == "PoseStamped":
+                    message = types[name](header, pose)
+                elif kind == "TransformStamped":
+                    message = types[name](
+                        header, "rig", types["geometry_msgs/msg/Transform"](vector(*p), turn(*q))
+                    )
+                else:
+                    still = types["geometry_msgs/msg/Twist"](vector(0, 0, 0), vector(0, 0, 0))
+                    spread = np.zeros(36)
+                    message = types[name](
+                        header,
+                        "rig",
+                        types["geometry_msgs/msg/PoseWithCovariance"](pose, spread),
+                        types["geometry_msgs/msg/TwistWithCovariance"](still, spread),
+                    )
+                writer.write(connection, stamp_ns, store.serialize_cdr(message, name))
+    return file
+
+
+@pytest.mark.parametrize("kind", ["PoseStamped", "TransformStamped", "Odometry"])
+def test_a_bag_gives_the_poses_of_its_messages(tmp_path, kind):
+    path = pose_path(PosesConfig(file=write_bag(tmp_path / "bag", [kind]), format="bag"))
+    np.testing.assert_allclose(path.knots_ns, np.rint((TIMES_S - TIMES_S[0]) * 1e9), atol=500)
+    np.testing.assert_allclose(path.evaluate(path.knots_ns).position, POSITIONS, atol=1e-12)
+
+
+def test_a_bag_with_several_poses_asks_which(tmp_path):
+    bag = write_bag(tmp_path / "bag", ["PoseStamped", "Odometry"])
+    with pytest.raises(ValueError, match="with poses: /odometry, /posestamped"):
+        pose_path(PosesConfig(file=bag, format="bag"))
+    path = pose_path(PosesConfig(file=bag, format="bag", topic="/odometry"))
+    assert len(path.knots_ns) == COUNT
+    with pytest.raises(ValueError, match="cannot read"):
+        pose_path(PosesConfig(file=tmp_path / "none", format="bag"))
+
+
 def test_a_rig_follows_splines_and_its_imu_feels_them(tmp_path):
     """Against SciPy's splines, with accelerations by central differences of their rotations."""
     packets = list(ns.run(settings({"file": str(write(tmp_path, "npy")), "format": "npy"})))

@@ -1,5 +1,5 @@
 # ruff: noqa: F821, UP037 - "n" names a dimension
-"""The messages of the C++ examples; `scan.hpp` beside this file is what `cortex cpp` makes of them."""
+"""The messages of the C++ examples; the build writes `scan.hpp` with `cortex cpp`."""
 
 from __future__ import annotations
 

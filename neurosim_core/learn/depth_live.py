@@ -1,0 +1,96 @@
+"""Processes that fly and stream over Cortex what depth is learned from, each scene after scene.
+
+`python -m neurosim_core.learn.depth_live NAMESPACE SETTINGS SEED` is one of them: flight k has the seeds
+SEED + k of scene, path and noise. It flies as fast as its readers take what it sends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+_SEEDS_APART = 10_000
+"""Between the first flights of two processes."""
+
+
+def flight_settings(
+    size_px: int, seed: int, *, duration_s: float = 6.0, device: str = "cpu"
+) -> dict[str, Any]:
+    """Return the settings of a flight through an apartment of its own; one camera has events and depth."""
+    lens = {"width": size_px, "height": size_px, "horizontal_fov_rad": 1.5}
+    return {
+        "duration_s": duration_s,
+        "device": device,
+        "seed": seed,
+        "scene": {"kind": "apartment", "rooms": 1, "seed": seed},
+        "path": {"kind": "tour", "seed": seed},
+        "vehicle": {"on_collision": "report"},
+        "sensors": {
+            "events": {
+                "kind": "event_camera", "lens": lens, "sampling_rate_hz": 200.0, "packet_rate_hz": 20.0,
+            },
+            "depth": {"kind": "depth", "lens": lens, "rate_hz": 20.0},
+        },
+    }  # fmt: skip
+
+
+@contextlib.contextmanager
+def live_flights(count: int, settings: Mapping[str, Any], *, seed: int = 0) -> Iterator[list[str]]:
+    """Run processes that stream flights, and end them; yield their namespaces, for `ns.data.LiveSource`."""
+    names = [f"/depth{index}" for index in range(count)]
+    commands = [
+        [sys.executable, "-m", __name__, name, json.dumps(settings), str(seed + _SEEDS_APART * index)]
+        for index, name in enumerate(names)
+    ]
+    with contextlib.ExitStack() as stack:
+        for command in commands:
+            process = subprocess.Popen(command)
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+        yield names
+
+
+def stream_flights(namespace: str, settings: Mapping[str, Any], seed: int) -> None:
+    """Fly and publish until the process is ended."""
+    from cortex import Node
+    from cortex.messages import Simulation
+    from neurosim_core import __version__
+    from neurosim_core.config import load_config, to_yaml
+    from neurosim_core.live.messages import message_type, to_message
+    from neurosim_core.live.topics import SIMULATION, stream_topic
+    from neurosim_core.sim.rollout import run
+
+    config = load_config(dict(settings))
+    (vehicle,) = config.vehicles
+    with Node(f"flights{namespace.replace('/', '_')}") as node:
+        publishers = {
+            name: node.publisher(
+                namespace + stream_topic(vehicle, name), message_type(sensor.packet_type), max_wait_s=600.0
+            )
+            for name, sensor in config.sensors.items()
+        }
+        announcement = Simulation(
+            config=to_yaml(config),
+            version=__version__,
+            vehicles=[vehicle],
+            mode="streaming",
+            control_rate_hz=100.0,
+        )
+        node.publisher(namespace + SIMULATION, Simulation, latch=True).publish(announcement)
+        for number in itertools.count(seed):
+            flight = {**settings, "seed": number}
+            for part in ("scene", "path"):
+                flight[part] = {**settings[part], "seed": number}
+            for packet in run(load_config(flight)):
+                for publisher in publishers.values():
+                    publisher.wait_for_subscribers(1, timeout_s=600.0)
+                publishers[packet.sensor].publish(to_message(packet))
+
+
+if __name__ == "__main__":
+    stream_flights(sys.argv[1], json.loads(sys.argv[2]), int(sys.argv[3]))

@@ -1,0 +1,91 @@
+"""`neurosim top`: a running simulator in the terminal: real-time factor, rates, losses, latency."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.markdown import Markdown
+from rich.text import Text
+
+from cortex import Node, latest
+from cortex.messages import SimulatorStatus
+from neurosim_core.clock import NS_PER_S
+from neurosim_core.live.call import describe_status, no_simulator
+from neurosim_core.live.topics import STATUS
+
+_BARS = " ▁▂▃▄▅▆▇█"
+_HISTORY = 60
+_NEXT_S = 1.0
+_LOST_AFTER_S = 5.0
+
+
+class Dashboard:
+    """What `top` shows, from one status to the next."""
+
+    def __init__(self) -> None:
+        self._before: SimulatorStatus | None = None
+        self._factors: deque[float] = deque(maxlen=_HISTORY)
+        self._rates_hz: dict[tuple[str, str], float] = {}
+
+    def update(self, status: SimulatorStatus) -> Group:
+        """Return the screen after a status.
+
+        Rates are messages a second of simulated time, between two statuses between which time passed.
+        """
+        before = self._before
+        if before is not None and status.stamp_ns < before.stamp_ns:  # a run that has begun again
+            self._rates_hz, before = {}, None
+        if before is None or status.stamp_ns > before.stamp_ns:
+            if before is not None:
+                passed_s = (status.stamp_ns - before.stamp_ns) / NS_PER_S
+                counts = {(sensor.vehicle, sensor.name): sensor.published_count for sensor in before.sensors}
+                self._rates_hz = {
+                    key: (sensor.published_count - counts[key]) / passed_s
+                    for sensor in status.sensors
+                    if (key := (sensor.vehicle, sensor.name)) in counts
+                }
+            self._before = status
+        self._factors.append(status.real_time_factor)
+        most = max(1.0, status.real_time_factor_wanted, *self._factors)
+        bars = "".join(_BARS[round(factor / most * (len(_BARS) - 1))] for factor in self._factors)
+        return Group(
+            Text.assemble(("real-time factor ", "dim"), (bars, "green"), f" {status.real_time_factor:.2f}"),
+            Markdown(describe_status(status, rates_hz=self._rates_hz)),
+        )
+
+
+def top(*, once: bool = False, timeout_s: float = 10.0) -> int:
+    """Show the status until Ctrl-C, or until the run has ended.
+
+    Args:
+        once: Print the screen after two statuses, and stop.
+        timeout_s: How long to wait for a simulator [s].
+
+    Raises:
+        RuntimeError: There is no simulator.
+    """
+    console, dashboard = Console(highlight=False), Dashboard()
+    with Node("top") as node, node.subscriber(STATUS, SimulatorStatus, policy=latest()) as statuses:
+        try:
+            screen = dashboard.update(statuses.recv(timeout_s))
+        except TimeoutError:
+            raise RuntimeError(no_simulator(timeout_s)) from None
+        if once:
+            with contextlib.suppress(TimeoutError):  # of a run that has ended there is no other
+                screen = dashboard.update(statuses.recv(_NEXT_S))
+            console.print(screen)
+            return 0
+        with Live(screen, console=console, screen=console.is_terminal, auto_refresh=False) as live:
+            while True:
+                try:
+                    status = statuses.recv(_LOST_AFTER_S)
+                except TimeoutError:
+                    break
+                live.update(dashboard.update(status), refresh=True)
+                if status.phase == "ended":
+                    break
+    console.print("the simulator has ended")
+    return 0
