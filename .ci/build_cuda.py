@@ -43,6 +43,15 @@ SENSORS = {
     "events": {"kind": "event_camera", "lens": LENS, "sampling_rate_hz": 100, "packet_rate_hz": 100},
     "rgb": {"kind": "rgb", "lens": LENS},
     "depth": {"kind": "depth", "lens": LENS},
+    "flow": {"kind": "optical_flow", "lens": LENS},
+    "corners": {"kind": "corners", "lens": LENS},
+    "labelled": {
+        "kind": "event_camera",
+        "lens": LENS,
+        "sampling_rate_hz": 100,
+        "packet_rate_hz": 100,
+        "labels": ["depth", "flow", "instance", "semantic"],
+    },
     "exact_imu": {"kind": "imu"},
     "noisy_imu": {
         "kind": "imu",
@@ -53,7 +62,7 @@ SENSORS = {
         "accelerometer_resolution_m_s2": 1e-3,
     },
 }
-LEARN = {"torch", "gymnasium", "rsl_rl", "tensordict"}
+LEARN = {"torch", "gymnasium", "rsl_rl", "stable_baselines3", "tensordict"}
 """Libraries of which the CUDA build needs none."""
 
 
@@ -85,7 +94,7 @@ def make_kernels() -> None:
     ):
         raycast_kernel(OUTPUTS, terms)
         fallback_kernel(OUTPUTS, terms)
-        antialiasing_kernel(OUTPUTS, terms)
+        antialiasing_kernel(OUTPUTS, terms, is_cuda=True)
     frustum_search_kernel(BLOCK)
     for moving in (False, True):
         rule_kernels(moving)

@@ -178,9 +178,10 @@ static PyObject *hasten(PyObject *module, PyObject *arguments) {
         return NULL;
     }
     const Py_ssize_t count = PyTuple_GET_SIZE(names);
-    PyObject *init = PyDict_GetItemWithError(cls->tp_dict, init_name);
-    if (count > ARGUMENTS_MAX || init == NULL || !(cls->tp_flags & Py_TPFLAGS_HEAPTYPE)
-        || !Py_IS_TYPE(cls, &PyType_Type)) {
+    /* from Python 3.12 on, types that are no heap types may have no `tp_dict` */
+    const int is_plain = (cls->tp_flags & Py_TPFLAGS_HEAPTYPE) && Py_IS_TYPE(cls, &PyType_Type);
+    PyObject *init = is_plain ? PyDict_GetItemWithError(cls->tp_dict, init_name) : NULL;
+    if (count > ARGUMENTS_MAX || init == NULL) {
         if (!PyErr_Occurred()) PyErr_Format(PyExc_TypeError, "%s cannot be hastened", cls->tp_name);
         return NULL;
     }

@@ -122,16 +122,14 @@ def end_to_end(streams: Sequence[str], *, seconds: float, encoding: str = "evt3"
             "CYCLONEDDS_URI": os.environ.get("CYCLONEDDS_URI", PROFILE),
         }
         names = ",".join(streams)
-        command = [sys.executable, "-m", "cortex_ros2_bridge"]
+
+        def run(*words: str) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
+            return _process([sys.executable, "-m", "cortex_ros2_bridge", *words], environment)
+
         with (
-            _process([*command, "--backend", "dds", "--config", str(config)], environment),
-            _process(
-                [*command, "bench", "--role", "subscribe", "--streams", names], environment
-            ) as subscriber,
-            _process(
-                [*command, "bench", "--role", "publish", "--streams", names, "--seconds", str(seconds)],
-                environment,
-            ) as publisher,
+            run("--backend", "dds", "--config", str(config)),
+            run("bench", "--role", "subscribe", "--streams", names) as subscriber,
+            run("bench", "--role", "publish", "--streams", names, "--seconds", str(seconds)) as publisher,
         ):
             sent = _hear(publisher)
             print("end", file=subscriber.stdin, flush=True)

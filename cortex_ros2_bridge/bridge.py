@@ -45,6 +45,7 @@ LOOK_INTERVAL_S = 0.05
 DIAGNOSTICS_INTERVAL_S = 1.0
 GONE_S = 10.0
 """For so long a route outlives its Cortex topic, so that a simulator that is restarted finds it open [s]."""
+GONE = "its Cortex topic has gone"
 RETRY_S = 1.0
 """When a route is tried again that the backend could not open [s]."""
 UNFIT_S = 5.0
@@ -541,11 +542,8 @@ class Bridge:
         for link in self._links.values():
             now = link.tally.totals()
             if link in gone:
-                statuses.append(
-                    diagnostics.Status(
-                        name=str(link.route), level=diagnostics.STALE, message="its Cortex topic has gone"
-                    )
-                )
+                stale = diagnostics.Status(name=str(link.route), level=diagnostics.STALE, message=GONE)
+                statuses.append(stale)
                 continue
             statuses.append(
                 diagnostics.route_status(

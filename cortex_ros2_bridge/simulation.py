@@ -23,7 +23,6 @@ from cortex_ros2_bridge import frames
 from cortex_ros2_bridge.backend.base import Backend
 from cortex_ros2_bridge.backend.names import service_path
 from cortex_ros2_bridge.config import BridgeConfig
-from cortex_ros2_bridge.convert.records import time_of
 from cortex_ros2_bridge.incoming import ask
 from cortex_ros2_bridge.msgs import message_class
 
@@ -41,8 +40,7 @@ _STOPPED, _PLAYING, _PAUSED = range(3)
 _ROBOT = 1
 _TIME_AND_STATE = 3
 _FEATURES = (8, 10, 11, 12, 20, 24, 25, 26, 31, 32)
-"""ENTITY_CATEGORIES; ENTITY_STATE_GETTING, _SETTING, ENTITY_INFO_GETTING; SIMULATION_RESET; SIMULATION_STATE_
-GETTING, _SETTING, _PAUSE; STEP_SIMULATION_SINGLE, _MULTIPLE."""
+"""Of SimulatorFeatures: categories, state and info of entities, reset, simulation states, steps."""
 
 
 class _Refused(Exception):
@@ -91,18 +89,16 @@ class SimulationServices:
         except ValueError as error:
             logger.info("no services of %s: %s", PACKAGE, error)
 
-    def close(self) -> None:
-        """Withdraw the services; a call that is under way is given up."""
-        self._resources.close()
+        self.close = self._resources.close  # withdraws the services; a call that is under way is given up
 
     def _answer(self, answer: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
-        code, reason = _OK, ""
+        found = _OK, ""
         try:
             answer(request, response)
         except _Refused as refused:
-            code, reason = refused.args
+            found = refused.args
         if hasattr(response, "result"):
-            response.result.result, response.result.error_message = code, reason
+            response.result.result, response.result.error_message = found
         return response
 
     # The simulation
@@ -159,9 +155,9 @@ class SimulationServices:
     def _set_entity_state(self, request: Any, response: Any) -> None:
         """Begin the run with the vehicle elsewhere; its time is 0 before and after."""
         self._check_entity(request.entity)
-        state = request.state
         if self._news("/status", msg.SimulatorStatus).stamp_ns:
             _refuse(_INCORRECT_STATE, "the simulation runs: stop it first (SetSimulationState)")
+        state = request.state
         if state.header.frame_id not in ("", self._frames.ros(frames.WORLD), frames.WORLD):
             _refuse(_FAILED, f"a state in frame {state.header.frame_id!r}, known: the world")
         q = np.array([getattr(state.pose.orientation, axis) for axis in "xyzw"])
@@ -193,8 +189,7 @@ class SimulationServices:
         """Return the EntityState of a vehicle, in the map frame."""
         seen = self._news(f"/{name}/odometry", msg.Odometry)
         state = message_class(f"{PACKAGE}/msg/EntityState")()
-        time = time_of(seen.stamp_ns)
-        state.header.stamp.sec, state.header.stamp.nanosec = time.sec, time.nanosec
+        state.header.stamp.sec, state.header.stamp.nanosec = divmod(seen.stamp_ns, 1_000_000_000)
         state.header.frame_id = self._frames.ros(frames.WORLD)
         parts = (
             (state.pose.position, "xyz", seen.position),

@@ -208,7 +208,10 @@ def _add_view(commands: _Commands) -> None:
     )
     view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(
-        "--save", type=Path, metavar="RRD", help="write a Rerun file instead of opening a window"
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="write a Rerun file (.rrd) instead of opening a window; of a flight also a film (.webp, .gif)",
     )
     view.add_argument(
         "--only", metavar="NAMES", help="live: show only these sensors, such as events,imu; others stay off"
@@ -386,7 +389,13 @@ def _view(arguments: argparse.Namespace) -> int:
             open_browser=not arguments.no_browser,
         )
     from neurosim_core.flight import rerun_file
+    from neurosim_core.view.film import SUFFIXES, save_film
 
+    if arguments.save is not None and arguments.save.suffix in SUFFIXES:
+        flight = arguments.flight
+        save_film(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
+        print(f"wrote {arguments.save}")
+        return 0
     file = rerun_file(arguments.flight, save=arguments.save)
     if arguments.save is not None:
         print(f"wrote {file}")

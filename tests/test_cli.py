@@ -117,6 +117,19 @@ def test_a_rerun_file_can_be_made_from_the_recording(flown, tmp_path):
     assert (tmp_path / "again.rrd").stat().st_size > 100_000
 
 
+def test_a_film_can_be_made_from_the_recording(flown, tmp_path):
+    """Four pictures in 0.3 s at 10 Hz, the plan beside the pictures; the path grows."""
+    folder, _ = flown
+    assert cli.main(["view", str(folder), "--save", str(tmp_path / "film.webp")]) == 0
+    with Image.open(tmp_path / "film.webp") as film:
+        assert (film.n_frames, film.height) == (4, 220)
+        frames = []
+        for index in (0, 3):
+            film.seek(index)
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+    assert (np.abs(frames[1] - frames[0]).max(axis=2) > 60).sum() > 200
+
+
 def test_view_serves_a_file_on_its_port_and_ends_with_its_viewer(flown):
     """Killed by SIGTERM it takes the viewer along: nobody listens on the port any more."""
     folder, _ = flown

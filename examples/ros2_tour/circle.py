@@ -20,6 +20,8 @@ from rclpy.qos import QoSProfile
 
 GAIN_1_S = 2.0
 """Velocity for each metre of error [1/s]."""
+LEAD_S = 0.1
+"""So much later the vehicle has the velocity that it is told [s]."""
 SETTLE_S = 3.0
 """So long after the start errors do not count [s]."""
 
@@ -53,8 +55,9 @@ class Circle(Node):
         command = TwistStamped()
         command.header.stamp, command.header.frame_id = stamp, "map"
         linear: Any = command.twist.linear
-        linear.x = -self._rate * (y - y0) + GAIN_1_S * (x - p.x)
-        linear.y = self._rate * (x - x0) + GAIN_1_S * (y - p.y)
+        speed, ahead = self._radius_m * self._rate, angle + self._rate * LEAD_S
+        linear.x = -speed * math.sin(ahead) + GAIN_1_S * (x - p.x)
+        linear.y = speed * math.cos(ahead) + GAIN_1_S * (y - p.y)
         linear.z = GAIN_1_S * (z - p.z)
         self._commands.publish(command)
         self.ended = elapsed_s > self._duration_s

@@ -25,6 +25,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 HERE = Path(__file__).resolve().parent
 SOON_S = 40.0
+START_S = 300.0
+"""Longest wait for a simulator that compiles its kernels [s]."""
 
 
 def any_message(message: Any) -> bool:
@@ -212,6 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rclpy.init()
     with _running(*serve) as simulator, _running(*bridge) as bridged:
         tour = Tour(simulator, bridged)
+        tour.until(lambda: tour.node.count_publishers("/clock"), START_S)
         for row, name, kind, check in OUT:
             topic = name if name.startswith("/") else f"/drone/{name}"
             latched = name in LATCHED

@@ -37,6 +37,9 @@ from neurosim_core.bench.scenes import refined
 from neurosim_core.bench.step import RATE_HZ, time_steps
 
 EXACT, ADAPTIVE = "every step rendered", "at most 0.5 px between renders"
+STACK = "events: the whole stack a call"
+DROP_IN, NAIVE = "events: one frame a call, read by the host", "naive: one frame a call, read by the host"
+"""Parts, besides what is rendered: the count of events is read each call, columns only of whole stacks."""
 _VGA, _DAVIS = (640, 480), (346, 260)
 _ALONE = ("renders per launch", "rays per pixel", "triangles")
 """What is varied alone, and the heading of its value."""
@@ -159,42 +162,43 @@ def _parts(model: Model, quick: bool, progress: Progress) -> list[Row]:
     size: dict[str, Any] = {"width": lens.width, "height": lens.height, "device": device}
     stamps = np.arange(1, count + 1, dtype=np.int64) * _STAMPS_NS
 
-    def ours(per_call: int) -> Row:
+    each = [frames[index] for index in range(count)]
+
+    def whole_stacks() -> Row:
         camera = EventCamera(pixel, **size)
-        camera.reset(frames[0], 0)
+        camera.reset(each[0], 0)
+        calls = found = 0
+
+        def call() -> None:
+            nonlocal calls, found
+            found += len(camera.feed(frames, calls * stamps[-1] + stamps).numpy().t)
+            calls += 1
+
+        taken_s = _seconds(call, device, seconds)
+        events = found / (calls * count)
+        return {"part": STACK, "us per frame": 1e6 * taken_s / count, "events per frame": events}
+
+    def one_by_one(title: str, camera: Any, feed: Callable[[Any, int], int]) -> Row:
+        camera.reset(each[0])
         shown = found = 0
 
         def call() -> None:
             nonlocal shown, found
-            first = shown % count
-            end = (shown // count) * stamps[-1] + stamps[first : first + per_call]
-            found += len(camera.feed(frames[first : first + per_call], end).numpy().t)
-            shown += per_call
+            shown += 1
+            found += feed(each[shown % count], shown * _STAMPS_NS)
 
         taken_s = _seconds(call, device, seconds)
-        title = (
-            "events: the whole stack a call" if per_call > 1 else "events: one frame a call, read by the host"
-        )
-        return {"part": title, "us per frame": 1e6 * taken_s / per_call, "events per frame": found / shown}
+        return {"part": title, "us per frame": 1e6 * taken_s, "events per frame": found / shown}
+
+    def drop_in() -> Row:
+        camera = EventCamera(pixel, **size)
+        return one_by_one(DROP_IN, camera, lambda frame, stamp_ns: len(camera.step(frame, stamp_ns)))
 
     def naive() -> Row:
         camera = NaiveEventCamera(**size, threshold_on=pixel.threshold_on, threshold_off=pixel.threshold_off)
-        camera.reset(frames[0])
-        shown = found = 0
+        return one_by_one(NAIVE, camera, lambda frame, stamp_ns: camera.feed(frame, stamp_ns // 1000))
 
-        def call() -> None:
-            nonlocal shown, found
-            found += camera.feed(frames[shown % count], 1000 * shown)
-            shown += 1
-
-        taken_s = _seconds(call, device, seconds)
-        return {
-            "part": "naive: one frame a call, read by the host",
-            "us per frame": 1e6 * taken_s,
-            "events per frame": found / shown,
-        }
-
-    for measure_camera in (lambda: ours(count), lambda: ours(1), naive):
+    for measure_camera in (whole_stacks, drop_in, naive):
         rows.append(_try(measure_camera))
     for row in rows:
         row["frames/s"] = 1e6 / row["us per frame"] if "us per frame" in row else None
@@ -205,10 +209,7 @@ def _chapter(rows: list[Row], parts: list[Row], device: str, on_cuda: bool) -> C
     known = [row for row in rows if "whole steps/s" in row]
     vga = next((row for row in known if row["pixels"] == "640x480" and row["mode"] == EXACT), None)
     by_part = {row.get("part"): row.get("frames/s") for row in parts}
-    stack, naive = (
-        by_part.get("events: the whole stack a call"),
-        by_part.get("naive: one frame a call, read by the host"),
-    )
+    stack, naive = by_part.get(STACK), by_part.get(NAIVE)
     best, y = max(known, key=lambda row: row["whole steps/s"]), "whole steps/s"
     panels = []
     for what, x in (("resolution", "pixels of the camera"), *((name, name) for name in _ALONE)):

@@ -24,6 +24,9 @@ def add_parsers(commands: _Commands) -> None:
         "--device", default=None, help="auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
     )
     learn.add_argument("--worlds", type=int, metavar="N", help="worlds of the student, or of `eval`")
+    learn.add_argument(
+        "--pixels", type=int, metavar="N", help="width and height of the camera (default: as the task says)"
+    )
     learn.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     learn.add_argument("--teacher-iterations", type=int, metavar="N", help="of PPO")
     learn.add_argument("--student-iterations", type=int, metavar="N", help="of the imitation")
@@ -61,10 +64,12 @@ def _learn(arguments: argparse.Namespace) -> int:
         return _learn_depth(arguments)
     if arguments.run is not None:
         raise ValueError(f"{arguments.run}: a folder is for `neurosim learn eval`; say --out")
-    from neurosim_core.learn.train import TrainConfig, train
+    from neurosim_core.learn.train import default_config, train
 
-    config = TrainConfig(task=arguments.what, device=arguments.device or "auto", seed=arguments.seed)
+    config = default_config(arguments.what, device=arguments.device or "auto", seed=arguments.seed)
     student, teacher = config.student, config.teacher
+    if arguments.pixels is not None:
+        config = dataclasses.replace(config, pixels=arguments.pixels)
     if arguments.worlds is not None:
         student = dataclasses.replace(student, worlds=arguments.worlds)
     if arguments.student_iterations is not None:

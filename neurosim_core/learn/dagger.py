@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import torch
 
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
+from neurosim_core.learn.task import MIRROR_ACTION
 
 Teacher = Callable[[torch.Tensor], torch.Tensor]
 """Returns actions for the observations of the group `teacher`."""
@@ -29,7 +30,7 @@ class DaggerConfig:
     """At first; it falls to a twentieth."""
     lead: float = 0.2
     """Share of the training in which the teacher flies less and less often."""
-    hint_weight: float = 0.5
+    hint_weight: float = 1.0
     """Of the error of the estimated velocity, against that of the action."""
     gradient_max: float = 1.0
 
@@ -56,6 +57,7 @@ class Dagger:
         self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=config.learning_rate)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
+        self._make_mirrors()
 
     def begin(self, seed: int) -> None:
         """Begin anew in all worlds, at different times of their episodes."""
@@ -88,6 +90,22 @@ class Dagger:
         self.policy.load_state_dict(state["policy"])
         self.optimizer.load_state_dict(state["optimizer"])
 
+    def _make_mirrors(self) -> None:
+        """Let half of the worlds be seen in a mirror, if the task says how."""
+        env, signs = self.env, self.env.task.mirror
+        vectors = [name for name in env.obs_groups["student"] if name != "events"]
+        known = all(name in signs for name in (*vectors, *(["velocity"] if "velocity" in self._now else [])))
+        self._mirrored = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+        self._mirrored[: env.num_envs // 2] = known
+
+        def rows(values: Sequence[float]) -> torch.Tensor:
+            sign = torch.tensor(values, device=env.device)
+            return torch.where(self._mirrored[:, None], sign, torch.ones_like(sign))
+
+        self._vector_sign = rows([sign for name in vectors for sign in signs[name]] if known else [1.0])
+        self._action_sign = rows(MIRROR_ACTION)
+        self._hint_sign = rows(signs["velocity"] if known and "velocity" in signs else [1.0])
+
     def _fly(self, *, lead: float) -> tuple[dict[str, torch.Tensor], dict[str, float]]:
         """Fly the horizon; in a share `lead` of the worlds the teacher acts."""
         env, config = self.env, self.config
@@ -102,17 +120,20 @@ class Dagger:
         led = (draw < lead)[:, None]
         for step in range(config.horizon):
             now = self._now
-            batch["surface"][step] = now["events"]
+            surface = now["events"]
+            surface = torch.where(self._mirrored[:, None, None, None], surface.flip(-1), surface)
+            batch["surface"][step] = surface
             batch["begun"][step] = self._begun
-            vector = env.group(now, "student")
-            label = self.teacher(env.group(now, "teacher")).clamp(-1.0, 1.0)
+            vector = env.group(now, "student") * self._vector_sign
+            label = self.teacher(env.group(now, "teacher")).clamp(-1.0, 1.0) * self._action_sign
             rows["vector"].append(vector)
             rows["label"].append(label)
             if "velocity" in now:
-                rows["hint"].append(now["velocity"])
+                rows["hint"].append(now["velocity"] * self._hint_sign)
             memory = self._memory * (1.0 - self._begun)[:, None]
-            action, self._memory = self.policy(now["events"], vector, memory)
-            self._now, _, terminated, truncated, info = env.step(torch.where(led, label, action))
+            action, self._memory = self.policy(surface, vector, memory)
+            action = torch.where(led, label, action) * self._action_sign
+            self._now, _, terminated, truncated, info = env.step(action)
             self._begun = (terminated | truncated).float()
             counted = (info["metrics"][name] * self._begun for name in ("success", "crash"))
             ended += torch.stack([self._begun.sum(), *(each.sum() for each in counted)])

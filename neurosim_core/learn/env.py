@@ -37,6 +37,7 @@ def make_env(
     scenes: Scenes = "seen",
     models: Sequence[Model] | None = None,
     randomise: bool | Randomisation = True,
+    pixels: int | None = None,
     seed: int = 0,
 ) -> Env:
     """Return a task in many worlds.
@@ -50,6 +51,7 @@ def make_env(
         scenes: Where to fly.
         models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
         randomise: Draw parameters anew in each episode; as the task says, or as told.
+        pixels: Width and height of the event camera [px]; None: as the task says.
         seed: Of world 0; world i has seed + i.
 
     Raises:
@@ -58,6 +60,8 @@ def make_env(
     import neurosim_core.learn.tasks  # noqa: F401  (registers)
 
     chosen = find("task", task)() if isinstance(task, str) else task
+    if pixels is not None:
+        chosen.camera = {**chosen.camera, "width": pixels, "height": pixels}
     return Env(
         chosen,
         worlds=worlds,
@@ -334,6 +338,7 @@ def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
     return {
         "device": device,
         "control": {"rate_hz": task.rate_hz},
+        "render": {"samples_per_pixel": task.rays_per_pixel},
         "path": {"kind": "hover"},
         "vehicle": {"on_collision": "end", "max_step_s": 0.004, **task.vehicle},
         "sensors": {CAMERA: camera} if sees else {},

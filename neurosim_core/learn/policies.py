@@ -87,7 +87,7 @@ class EventPolicy(nn.Module):
         vector_size: int,
         action_count: int = 4,
         hint_count: int = 3,
-        memory_size: int = 96,
+        memory_size: int = 128,
     ) -> None:
         super().__init__()
         self.shape = {
@@ -102,7 +102,7 @@ class EventPolicy(nn.Module):
         self.memory_size, self.action_count = memory_size, action_count
         convolutions: list[nn.Module] = []
         rows, columns, inputs = height, width, channels
-        for outputs in (12, 24, 32):
+        for outputs in (16, 32, 48):
             convolutions += [nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ELU()]
             rows, columns, inputs = -(-rows // 2), -(-columns // 2), outputs
         self.eyes = nn.Sequential(

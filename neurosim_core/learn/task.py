@@ -11,6 +11,9 @@ import torch
 from neurosim_core.learn.episodes import StartConfig
 from neurosim_core.vehicle import MultirotorConfig
 
+MIRROR_ACTION = (1.0, -1.0, 1.0, -1.0)
+"""Signs of an action when left and right are exchanged."""
+
 Observations = dict[str, torch.Tensor]
 """What is observed, by name: float32, shape [N, ...]."""
 
@@ -102,6 +105,8 @@ class Task:
     """Of the event camera, both ways."""
     renders_per_step: int = 1
     """Pictures that events are made of."""
+    rays_per_pixel: int = 4
+    """Rays that a pixel takes the mean of: with one, half the events of a coarse picture are false."""
     vehicle: Mapping[str, Any] = {"preset": "hummingbird"}
     """Settings of the vehicle."""
     start: StartConfig = StartConfig()
@@ -112,6 +117,8 @@ class Task:
     """Change of thrust of an action of 1, as a share of the hover thrust."""
     groups: Mapping[str, Sequence[str]] = {}
     """Names of observations that each group sees: actor, critic, teacher, student."""
+    mirror: Mapping[str, Sequence[float]] = {}
+    """Signs of the numbers of observations when left and right are exchanged, for students; {}: not known."""
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
         """Return settings of the scenes to train in, or of others."""
@@ -122,8 +129,8 @@ class Task:
         """Return collective thrust [N] and body rate [rad/s] of the last actions, [N, 4]."""
         hover_n = view.vehicle.hover_thrust_n
         thrust = hover_n * (1.0 + self.thrust_span * view.action[:, :1])
-        rates = view.action[:, 1:] * torch.tensor(self.rate_max_rad_s, device=view.action.device)
-        return torch.cat([thrust, rates], dim=1)
+        rates = [most * view.action[:, 1 + axis, None] for axis, most in enumerate(self.rate_max_rad_s)]
+        return torch.cat([thrust, *rates], dim=1)
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
         """Note that the episodes of the worlds of a mask (bool, [N]) have begun."""

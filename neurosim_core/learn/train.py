@@ -21,15 +21,15 @@ import torch
 
 from neurosim_core.learn import need
 from neurosim_core.learn.dagger import Dagger, DaggerConfig
-from neurosim_core.learn.env import make_env
+from neurosim_core.learn.env import Env, make_env
 from neurosim_core.learn.evaluate import Evaluation, evaluate, student_actor, teacher_actor
 from neurosim_core.learn.policies import ActorCritic, EventPolicy
 from neurosim_core.learn.ppo import Ppo, PpoConfig
-from neurosim_core.sim.model import Model
+from neurosim_core.sim.model import Model, find_device
 
 Say = Callable[[str], None]
 
-_BLOCK = 20
+_BLOCK = 60
 _SEEDS_APART = 1 << 20
 
 
@@ -42,6 +42,8 @@ class TrainConfig:
     seed: int = 0
     teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
     student: DaggerConfig = dataclasses.field(default_factory=DaggerConfig)
+    pixels: int | None = None
+    """Width and height of the event camera [px]; None: as the task says."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
@@ -58,7 +60,9 @@ class Training:
 
     Attributes:
         config: What is done.
-        trained_s: Processor time that each stage took in this process [s], `teacher` and `student`.
+        env: Where the student flies.
+        trained_s: Time that each stage took in this process [s], `teacher` and `student`; checkpoints count.
+        processor_s: Processor time that both took [s].
     """
 
     def __init__(
@@ -72,23 +76,29 @@ class Training:
         self.folder, self._say = folder, say
         self.config = config = read_config(folder) if config is None else config
         self.trained_s: dict[str, float] = {}
+        self.processor_s = 0.0
         torch.manual_seed(config.seed)  # of the first weights
-        self._env = make_env(
-            config.task, worlds=config.student.worlds, device=config.device, models=models, seed=config.seed
+        self.env = make_env(
+            config.task,
+            worlds=config.student.worlds,
+            device=config.device,
+            models=models,
+            pixels=config.pixels,
+            seed=config.seed,
         )
-        device = self._env.device
+        device = self.env.device
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
-        states = {*self._env.obs_groups["actor"], *self._env.obs_groups["critic"]}
+        states = {*self.env.obs_groups["actor"], *self.env.obs_groups["critic"]}
         teacher_env = make_env(
             config.task,
             worlds=config.teacher.worlds,
             device=config.device,
             observe=states,
-            models=self._env.sim.models,
+            models=self.env.sim.models,
             seed=config.seed,
         )
         self._teacher = Ppo(teacher_env, config.teacher, self._generator)
-        self._student = Dagger(self._env, self._teacher.policy, config.student, self._generator)
+        self._student = Dagger(self.env, self._teacher.policy, config.student, self._generator)
         self._done = {"teacher": 0, "student": 0}
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "run.json").write_text(json.dumps(dataclasses.asdict(config), indent=1) + "\n")
@@ -106,7 +116,7 @@ class Training:
     @property
     def models(self) -> Sequence[Model]:
         """Of the scenes it trains in."""
-        return self._env.sim.models
+        return self.env.sim.models
 
     def resume(self) -> None:
         """Go on from the checkpoint of the folder.
@@ -114,7 +124,7 @@ class Training:
         Raises:
             FileNotFoundError: There is none.
         """
-        state = torch.load(self.folder / "checkpoint.pt", map_location=self._env.device, weights_only=True)
+        state = torch.load(self.folder / "checkpoint.pt", map_location=self.env.device, weights_only=True)
         self._teacher.load_state_dict(state["teacher"])
         self._student.load_state_dict(state["student"])
         self._generator.set_state(state["generator"].cpu())
@@ -137,7 +147,7 @@ class Training:
                 self._train_block("student", self._student, config.student.iterations, writer)
 
     def _train_block(self, stage: str, trainer: Ppo | Dagger, whole: int, writer: Any) -> None:
-        begin_s, done = _processor_s(), self._done[stage]
+        begin_s, processor_s, done = time.monotonic(), _processor_s(), self._done[stage]
         offset = 1 + done // self.config.block + (stage == "student") * (1 << 10)
         trainer.begin((self.config.seed * (1 << 11) + offset) * _SEEDS_APART)
         end = min(done + self.config.block, whole)
@@ -149,9 +159,11 @@ class Training:
                 sums.setdefault(name, []).append(value)
         self._done[stage] = end
         self._save()
-        self.trained_s[stage] = self.trained_s.get(stage, 0.0) + _processor_s() - begin_s
+        self.trained_s[stage] = self.trained_s.get(stage, 0.0) + time.monotonic() - begin_s
+        self.processor_s += _processor_s() - processor_s
         means = ", ".join(f"{name} {sum(v) / len(v):.3g}" for name, v in sums.items())
-        self._say(f"{stage} {end}/{whole} ({self.trained_s[stage]:.0f} s of processor time): {means}")
+        times = f"{self.trained_s[stage]:.0f} s, {self.processor_s:.0f} s of processor time in all"
+        self._say(f"{stage} {end}/{whole} ({times}): {means}")
 
     def _save(self) -> None:
         file = self.folder / "checkpoint.pt"
@@ -172,6 +184,18 @@ class Training:
         """Return how the teacher does in the scenes of the training, without noise on its actions."""
         env = self._teacher.env
         return evaluate(env, teacher_actor(self.teacher, env))
+
+
+def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
+    """Return how a task is trained: with more worlds on a GPU, and for longer."""
+    config = TrainConfig(task=task, device=device, seed=seed)
+    if not find_device(device).startswith("cuda"):
+        return config
+    return dataclasses.replace(
+        config,
+        teacher=PpoConfig(worlds=512),
+        student=DaggerConfig(worlds=2048, iterations=220, horizon=25, minibatches=6),
+    )
 
 
 def read_config(folder: Path) -> TrainConfig:
@@ -221,7 +245,9 @@ def evaluate_run(
     """
     config = read_config(folder)
     worlds = worlds or config.evaluation_worlds
-    env = make_env(config.task, worlds=worlds, device=device or config.device, scenes=scenes)
+    env = make_env(
+        config.task, worlds=worlds, device=device or config.device, scenes=scenes, pixels=config.pixels
+    )
     policy = load_student(folder, env.device)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
@@ -253,7 +279,7 @@ def train(
     say(f"set up in {time.monotonic() - begin_s:.0f} s")
     training.run()
     say(f"teacher: {training.evaluate_teacher()}")
-    export_onnx(training.student, make_card(training), folder / "policy.onnx")
+    export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
     for name, evaluation in evaluate_run(folder):
         say(f"student, unseen scenes, {name}: {evaluation}")
@@ -264,16 +290,16 @@ def train(
     return found
 
 
-def make_card(training: Training) -> dict[str, Any]:
-    """Return what whoever flies a policy needs to know."""
-    env = training._env
+def make_card(env: Env, name: str) -> dict[str, Any]:
+    """Return what whoever flies a policy needs to know; `name` is that of the task."""
     task = env.task
     return {
-        "task": training.config.task,
+        "task": name,
         "rate_hz": task.rate_hz,
         "camera": dict(task.camera),
         "threshold": task.threshold,
         "renders_per_step": task.renders_per_step,
+        "rays_per_pixel": task.rays_per_pixel,
         "surface": env.surface_card,
         "hover_thrust_n": env.view.vehicle.hover_thrust_n,
         "thrust_span": task.thrust_span,

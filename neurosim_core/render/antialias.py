@@ -8,11 +8,11 @@
    through different points of their pixels: a bar as thin as a quarter of a pixel is hit in one of four
    adjacent rows or columns.
 2. A block of 4 x 4 pixels may show the faces that the first rays hit in it and in a ring of one pixel around
-   it, and those beyond their edges that cross the block. Each of SAMPLE_COUNT points of a pixel shows the
-   nearest of them. That takes products and sums: no ray is cast. A plane surface is shaded once per pixel, at
-   the middle of the points that show it.
+   it, and, step by step, those beyond their edges that cross the block. Each of SAMPLE_COUNT points of a
+   pixel shows the nearest of them. That takes products and sums: no ray is cast. A plane surface is shaded
+   once per pixel, at the middle of the points that show it.
 3. Blocks with more than FACE_COUNT_MAX faces or with moving bodies, and pixels that show for the most part
-   none of the faces, are the mean of SAMPLE_COUNT rays.
+   none of the faces, are the mean of RAY_COUNT rays, through every other point.
 
 Faces are those of the scene before they are cut for baked light, which makes many of one.
 
@@ -33,8 +33,17 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
+from neurosim_core.render.antialias_groups import group_kernel
 from neurosim_core.render.body_arrays import BodyData
 from neurosim_core.render.camera import Lens
+from neurosim_core.render.coverage import (
+    FACE_COUNT_MAX,
+    RAY_COUNT,
+    RAY_WIDTH,
+    SAMPLE_COUNT,
+    SHARPNESS,
+    ray_point,
+)
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.lighting import spread_order
@@ -47,12 +56,6 @@ from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
 from neurosim_core.render.view_data import ViewData, WorldData, tile_finder
 
-SAMPLE_COUNT = 16
-"""Points of a pixel."""
-FACE_COUNT_MAX = 16
-"""Most faces of a block of 4 x 4 pixels and the ring around it."""
-SHARPNESS = wp.constant(0.7)
-"""Width of the footprint that a texture is averaged over [px]: a lookup blurs more than a mean does."""
 _CELLS = 4
 _SIDE = 4
 _LANES = _SIDE * _SIDE
@@ -114,12 +117,6 @@ def pixel_rays(lens: Lens, fill_factor: float = 1.0) -> NDArray[np.float32]:
     return np.stack([center, right - left, lower - upper])
 
 
-@wp.func_native(read_native(__file__, "sample_point", SAMPLES=SAMPLE_COUNT))
-def _sample_point(sample: int) -> wp.vec2:
-    """Return a point of a pixel, from its centre [px]."""
-    ...
-
-
 @wp.func_native(read_native(__file__, "cover_pixel", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
 def _cover_pixel(
     scene: SceneData,
@@ -147,7 +144,6 @@ def _cover_pixel(
     ...
 
 
-@cache
 def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel whose threads are pixels, for any device and all terms."""
     find_tile = tile_finder(terms)
@@ -238,24 +234,24 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             total += number[entry] * light
             whole += number[entry]
         if count < 0:
-            whole = float(SAMPLE_COUNT)
+            whole = float(RAY_COUNT)
             if wp.static(bool(terms.embree)):
-                toward = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-                part = wp.zeros(shape=(SAMPLE_COUNT,), dtype=int)
-                t = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-                u = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-                v = wp.zeros(shape=(SAMPLE_COUNT,), dtype=float)
-                front = wp.zeros(shape=(SAMPLE_COUNT,), dtype=wp.vec3)
-                for sample in range(SAMPLE_COUNT):
-                    point = _sample_point(sample)
+                toward = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+                part = wp.zeros(shape=(_LANES,), dtype=int)
+                t = wp.zeros(shape=(_LANES,), dtype=float)
+                u = wp.zeros(shape=(_LANES,), dtype=float)
+                v = wp.zeros(shape=(_LANES,), dtype=float)
+                front = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
+                for sample in range(RAY_COUNT):
+                    point = ray_point(sample)
                     toward[sample] = wp.quat_rotate(
                         q, wp.normalize(center + point[0] * across + point[1] * down)
                     )
                 cast_packet(
                     scene.embree_intersect, scene.embree_scene, origin, toward, FAR_M, part, t, u, v, front
                 )
-            for sample in range(SAMPLE_COUNT):
-                point = _sample_point(sample)
+            for sample in range(RAY_COUNT):
+                point = ray_point(sample)
                 direction_C = wp.normalize(center + point[0] * across + point[1] * down)
                 direction = wp.quat_rotate(q, direction_C)
                 hit = Hit()
@@ -271,7 +267,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                 if wp.static(terms.bodies):
                     hit, body = intersect_bodies(bodies, instant, direction_C, q, hit)
                 total += radiance_of(
-                    scene, bodies, instant, body, q, direction, origin, 0.25 * spread_rad, hit
+                    scene, bodies, instant, body, q, direction, origin, RAY_WIDTH * spread_rad, hit
                 )
         write_radiance(scene, total / whole, 1, instant, slot, row, col, out)
 
@@ -319,7 +315,6 @@ def _block_shader(*, textured: bool, emissive: bool) -> Any:
     return wp.func_native(code)(shade_block)
 
 
-@cache
 def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     """Return the kernel of a CPU whose threads are blocks of 4 x 4 pixels, with rays cast by Embree."""
     find_tile = tile_finder(terms)
@@ -399,8 +394,8 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             normal = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
             spread_rad = wp.zeros(shape=(_LANES,), dtype=float)
             total = wp.zeros(shape=(_LANES,), dtype=wp.vec3)
-            for sample in range(SAMPLE_COUNT):
-                point = _sample_point(sample)
+            for sample in range(RAY_COUNT):
+                point = ray_point(sample)
                 for y in range(rows):
                     for x in range(columns):
                         lane = _SIDE * y + x
@@ -409,14 +404,14 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
                             sum_C = rays[0, pixel] + point[0] * rays[1, pixel] + point[1] * rays[2, pixel]
                             toward = wp.normalize(wp.vec3(sum_C[0], sum_C[1], sum_C[2]))
                             ray[lane] = wp.quat_rotate(q, toward)
-                            spread_rad[lane] = 0.25 * rays[0, pixel][3]
+                            spread_rad[lane] = RAY_WIDTH * rays[0, pixel][3]
                 cast_packet(
                     scene.embree_intersect, scene.embree_scene, origin, ray, FAR_M, face, t, u, v, normal
                 )
                 shade_packet(scene, ray, spread_rad, face, t, u, v, normal, total)
             for lane in range(_LANES):
                 if (unresolved >> lane) & 1:
-                    radiance[lane] = total[lane] / float(SAMPLE_COUNT)
+                    radiance[lane] = total[lane] / float(RAY_COUNT)
         for y in range(rows):
             for x in range(columns):
                 write_radiance(scene, radiance[_SIDE * y + x], 1, instant, slot, top + y, left + x, out)
@@ -424,17 +419,20 @@ def _block_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
     return average_blocks
 
 
-def antialiasing_kernel(outputs: Collection[str], terms: RenderTerms) -> wp.Kernel:
+@cache
+def antialiasing_kernel(outputs: tuple[str, ...], terms: RenderTerms, *, is_cuda: bool) -> wp.Kernel:
     """Return the kernel of the second pass.
 
     Args:
         outputs: Outputs of the renderer, of which those in `RADIANCE` are written.
         terms: Terms of the first pass.
+        is_cuda: Whether it is for CUDA.
     """
     written = tuple(name for name in RADIANCE if name in outputs)
     plain = terms._replace(candidate_group=0, by_tile=False, fallback=False, supersampled=False)
-    in_blocks = _in_blocks(terms)
-    return (_block_kernel if in_blocks else _pixel_kernel)(written, plain)
+    if is_cuda:
+        return group_kernel(written, plain)
+    return (_block_kernel if _in_blocks(terms) else _pixel_kernel)(written, plain)
 
 
 def _in_blocks(terms: RenderTerms) -> bool:
@@ -463,7 +461,8 @@ class Antialiasing:
             thread_count: Threads on a CPU device; all cores if None.
         """
         self._device, self._thread_count = device, thread_count
-        self._kernel = antialiasing_kernel(outputs, terms)
+        is_cuda = wp.get_device(device).is_cuda
+        self._kernel = antialiasing_kernel(tuple(sorted(outputs)), terms, is_cuda=is_cuda)
         self._pixels_per_thread = _LANES if _in_blocks(terms) else 1
         self._rays: Any = wp.array(rays, dtype=wp.vec4, device=device)
 

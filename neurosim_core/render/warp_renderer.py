@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from neurosim_core.render.antialias import SAMPLE_COUNT, Antialiasing, first_rays, pixel_rays, ray_layers
+from neurosim_core.render.antialias import Antialiasing, first_rays, pixel_rays, ray_layers
 from neurosim_core.render.blind_pixels import BlindPixels
 from neurosim_core.render.body_arrays import (
     make_body_data,
@@ -21,6 +21,7 @@ from neurosim_core.render.camera import Lens
 from neurosim_core.render.candidate_data import TILE, CandidateListData
 from neurosim_core.render.candidate_lists import CandidateLists, choose_candidate_lists
 from neurosim_core.render.config import CandidateListConfig
+from neurosim_core.render.coverage import SAMPLE_COUNT
 from neurosim_core.render.embree import PACKET
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.outputs import FACE, OUTPUTS, RADIANCE, make_render_outputs, requested_outputs

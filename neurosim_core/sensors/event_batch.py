@@ -22,6 +22,7 @@ from neurosim_core.sensors import event_worlds_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_input import as_frames, invalid_message
 from neurosim_core.sensors.event_worlds import WorldEventCamera
+from neurosim_core.warp_start import start_warp
 
 _ROOM_MIN = 1024
 _PIXELS_PER_EVENT = 2
@@ -116,6 +117,7 @@ class EventCameraBatch:
     ) -> None:
         if config.readout is not None:
             raise ValueError("readout is for EventCamera.feed: events wait for each other on the host")
+        start_warp()
         self.device = wp.get_device(device)
         self._event_count_max = config.event_count_max
         self._shape = (count, height, width)

@@ -30,6 +30,7 @@ from neurosim_core.sensors.event_levels import SUB_BITS
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
 from neurosim_core.sensors.event_pixels import LostEvents, Pixels, Scan
 from neurosim_core.sensors.event_readout import Readout
+from neurosim_core.warp_start import start_warp
 
 _MIXED = "step() and feed() must not be mixed: call reset() between them"
 
@@ -104,6 +105,7 @@ class EventCamera:
         self.width = width
         self.height = height
         self.sensor = sensor
+        start_warp()
         self.device = wp.get_device(device)
         self._row_shift = SUB_BITS + (width - 1).bit_length()
         if CAUSE in (terms or ()):

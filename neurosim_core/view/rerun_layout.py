@@ -29,7 +29,7 @@ _ASPECT = 1.6
 class Panel(NamedTuple):
     """One view of the layout."""
 
-    kind: Literal["picture", "plot", "bars", "text"]
+    kind: Literal["picture", "plot", "bars", "text", "space"]
     name: str
     """Its title."""
     origin: str
@@ -66,6 +66,10 @@ def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *,
     """
     at = f"plots/{vehicle}/{sensor}"
     numbers = [field for field in schema.fields if field.is_number]
+    if kind == "events":
+        cloud = [] if live else [Panel("space", f"{sensor}: x, y, time", cloud_entity(vehicle, sensor))]
+        rate = Panel("plot", f"{sensor} [M events/s]", f"{at}/rate")
+        return [picture_panel(vehicle, sensor, kind), rate, *cloud]
     if kind in PICTURES:
         return [picture_panel(vehicle, sensor, kind)]
     if kind == "time series":
@@ -84,6 +88,11 @@ def sensor_panels(vehicle: str, sensor: str, schema: PacketSchema, kind: str, *,
             Panel("plot", "rotor speed [rad/s]", f"{at}/rotor_speed"),
         ]
     return []
+
+
+def cloud_entity(vehicle: str, sensor: str) -> str:
+    """Return where the events of a camera are as points in x, y and time."""
+    return f"events/{vehicle}/{sensor}"
 
 
 def title(field: FieldSchema) -> str:
@@ -158,7 +167,12 @@ def _columns(count: int) -> int:
 
 def _view(panel: Panel, *, rolling: bool) -> Any:
     rrb = import_rerun().blueprint
-    kinds = {"picture": rrb.Spatial2DView, "bars": rrb.BarChartView, "text": rrb.TextLogView}
+    kinds = {
+        "picture": rrb.Spatial2DView,
+        "bars": rrb.BarChartView,
+        "text": rrb.TextLogView,
+        "space": rrb.Spatial3DView,
+    }
     options: dict[str, Any] = {"origin": panel.origin, "contents": list(panel.contents), "name": panel.name}
     if panel.kind != "plot":
         return kinds[panel.kind](**options)

@@ -11,6 +11,8 @@ Exact values are in the HDF5 recording. All data is on the timeline `sim_time`. 
     world/paths/<vehicle>                   the planned path
     world/trails/<vehicle>                  where it was, one stroke per batch of poses
     world/collisions/<vehicle>              where it touched the scene
+    events/<vehicle>/<sensor>               events of the last 0.1 s as points in x, y and time; not live
+    plots/<vehicle>/<sensor>/rate           millions of events a second
     plots/<vehicle>/<sensor>/<field>        numbers, bars and texts; speed, height, rotor speeds of a pose
     plots/<vehicle>/command/<mode>          what it was told to do
     plots/<vehicle>/links/<link>            delay of each message [ms]; a gap where one was lost
@@ -34,12 +36,14 @@ from scipy.spatial.transform import Rotation
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, schema_of
 from neurosim_core.record.header import SensorDescription
 from neurosim_core.scene.bodies import BodyConfig, body_poses
+from neurosim_core.view.event_cloud import EventCloud
 from neurosim_core.view.pictures import EventWindow, picture_of
 from neurosim_core.view.rerun_batches import RateLimit, Table
 from neurosim_core.view.rerun_layout import (
     PICTURES,
     Panel,
     body,
+    cloud_entity,
     make_blueprint,
     picture_panel,
     sensor_panels,
@@ -137,6 +141,7 @@ class RerunLogger:
         self._keep_layout = keep_layout
         self._clock_ns = clock_ns
         self._windows: dict[str, EventWindow] = {}
+        self._clouds: dict[str, EventCloud] = {}
         self._tables: dict[str, Table] = {}
         self._trail_end: dict[str, NDArray[np.float64]] = {}
         self._pose_of: dict[str, str] = {}
@@ -445,6 +450,13 @@ class RerunLogger:
                     events, width=packet.width, height=packet.height, compress=self._compress
                 )
                 self._recording.log(entity, picture)
+                rate_m_s = 1e3 * len(events.t) / self._event_window_ns
+                self._plot(f"plots/{vehicle}/{packet.sensor}/rate", end_ns, rate_m_s, ("events",))
+                if not self._live:
+                    made = EventCloud(width=packet.width, window_ns=self._event_window_ns)
+                    points, colors = self._clouds.setdefault(entity, made).add(events, end_ns)
+                    cloud = self._rr.Points3D(points, colors=colors)
+                    self._recording.log(cloud_entity(vehicle, packet.sensor), cloud)
 
     def _log_contact(self, vehicle: str, packet: Any, _schema: PacketSchema) -> None:
         self._set_time(packet.stamp_ns)

@@ -23,7 +23,7 @@ from cortex import messages as msg
 from cortex_ros2_bridge import bench, cli
 from cortex_ros2_bridge.config import load
 from cortex_ros2_bridge.options import OPTIONS
-from cortex_ros2_bridge.routes import known_options, make_routes
+from cortex_ros2_bridge.routes import known_options, look, make_routes
 
 SETTINGS = {
     "namespace": "/sim",
@@ -45,10 +45,13 @@ def one_registry():
 
 
 @pytest.fixture
-def simulator() -> Iterator[Node]:
-    with Node("simulator") as node:
+def simulator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    """A node that others see, with both its topics; the command looks for as long as it takes to find it."""
+    monkeypatch.setattr(cli, "LIST_S", SOON_S)
+    with Node("simulator") as node, Node("observer") as observer:
         node.publisher("/drone/imu", msg.Imu)
         node.subscriber("/drone/command/rates", msg.RateThrustCommand)
+        wait_for(lambda: len(look(observer).topics) == 2)
         yield node
 
 

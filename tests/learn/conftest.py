@@ -32,6 +32,7 @@ def hall(tmp_path_factory):
         ns.load_config(
             {
                 "device": "cpu",
+                "render": {"samples_per_pixel": 4},
                 "scene": mesh,
                 "path": {"kind": "hover"},
                 "sensors": {"front": {"kind": "event_camera", "lens": lens}},

@@ -6,13 +6,18 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from small_room import room_scene
 
 import neurosim_core as ns
 from neurosim_core.data.batch import Sample, collate
-from neurosim_core.learn.depth import DepthNet, ErrorSums, depth_loss
-from neurosim_core.learn.depth_train import (
+from neurosim_core.packets import EventArrays
+from neurosim_core.record import RecordingWriter
+from neurosim_core.record.header import RecordingHeader
+
+torch = pytest.importorskip("torch", reason="needs the extra learn")
+
+from neurosim_core.learn.depth import DepthNet, ErrorSums, depth_loss  # noqa: E402
+from neurosim_core.learn.depth_train import (  # noqa: E402
     DepthConfig,
     WindowPool,
     evaluate,
@@ -20,9 +25,6 @@ from neurosim_core.learn.depth_train import (
     load_depth,
     train_depth,
 )
-from neurosim_core.packets import EventArrays
-from neurosim_core.record import RecordingWriter
-from neurosim_core.record.header import RecordingHeader
 
 
 @pytest.fixture(autouse=True)

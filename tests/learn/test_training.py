@@ -77,7 +77,7 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
 
     training = Training(tmp_path, small(), models=[hall])
     policy = training.student
-    export_onnx(policy, make_card(training), tmp_path / "policy.onnx")
+    export_onnx(policy, make_card(training.env, "brief-hover"), tmp_path / "policy.onnx")
     pilot = Pilot(tmp_path / "policy.onnx")
     rng = np.random.default_rng(0)
     memory, action = torch.zeros(1, policy.memory_size), torch.zeros(1, 4)
@@ -104,6 +104,31 @@ def test_an_exported_policy_acts_as_the_trained_one(tmp_path, hall):
     ns.load_config(pilot_settings(pilot.card))
     with pytest.raises(ValueError, match="there is no policy"):
         Pilot(tmp_path / "nothing.onnx")
+
+
+def test_onnx_runtime_computes_what_torch_does(tmp_path, hall):
+    """Both act alike to 1e-5 for 50 steps, each with a memory of its own, with weights that matter."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    from neurosim_core.learn.export import export_onnx
+
+    training = Training(tmp_path, small(), models=[hall])
+    policy = training.student
+    export_onnx(policy, make_card(training.env, "brief-hover"), tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
+    rng = np.random.default_rng(3)
+    memories = [np.zeros((1, policy.memory_size), np.float32) for _ in range(2)]
+    actions = []
+    for _ in range(50):
+        seen = rng.exponential(2.0, (1, 4, 8, 8)).astype(np.float32)
+        vector = rng.normal(size=(1, 10)).astype(np.float32)
+        inputs = {"events": seen, "vector": vector, "memory": memories[0]}
+        action, memories[0] = session.run(None, inputs)
+        with torch.no_grad():
+            expected, memory = policy(*map(torch.from_numpy, (seen, vector, memories[1])))
+        memories[1] = memory.numpy()
+        np.testing.assert_allclose(action, expected, atol=1e-5)
+        actions.append(action)
+    assert np.std(actions, axis=0).min() > 0.01  # a constant would agree, too
 
 
 def test_ppo_learns_to_stop(hall):
@@ -141,3 +166,40 @@ def test_a_task_of_ones_own_is_learnt(monkeypatch):
 
     errors = [custom_task.main(iterations) for iterations in (0, 30)]
     assert errors[1] < 0.8 * errors[0]
+
+
+def test_the_policy_that_comes_with_the_package_stops():
+    """Thrown at 0.8 m/s in the default apartment, it ends slower than 0.2 m/s: the bar of the task."""
+    pytest.importorskip("onnxruntime")
+    from neurosim_core.learn.pilot import fly_policy, shipped_policy
+
+    assert shipped_policy("hover").stat().st_size < 1_000_000
+    assert fly_policy("hover", overrides={"device": "cpu"}, say=lambda line: None) < 0.2
+
+
+def test_a_flight_in_a_mirror_is_a_flight(hall):
+    """Two vehicles that begin and act as mirror images stay so: the signs are those of physics."""
+    from neurosim_core.learn.task import MIRROR_ACTION
+
+    sim = ns.Simulation(hall.config, worlds=2, models=[hall])
+    sign = np.array([1.0, -1.0, 1.0])
+    signs = np.array(Hover.mirror["proprioception"])
+    np.testing.assert_array_equal(signs[:3], sign)  # gravity is a vector,
+    np.testing.assert_array_equal(signs[3:6], -sign)  # the gyroscope's is an axial one
+    np.testing.assert_array_equal(Hover.mirror["velocity"], sign)
+    velocity, rate, turn = np.array([0.4, 0.3, -0.2]), np.array([0.5, -0.4, 0.3]), np.array([0.1, 0.2, -0.3])
+    q = np.array([*turn, np.sqrt(1.0 - turn @ turn)])
+    sim.reset(
+        position=[0.0, 0.0, 2.0],
+        velocity=np.stack([velocity, sign * velocity]),
+        orientation=np.stack([q, q * [-1.0, 1.0, -1.0, 1.0]]),
+        body_rate=np.stack([rate, -sign * rate]),
+    )
+    action = np.array([6.0, 0.8, -0.5, 0.4])
+    for _ in range(20):
+        seen = sim.step(np.stack([action, action * MIRROR_ACTION]).astype(np.float32), mode="rates")
+    state = seen.state
+    rates, speeds = state.body_rate.numpy(), state.velocity.numpy()
+    np.testing.assert_allclose(rates[1], -sign * rates[0], atol=1e-6)
+    np.testing.assert_allclose(speeds[1], sign * speeds[0], atol=1e-6)
+    assert np.abs(speeds[0] - velocity).min() > 0.01

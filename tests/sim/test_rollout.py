@@ -547,7 +547,7 @@ def test_a_camera_that_nobody_wants_is_not_rendered(outside_model):
 
 def test_an_event_camera_that_comes_back_starts_from_what_it_sees(outside_model):
     """Its first window begins at the first instant it saw; nothing of the time before is in it."""
-    model, command = outside_model, 1.05 * hover(outside_model)
+    model, command = outside_model, 1.2 * hover(outside_model)
     state = sim.make_state(model)
     windows = of([p for _ in range(10) for p in sim.step(model, state, command)], "events")
     sim.select_cameras(model, state, ())

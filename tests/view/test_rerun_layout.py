@@ -71,12 +71,13 @@ def test_nothing_has_an_empty_place():
     file = origins(make_blueprint({"drone": rig()}))
     pictures = [f"world/vehicles/drone/{name}" for name in ("rgb", "dvs", "z")]
     plots = [
+        "plots/drone/dvs/rate",
         "plots/drone/imu/specific_force",
         "plots/drone/imu/angular_rate",
         "plots/drone/truth",
         "plots/drone/truth/rotor_speed",
     ]
-    assert file == ["world", *plots, *pictures]
+    assert file == ["world", plots[0], "events/drone/dvs", *plots[1:], *pictures]
     live = origins(make_blueprint({"drone": rig(live=True)}, live=True))
     simulator = ["simulator/timing", "simulator/real_time_factor", "simulator/losses"]
     commands = ["plots/drone/command", "simulator/timing"]
@@ -90,7 +91,7 @@ def test_several_vehicles_have_tabs():
     blueprint = make_blueprint({name: rig(name, live=True) for name in ("alpha", "beta")}, live=True)
     found = origins(blueprint)
     assert len([o for o in found if o.startswith("world/vehicles/beta/")]) == 3
-    assert len([o for o in found if o.startswith("plots/alpha/")]) == 5
+    assert len([o for o in found if o.startswith("plots/alpha/")]) == 6
     left, right = blueprint.root_container.contents
     for tabs, names in (
         (left.contents[1], ["alpha", "beta", "simulator"]),
@@ -105,6 +106,6 @@ def test_what_rolls_shows_the_last_seconds():
     for rolling in (False, True):
         blueprint = make_blueprint({"drone": rig(live=True)}, live=True, rolling=rolling)
         plots = [view for view in views(blueprint.root_container) if isinstance(view, rrb.TimeSeriesView)]
-        assert len(plots) == 9
+        assert len(plots) == 10
         assert all(("VisibleTimeRanges" in plot.properties) == rolling for plot in plots)
         assert (blueprint.time_panel.play_state is not None) == rolling

@@ -40,8 +40,9 @@ class CircleController : public rclcpp::Node {
     geometry_msgs::msg::TwistStamped command;
     command.header.stamp = state.header.stamp;
     command.header.frame_id = "map";
-    command.twist.linear.x = -radius_m_ * rate * std::sin(angle) + correction(x - p.x);
-    command.twist.linear.y = radius_m_ * rate * std::cos(angle) + correction(y - p.y);
+    const double ahead = angle + rate * 0.1;  // 0.1 s later the vehicle has the velocity that it is told
+    command.twist.linear.x = -radius_m_ * rate * std::sin(ahead) + correction(x - p.x);
+    command.twist.linear.y = radius_m_ * rate * std::cos(ahead) + correction(y - p.y);
     command.twist.linear.z = correction(height_m_ - p.z);
     commands_->publish(command);
   }

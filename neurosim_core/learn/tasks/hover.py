@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
 from neurosim_core.learn.episodes import StartConfig
-from neurosim_core.learn.task import Observations, Randomisation, Task, View
+from neurosim_core.learn.task import MIRROR_ACTION, Observations, Randomisation, Task, View
 from neurosim_core.registry import register
 
 SPEED_MAX_M_S = 0.2
@@ -35,6 +36,16 @@ class Hover(Task):
         "teacher": ("state",),
         "student": ("proprioception", "events"),
     }
+    camera: Mapping[str, Any] = {"width": 32, "height": 32, "horizontal_fov_rad": 1.6}
+    mirror: Mapping[str, Sequence[float]] = {
+        "proprioception": (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, *MIRROR_ACTION),
+        "velocity": (1.0, -1.0, 1.0),
+    }
+
+    def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
+        """Return settings of twelve apartments of one room to train in, or of four others."""
+        seeds = range(100, 104) if unseen else range(12)
+        return [{"kind": "apartment", "rooms": 1, "seed": seed} for seed in seeds]
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
         """Forget how long vehicles have hovered."""

@@ -3,26 +3,7 @@
 // Faces of one surface are taken together. For each of `layer_count` surfaces `number` [LANES] is how many points show it,
 // and `middle` [2][LANES] their mean. Where the first rays hit one surface only, all points show it.
 constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is extrapolated beyond its horizon
-constexpr float OVERLAP = 1e-5f; // of a triangle's size: no point falls between two that share an edge
-// Functions of a direction whose values are the weights of a triangle's corners over the distance to its plane along it.
-auto functions_of = [&](const wp::vec3& a, const wp::vec3& b, const wp::vec3& c, auto& function) {
-    const wp::vec3 normals[3] = {wp::cross(b, c), wp::cross(c, a), wp::cross(a, b)};
-    const float volume = wp::dot(a, normals[0]);
-    for (int side = 0; side < 3; ++side)
-        for (int axis = 0; axis < 3; ++axis) function[side][axis] = normals[side][axis] / volume;
-    return volume;
-};
-// Whether the face beyond an edge does not lie on the same side of it as the face itself, as seen from `origin`.
-auto is_beyond = [&](int face, const auto& function) {
-    float least = 0.0f, largest = 0.0f;
-    for (int tip = 0; tip < 3; ++tip) {
-        const wp::vec3 toward = scene.whole_corner.data[3 * face + tip] - origin;
-        const float at = function[0] * toward[0] + function[1] * toward[1] + function[2] * toward[2];
-        least = wp::min(least, at);
-        largest = wp::max(largest, at);
-    }
-    return -least > largest;
-};
+#include "edge_functions.cuh"
 alignas(64) float number[MOST][LANES], middle[2][MOST][LANES];
 int layer_surface[MOST], layer_part[MOST], layer_count = 0; // layer_part: a part that a first ray hit, -1 - face: none
 bool even = !sky;
@@ -69,7 +50,7 @@ if (even) {
             for (int side = 0; side < 3; ++side) crossed[side] |= cut[side] & reached;
         }
         if (!touched) continue;
-        if (entry < hit_count)
+        if (entry < MOST)
             for (int side = 0; side < 3; ++side) {
                 const int beyond = crossed[side] ? scene.whole_neighbor.data[3 * (size_t)face + side] : -1;
                 if (beyond >= 0 && is_beyond(beyond, function[side])) list_face(beyond, -1 - beyond);
@@ -113,27 +94,11 @@ if (even) {
         }
     }
 }
+#include "nearest_part.cuh"
 // Returns the part of a layer to shade in a direction: the one that the pixel's own ray hit, if it is of this surface;
 // else one that another ray hit; else, of a face that none hit, the one in this direction.
 auto part_of = [&](int layer, int own, const wp::vec3& direction) {
     if (own >= 0 && scene.whole_surface.data[scene.whole_of_face.data[own]] == layer_surface[layer]) return own;
     if (layer_part[layer] >= 0) return layer_part[layer];
-    const int face = -1 - layer_part[layer];
-    int found = scene.whole_first.data[face];
-    float most = -1e30f;
-    for (int part = scene.whole_first.data[face]; part < scene.whole_first.data[face + 1]; ++part) {
-        const int* index = &mesh.indices[3 * (size_t)part];
-        float function[3][3], least = 1e30f, near = 0.0f;
-        functions_of(mesh.points[index[0]] - origin, mesh.points[index[1]] - origin, mesh.points[index[2]] - origin, function);
-        for (int side = 0; side < 3; ++side) {
-            const float at = function[side][0] * direction[0] + function[side][1] * direction[1] + function[side][2] * direction[2];
-            least = wp::min(least, at);
-            near += at;
-        }
-        if (least / near > most) {
-            most = least / near;
-            found = part;
-        }
-    }
-    return found;
+    return nearest_part(-1 - layer_part[layer], direction);
 };

@@ -1,0 +1,126 @@
+"""A short film of a recording, as WebP or GIF: picture, events, and the path in the plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import ImageDraw
+
+from neurosim_core.config import load_config
+from neurosim_core.packets import Events, Image, Odometry, join_events
+from neurosim_core.record import Recording
+from neurosim_core.scene.scene import Scene
+from neurosim_core.view.pictures import event_picture
+from neurosim_core.view.plan import cut_plan
+
+SUFFIXES = (".webp", ".gif")
+_HEIGHT_PX = 220
+_GAP_PX = 6
+_EVENT_WINDOW_US = 20_000
+_PATH_SRGB = (240, 110, 20)
+
+
+def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
+    """Draw the first colour camera and the first event camera of a recording side by side, with the path.
+
+    Args:
+        recorded: flight.h5.
+        out: File to write, .webp or .gif.
+        rate_hz: Pictures a second of simulated time, and of the film [Hz].
+
+    Raises:
+        ValueError: The recording has no colour camera.
+        OSError: The file cannot be written.
+    """
+    with Recording(recorded) as flight:
+        packets = list(flight.packets())
+        scene = load_config(yaml.safe_load(flight.header.config_yaml)).scene.load()
+    pictures = [p for p in packets if isinstance(p, Image) and p.data.ndim == 3]
+    if not pictures:
+        raise ValueError(
+            f"a film needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}}"
+        )
+    pictures = [p for p in pictures if p.sensor == pictures[0].sensor]
+    events = [p for p in packets if isinstance(p, Events)]
+    poses = [p for p in packets if isinstance(p, Odometry)]
+    way = _Way(scene, np.array([pose.position for pose in poses]).reshape(-1, 3))
+    last_ns = pictures[-1].stamp_ns
+    frames = []
+    for stamp_ns in np.arange(0, last_ns + 1, round(1e9 / rate_hz)):
+        picture = min(pictures, key=lambda p: abs(p.stamp_ns - int(stamp_ns)))
+        panels = [_scaled(picture.data), *_seen(events, int(stamp_ns))]
+        if poses:
+            panels.append(way.drawn(int(np.searchsorted([p.stamp_ns for p in poses], stamp_ns))))
+        frames.append(_beside(panels))
+    options: dict[str, Any] = {"quality": 60, "method": 6} if out.suffix == ".webp" else {}
+    frames[0].save(
+        out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
+    )
+
+
+def _seen(events: list[Events], stamp_ns: int) -> list[Pillow.Image]:
+    """Return the events of the window that ends at a stamp, if there is an event camera."""
+    if not events:
+        return []
+    first = events[0]
+    low_us = stamp_ns // 1000 - _EVENT_WINDOW_US
+    near = [
+        p
+        for p in events
+        if p.sensor == first.sensor and p.stamp_ns // 1000 > low_us and p.start_ns <= stamp_ns
+    ]
+    if not near:
+        return [_scaled(np.full((first.height, first.width, 3), 255, np.uint8))]
+    window = join_events([p.numpy() for p in near])
+    window = window.rows((window.t > low_us) & (window.t <= stamp_ns // 1000))
+    return [_scaled(event_picture(window, width=first.width, height=first.height))]
+
+
+def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:
+    height, width = picture.shape[:2]
+    return Pillow.fromarray(picture).resize((round(width * _HEIGHT_PX / height), _HEIGHT_PX))
+
+
+def _beside(panels: list[Pillow.Image]) -> Pillow.Image:
+    width = sum(panel.width + _GAP_PX for panel in panels) - _GAP_PX
+    frame, left = Pillow.new("RGB", (width, _HEIGHT_PX), (255, 255, 255)), 0
+    for panel in panels:
+        frame.paste(panel, (left, 0))
+        left += panel.width + _GAP_PX
+    return frame
+
+
+class _Way:
+    """The plan of a scene, and a path in it."""
+
+    def __init__(self, scene: Scene, position: NDArray[np.float64]) -> None:
+        height_m = float(np.median(position[:, 2])) if len(position) else float(scene.bounds_m[:, 2].mean())
+        plan = cut_plan(scene, height_m=height_m)
+        self._low, size = plan.bounds[0], plan.bounds[1] - plan.bounds[0]
+        self._scale = (_HEIGHT_PX - 2) / size[1]
+        self._picture = Pillow.new("RGB", (round(self._scale * size[0]) + 2, _HEIGHT_PX), (255, 255, 255))
+        draw = ImageDraw.Draw(self._picture)
+        for triangle, color in zip(plan.triangles, 1.0 - 0.7 * (1.0 - plan.colors), strict=True):
+            draw.polygon(self._at(triangle), fill=tuple((255 * color).astype(int).tolist()))
+        for line in plan.outlines:
+            draw.line(self._at(line), fill=(40, 40, 40))
+        self._path = self._at(position[:, :2])
+
+    def _at(self, points: NDArray[np.float64]) -> list[tuple[float, float]]:
+        x, y = (self._scale * (points - self._low)).T
+        return list(zip((1 + x).tolist(), (_HEIGHT_PX - 1 - y).tolist(), strict=True))
+
+    def drawn(self, count: int) -> Pillow.Image:
+        """Return the plan with the first places of the path."""
+        picture = self._picture.copy()
+        draw = ImageDraw.Draw(picture)
+        count = min(max(count, 1), len(self._path))
+        draw.line(self._path[:count], fill=_PATH_SRGB, width=2)
+        x, y = self._path[count - 1]
+        draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=_PATH_SRGB)
+        return picture

@@ -1,0 +1,32 @@
+"""Events in x, y and time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurosim_core.packets import EventArrays
+from neurosim_core.view.event_cloud import EventCloud
+
+
+def events(t: np.ndarray) -> EventArrays:
+    count = len(t)
+    x = (np.arange(count) % 64).astype(np.uint16)
+    return EventArrays(t.astype(np.int64), x, np.full(count, 7, np.uint16), (x % 2).astype(np.uint8))
+
+
+def test_events_lie_at_their_pixel_and_behind_now():
+    """Five windows of 20 ms are as deep as the camera is wide: 64 px for 100 ms."""
+    cloud = EventCloud(width=64, window_ns=20_000_000)
+    cloud.add(events(np.array([5_000])), 20_000_000)
+    points, colors = cloud.add(events(np.array([30_000, 40_000])), 40_000_000)
+    np.testing.assert_allclose(points, [[0, -22.4, -7], [0, -6.4, -7], [1, 0, -7]], rtol=1e-6)
+    assert colors[1].argmax() == 2  # darker: blue
+    assert colors[2].argmax() == 0  # brighter: red
+
+
+def test_the_number_of_points_is_bounded():
+    cloud = EventCloud(width=64, window_ns=20_000_000)
+    for k in range(8):
+        points, _ = cloud.add(events(np.linspace(k * 20_000, (k + 1) * 20_000, 9_999)), (k + 1) * 20_000_000)
+    assert 3_000 < len(points) <= 4_000
+    assert points[:, 1].min() >= -64.0
