@@ -50,7 +50,6 @@ from neurosim_core.render.lighting import spread_order
 from neurosim_core.render.outputs import RADIANCE, RenderOutputs, radiance_writer, requested_outputs
 from neurosim_core.render.packet_shading import packet_shader
 from neurosim_core.render.ray_intersection import FAR_M, UNFUSED, Hit, intersect_bodies, intersect_scene
-from neurosim_core.render.raycast_pixels import PIXEL_BOUNDS
 from neurosim_core.render.render_terms import RenderTerms
 from neurosim_core.render.scene_data import SceneData
 from neurosim_core.render.shading import pixel_shader
@@ -145,14 +144,14 @@ def _cover_pixel(
 
 
 def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
-    """Return the kernel whose threads are pixels, for any device and all terms."""
+    """Return the kernel of a CPU whose threads are pixels, for all terms."""
     find_tile = tile_finder(terms)
     radiance_of = pixel_shader(terms)
     requested = requested_outputs(outputs)
     write_radiance = radiance_writer(outputs, supersampled=False)
     cast_packet = packet_caster(terms.embree) if terms.embree else None
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED, launch_bounds=PIXEL_BOUNDS)
+    @wp.kernel(module="unique", enable_backward=False, module_options=UNFUSED)
     def average_pixels(
         first: int,
         # In:
@@ -165,7 +164,7 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
         out: RenderOutputs,
     ) -> None:
         index = first + wp.tid()
-        # 64 threads are a tile of 8 x 8 pixels, and 16 side by side a block of 4 x 4
+        # 64 indices are a tile of 8 x 8 pixels, and 16 side by side a block of 4 x 4
         in_tile = index % 64
         block = index // 64
         instant = block % view.instant_count

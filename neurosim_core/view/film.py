@@ -48,6 +48,7 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
     pictures = [p for p in pictures if p.sensor == pictures[0].sensor]
     events = [p for p in packets if isinstance(p, Events)]
     poses = [p for p in packets if isinstance(p, Odometry)]
+    pose_stamps_ns = [p.stamp_ns for p in poses]
     way = _Way(scene, np.array([pose.position for pose in poses]).reshape(-1, 3))
     last_ns = pictures[-1].stamp_ns
     frames = []
@@ -55,7 +56,7 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
         picture = min(pictures, key=lambda p: abs(p.stamp_ns - int(stamp_ns)))
         panels = [_scaled(picture.data), *_seen(events, int(stamp_ns))]
         if poses:
-            panels.append(way.drawn(int(np.searchsorted([p.stamp_ns for p in poses], stamp_ns))))
+            panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
         frames.append(_beside(panels))
     options: dict[str, Any] = {"quality": 60, "method": 6} if out.suffix == ".webp" else {}
     frames[0].save(
