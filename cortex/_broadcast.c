@@ -72,9 +72,11 @@ static int cast_is_open(const Broadcast *cast) {
 static PyObject *cast_add(Broadcast *cast, PyObject *arguments) {
     CortexHello hello = {0};
     int strict;
-    if (!PyArg_ParseTuple(arguments, "iiip:add", &hello.socket, &hello.page, &hello.bell, &strict) || !cast_is_open(cast))
+    unsigned long long first;
+    if (!PyArg_ParseTuple(arguments, "iiipK:add", &hello.socket, &hello.page, &hello.bell, &strict, &first)
+        || !cast_is_open(cast))
         return NULL;
-    const int member = cortex_writer_add(&cast->writer, &hello, strict);
+    const int member = cortex_writer_add(&cast->writer, &hello, strict, first);
     return member < 0 ? PyErr_SetFromErrno(PyExc_OSError) : PyLong_FromLong(member);
 }
 
@@ -269,7 +271,8 @@ static PyObject *reader_close(RingReader *reader, PyObject *unused) {
 
 static PyObject *reader_welcomed(RingReader *reader, PyObject *unused) {
     (void)unused;
-    return PyBool_FromLong(reader->open && cortex_reader_welcomed(&reader->ring));
+    if (!reader->open || !cortex_reader_welcomed(&reader->ring)) Py_RETURN_NONE;
+    return PyLong_FromUnsignedLongLong(reader->ring.first);
 }
 
 static int reader_traverse(RingReader *reader, visitproc visit, void *arg) {
@@ -309,7 +312,7 @@ static PyGetSetDef reader_properties[] = {
 
 static PyMethodDef reader_methods[] = {
     {"receive", (PyCFunction)reader_receive, METH_O, "Take the next frame; `again` if there is none."},
-    {"welcomed", (PyCFunction)reader_welcomed, METH_NOARGS, "Whether the publisher has taken us in."},
+    {"welcomed", (PyCFunction)reader_welcomed, METH_NOARGS, "The sequence of the first message for us, once the publisher has taken us in; else None."},
     {"close", (PyCFunction)reader_close, METH_NOARGS, "Read no more."},
     {NULL, NULL, 0, NULL},
 };

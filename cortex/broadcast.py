@@ -113,8 +113,8 @@ class Broadcast:
         self.sends: dict[Callable[..., Any], Callable[[bytes], bool]] = {}
         """Takes a frame and flags, or raises `zmq.Again`; with what to call then, see `send`."""
 
-    def admit(self, reader: Reader) -> None:
-        """Take a reader in that asks for the ring; it then is a member of it."""
+    def admit(self, reader: Reader, sequence: int) -> None:
+        """Take a reader in that asks for the ring, from a message on; it then is a member of it."""
         listener = reader.outlet.listener
         hello = None if listener is None else listener.take(self._source, reader.request.reader)
         if hello is None:
@@ -126,7 +126,7 @@ class Broadcast:
             hello.close()
             return
         with contextlib.suppress(OSError):  # it has left
-            reader.member = self._ring.add(*hello, reader.request.strict)
+            reader.member = self._ring.add(*hello, reader.request.strict, sequence)
             self._readers[reader.member] = reader
             self.sends = {self._ring.send: self.send}
 

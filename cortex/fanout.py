@@ -95,9 +95,9 @@ class Fanout:
             self._crowded = True
             return
         request = request._replace(timeout_ms=min(request.timeout_ms, self._max_wait_ms))
-        reader = self._large.admit(key, request, outlet, self.ring.admit)
-        self.readers[key] = reader
         sequence = self._next_sequence()
+        reader = self._large.admit(key, request, outlet, lambda reader: self.ring.admit(reader, sequence))
+        self.readers[key] = reader
         self._large.reserve(reader, sequence)
         self.route()
         answer = self._large.answer(reader, sequence, self.latched)

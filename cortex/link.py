@@ -408,9 +408,10 @@ class Link:
                 self.socket.unsubscribe(self._large_head)
                 self._large_subscribed = False
                 self._shorten()
+        known = self.expected >= 0
         if first:
             self._use_ring()
-        if self.expected >= 0:
+        if known:
             return []
         items = self._latched(answer.latched) if answer.latched else []
         self.expected = answer.sequence
@@ -418,11 +419,14 @@ class Link:
 
     def _use_ring(self) -> None:
         """If the publisher has taken us in, it sends all that follows through its ring."""
-        if self._end is None or not self._end.welcomed():
+        first = None if self._end is None else self._end.welcomed()
+        if first is None:
             return
         self._ring = self._end
         self.receive = self._ring.receive
         self.attached = True
+        if self.expected < 0:  # what is lost counts from there on, also if the answer never comes
+            self.expected = first
         for head in (self._message_prefix, self.batch_head, self._slot_head):
             self.socket.unsubscribe(head)
 

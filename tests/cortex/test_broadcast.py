@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import select
@@ -58,9 +59,9 @@ class Ring:
         connection = native.accept(self.listener)
         source, number, page, bell = native.hear(connection)
         assert (source, number) == (SOURCE, len(self.readers) + 1)
-        assert not reader.welcomed()
-        member = self.writer.add(connection, page, bell, strict)
-        assert reader.welcomed()
+        assert reader.welcomed() is None
+        member = self.writer.add(connection, page, bell, strict, 5)
+        assert reader.welcomed() == 5
         self.readers.append(reader)
         return reader, member
 
@@ -357,6 +358,31 @@ def test_a_ring_is_read_to_its_end_however_long_that_takes(make_node, start_chil
     assert [subscriber.recv(SOON_S).number for _ in range(40)] == list(range(40))
     wait_for(lambda: not subscriber._links)
     assert subscriber.counters.lost == 0
+
+
+def test_what_came_before_the_answer_was_read_counts(make_node, start_child, monkeypatch):
+    """Its publisher was gone before the reader, which lost most of it, looked for the first time."""
+    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 10**15)
+    child = start_child("peer")
+    child.hear()
+    child.ask(do="publisher", topic="/blocks", type="Block")
+    subscriber = make_node().subscriber("/blocks", Block, policy=keep_last(8))
+    child.ask(do="await_subscribers", topic="/blocks")
+    child.ask(do="publish", topic="/blocks", count=100, size=RING_BYTES // 20)
+    child.finish()
+    wait_for(lambda: not subscriber.sources())
+    count = 0
+
+    def accounted() -> int:
+        nonlocal count
+        with contextlib.suppress(TimeoutError):
+            assert is_whole(subscriber.recv(0.0))
+            count += 1
+        return count + subscriber.counters.lost + subscriber.counters.overtaken
+
+    wait_for(lambda: accounted() >= 100)
+    assert accounted() == 100
+    assert subscriber.counters.lost > 0
 
 
 @pytest.mark.parametrize("policy", [reliable(8, 60.0), keep_last(8)], ids=str)

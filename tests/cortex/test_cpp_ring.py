@@ -265,7 +265,7 @@ class SlowReader:
         self._socket.subscribe(self.key)
         column = self.answer().column
         assert column is not None
-        assert self._ring.welcomed()
+        assert self._ring.welcomed() is not None
         self.column: int = column
 
     def answer(self) -> wire.AttachAnswer:
@@ -386,7 +386,7 @@ class RingImpostor(Impostor):
         fd = native.accept(self.listener)
         source, number, page, bell = native.hear(fd)
         assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
-        self.ring.add(fd, page, bell, False)
+        self.ring.add(fd, page, bell, False, 0)
         self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, 3, (), b"")))
 
     def close(self) -> None:

@@ -66,6 +66,7 @@ typedef struct {
     const uint8_t *data;
     CortexPage *page;
     uint64_t capacity, source, tail;
+    uint64_t first; /* sequence of the first message that is sent to it */
     int socket, bell;
     int armed, broken;
 } CortexReader;
@@ -78,7 +79,7 @@ typedef struct {
 /* Processes: memory, sockets, bells. Each returns -1 with errno set if it fails, and where there is no memfd. */
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity);
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict); /* owns what it was given */
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first); /* owns the hello */
 static inline void cortex_writer_remove(CortexWriter *writer, int member);
 static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity);
 static inline void cortex_writer_close(CortexWriter *writer);

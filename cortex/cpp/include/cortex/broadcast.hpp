@@ -85,7 +85,9 @@ class Broadcast {
   }
 
   // The reader's number, -1 if it has left; the descriptors are ours in any case.
-  int add(const CortexHello& hello, bool strict) noexcept { return cortex_writer_add(&writer_, &hello, strict ? 1 : 0); }
+  int add(const CortexHello& hello, bool strict, std::uint64_t first) noexcept {
+    return cortex_writer_add(&writer_, &hello, strict ? 1 : 0, first);
+  }
   void remove(int member) noexcept { cortex_writer_remove(&writer_, member); }
   // CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL or CORTEX_TOO_LARGE.
   int put(Span<const std::uint8_t> frame) noexcept { return cortex_writer_put(&writer_, frame.data(), frame.size(), 0); }

@@ -217,8 +217,8 @@ static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint
 }
 
 /* Tell a reader where the ring is. */
-static inline int cortex_welcome(const CortexWriter *writer, int socket) {
-    const uint64_t said[4] = {CORTEX_RING_MAGIC, writer->capacity, writer->source, writer->head};
+static inline int cortex_welcome(const CortexWriter *writer, int socket, uint64_t first) {
+    const uint64_t said[5] = {CORTEX_RING_MAGIC, writer->capacity, writer->source, writer->head, first};
     return cortex_send(socket, said, sizeof said, &writer->fd, 1);
 }
 
@@ -228,13 +228,13 @@ static inline void cortex_hello_close(const CortexHello *hello) {
     cortex_close_fd(hello->socket);
 }
 
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict) {
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first) {
     int number = 0;
     while (number < writer->count && writer->members[number].used) ++number;
     void *page = MAP_FAILED;
     if (number < CORTEX_MEMBERS)
         page = mmap(NULL, CORTEX_PAGE_BYTES, PROT_READ | PROT_WRITE, MAP_SHARED, hello->page, 0);
-    if (page == MAP_FAILED || cortex_welcome(writer, hello->socket) < 0) {
+    if (page == MAP_FAILED || cortex_welcome(writer, hello->socket, first) < 0) {
         if (page != MAP_FAILED) munmap(page, CORTEX_PAGE_BYTES);
         cortex_hello_close(hello);
         return -1;
@@ -270,7 +270,7 @@ static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity) {
     if (cortex_writer_make(&larger, capacity) < 0) return -1;
     for (int index = 0; index < writer->count; ++index) {
         CortexMember *member = &larger.members[index];
-        if (!member->used || cortex_welcome(&larger, member->socket) == 0) continue;
+        if (!member->used || cortex_welcome(&larger, member->socket, 0) == 0) continue;
         shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
         member->late = 1;
     }
@@ -291,7 +291,7 @@ static inline void cortex_writer_close(CortexWriter *writer) {
 
 /* Take the ring that the publisher hands over, instead of the one there is; 0 if none has come, -1 if it is none. */
 static inline int cortex_reader_map(CortexReader *reader) {
-    uint64_t said[4];
+    uint64_t said[5];
     int fd;
     if (cortex_receive(reader->socket, said, sizeof said, &fd, 1) < 0) return errno == EAGAIN ? 0 : -1;
     const uint64_t capacity = said[1];
@@ -301,6 +301,7 @@ static inline int cortex_reader_map(CortexReader *reader) {
         ring = cortex_map(fd, capacity, PROT_READ);
     close(fd);
     if (ring == NULL) return -1;
+    if (reader->ring == NULL) reader->first = said[4];
     cortex_unmap(reader->ring, reader->capacity);
     reader->ring = ring;
     reader->data = (const uint8_t *)ring + CORTEX_HEAD_BYTES;
@@ -366,8 +367,8 @@ static inline void cortex_hello_close(const CortexHello *hello) { (void)hello; }
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity) {
     return (void)writer, (void)source, (void)capacity, cortex_unsupported();
 }
-static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict) {
-    return (void)writer, (void)hello, (void)strict, cortex_unsupported();
+static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint64_t first) {
+    return (void)writer, (void)hello, (void)strict, (void)first, cortex_unsupported();
 }
 static inline void cortex_writer_remove(CortexWriter *writer, int member) { (void)writer, (void)member; }
 static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity) {

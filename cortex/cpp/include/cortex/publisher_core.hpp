@@ -166,7 +166,7 @@ class PublisherCore {
   void attach(Outlet& outlet, const std::string& key, wire::AttachKey request) {
     if (closed_ || readers_.size() >= 1024) return;
     request.timeout_ms = std::min(request.timeout_ms, max_wait_ms_);
-    const auto& reader = readers_.add(outlet, key, request, !unavailable_, outlets_->listener);
+    const auto& reader = readers_.add(outlet, key, request, sequence_, !unavailable_, outlets_->listener);
     answer(*reader, latched_);
   }
 

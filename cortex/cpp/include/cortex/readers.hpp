@@ -41,14 +41,15 @@ class Readers {
   std::size_t socket_count(const Outlet& outlet) const noexcept { return outlet.strict ? strict_ : lossy_; }
 
   // Takes a reader in; with a column of the lease table, and through the ring, if it asks for that and there is room.
+  // `first` is the sequence of the first message for it.
   const std::shared_ptr<Reader>& add(Outlet& outlet, const std::string& key, const wire::AttachKey& request,
-                                     bool shared_memory, Listener& listener) {
+                                     std::uint64_t first, bool shared_memory, Listener& listener) {
     auto reader = std::make_shared<Reader>();
     reader->key = key;
     reader->request = request;
     reader->outlet = &outlet;
     if (request.shared_memory && shared_memory) reader->column = free_column();
-    if (reader->column != wire::no_column) join(*reader, listener);
+    if (reader->column != wire::no_column) join(*reader, first, listener);
     ++(reader->member >= 0 ? members_ : outlet.strict ? strict_ : lossy_);
     return all_.emplace_back(std::move(reader));
   }
@@ -148,14 +149,14 @@ class Readers {
     return reader.member >= 0 && ring_->is_full(reader.member, frame_size);
   }
 
-  void join(Reader& reader, Listener& listener) {
+  void join(Reader& reader, std::uint64_t first, Listener& listener) {
     CortexHello hello;
     if (!listener.take(reader.request.source, reader.request.reader, hello)) return;
     if (ring_ == nullptr) ring_ = Broadcast::open(reader.request.source);
     if (ring_ == nullptr) {
       cortex_hello_close(&hello);
     } else {
-      reader.member = ring_->add(hello, reader.request.strict);
+      reader.member = ring_->add(hello, reader.request.strict, first);
     }
   }
 
