@@ -7,6 +7,7 @@ import functools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -129,16 +130,17 @@ def make_fleet(
         seeing = any(plan_render_groups(member.sensors) for member in members.values())
         scene = config.scene.load(pictures=seeing) if scene is None else scene
         bodies = make_bodies(config.bodies) if seeing else ()
-    with phase("free space"):
-        free_space = make_free_space(scene, config.free_space, device=device)
-    with phase("path"):
-        paths = {name: _plan(member, free_space) for name, member in members.items()}
-    with phase("light"):
-        scene_on_device = (
-            upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)
-            if seeing
-            else None
+    with ThreadPoolExecutor(max_workers=1) as aside:  # light needs no path: both at once
+        light = functools.partial(
+            upload_scene, scene, config.render, device=device, renderer=config.renderer, bodies=bodies
         )
+        lit = aside.submit(light) if seeing else None
+        with phase("free space"):
+            free_space = make_free_space(scene, config.free_space, device=device)
+        with phase("path"):
+            paths = {name: _plan(member, free_space) for name, member in members.items()}
+        with phase("light"):
+            scene_on_device = None if lit is None else lit.result()
     return {
         name: _make_member(member, device, scene, bodies, free_space, paths[name], scene_on_device, setup_s)
         for name, member in members.items()
