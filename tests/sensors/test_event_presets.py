@@ -69,15 +69,21 @@ def test_single_keys_win():
     assert pixel_of(later).leak.rate_hz == 0.1
 
 
+def test_noise_of_ones_own_takes_the_place_of_measured_noise():
+    assert EventCameraConfig(preset="davis346").measured_noise is not None
+    assert EventCameraConfig(preset="davis346", shot_noise=None).measured_noise is None
+    assert EventCameraConfig(preset="davis346", shot_noise={"rate_hz": 2.0}).measured_noise is None
+
+
 def test_settings_explain_themselves():
     """Also the groups that are off say what they would take."""
     text = to_yaml(load({}), comments=True)
-    for key in ("threshold_spread", "low_pass", "leak", "shot_noise", "hot_pixels", "stochastic", "readout"):
+    for key in ("threshold_spread", "low_pass", "leak", "shot_noise", "measured_noise", "hot_pixels"):
         above = text[: text.index(f"      {key}: null")].splitlines()
         assert above[-1].strip().startswith("#")
         assert any("{" in line for line in above[-3:]), key
     text = to_yaml(load({"preset": "davis346"}), comments=True)
-    assert "# Events a second and pixel in a still scene [Hz]." in text
+    assert "# Events a second and pixel in a still scene, in the dark [Hz]." in text
 
 
 @pytest.mark.parametrize(
@@ -106,6 +112,7 @@ def test_darkness_and_glare_stay_finite(device):
     for config in (
         EventCameraConfig(preset="v2e_noisy", low_pass={"dark_radiance": 0.0}),
         EventCameraConfig(preset="voltmeter_dvs346", stochastic={"k2": 0.0, "k3": 0.0}),
+        EventCameraConfig(preset="gen3", readout=None),
     ):
         camera = EventCamera(config, width=1, height=1, device=device)
         camera.reset(samples[0])
