@@ -246,8 +246,8 @@ class FreeSpace:
         """Refuse to begin inside a solid, or outside of a scene that names its inside (`Scene.inside_m`).
 
         A solid is a region that is closed on all sides, does not hold the seed, and is smaller than a room
-        (12 m^3). Where a surface passes, there is no solid to be inside of. What is beyond the grid or open to
-        it, and does not hold the seed, is outside.
+        (12 m^3). Where a surface passes, there is no solid to be inside of. Outside is what is beyond the
+        grid or open to that, and does not hold the seed.
 
         Args:
             point_m: In the world [m], shape [3].
