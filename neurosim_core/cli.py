@@ -18,6 +18,7 @@ from neurosim_core import __version__, docs
 from neurosim_core.bench import commands as bench
 from neurosim_core.convert import command as convert
 from neurosim_core.data import command as dataset
+from neurosim_core.fit import command as fit
 from neurosim_core.learn import command as learn
 from neurosim_core.overrides import add_set_option, read_settings, set_options
 from neurosim_core.signals import INTERRUPTED_LINE, handle_signals, leave_at_once
@@ -93,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         convert.add_parser,
         dataset.add_parser,
         dataset.add_compare_parser,
+        fit.add_parser,
         bench.add_parser,
         learn.add_parsers,
         docs.add_parser,
