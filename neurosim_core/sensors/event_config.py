@@ -49,10 +49,10 @@ class LeakConfig(Settings):
 
     rate_hz: Annotated[float, Field(ge=0.0, le=1e4)] = 0.1
     """Events a second and pixel in a still scene, in the dark [Hz]."""
-    bright_factor: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
-    """Factor on the rate at `white_radiance`; light leaks through the switch, so that it grows linearly."""
     spread_decades: Decades = 0.1
     """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+    bright_factor: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
+    """Factor on the rate at `white_radiance`; light leaks through the switch, so that it grows linearly."""
 
 
 class ShotNoiseConfig(Settings):
