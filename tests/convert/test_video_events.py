@@ -279,7 +279,7 @@ def test_the_summary_says_what_the_pixels_are(tmp_path, capsys):
     for preset, said in (
         (
             "davis346",
-            "davis346, thresholds 0.1337 on, 0.2029 off, threshold_spread, leak, measured_noise, readout, dark",
+            "davis346, thresholds 0.1337 on, 0.2029 off, threshold_spread, leak, measured_noise, readout",
         ),
         ("voltmeter_dvs346", "voltmeter_dvs346, steps of about 0.19, stochastic, dark floor"),
     ):
