@@ -236,7 +236,16 @@ def _noise_rates(config: EventCameraConfig, radiance: float, rank: Floats) -> tu
     if (shot := config.shot_noise) is not None:
         median_hz = shot.rate_hz * (1.0 + (shot.bright_factor - 1.0) * radiance)
         rate_hz = median_hz * 10.0 ** (shot.spread_decades * rank)
-        return rate_hz * shot.on_fraction, rate_hz * (1.0 - shot.on_fraction)
+        more = [1.0, 1.0]
+        if shot.by_threshold and (mismatch := config.threshold_spread) is not None:
+            normal = np.linspace(-6.0, 6.0, 6001)
+            nominal = (
+                (config.threshold_on, mismatch.sigma_on),
+                (config.threshold_off, mismatch.sigma_off),
+            )
+            drawn = [np.maximum(mean + sigma * normal, mismatch.minimum) / mean for mean, sigma in nominal]
+            more = [float(np.average(1.0 / one, weights=np.exp(-0.5 * normal**2))) for one in drawn]
+        return rate_hz * shot.on_fraction * more[0], rate_hz * (1.0 - shot.on_fraction) * more[1]
     if (measured := config.measured_noise) is None:
         return np.zeros_like(rank), np.zeros_like(rank)
     place = math.log(radiance * measured.white_lux)

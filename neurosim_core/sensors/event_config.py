@@ -31,6 +31,17 @@ class ThresholdSpreadConfig(Settings):
     """Smaller thresholds are raised to this one."""
 
 
+class LinLogConfig(Settings):
+    """A logarithm that becomes a line in the dark, as in v2e, where 8-bit pictures have no more steps.
+
+    With DN the radiance in units of white_radiance / 255, the pixel sees ln(DN) above `linear_below`, here D,
+    and DN ln(D) / D below.
+    """
+
+    linear_below: Annotated[float, Field(gt=1.0, le=255.0)] = 20.0
+    """Light at which the logarithm begins [white / 255]."""
+
+
 class LowPassConfig(Settings):
     """The photoreceptor: first order, the slower the darker.
 
@@ -66,6 +77,8 @@ class ShotNoiseConfig(Settings):
     """Share of ON events."""
     spread_decades: Decades = 0.1
     """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+    by_threshold: bool = False
+    """Whether the rate of a polarity is inversely proportional to the threshold of the pixel, as in v2e."""
 
 
 class NoiseLevelConfig(Settings):
@@ -223,10 +236,12 @@ class EventCameraConfig(Settings):
     threshold_off: float = Field(default=0.2, ge=1e-3, le=100.0)
     """Fall of log radiance (natural logarithm) that fires an event of polarity 0."""
     white_radiance: float = Field(default=1.0, gt=0.0, le=1e30)
-    """Radiance that `low_pass`, `shot_noise` and `stochastic` take for white, the brightest of a picture."""
+    """Radiance that all that depends on light takes for white, the brightest of a picture."""
     threshold_spread: ThresholdSpreadConfig | None = None
     """Thresholds that differ from pixel to pixel, and stay: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01},
     standard deviations in log radiance; null: none."""
+    lin_log: LinLogConfig | None = None
+    """Linear, not logarithmic, in the dark, as v2e: {linear_below: 20}; null: logarithmic everywhere."""
     low_pass: LowPassConfig | None = None
     """Finite bandwidth of the photoreceptor, falling with light: {cutoff_hz: 3000, dark_radiance: 0.08};
     null: infinitely fast."""
@@ -264,7 +279,7 @@ class EventCameraConfig(Settings):
     @model_validator(mode="after")
     def _law_is_one(self) -> EventCameraConfig:
         if self.stochastic is not None:
-            for name in ("low_pass", "leak", "shot_noise", "measured_noise"):
+            for name in ("lin_log", "low_pass", "leak", "shot_noise", "measured_noise"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} must be null where stochastic is given, which has its own")
         if self.shot_noise is not None and self.measured_noise is not None:

@@ -76,6 +76,7 @@ def _draw_rates(
     seed: wp.uint64,
     rate_stream: wp.uint32,
     hot_stream: wp.uint32,
+    model: PixelModel,
     # Out:
     rate_out: wp.array[wp.vec2d],
 ) -> None:
@@ -83,6 +84,10 @@ def _draw_rates(
     normal = normal2(random_bits(seed, rate_stream, wp.int64(0), pixel))
     hot = uniform2(random_bits(seed, hot_stream, wp.int64(0), pixel))[0] < hot_fraction
     shot = _spread_rate(shot_per_ns, decades, normal[0])
+    if model.shot_by_threshold and model.thresholds.shape[0] > 0:
+        on = model.shot_on_fraction * model.threshold_on / model.thresholds[pixel][0]
+        off = (wp.float64(1.0) - model.shot_on_fraction) * model.threshold_off / model.thresholds[pixel][1]
+        shot *= on + off
     rate_out[pixel] = wp.vec2d(shot, wp.where(hot, hot_per_ns, _ZERO))
 
 
@@ -265,6 +270,9 @@ class PixelNoise:
         model.threshold_off = config.threshold_off
         model.white_radiance = config.white_radiance
         model.refractory_ns = 1e9 * config.refractory_s
+        if config.lin_log is not None and self._has("lin_log"):
+            model.linear_below = config.white_radiance * config.lin_log.linear_below / 255.0
+            model.linear_slope = math.log(config.lin_log.linear_below)
         if config.low_pass is not None:
             model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz
             model.dark_radiance = config.low_pass.dark_radiance
@@ -275,6 +283,7 @@ class PixelNoise:
         if config.shot_noise is not None:
             model.bright_factor = config.shot_noise.bright_factor
             model.shot_on_fraction = config.shot_noise.on_fraction
+            model.shot_by_threshold = config.shot_noise.by_threshold
         if config.hot_pixels is not None:
             model.hot_on_fraction = config.hot_pixels.on_fraction
         if config.stochastic is not None:
@@ -286,7 +295,7 @@ class PixelNoise:
         model.touch_stream = self._stream("passage")
         model.thresholds = self._draw_thresholds()
         model.leak = self._draw_leak()
-        model.rates = self._draw_rates()
+        model.rates = self._draw_rates(model)
         if config.measured_noise is not None and self._has("measured"):
             light, medians, sampled = read_noise(config.measured_noise)
             light = np.log(light * config.white_radiance / config.measured_noise.white_lux)
@@ -335,7 +344,7 @@ class PixelNoise:
             self._stream("leak_phase"),
         )
 
-    def _draw_rates(self) -> Any:
+    def _draw_rates(self, model: Any) -> Any:
         shot, hot = self._config.shot_noise, self._config.hot_pixels
         return self._draw(
             _draw_rates,
@@ -347,4 +356,5 @@ class PixelNoise:
             self._seed,
             self._stream("shot"),
             self._stream("hot"),
+            model,
         )

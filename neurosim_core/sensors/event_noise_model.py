@@ -4,6 +4,9 @@
 time and tau that is constant; an interval is cut where L moves by more than 1/8, and tau is taken in the
 middle of each piece. One pole is what measurements show (v2e).
 
+**Lin-log** (lin_log). In the dark the pixel sees light itself in place of its logarithm, as in v2e; what it
+sees is linear in time between frames.
+
 **Mismatch** (spread). Thresholds of each pixel are normal numbers, drawn once, at least `minimum`.
 
 **Leak** (leak). The reference falls by rate times ON threshold, so a still pixel fires ON events at `rate`. A
@@ -37,7 +40,8 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 wp.set_module_options({"enable_backward": False})
 
 TERMS = (
-    "spread", "low_pass", "refractory", "leak", "light_leak", "spontaneous", "measured", "stochastic",
+    "spread", "lin_log", "low_pass", "refractory", "leak", "light_leak", "spontaneous", "measured",
+    "stochastic",
 )  # fmt: skip
 """All terms that may be compiled in."""
 CAUSE = "cause"
@@ -55,11 +59,14 @@ class PixelModel:
     threshold_off: wp.float64
     white_radiance: wp.float64
     refractory_ns: wp.float64
+    linear_below: wp.float64  # radiance; 0: logarithmic everywhere
+    linear_slope: wp.float64  # log radiance seen over that light
     corner_per_ns: wp.float64  # 1 / tau at white
     dark_radiance: wp.float64
     bright_factor: wp.float64
     leak_growth: wp.float64  # of the leak from dark to white, as a share
     shot_on_fraction: wp.float64
+    shot_by_threshold: wp.bool
     hot_on_fraction: wp.float64
     k1: wp.float64
     k2: wp.float64
@@ -102,6 +109,7 @@ def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
     """Return the terms that a configuration asks for; none: the pixels are ideal."""
     present = {
         "spread": config.threshold_spread is not None,
+        "lin_log": config.lin_log is not None,
         "low_pass": config.low_pass is not None,
         "refractory": config.refractory_s > 0.0,
         "leak": config.leak is not None,

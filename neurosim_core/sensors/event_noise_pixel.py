@@ -38,6 +38,17 @@ class NoisyPixel:
 
 
 @wp.func
+def see(model: PixelModel, log_radiance: wp.float32) -> wp.float32:
+    """Return what a pixel sees of log radiance: a line below some light, with the same value there."""
+    if model.linear_below > _ZERO:
+        radiance = wp.exp(wp.float64(log_radiance))
+        if radiance < model.linear_below:
+            rise = model.linear_slope * (radiance / model.linear_below - _ONE)
+            return wp.float32(wp.log(model.linear_below) + rise)
+    return log_radiance
+
+
+@wp.func
 def wait_ns(rate: wp.float64, uniform: wp.float64) -> wp.int64:
     """Return an exponential waiting time, at least 1 ns."""
     if rate <= _ZERO:
@@ -64,7 +75,11 @@ def noise_polarity(
     rate = state.shot_rate * (_ONE + (model.bright_factor - _ONE) * light)
     if place >= rate:
         return -1
-    return wp.where(place < rate * model.shot_on_fraction, 1, 0)
+    share = model.shot_on_fraction
+    if model.shot_by_threshold:
+        on = share * model.threshold_on / state.on
+        share = on / (on + (_ONE - share) * model.threshold_off / state.off)
+    return wp.where(place < rate * share, 1, 0)
 
 
 @wp.func
@@ -117,7 +132,7 @@ def begin_pixel(
     memory_out: Memory,
 ) -> None:
     """Let a pixel begin anew at what it sees now."""
-    value = wp.float64(base[pixel])
+    value = wp.float64(see(model, base[pixel]))
     if memory_out.reference.shape[0] > 0:
         memory_out.reference[pixel] = value
     if memory_out.filtered.shape[0] > 0:

@@ -23,6 +23,7 @@ from neurosim_core.sensors.event_noise_pixel import (
     mean_light,
     measured_polarity,
     noise_polarity,
+    see,
     wait_ns,
 )
 from neurosim_core.sensors.event_scan import LIMIT, PUT, call_up, write_key
@@ -71,6 +72,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     if unknown := terms - {*TERMS, CAUSE}:
         raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
     spread = "spread" in terms
+    lin_log = "lin_log" in terms
     low_pass = "low_pass" in terms
     refractory = "refractory" in terms
     leak = "leak" in terms
@@ -271,6 +273,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             state.off = state.off / model.threshold_off
             state.voltage = before.voltage[pixel]
         state.reference = wp.float64(base[pixel])
+        if wp.static(lin_log):
+            state.reference = wp.float64(see(model, base[pixel]))
         if wp.static(resets):
             state.reference = before.reference[pixel]
         state.up = crossed[pixel][0]
@@ -305,6 +309,13 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 span_ns = wp.float64(stamps[frame + 1] - start_ns)
                 light = wp.float64(sample_before)
                 light_slope = (wp.float64(sample) - light) / span_ns
+                seen = light  # as light, where the pixel sees its logarithm
+                seen_last = wp.float64(sample)
+                seen_slope = light_slope
+                if wp.static(lin_log):
+                    seen = wp.float64(see(model, sample_before))
+                    seen_last = wp.float64(see(model, sample))
+                    seen_slope = (seen_last - seen) / span_ns
                 leaked = _ZERO
                 leak_slope = _ZERO
                 if wp.static(leak):
@@ -332,7 +343,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
 
                 pieces = wp.int32(1)
                 if wp.static(low_pass):
-                    rise = wp.abs(wp.float64(sample) - light)
+                    rise = wp.max(wp.abs(wp.float64(sample) - light), wp.abs(seen_last - seen))
                     pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
                 for piece in range(pieces):
                     signal = Signal()
@@ -341,18 +352,18 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                     busy = wp.bool(True)
                     if wp.static(low_pass):
                         length_ns = signal.end - signal.begin
-                        light_begin = light + light_slope * signal.begin
-                        middle = light_begin + light_slope * length_ns / _TWO
+                        seen_begin = seen + seen_slope * signal.begin
+                        middle = light + light_slope * signal.begin + light_slope * length_ns / _TWO
                         share = (wp.exp(middle) + model.dark_radiance) / (
                             model.white_radiance + model.dark_radiance
                         )
                         signal.tau = _ONE / (model.corner_per_ns * wp.clamp(share, _DARKEST, _ONE))
-                        decay = filtered - light_begin + light_slope * signal.tau
+                        decay = filtered - seen_begin + seen_slope * signal.tau
                         gain = wp.exp(-length_ns / signal.tau) - _ONE
                         signal.start = filtered + leaked + leak_slope * signal.begin
-                        signal.slope = light_slope + leak_slope
+                        signal.slope = seen_slope + leak_slope
                         signal.decay = decay
-                        filtered += light_slope * length_ns + decay * gain
+                        filtered += seen_slope * length_ns + decay * gain
                         signal.last = filtered + leaked + leak_slope * signal.end
                         steepness = signal.slope - decay / signal.tau
                         turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
@@ -362,8 +373,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                         if wp.static(spontaneous):
                             busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
                     elif wp.static(not stochastic):
-                        signal.start = light + leaked
-                        signal.last = wp.float64(sample) + leaked + leak_slope * span_ns
+                        signal.start = seen + leaked
+                        signal.last = seen_last + leaked + leak_slope * span_ns
                         busy = reached(signal.last, quiet) >= 0
                         if wp.static(refractory):
                             busy = busy or state.held_ns >= _ZERO

@@ -187,9 +187,12 @@ _V2E_CLEAN = Preset(
     title="v2e, clean",
     width=346,
     height=260,
-    pixel={"threshold_spread": {"sigma_on": 0.02, "sigma_off": 0.02}},
+    pixel={
+        "threshold_spread": {"sigma_on": 0.02, "sigma_off": 0.02},
+        "lin_log": {"linear_below": 20.0},
+    },
     sources="Hu, Liu, Delbruck (2021), v2e; its code (SensorsINI/v2e, set_dvs_params), option clean:"
-    " thresholds 0.2, mismatch 0.02, nothing else.",
+    " thresholds 0.2, mismatch 0.02, linear below 20 of 255, nothing else.",
 )
 
 _V2E_NOISY = Preset(
@@ -200,13 +203,21 @@ _V2E_NOISY = Preset(
         "threshold_spread": {"sigma_on": 0.05, "sigma_off": 0.05},
         "low_pass": {"cutoff_hz": 30.0, "dark_radiance": round(20 / 255, 4)},
         "leak": {"rate_hz": 0.1, "spread_decades": 0.1},
-        "shot_noise": {"rate_hz": 5.0, "bright_factor": 0.25, "spread_decades": 0.0},
+        "lin_log": {"linear_below": 20.0},
+        # 5 Hz ((0.25 - 1) (DN + 20) / 275 + 1), as a rate at DN 0 and a factor at DN 255
+        "shot_noise": {
+            "rate_hz": round(5.0 * (1.0 - 0.75 * 20 / 275), 4),
+            "bright_factor": round(0.25 / (1.0 - 0.75 * 20 / 275), 5),
+            "spread_decades": 0.0,
+            "by_threshold": True,
+        },
     },
     sources="Hu, Liu, Delbruck (2021), v2e; its code (SensorsINI/v2e, set_dvs_params), option noisy:"
     " thresholds 0.2, mismatch 0.05, 30 Hz at white with 20 of 255 added to the light, leak 0.1 Hz with"
-    " noise_rate_cov_decades 0.1, shot noise 5 Hz falling to a quarter at white, no refractory time (one old"
-    " version has 10 ms). The spread of 0.1 decades is that of the leak alone there, as here; its jitter of"
-    " the leak in time, a tenth, is left out.",
+    " noise_rate_cov_decades 0.1, linear below 20 of 255, shot noise of 5 Hz times nominal over own"
+    " threshold, falling to a quarter at white, no refractory time (one old version has 10 ms). Its grey"
+    " levels are those of linear light here. The spread of 0.1 decades is that of the leak alone there, as"
+    " here; its jitter of the leak in time, a tenth, is left out.",
 )
 
 

@@ -107,7 +107,7 @@ def test_what_is_off_is_not_there(device):
         ("spread", "refractory", "leak", "spontaneous"),
         ("low_pass",),
         ("spread", "refractory", "leak", "spontaneous", "low_pass"),
-        ("leak", "light_leak", "spontaneous", "measured"),
+        ("lin_log", "leak", "light_leak", "spontaneous", "measured"),
     ],
 )
 def test_terms_with_zero_coefficients_change_no_bit(terms, device):
