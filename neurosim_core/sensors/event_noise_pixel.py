@@ -7,7 +7,7 @@ What each term does is described in `event_noise_model`, and a pixel is scanned 
 
 import warp as wp
 
-from neurosim_core.random import random_bits, uniform2
+from neurosim_core.random import normal2, random_bits, uniform2
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
 
 wp.set_module_options({"enable_backward": False})
@@ -25,6 +25,8 @@ class NoisyPixel:
 
     on: wp.float64
     off: wp.float64
+    steady: wp.vec2d  # thresholds ON and OFF without jitter
+    event_count: wp.int32
     reference: wp.float64
     up: wp.int32
     down: wp.int32
@@ -35,6 +37,15 @@ class NoisyPixel:
     shot_rate: wp.float64
     hot_rate: wp.float64
     voltage: wp.float64
+
+
+@wp.func
+def jittered(model: PixelModel, index: wp.int32, state: NoisyPixel) -> NoisyPixel:
+    """Draw the thresholds until the next event."""
+    normal = normal2(random_bits(model.seed, model.jitter_stream, wp.int64(state.event_count), index))
+    state.on = wp.max(state.steady[0] + model.jitter[0] * normal[0], model.jitter_least)
+    state.off = wp.max(state.steady[1] + model.jitter[1] * normal[1], model.jitter_least)
+    return state
 
 
 @wp.func
@@ -77,8 +88,8 @@ def noise_polarity(
         return -1
     share = model.shot_on_fraction
     if model.shot_by_threshold:
-        on = share * model.threshold_on / state.on
-        share = on / (on + (_ONE - share) * model.threshold_off / state.off)
+        on = share * model.threshold_on / state.steady[0]
+        share = on / (on + (_ONE - share) * model.threshold_off / state.steady[1])
     return wp.where(place < rate * share, 1, 0)
 
 
@@ -135,6 +146,8 @@ def begin_pixel(
     value = wp.float64(see(model, base[pixel]))
     if memory_out.reference.shape[0] > 0:
         memory_out.reference[pixel] = value
+    if memory_out.event_count.shape[0] > 0:
+        memory_out.event_count[pixel] = 0
     if memory_out.filtered.shape[0] > 0:
         memory_out.filtered[pixel] = value
     if memory_out.exposure_ns.shape[0] > 0:

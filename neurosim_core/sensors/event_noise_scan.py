@@ -20,6 +20,7 @@ from neurosim_core.sensors.event_noise_pixel import (
     NEVER,
     NoisyPixel,
     draw_noise,
+    jittered,
     mean_light,
     measured_polarity,
     noise_polarity,
@@ -72,6 +73,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     if unknown := terms - {*TERMS, CAUSE}:
         raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
     spread = "spread" in terms
+    jitter = "jitter" in terms
     lin_log = "lin_log" in terms
     low_pass = "low_pass" in terms
     refractory = "refractory" in terms
@@ -81,7 +83,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     spontaneous = "spontaneous" in terms
     stochastic = "stochastic" in terms
     cause = CAUSE in terms
-    resets = refractory or spontaneous
+    resets = refractory or spontaneous or jitter
     value_at = curve_at if low_pass else line_at
     find_crossing = curve_crossing if low_pass else line_crossing
 
@@ -222,6 +224,15 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 if not reset:
                     state.up += polarity
                     state.down += 1 - polarity
+                if wp.static(jitter):
+                    if not reset:
+                        state.reference = level_at(
+                            state.reference, state.up - state.fold, state.down, state.on, state.off
+                        )
+                        state.up = state.fold
+                        state.down = 0
+                    state.event_count += 1
+                    state = jittered(model, pixel, state)
                 if wp.static(refractory):  # noqa: SIM102
                     if model.refractory_ns > _ZERO:
                         state.held_ns = now + model.refractory_ns
@@ -268,6 +279,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         if wp.static(spread):
             state.on = model.thresholds[pixel][0]
             state.off = model.thresholds[pixel][1]
+        state.steady = wp.vec2d(state.on, state.off)
         if wp.static(stochastic):
             state.on = state.on / model.threshold_on
             state.off = state.off / model.threshold_off
@@ -279,6 +291,10 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             state.reference = before.reference[pixel]
         state.up = crossed[pixel][0]
         state.down = crossed[pixel][1]
+        if wp.static(jitter):
+            state.fold = state.up  # levels count from the last one crossed
+            state.event_count = before.event_count[pixel]
+            state = jittered(model, pixel, state)
         state.held_ns = -_ONE
         if wp.static(refractory):
             state.held_ns = before.held_ns[pixel]
@@ -320,15 +336,18 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 leak_slope = _ZERO
                 if wp.static(leak):
                     cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
-                    leak_slope = model.leak[pixel][0] * state.on
+                    leak_slope = model.leak[pixel][0] * state.steady[0]
                     if wp.static(light_leak):
                         cycles += model.leak[pixel][0] * model.leak_growth * exposure_ns
                         brightness = mean_light(model, light, wp.float64(sample))
                         leak_slope *= _ONE + model.leak_growth * brightness
                         exposure_ns += brightness * span_ns
                     whole = wp.floor(cycles)
-                    leaked = (cycles - whole) * state.on
+                    leaked = (cycles - whole) * state.steady[0]
                     if wp.int32(whole) != state.fold:
+                        if wp.static(jitter):  # a cycle is worth a threshold without jitter
+                            state.reference -= wp.float64(wp.int32(whole) - state.fold) * state.steady[0]
+                            state.up = state.up - state.fold + wp.int32(whole)
                         state.fold = wp.int32(whole)
                         quiet = range_of(state)
                 drift = _ZERO
@@ -419,6 +438,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             crossed_out[pixel] = wp.vec2i(state.up, state.down)
             if wp.static(resets):
                 after.reference[pixel] = state.reference
+            if wp.static(jitter):
+                after.event_count[pixel] = state.event_count
             if wp.static(low_pass):
                 after.filtered[pixel] = filtered
             if wp.static(light_leak):
