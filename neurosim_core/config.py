@@ -402,7 +402,8 @@ def _beside(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     for name in bodies if isinstance(bodies, Mapping) else ():
         places += [("bodies", name, "shape"), ("bodies", name, "surface")]
     sensors = raw.get("sensors")
-    places += [("sensors", name, "lens") for name in (sensors if isinstance(sensors, Mapping) else ())]
+    for name in sensors if isinstance(sensors, Mapping) else ():
+        places += [("sensors", name, "lens"), ("sensors", name, "pixel", "measured_noise")]
     for place in places:
         group: Any = raw
         for key in place:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,15 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="time that light takes from one level to the other, linear in its logarithm [s] (default: 0)",
     )
     parser.add_argument("-o", "--out", type=Path, default=Path("my_camera.yaml"), metavar="YAML")
+    parser.add_argument(
+        "--also",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("FILE", "LUX"),
+        help="the same still surface in other light; may be repeated. Rates of all pixels by light go to a "
+        ".npz beside the settings, which take noise from it",
+    )
     parser.add_argument("--size", metavar="WxH", help="of the sensor, where the file does not say it")
     parser.add_argument("--sensor", default="", metavar="NAME", help="event camera, of files with several")
     parser.add_argument("--repeats", type=int, default=8, help="simulations for the errors (default: 8)")
@@ -57,8 +67,8 @@ def _fit(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--contrast is bright over dark light, above 1, got {arguments.contrast}")
     if not (arguments.lux >= 0.0 and arguments.rise >= 0.0):
         raise ValueError(f"--lux and --rise must be >= 0, got {arguments.lux} and {arguments.rise}")
-    picture = arguments.out.with_suffix(".png")
-    for path in (arguments.out, picture):
+    picture, rates = (arguments.out.with_suffix(suffix) for suffix in (".png", ".npz"))
+    for path in (arguments.out, picture, *([rates] if arguments.also else [])):
         if path.exists() and not arguments.overwrite:
             raise FileExistsError(f"{path} is already there: add --overwrite, or name another file with -o")
     console = Console()
@@ -74,11 +84,18 @@ def _fit(arguments: argparse.Namespace) -> int:
             rise_s=arguments.rise,
         )
         fit = fit_sensor(stimulus, repeats=arguments.repeats, progress=status.update)
+        if arguments.also:
+            others = [(float(lux), _read(Path(file), arguments)[0]) for file, lux in arguments.also]
+            write_noise_table(rates, [(arguments.lux, still), *others], reader.width, reader.height)
+            own = ("shot_noise.", "leak.", "hot_pixels.")  # what pixels do at each light holds all of it
+            kept = {key: value for key, value in fit.settings.items() if not key.startswith(own)}
+            fit = replace(fit, settings=kept | {"measured_noise.file": rates.name})
     print_fit(fit, console)
     names = [path.name for path in (arguments.still, arguments.steps) if path is not None]
     arguments.out.write_text(fit_yaml(fit, stimulus.width, stimulus.height, arguments.lux, names), "utf-8")
     draw_fit(fit, picture)
-    console.print(f"{arguments.out}\n{picture}", markup=False, highlight=False, soft_wrap=True)
+    made = "\n".join(str(path) for path in (arguments.out, picture, *([rates] if arguments.also else [])))
+    console.print(made, markup=False, highlight=False, soft_wrap=True)
     return 0
 
 
@@ -90,6 +107,24 @@ def _read(path: Path, arguments: argparse.Namespace) -> tuple[EventArrays, Event
     size = None if arguments.size is None else read_size(arguments.size)
     with closing(open_events(path, size=size, sensor=arguments.sensor)) as reader:
         return join_events(list(reader.blocks())), reader
+
+
+def write_noise_table(
+    path: Path, recordings: list[tuple[float, EventArrays]], width: int, height: int
+) -> None:
+    """Write the rates of all pixels in several lights [lux], as `MeasuredNoiseConfig.file` has them."""
+    import numpy as np
+
+    from neurosim_core.fit.recordings import sort_still
+
+    by_light = sorted(recordings, key=lambda one: one[0])
+    stills = [sort_still(events, width, height) for _, events in by_light]
+    np.savez_compressed(
+        path,
+        lux=np.array([lux for lux, _ in by_light]),
+        on_hz=np.array([still.on / still.span_s for still in stills], dtype=np.float32),
+        off_hz=np.array([still.off / still.span_s for still in stills], dtype=np.float32),
+    )
 
 
 def print_fit(fit: SensorFit, console: Console) -> None:

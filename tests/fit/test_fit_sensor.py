@@ -147,6 +147,13 @@ def test_the_command_leaves_settings_and_a_picture(recordings, tmp_path, capsys,
     for part in ("300 lux", "+-", "steps.raw"):
         assert part in Path("cam.yaml").read_text()
     assert Path("cam.png").stat().st_size > 10_000
+    also = ["--also", "still.raw", "3000", "--repeats", "2", "-o", "both.yaml"]
+    assert cli.main(["fit-sensor", "still.raw", "--lux", "0.1", *also]) == 0
+    pixel = load_config("both.yaml").sensors["events"].pixel
+    assert (pixel.shot_noise, pixel.leak, pixel.hot_pixels) == (None, None, None)
+    with np.load(pixel.measured_noise.file) as table:
+        assert table["lux"].tolist() == [0.1, 3000.0]
+        assert table["on_hz"].mean() == pytest.approx(recordings[0].polarity.sum() / 30 / 64 / 48, rel=1e-3)
     assert cli.main([*command, "-o", "cam.yaml"]) == 1
     assert "already there" in capsys.readouterr().err
     assert cli.main(["fit-sensor", "still.raw", "--lux", "300", "--contrast", "1", "-o", "x.yaml"]) == 1
