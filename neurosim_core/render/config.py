@@ -63,7 +63,7 @@ class RenderConfig(Settings):
     scene. Event cameras do not use it."""
     dark_floor: float = Field(default=1.0e-3, gt=0.0)
     """Radiance added before the logarithm that event cameras see: what a black surface gives."""
-    samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = 1
+    samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = "adaptive"
     """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray
     finds the surfaces around a pixel, and 16 points of the pixel tell how much of it each covers; 8 rays
     where many small surfaces meet and for moving bodies. It takes 2 to 4 times as long as one ray, and 7
