@@ -42,6 +42,7 @@ from neurosim_core.render.coverage import (
     RAY_WIDTH,
     SAMPLE_COUNT,
     SHARPNESS,
+    footprint_width,
     ray_point,
 )
 from neurosim_core.render.embree import packet_caster
@@ -213,9 +214,8 @@ def _pixel_kernel(outputs: tuple[str, ...], terms: RenderTerms) -> wp.Kernel:
             hit.u = wp.clamp(met[entry][1], 0.0, 1.0)
             hit.v = wp.clamp(met[entry][2], 0.0, 1.0 - hit.u)
             hit.normal = normal[entry]
-            light = radiance_of(
-                scene, bodies, instant, -1, q, ray[entry], origin, SHARPNESS * spread_rad, hit
-            )
+            width_rad = footprint_width(number[entry]) * spread_rad
+            light = radiance_of(scene, bodies, instant, -1, q, ray[entry], origin, width_rad, hit)
             total += number[entry] * light
             whole += number[entry]
         if count < 0:

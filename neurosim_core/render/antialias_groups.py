@@ -26,6 +26,7 @@ from neurosim_core.render.coverage import (
     RAY_WIDTH,
     SAMPLE_COUNT,
     SHARPNESS,
+    footprint_width,
     ray_point,
 )
 from neurosim_core.render.outputs import RenderOutputs, radiance_writer, requested_outputs
@@ -292,7 +293,7 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> GroupKernels:
                         q,
                         wp.normalize(toward),
                         origin,
-                        SHARPNESS * spread_rad,
+                        footprint_width(met[1]) * spread_rad,
                         hit,
                     )
                     _store_pair(covered[5], pair, met[1] * light)
