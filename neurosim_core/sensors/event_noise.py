@@ -270,11 +270,13 @@ class PixelNoise:
         model.threshold_on = config.threshold_on
         model.threshold_off = config.threshold_off
         model.white_radiance = config.white_radiance
+        model.log_white = math.log(config.white_radiance)
         model.refractory_ns = 1e9 * config.refractory_s
         if (jitter := config.threshold_jitter) is not None:
             model.jitter, model.jitter_least = wp.vec2d(jitter.sigma_on, jitter.sigma_off), jitter.minimum
         if config.lin_log is not None and self._has("lin_log"):
             model.linear_below = config.white_radiance * config.lin_log.linear_below / 255.0
+            model.linear_level = math.log(model.linear_below)
             model.linear_slope = math.log(config.lin_log.linear_below)
         if config.low_pass is not None:
             model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz

@@ -61,10 +61,12 @@ class PixelModel:
     threshold_on: wp.float64
     threshold_off: wp.float64
     white_radiance: wp.float64
+    log_white: wp.float64
     jitter: wp.vec2d  # standard deviations ON, OFF
     jitter_least: wp.float64
     refractory_ns: wp.float64
     linear_below: wp.float64  # radiance; 0: logarithmic everywhere
+    linear_level: wp.float64  # its logarithm
     linear_slope: wp.float64  # log radiance seen over that light
     corner_per_ns: wp.float64  # 1 / tau at white
     dark_radiance: wp.float64

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value"
+# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var"
 """One event pixel that is not ideal as it begins, and its noise events: when they come, of which polarity.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
@@ -55,7 +55,7 @@ def see(model: PixelModel, log_radiance: wp.float32) -> wp.float32:
         radiance = wp.exp(wp.float64(log_radiance))
         if radiance < model.linear_below:
             rise = model.linear_slope * (radiance / model.linear_below - _ONE)
-            return wp.float32(wp.log(model.linear_below) + rise)
+            return wp.float32(model.linear_level + rise)
     return log_radiance
 
 
@@ -123,14 +123,21 @@ def measured_polarity(
 
 
 @wp.func
-def mean_light(model: PixelModel, first: wp.float64, last: wp.float64) -> wp.float64:
-    """Return the mean of light, in units of white, whose logarithm goes linearly from first to last."""
-    white = wp.log(model.white_radiance)
-    begin = wp.min(first - white, _GLARE)
-    rise = wp.min(last - white, _GLARE) - begin
+def light_of(model: PixelModel, log_radiance: wp.float32) -> wp.float64:
+    """Return light in units of white, at most 1000."""
+    return wp.exp(wp.min(wp.float64(log_radiance) - model.log_white, _GLARE))
+
+
+@wp.func
+def mean_light(
+    model: PixelModel, first: wp.float32, last: wp.float32, begin: wp.float64, end: wp.float64
+) -> wp.float64:
+    """Return the mean of light whose logarithm goes linearly from first to last, from what it is there."""
+    rise = wp.min(wp.float64(last) - model.log_white, _GLARE)
+    rise -= wp.min(wp.float64(first) - model.log_white, _GLARE)
     if wp.abs(rise) < wp.float64(1e-6):
-        return wp.exp(begin) * (_ONE + wp.float64(0.5) * rise)
-    return (wp.exp(begin + rise) - wp.exp(begin)) / rise
+        return wp.float64(0.5) * (begin + end)
+    return (end - begin) / rise
 
 
 @wp.func

@@ -21,6 +21,7 @@ from neurosim_core.sensors.event_noise_pixel import (
     NoisyPixel,
     draw_noise,
     jittered,
+    light_of,
     mean_light,
     measured_polarity,
     noise_polarity,
@@ -310,6 +311,12 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         if wp.static(light_leak):
             exposure_ns = before.exposure_ns[pixel]
         sample_before = last[pixel]
+        seen_last = wp.float64(sample_before)
+        if wp.static(lin_log):
+            seen_last = wp.float64(see(model, sample_before))
+        end_light = _ZERO
+        if wp.static(light_leak):
+            end_light = light_of(model, sample_before)
         dn_end = _ZERO
         if wp.static(stochastic):
             dn_end = _digital(model, sample_before)
@@ -325,13 +332,11 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 span_ns = wp.float64(stamps[frame + 1] - start_ns)
                 light = wp.float64(sample_before)
                 light_slope = (wp.float64(sample) - light) / span_ns
-                seen = light  # as light, where the pixel sees its logarithm
+                seen = seen_last  # as light, where the pixel sees its logarithm
                 seen_last = wp.float64(sample)
-                seen_slope = light_slope
                 if wp.static(lin_log):
-                    seen = wp.float64(see(model, sample_before))
                     seen_last = wp.float64(see(model, sample))
-                    seen_slope = (seen_last - seen) / span_ns
+                seen_slope = (seen_last - seen) / span_ns
                 leaked = _ZERO
                 leak_slope = _ZERO
                 if wp.static(leak):
@@ -339,7 +344,9 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                     leak_slope = model.leak[pixel][0] * state.steady[0]
                     if wp.static(light_leak):
                         cycles += model.leak[pixel][0] * model.leak_growth * exposure_ns
-                        brightness = mean_light(model, light, wp.float64(sample))
+                        begin_light = end_light
+                        end_light = light_of(model, sample)
+                        brightness = mean_light(model, sample_before, sample, begin_light, end_light)
                         leak_slope *= _ONE + model.leak_growth * brightness
                         exposure_ns += brightness * span_ns
                     whole = wp.floor(cycles)
