@@ -31,6 +31,17 @@ class ThresholdSpreadConfig(Settings):
     """Smaller thresholds are raised to this one."""
 
 
+class ThresholdJitterConfig(Settings):
+    """Thresholds that are drawn anew after each event, around those of the pixel, as in ESIM."""
+
+    sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold upwards, in log radiance."""
+    sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
+    """Standard deviation of the threshold downwards, in log radiance."""
+    minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
+    """Smaller thresholds are raised to this one."""
+
+
 class LinLogConfig(Settings):
     """A logarithm that becomes a line in the dark, as in v2e, where 8-bit pictures have no more steps.
 
@@ -184,6 +195,13 @@ class ReadoutConfig(Settings):
     """Events a second that can be read [Hz]."""
     row_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """`row`: time to reach a row, before its events are read [s]."""
+    handshake: bool = False
+    """Whether a pixel waits in reset until its event is read: what it would have fired meanwhile is lost, and
+    counted in `Events.dropped_count`."""
+    latency_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Time from the readout of an event to its stamp, on average [s]."""
+    jitter_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Standard deviation of that time, event by event; no stamp is before the readout [s]."""
     queue_length: Annotated[int, Field(ge=1, le=1 << 26)] = 65_536
     """Most events that wait; those that come while so many do are lost, and counted in
     `Events.dropped_count`. To read them must take 60 s at most."""
@@ -240,6 +258,9 @@ class EventCameraConfig(Settings):
     threshold_spread: ThresholdSpreadConfig | None = None
     """Thresholds that differ from pixel to pixel, and stay: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01},
     standard deviations in log radiance; null: none."""
+    threshold_jitter: ThresholdJitterConfig | None = None
+    """Thresholds drawn anew after each event: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01}; null: they
+    stay."""
     lin_log: LinLogConfig | None = None
     """Linear, not logarithmic, in the dark, as v2e: {linear_below: 20}; null: logarithmic everywhere."""
     low_pass: LowPassConfig | None = None
@@ -279,7 +300,7 @@ class EventCameraConfig(Settings):
     @model_validator(mode="after")
     def _law_is_one(self) -> EventCameraConfig:
         if self.stochastic is not None:
-            for name in ("lin_log", "low_pass", "leak", "shot_noise", "measured_noise"):
+            for name in ("threshold_jitter", "lin_log", "low_pass", "leak", "shot_noise", "measured_noise"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} must be null where stochastic is given, which has its own")
         if self.shot_noise is not None and self.measured_noise is not None:

@@ -133,7 +133,7 @@ def _begin(
     begin_pixel(model, phase_stream, random_phase, base, pixel, memory_out)
 
 
-def _mix(seed: int, stamp_ns: int) -> int:
+def mix_seed(seed: int, stamp_ns: int) -> int:
     """Return a seed of 64 bits that differs for each stamp (finaliser of SplitMix64, Steele et al. 2014)."""
     mixed = (seed + 0x9E3779B97F4A7C15 * (stamp_ns + 1)) % 2**64
     mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
@@ -223,7 +223,7 @@ class PixelNoise:
     def set_reset(self, stamp_ns: int) -> None:
         """Let the noise that follows be that after a reset at a stamp."""
         self._reset_ns = stamp_ns
-        self._model.seed = _mix(self._seed, stamp_ns)
+        self._model.seed = mix_seed(self._seed, stamp_ns)
 
     @property
     def model(self) -> Any:
@@ -254,7 +254,8 @@ class PixelNoise:
 
     def _make_memory(self) -> Any:
         memory = Memory()
-        memory.reference = self._array(wp.float64, self._has("refractory", "spontaneous"))
+        memory.reference = self._array(wp.float64, self._has("refractory", "spontaneous", "jitter"))
+        memory.event_count = self._array(wp.int32, self._has("jitter"))
         memory.filtered = self._array(wp.float64, self._has("low_pass"))
         memory.exposure_ns = self._array(wp.float64, self._has("light_leak"))
         memory.held_ns = self._array(wp.float64, self._has("refractory"))
@@ -269,9 +270,13 @@ class PixelNoise:
         model.threshold_on = config.threshold_on
         model.threshold_off = config.threshold_off
         model.white_radiance = config.white_radiance
+        model.log_white = math.log(config.white_radiance)
         model.refractory_ns = 1e9 * config.refractory_s
+        if (jitter := config.threshold_jitter) is not None:
+            model.jitter, model.jitter_least = wp.vec2d(jitter.sigma_on, jitter.sigma_off), jitter.minimum
         if config.lin_log is not None and self._has("lin_log"):
             model.linear_below = config.white_radiance * config.lin_log.linear_below / 255.0
+            model.linear_level = math.log(model.linear_below)
             model.linear_slope = math.log(config.lin_log.linear_below)
         if config.low_pass is not None:
             model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz
@@ -293,6 +298,7 @@ class PixelNoise:
         model.spontaneous_stream = self._stream("noise")
         model.step_stream = self._stream("voltage")
         model.touch_stream = self._stream("passage")
+        model.jitter_stream = self._stream("jitter")
         model.thresholds = self._draw_thresholds()
         model.leak = self._draw_leak()
         model.rates = self._draw_rates(model)

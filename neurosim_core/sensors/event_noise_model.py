@@ -9,6 +9,9 @@ sees is linear in time between frames.
 
 **Mismatch** (spread). Thresholds of each pixel are normal numbers, drawn once, at least `minimum`.
 
+**Jitter** (jitter). After each event the thresholds of a pixel are drawn anew, normal around its own ones,
+and count from the level crossed.
+
 **Leak** (leak). The reference falls by rate times ON threshold, so a still pixel fires ON events at `rate`. A
 pixel begins at a random phase, as if it had been on for long. Where light leaks through the switch (term
 light_leak), the rate grows linearly with it; what has leaked is integrated over each frame.
@@ -40,7 +43,7 @@ from neurosim_core.sensors.event_config import EventCameraConfig
 wp.set_module_options({"enable_backward": False})
 
 TERMS = (
-    "spread", "lin_log", "low_pass", "refractory", "leak", "light_leak", "spontaneous", "measured",
+    "spread", "jitter", "lin_log", "low_pass", "refractory", "leak", "light_leak", "spontaneous", "measured",
     "stochastic",
 )  # fmt: skip
 """All terms that may be compiled in."""
@@ -58,8 +61,12 @@ class PixelModel:
     threshold_on: wp.float64
     threshold_off: wp.float64
     white_radiance: wp.float64
+    log_white: wp.float64
+    jitter: wp.vec2d  # standard deviations ON, OFF
+    jitter_least: wp.float64
     refractory_ns: wp.float64
     linear_below: wp.float64  # radiance; 0: logarithmic everywhere
+    linear_level: wp.float64  # its logarithm
     linear_slope: wp.float64  # log radiance seen over that light
     corner_per_ns: wp.float64  # 1 / tau at white
     dark_radiance: wp.float64
@@ -78,6 +85,7 @@ class PixelModel:
     spontaneous_stream: wp.uint32
     step_stream: wp.uint32
     touch_stream: wp.uint32
+    jitter_stream: wp.uint32
     thresholds: wp.array[wp.vec2d]  # ON, OFF
     leak: wp.array[wp.vec2d]  # cycles per ns, phase in cycles
     rates: wp.array[wp.vec2d]  # shot noise in the dark, or at most, and hot pixel, per ns
@@ -90,7 +98,9 @@ class Memory:
     """What pixels remember beside their last sample and the levels they crossed, shape [pixel]."""
 
     reference: wp.array[wp.float64]
-    """What `base` is to an ideal pixel; changes when a pixel is reset (refractory, spontaneous)."""
+    """What `base` is to an ideal pixel; changes at resets (refractory, spontaneous) and events (jitter)."""
+    event_count: wp.array[wp.int32]
+    """Events since the reset, which number the draws of thresholds."""
     filtered: wp.array[wp.float64]
     """Output of the photoreceptor."""
     exposure_ns: wp.array[wp.float64]
@@ -109,6 +119,7 @@ def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
     """Return the terms that a configuration asks for; none: the pixels are ideal."""
     present = {
         "spread": config.threshold_spread is not None,
+        "jitter": config.threshold_jitter is not None,
         "lin_log": config.lin_log is not None,
         "low_pass": config.low_pass is not None,
         "refractory": config.refractory_s > 0.0,

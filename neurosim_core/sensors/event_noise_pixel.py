@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,arg-type,operator,no-any-return,no-untyped-call,call-overload,assignment"
-# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value"
+# mypy: disable-error-code="attr-defined,misc,untyped-decorator,return-value,type-var"
 """One event pixel that is not ideal as it begins, and its noise events: when they come, of which polarity.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
@@ -7,7 +7,7 @@ What each term does is described in `event_noise_model`, and a pixel is scanned 
 
 import warp as wp
 
-from neurosim_core.random import random_bits, uniform2
+from neurosim_core.random import normal2, random_bits, uniform2
 from neurosim_core.sensors.event_noise_model import Memory, PixelModel
 
 wp.set_module_options({"enable_backward": False})
@@ -25,6 +25,8 @@ class NoisyPixel:
 
     on: wp.float64
     off: wp.float64
+    steady: wp.vec2d  # thresholds ON and OFF without jitter
+    event_count: wp.int32
     reference: wp.float64
     up: wp.int32
     down: wp.int32
@@ -38,13 +40,22 @@ class NoisyPixel:
 
 
 @wp.func
+def jittered(model: PixelModel, index: wp.int32, state: NoisyPixel) -> NoisyPixel:
+    """Draw the thresholds until the next event."""
+    normal = normal2(random_bits(model.seed, model.jitter_stream, wp.int64(state.event_count), index))
+    state.on = wp.max(state.steady[0] + model.jitter[0] * normal[0], model.jitter_least)
+    state.off = wp.max(state.steady[1] + model.jitter[1] * normal[1], model.jitter_least)
+    return state
+
+
+@wp.func
 def see(model: PixelModel, log_radiance: wp.float32) -> wp.float32:
     """Return what a pixel sees of log radiance: a line below some light, with the same value there."""
     if model.linear_below > _ZERO:
         radiance = wp.exp(wp.float64(log_radiance))
         if radiance < model.linear_below:
             rise = model.linear_slope * (radiance / model.linear_below - _ONE)
-            return wp.float32(wp.log(model.linear_below) + rise)
+            return wp.float32(model.linear_level + rise)
     return log_radiance
 
 
@@ -77,8 +88,8 @@ def noise_polarity(
         return -1
     share = model.shot_on_fraction
     if model.shot_by_threshold:
-        on = share * model.threshold_on / state.on
-        share = on / (on + (_ONE - share) * model.threshold_off / state.off)
+        on = share * model.threshold_on / state.steady[0]
+        share = on / (on + (_ONE - share) * model.threshold_off / state.steady[1])
     return wp.where(place < rate * share, 1, 0)
 
 
@@ -112,14 +123,21 @@ def measured_polarity(
 
 
 @wp.func
-def mean_light(model: PixelModel, first: wp.float64, last: wp.float64) -> wp.float64:
-    """Return the mean of light, in units of white, whose logarithm goes linearly from first to last."""
-    white = wp.log(model.white_radiance)
-    begin = wp.min(first - white, _GLARE)
-    rise = wp.min(last - white, _GLARE) - begin
+def light_of(model: PixelModel, log_radiance: wp.float32) -> wp.float64:
+    """Return light in units of white, at most 1000."""
+    return wp.exp(wp.min(wp.float64(log_radiance) - model.log_white, _GLARE))
+
+
+@wp.func
+def mean_light(
+    model: PixelModel, first: wp.float32, last: wp.float32, begin: wp.float64, end: wp.float64
+) -> wp.float64:
+    """Return the mean of light whose logarithm goes linearly from first to last, from what it is there."""
+    rise = wp.min(wp.float64(last) - model.log_white, _GLARE)
+    rise -= wp.min(wp.float64(first) - model.log_white, _GLARE)
     if wp.abs(rise) < wp.float64(1e-6):
-        return wp.exp(begin) * (_ONE + wp.float64(0.5) * rise)
-    return (wp.exp(begin + rise) - wp.exp(begin)) / rise
+        return wp.float64(0.5) * (begin + end)
+    return (end - begin) / rise
 
 
 @wp.func
@@ -135,6 +153,8 @@ def begin_pixel(
     value = wp.float64(see(model, base[pixel]))
     if memory_out.reference.shape[0] > 0:
         memory_out.reference[pixel] = value
+    if memory_out.event_count.shape[0] > 0:
+        memory_out.event_count[pixel] = 0
     if memory_out.filtered.shape[0] > 0:
         memory_out.filtered[pixel] = value
     if memory_out.exposure_ns.shape[0] > 0:

@@ -20,6 +20,8 @@ from neurosim_core.sensors.event_noise_pixel import (
     NEVER,
     NoisyPixel,
     draw_noise,
+    jittered,
+    light_of,
     mean_light,
     measured_polarity,
     noise_polarity,
@@ -72,6 +74,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     if unknown := terms - {*TERMS, CAUSE}:
         raise ValueError(f"unknown terms {sorted(unknown)}, known: {', '.join(TERMS)}")
     spread = "spread" in terms
+    jitter = "jitter" in terms
     lin_log = "lin_log" in terms
     low_pass = "low_pass" in terms
     refractory = "refractory" in terms
@@ -81,7 +84,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     spontaneous = "spontaneous" in terms
     stochastic = "stochastic" in terms
     cause = CAUSE in terms
-    resets = refractory or spontaneous
+    resets = refractory or spontaneous or jitter
     value_at = curve_at if low_pass else line_at
     find_crossing = curve_crossing if low_pass else line_crossing
 
@@ -222,6 +225,15 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 if not reset:
                     state.up += polarity
                     state.down += 1 - polarity
+                if wp.static(jitter):
+                    if not reset:
+                        state.reference = level_at(
+                            state.reference, state.up - state.fold, state.down, state.on, state.off
+                        )
+                        state.up = state.fold
+                        state.down = 0
+                    state.event_count += 1
+                    state = jittered(model, pixel, state)
                 if wp.static(refractory):  # noqa: SIM102
                     if model.refractory_ns > _ZERO:
                         state.held_ns = now + model.refractory_ns
@@ -268,6 +280,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         if wp.static(spread):
             state.on = model.thresholds[pixel][0]
             state.off = model.thresholds[pixel][1]
+        state.steady = wp.vec2d(state.on, state.off)
         if wp.static(stochastic):
             state.on = state.on / model.threshold_on
             state.off = state.off / model.threshold_off
@@ -279,6 +292,10 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             state.reference = before.reference[pixel]
         state.up = crossed[pixel][0]
         state.down = crossed[pixel][1]
+        if wp.static(jitter):
+            state.fold = state.up  # levels count from the last one crossed
+            state.event_count = before.event_count[pixel]
+            state = jittered(model, pixel, state)
         state.held_ns = -_ONE
         if wp.static(refractory):
             state.held_ns = before.held_ns[pixel]
@@ -294,6 +311,12 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         if wp.static(light_leak):
             exposure_ns = before.exposure_ns[pixel]
         sample_before = last[pixel]
+        seen_last = wp.float64(sample_before)
+        if wp.static(lin_log):
+            seen_last = wp.float64(see(model, sample_before))
+        end_light = _ZERO
+        if wp.static(light_leak):
+            end_light = light_of(model, sample_before)
         dn_end = _ZERO
         if wp.static(stochastic):
             dn_end = _digital(model, sample_before)
@@ -309,26 +332,29 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 span_ns = wp.float64(stamps[frame + 1] - start_ns)
                 light = wp.float64(sample_before)
                 light_slope = (wp.float64(sample) - light) / span_ns
-                seen = light  # as light, where the pixel sees its logarithm
+                seen = seen_last  # as light, where the pixel sees its logarithm
                 seen_last = wp.float64(sample)
-                seen_slope = light_slope
                 if wp.static(lin_log):
-                    seen = wp.float64(see(model, sample_before))
                     seen_last = wp.float64(see(model, sample))
-                    seen_slope = (seen_last - seen) / span_ns
+                seen_slope = (seen_last - seen) / span_ns
                 leaked = _ZERO
                 leak_slope = _ZERO
                 if wp.static(leak):
                     cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
-                    leak_slope = model.leak[pixel][0] * state.on
+                    leak_slope = model.leak[pixel][0] * state.steady[0]
                     if wp.static(light_leak):
                         cycles += model.leak[pixel][0] * model.leak_growth * exposure_ns
-                        brightness = mean_light(model, light, wp.float64(sample))
+                        begin_light = end_light
+                        end_light = light_of(model, sample)
+                        brightness = mean_light(model, sample_before, sample, begin_light, end_light)
                         leak_slope *= _ONE + model.leak_growth * brightness
                         exposure_ns += brightness * span_ns
                     whole = wp.floor(cycles)
-                    leaked = (cycles - whole) * state.on
+                    leaked = (cycles - whole) * state.steady[0]
                     if wp.int32(whole) != state.fold:
+                        if wp.static(jitter):  # a cycle is worth a threshold without jitter
+                            state.reference -= wp.float64(wp.int32(whole) - state.fold) * state.steady[0]
+                            state.up = state.up - state.fold + wp.int32(whole)
                         state.fold = wp.int32(whole)
                         quiet = range_of(state)
                 drift = _ZERO
@@ -419,6 +445,8 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
             crossed_out[pixel] = wp.vec2i(state.up, state.down)
             if wp.static(resets):
                 after.reference[pixel] = state.reference
+            if wp.static(jitter):
+                after.event_count[pixel] = state.event_count
             if wp.static(low_pass):
                 after.filtered[pixel] = filtered
             if wp.static(light_leak):

@@ -88,7 +88,7 @@ _DVS128 = Preset(
         "threshold_spread": {"sigma_on": 0.021, "sigma_off": 0.021},
         "low_pass": {"cutoff_hz": 3000.0},
         "leak": {"rate_hz": 0.05},
-        "readout": {"kind": "event", "bandwidth_hz": 1e6},
+        "readout": {"kind": "event", "bandwidth_hz": 1e6, "handshake": True},
     },
     sources="Gallego et al. (2022), Event-based vision: a survey, table 1: smallest contrast 17 %, 1 Meps,"
     " 0.05 ON events / s in a still scene. Lichtsteiner, Posch, Delbruck (2008): mismatch 2.1 % contrast, 3"
@@ -105,7 +105,7 @@ _DAVIS240C = Preset(
         "threshold_off": _contrast(0.11),
         "threshold_spread": {"sigma_on": 0.035, "sigma_off": 0.035},
         "leak": {"rate_hz": 0.1},
-        "readout": {"kind": "event", "bandwidth_hz": 12e6},
+        "readout": {"kind": "event", "bandwidth_hz": 12e6, "handshake": True},
     },
     sources="Brandli et al. (2014), A 240x180 130 dB 3 us latency global shutter spatiotemporal vision"
     " sensor: contrast threshold 11 %, contrast matching 3.5 %. Gallego et al. (2022), table 1: 12 Meps,"
@@ -128,7 +128,7 @@ _DAVIS346 = Preset(
                 {"lux": 161.0, "on_hz": 0.0, "off_hz": 0.0},
             ]
         },
-        "readout": {"kind": "event", "bandwidth_hz": 12e6},
+        "readout": {"kind": "event", "bandwidth_hz": 12e6, "handshake": True},
     },
     noise=(
         NoiseFigure(0.1, "rate", 10.0, 1.0),
@@ -151,7 +151,7 @@ _GEN3 = Preset(
         "threshold_on": _contrast(0.12),
         "threshold_off": _contrast(0.12),
         **_JOUBERT,
-        "readout": {"kind": "row", "bandwidth_hz": 66e6},
+        "readout": {"kind": "row", "bandwidth_hz": 66e6, "row_s": 0.24e-6, "handshake": True},
     },
     noise=_JOUBERT_FIGURES,
     sources="Gallego et al. (2022), table 1: smallest contrast 12 %, 66 Meps, 0.1 ON events / s. Rows are"
@@ -166,7 +166,7 @@ _GEN4 = Preset(
         "threshold_on": _contrast(0.11),
         "threshold_off": _contrast(0.11),
         **_JOUBERT,
-        "readout": {"kind": "row", "bandwidth_hz": 1.066e9},
+        "readout": {"kind": "row", "bandwidth_hz": 1.066e9, "handshake": True},
     },
     noise=_JOUBERT_FIGURES,
     sources="Gallego et al. (2022), table 1: smallest contrast 11 %, 1066 Meps, 0.1 ON events / s. Finateu"

@@ -164,6 +164,31 @@ def test_thresholds_are_normal_and_stay(device):
         assert abs(np.corrcoef(measured[0], first_event_s(other, 128**2, 128))[0, 1]) < 4.9 / 128
 
 
+def test_thresholds_that_are_drawn_for_each_event(device):
+    """On a ramp the intervals of a pixel are independent normal numbers over the slope, up and down."""
+    jitter = {"sigma_on": 0.02, "sigma_off": 0.01, "minimum": 0.05}
+    for sign, mean, sigma in ((1.0, 0.2, 0.02), (-1.0, 0.15, 0.01)):
+        camera = make_camera(40, 30, device, threshold_jitter=jitter, threshold_off=0.15)
+        frames = np.stack([np.zeros((30, 40)), np.full((30, 40), sign * 20.0)])
+        found = feed(camera, frames, [0, 20 * S])  # 1 / s
+        steps = 1e-6 * intervals_us(found, 40)
+        assert len(steps) > 100_000
+        worst = stats.kstest(steps, stats.norm(mean, sigma).cdf).statistic  # ends are cut off: 1 of 100
+        assert worst < 0.01 + stats.kstwobign.isf(ALARM) / math.sqrt(len(steps))
+        mine = np.diff(of_pixel(found, 7, 5).t)
+        assert abs(np.corrcoef(mine[1:], mine[:-1])[0, 1]) < 5.0 / math.sqrt(len(mine))
+
+
+def test_jitter_leaks_as_thresholds_without(device):
+    """The leak is that of the own threshold: intervals have its mean, and the spread of the jitter."""
+    jitter = {"sigma_on": 0.02, "sigma_off": 0.02, "minimum": 0.05}
+    leak = {"rate_hz": 2.0, "spread_decades": 0.0}
+    found = still(make_camera(40, 30, device, threshold_jitter=jitter, leak=leak), 0.0, [0, 7 * S, 40 * S])
+    steps = 1e-6 * intervals_us(found, 40)
+    assert steps.mean() == pytest.approx(0.5, rel=0.003)
+    assert steps.std() == pytest.approx(0.05, rel=0.03)
+
+
 def test_thresholds_are_clipped_to_their_minimum(device):
     """With a deviation of half the mean, a normal share of Phi((0.05 - 0.2) / 0.1) lies at the minimum."""
     spread = {"sigma_on": 0.1, "sigma_off": 0.0, "minimum": 0.05}
@@ -643,7 +668,17 @@ def test_voltmeter_random_phase(device):
 
 @pytest.mark.parametrize(
     "config",
-    [NOISY, {**NOISY, "low_pass": {"cutoff_hz": 80.0}}, {"preset": "voltmeter_dvs240", "refractory_s": 1e-3}],
+    [
+        NOISY,
+        {**NOISY, "low_pass": {"cutoff_hz": 80.0}},
+        {"preset": "voltmeter_dvs240", "refractory_s": 1e-3},
+        {
+            "threshold_jitter": {},
+            "lin_log": {"linear_below": 60.0},
+            "leak": {"rate_hz": 500.0, "bright_factor": 3.0},
+            "measured_noise": {"levels": [{"lux": 500.0, "on_hz": 90.0, "off_hz": 40.0}]},
+        },
+    ],
 )
 def test_split_into_calls_does_not_change_a_bit(config, device):
     """One stack, single frames, and stacks under way together: the same packets."""
