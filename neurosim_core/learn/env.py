@@ -331,6 +331,7 @@ def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
     camera = {
         "kind": "event_camera",
         "lens": dict(task.camera),
+        "mount": dict(task.mount),
         "sampling_rate_hz": rate_hz,
         "packet_rate_hz": rate_hz,
         "pixel": {"threshold_on": task.threshold, "threshold_off": task.threshold},

@@ -148,6 +148,7 @@ def pilot_settings(card: Mapping[str, Any]) -> dict[str, Any]:
             CAMERA: {
                 "kind": "event_camera",
                 "lens": dict(card["camera"]),
+                "mount": dict(card["mount"]),
                 "sampling_rate_hz": rate_hz * card["renders_per_step"],
                 "packet_rate_hz": rate_hz,
                 "pixel": {"threshold_on": card["threshold"], "threshold_off": card["threshold"]},

@@ -101,6 +101,8 @@ class Task:
     """When an episode is cut (truncated) [s]."""
     camera: Mapping[str, Any] = {"width": 24, "height": 24, "horizontal_fov_rad": 1.6}
     """Lens of the event camera."""
+    mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03)}
+    """Where it sits on the body: {position_m, rpy_rad}; a positive pitch looks down."""
     threshold: float = 0.1
     """Of the event camera, both ways."""
     renders_per_step: int = 1

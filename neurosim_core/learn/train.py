@@ -297,6 +297,7 @@ def make_card(env: Env, name: str) -> dict[str, Any]:
         "task": name,
         "rate_hz": task.rate_hz,
         "camera": dict(task.camera),
+        "mount": dict(task.mount),
         "threshold": task.threshold,
         "renders_per_step": task.renders_per_step,
         "rays_per_pixel": task.rays_per_pixel,

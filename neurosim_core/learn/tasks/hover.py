@@ -25,8 +25,8 @@ class Hover(Task):
     position nor velocity. The teacher and the critic see the velocity.
     """
 
-    episode_s = 6.0
-    start = StartConfig(clearance_m=0.9, speed_m_s=(0.3, 0.9), tilt_max_rad=0.15, rate_max_rad_s=0.2)
+    episode_s = 5.0
+    start = StartConfig(clearance_m=0.9, speed_m_s=(0.6, 1.4), tilt_max_rad=0.15, rate_max_rad_s=0.2)
     randomisation = Randomisation(thrust_factor=(0.98, 1.02))
     rate_max_rad_s = (2.0, 2.0, 1.0)
     thrust_span = 0.4
