@@ -68,7 +68,9 @@ class Dagger:
         self.policy = EventPolicy(channels, height, width, vector.shape[1], hint_count=hints).to(env.device)
         on_cuda = env.device.type == "cuda"
         rate = torch.tensor(config.learning_rate, device=env.device) if on_cuda else config.learning_rate
-        self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=rate, capturable=on_cuda, fused=on_cuda)
+        self.optimizer = torch.optim.Adam(
+            self.policy.parameters(), lr=rate, capturable=on_cuda, fused=on_cuda
+        )
         self._update = Replayed(self._descend) if on_cuda else self._descend
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
@@ -136,7 +138,9 @@ class Dagger:
         config, env = self.config, self.env
         stretches, steps = (config.replay, env.num_envs), (config.horizon,)
         sizes = {"vector": vector_size, "label": 4, "hint": hint_count}
-        self._kept = {name: torch.zeros((*stretches, *steps, n), device=env.device) for name, n in sizes.items()}
+        self._kept = {
+            name: torch.zeros((*stretches, *steps, n), device=env.device) for name, n in sizes.items()
+        }
         self._kept["begun"] = torch.zeros((*stretches, *steps), device=env.device)
         self._kept["memory"] = torch.zeros((*stretches, self.policy.memory_size), device=env.device)
         self._kept["surface"] = torch.zeros(
@@ -147,7 +151,7 @@ class Dagger:
         self._flown = 0
 
     def _fly(self, *, lead: float) -> dict[str, float]:
-        """Fly the horizon, and keep it; in a share `lead` of the worlds the teacher acts, and is disturbed."""
+        """Fly the horizon, and keep it; in a share `lead` of the worlds a disturbed teacher acts."""
         env, config = self.env, self.config
         kept = {name: value[self._flown % config.replay] for name, value in self._kept.items()}
         kept["memory"].copy_(self._memory)

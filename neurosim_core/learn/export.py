@@ -59,9 +59,9 @@ def export_onnx(policy: EventPolicy, card: Mapping[str, Any], file: Path) -> Non
             [
                 tensor("events", shape["channels"], shape["height"], shape["width"]),
                 tensor("vector", shape["vector_size"]),
-                tensor("memory", shape["memory_size"]),
+                tensor("memory", size),
             ],
-            [tensor("action", shape["action_count"]), tensor("memory_out", shape["memory_size"])],
+            [tensor("action", shape["action_count"]), tensor("memory_out", size)],
             graph.constants,
         ),
         opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
