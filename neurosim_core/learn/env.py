@@ -21,6 +21,9 @@ from neurosim_core.sim.simulation import Simulation
 CAMERA = "front"
 """Name of the event camera."""
 
+_EVENTS_PER_PIXEL = 8
+"""Room for the events of a step: at 2 rad/s some pixels see five edges in 20 ms."""
+
 Scenes = Sequence[SceneSource] | Literal["seen", "unseen"]
 """Scenes, or those of a task to train in (`seen`) or to test in (`unseen`)."""
 
@@ -118,6 +121,7 @@ class Env:
             _settings(task, device, sees),
             worlds=worlds,
             seeds=seed,
+            event_capacity=_EVENTS_PER_PIXEL * task.camera["width"] * task.camera["height"],
             sorted=False,
             **({"scenes": scenes} if models is None else {"models": models}),
         )
