@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from neurosim_core.learn.descent import Descent
 from neurosim_core.learn.env import Env
 from neurosim_core.learn.policies import EventPolicy
 from neurosim_core.learn.task import MIRROR_ACTION
@@ -66,12 +67,7 @@ class Dagger:
         _, channels, height, width = self._now["events"].shape
         hints = self._now["velocity"].shape[1]
         self.policy = EventPolicy(channels, height, width, vector.shape[1], hint_count=hints).to(env.device)
-        on_cuda = env.device.type == "cuda"
-        rate = torch.tensor(config.learning_rate, device=env.device) if on_cuda else config.learning_rate
-        self.optimizer = torch.optim.Adam(
-            self.policy.parameters(), lr=rate, capturable=on_cuda, fused=on_cuda
-        )
-        self._update = Replayed(self._descend) if on_cuda else self._descend
+        self._descent = Descent(self.policy, self._loss, gradient_max=config.gradient_max)
         self._memory = torch.zeros((env.num_envs, self.policy.memory_size), device=env.device)
         self._begun = torch.ones(env.num_envs, device=env.device)
         self._pushed = torch.zeros((env.num_envs, 4), device=env.device)
@@ -97,25 +93,20 @@ class Dagger:
         """
         config = self.config
         rate = config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * min(done, 1.0)))
-        for group in self.optimizer.param_groups:
-            if isinstance(group["lr"], torch.Tensor):
-                group["lr"].fill_(rate)
-            else:
-                group["lr"] = rate
         lead = 1.0 - (1.0 - config.lead_last) * min(done / max(config.lead, 1e-9), 1.0)
         lead = max(lead, 1e-9)
         with torch.no_grad():
             log = self._fly(lead=lead)
-        return log | self._learn()
+        return log | self._learn(rate)
 
     def state_dict(self) -> dict[str, Any]:
         """Return what training goes on from."""
-        return {"policy": self.policy.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return {"policy": self.policy.state_dict(), "optimizer": self._descent.optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.policy.load_state_dict(state["policy"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self._descent.optimizer.load_state_dict(state["optimizer"])
 
     def _make_mirrors(self) -> None:
         """Let half of the worlds be seen in a mirror, if the task says how."""
@@ -187,7 +178,7 @@ class Dagger:
         episodes, successes, crashes = ended.tolist()
         return {"success": successes / episodes, "crash": crashes / episodes} if episodes else {}
 
-    def _learn(self) -> dict[str, float]:
+    def _learn(self, rate: float) -> dict[str, float]:
         """Learn from stretches of flight that are drawn from those kept."""
         config = self.config
         stretches = min(self._flown, config.replay) * self.env.num_envs
@@ -197,53 +188,19 @@ class Dagger:
                 stretches, (config.batch,), generator=self._generator, device=self.env.device
             )
             self._rows.copy_(rows)
-            self._update()
+            self._descent.step(rate)
         imitation, hint = (self._losses / config.updates).tolist()
         return {"imitation": imitation, "hint": hint}
 
-    def _descend(self) -> None:
-        """Take a gradient step for the stretches that `_rows` names; adds to `_losses`."""
-        config = self.config
+    def _loss(self) -> torch.Tensor:
+        """Return the loss of the stretches that `_rows` names; adds to `_losses`."""
         part = {name: value.flatten(0, 1).index_select(0, self._rows) for name, value in self._kept.items()}
         memory = part.pop("memory")
         part = {name: value.transpose(0, 1).float() for name, value in part.items()}
         action, hint = self.policy.unroll(part["surface"], part["vector"], part["begun"], memory)
         errors = (action - part["label"]).square().mean(), (hint - part["hint"]).square().mean()
-        loss = errors[0] + config.hint_weight * errors[1]
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), config.gradient_max)
-        self.optimizer.step()
         self._losses += torch.stack(errors).detach()
+        return errors[0] + self.config.hint_weight * errors[1]
 
 
 _COUNTED = ("success", "crash")
-
-
-class Replayed:
-    """A function that works on fixed tensors of a CUDA device, replayed as a graph from the fourth call on.
-
-    Args:
-        function: What to do; it must not wait for the device.
-    """
-
-    def __init__(self, function: Callable[[], None]) -> None:
-        self._function = function
-        self._count = 0
-        self._graph: Any = None
-
-    def __call__(self) -> None:
-        """Do it."""
-        self._count += 1
-        if self._count <= 3:  # PyTorch sets things up at first, on a stream that is not captured
-            stream = torch.cuda.Stream()
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
-                self._function()
-            torch.cuda.current_stream().wait_stream(stream)
-            return
-        if self._graph is None:
-            self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
-                self._function()
-        self._graph.replay()
