@@ -193,8 +193,9 @@ def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainCo
         return config
     return dataclasses.replace(
         config,
-        teacher=PpoConfig(worlds=512),
-        student=DaggerConfig(worlds=2048, iterations=220, horizon=25, minibatches=6),
+        teacher=PpoConfig(worlds=512, iterations=50),
+        student=DaggerConfig(worlds=1024, iterations=120, replay=4, updates=24, batch=128),
+        evaluation_worlds=512,
     )
 
 
@@ -272,6 +273,8 @@ def train(
 
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
+    torch.backends.cudnn.benchmark = True
+    torch.set_float32_matmul_precision("high")
     torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
     training = Training(folder, None if resume else config, say=say)
     if resume:
