@@ -10,7 +10,14 @@ from typing import Any, Literal
 import torch
 import warp as wp
 
-from neurosim_core.learn.episodes import COLUMN_COUNT, COLUMNS, Episodes, free_points, look_at_vehicles
+from neurosim_core.learn.episodes import (
+    COLUMN_COUNT,
+    COLUMNS,
+    PARAMETERS,
+    Episodes,
+    free_points,
+    look_at_vehicles,
+)
 from neurosim_core.learn.surfaces import EventSurface, LeakySurface, SurfaceConfig
 from neurosim_core.learn.task import NO_RANDOMISATION, Observations, Randomisation, Task, View
 from neurosim_core.registry import find
@@ -117,8 +124,11 @@ class Env:
         sees = observe is None or "events" in observe
         if isinstance(scenes, str):
             scenes = task.scenes(unseen=scenes == "unseen")
+        self.randomisation = randomise if isinstance(randomise, Randomisation) else task.randomisation
+        if randomise is False:
+            self.randomisation = NO_RANDOMISATION
         self.sim = Simulation(
-            _settings(task, device, sees),
+            _settings(task, device, sees, wind=self.randomisation.wind_m_s > 0.0),
             worlds=worlds,
             seeds=seed,
             event_capacity=_EVENTS_PER_PIXEL * task.camera["width"] * task.camera["height"],
@@ -126,9 +136,6 @@ class Env:
             **({"scenes": scenes} if models is None else {"models": models}),
         )
         self.num_envs, self.action_count = worlds, 4
-        self.randomisation = randomise if isinstance(randomise, Randomisation) else task.randomisation
-        if randomise is False:
-            self.randomisation = NO_RANDOMISATION
         wp_device = self.sim.device
         self.device = torch.device(wp.device_to_torch(wp_device))
         self._points = free_points(
@@ -170,6 +177,22 @@ class Env:
     def obs_groups(self) -> Mapping[str, Sequence[str]]:
         """Names of the observations that each group sees: actor, critic, teacher, student."""
         return self.task.groups
+
+    @property
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """What differs between the worlds in their present episodes, by name of `Randomisation`, [N, ...].
+
+        They are tensors of the device; what `step` returned as `seed` gives them again.
+        """
+        rows = wp.to_torch(self._episodes.parameters)
+        found = {name: rows[:, columns].clone() for name, columns in PARAMETERS.items()}
+        low, high = self.randomisation.thrust_factor
+        found["thrust_factor"] = low + (high - low) * self.view.draws[:, -1]
+        found["latency_steps"] = self._latency()
+        if self._surface is not None:
+            thresholds = wp.to_torch(self.sim.thresholds(CAMERA)).float()
+            found["threshold_factor"] = thresholds / self.task.threshold
+        return found
 
     @property
     def surface_card(self) -> dict[str, Any]:
@@ -252,6 +275,16 @@ class Env:
                 nominal=(threshold, threshold),
                 factor=factor,
             )
+        drawn = self.randomisation
+        if drawn.airframes_differ:
+            episodes.vary_airframes(
+                self._mask_array,
+                self.sim.airframes,
+                mass=drawn.mass_factor,
+                inertia=drawn.inertia_factor,
+                drag=drawn.drag_factor,
+                wind_max_m_s=drawn.wind_m_s,
+            )
         observation = self.sim.reset(
             mask=None if everywhere else self._mask_array, seed=episodes.seeds, **episodes.start
         )
@@ -290,10 +323,14 @@ class Env:
         if length == 1:
             return command
         self._queue[self._queue_place] = command
-        late = (draws[:, -2] * length).long().clamp_(max=length - 1)
-        chosen = self._queue[(self._queue_place - late) % length, self._each]
+        chosen = self._queue[(self._queue_place - self._latency()) % length, self._each]
         self._queue_place = (self._queue_place + 1) % length
         return chosen
+
+    def _latency(self) -> torch.Tensor:
+        """Return the steps from an action to its effect in each episode, int64, [N]."""
+        length = self._queue.shape[0]
+        return (self.view.draws[:, -2] * length).long().clamp_(max=length - 1)
 
     def _look(self, observation: Any) -> None:
         look_at_vehicles(
@@ -302,6 +339,7 @@ class Env:
             self._episodes,
             fields=self.sim.fields,
             scene_of_world=self.sim.scene_of_world,
+            gyro_bias_rad_s=self.randomisation.gyro_bias_rad_s,
             gyro_noise_rad_s=self.randomisation.gyro_noise_rad_s,
             gravity_noise=self.randomisation.gravity_noise,
         )
@@ -329,8 +367,8 @@ class Env:
         return seen if self._observe is None else {k: v for k, v in seen.items() if k in self._observe}
 
 
-def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
-    """Return the settings of the simulator for a task."""
+def _settings(task: Task, device: str, sees: bool, *, wind: bool) -> dict[str, Any]:
+    """Return the settings of the simulator for a task, in which there can be wind."""
     rate_hz = task.rate_hz * task.renders_per_step
     camera = {
         "kind": "event_camera",
@@ -340,11 +378,14 @@ def _settings(task: Task, device: str, sees: bool) -> dict[str, Any]:
         "packet_rate_hz": rate_hz,
         "pixel": {"threshold_on": task.threshold, "threshold_off": task.threshold},
     }
+    vehicle = {"on_collision": "end", "max_step_s": 0.004, **task.vehicle}
+    if wind:  # that of the episodes takes its place
+        vehicle["parameters"] = {**vehicle.get("parameters", {}), "wind_m_s": (1.0, 0.0, 0.0)}
     return {
         "device": device,
         "control": {"rate_hz": task.rate_hz},
         "render": {"samples_per_pixel": task.rays_per_pixel},
         "path": {"kind": "hover"},
-        "vehicle": {"on_collision": "end", "max_step_s": 0.004, **task.vehicle},
+        "vehicle": vehicle,
         "sensors": {CAMERA: camera} if sees else {},
     }

@@ -28,10 +28,26 @@ class Randomisation:
     """Most steps between an action and its effect; each episode has its own, from 0 on."""
     threshold_factor: tuple[float, float] = (0.8, 1.25)
     """Range of each threshold of the event camera against the nominal one."""
+    mass_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of the mass; with the inertia of the same shape."""
+    inertia_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of the inertia besides."""
+    drag_factor: tuple[float, float] = (1.0, 1.0)
+    """Range of rotor drag and parasitic drag."""
+    wind_m_s: float = 0.0
+    """Strongest wind, level and constant in an episode [m/s]; if > 0, in place of the vehicle's."""
+    gyro_bias_rad_s: float = 0.0
+    """Largest bias of the gyroscope about each axis, constant in an episode [rad/s]."""
     gyro_noise_rad_s: float = 0.02
     """Standard deviation of the gyroscope [rad/s]."""
     gravity_noise: float = 0.01
     """Standard deviation of each part of the measured direction of gravity."""
+
+    @property
+    def airframes_differ(self) -> bool:
+        """Mass, inertia, drag or wind are drawn."""
+        factors = self.mass_factor, self.inertia_factor, self.drag_factor
+        return self.wind_m_s > 0.0 or any(factor != (1.0, 1.0) for factor in factors)
 
 
 NO_RANDOMISATION = Randomisation(
