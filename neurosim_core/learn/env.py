@@ -29,7 +29,7 @@ CAMERA = "front"
 """Name of the event camera."""
 
 _EVENTS_PER_PIXEL = 8
-"""Room for the events of a step: at 2 rad/s some pixels see five edges in 20 ms."""
+"""Room for the events of a step, in the mean of a picture: turns of 1 rad/s give up to three."""
 
 Scenes = Sequence[SceneSource] | Literal["seen", "unseen"]
 """Scenes, or those of a task to train in (`seen`) or to test in (`unseen`)."""
@@ -233,7 +233,8 @@ class Env:
         Returns:
             Observations (of worlds whose episode ended: of their new one), rewards, terminated, truncated,
             and a dictionary: `final_obs` (what was seen last where an episode ended), `metrics` of all
-            worlds, which count there, and `seed`, from which each episode can be played again.
+            worlds, which count there, `seed`, from which each episode can be played again, and `dropped`,
+            the events that there was no room for.
         """
         view = self.view
         view.last_action.copy_(view.action)
@@ -252,6 +253,8 @@ class Env:
         torch.logical_or(terminated, truncated, out=self._mask)
         final = self._observations()
         info = {"final_obs": final, "metrics": task.metrics(view), "seed": self._seeds.clone()}
+        if self._surface is not None:
+            info["dropped"] = wp.to_torch(observation.events[CAMERA].dropped)
         if self.device.type == "cpu" and not self._mask.any():
             return final, reward, terminated, truncated, info
         if "events" in final:

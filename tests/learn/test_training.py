@@ -203,3 +203,23 @@ def test_a_flight_in_a_mirror_is_a_flight(hall):
     np.testing.assert_allclose(rates[1], -sign * rates[0], atol=1e-6)
     np.testing.assert_allclose(speeds[1], sign * speeds[0], atol=1e-6)
     assert np.abs(speeds[0] - velocity).min() > 0.01
+
+
+def test_a_stretch_of_flight_is_learnt_from_as_it_was_flown():
+    """`unroll` gives the actions of single steps, also where an episode begins within."""
+    from neurosim_core.learn.policies import EventPolicy
+
+    torch.manual_seed(1)
+    policy = EventPolicy(4, 9, 9, 10)
+    surfaces, vectors = torch.rand(6, 3, 4, 9, 9), torch.randn(6, 3, 10)
+    begun = torch.zeros(6, 3)
+    begun[2, 1] = 1.0
+    memory = 0.1 * torch.randn(3, policy.memory_size)
+    with torch.no_grad():
+        actions, estimates = policy.unroll(surfaces, vectors, begun, memory)
+        for step in range(6):
+            memory = memory * (1.0 - begun[step])[:, None]
+            action, memory = policy(surfaces[step], vectors[step], memory)
+            torch.testing.assert_close(action, actions[step].clamp(-1.0, 1.0))
+            torch.testing.assert_close(memory[:, policy.hidden :], estimates[step])
+    assert estimates.std() > 0.0
