@@ -226,7 +226,8 @@ def test_a_biased_gyroscope_is_wrong_by_the_same_in_each_step(make):
 
 
 def test_a_fast_turn_loses_no_events(make):
-    env = make(4, type("Turning", (Brief,), {"rate_max_rad_s": (4.0, 4.0, 4.0), "episode_s": 1.0})())
+    changes = {"rate_max_rad_s": (4.0, 4.0, 4.0), "episode_s": 1.0, "threshold": 0.02}
+    env = make(4, type("Turning", (Brief,), changes)())
     env.reset(seed=1)
     turn = torch.tensor([0.0, 0.0, 0.5, 1.0]).expand(4, 4)
     events = torch.zeros(())
