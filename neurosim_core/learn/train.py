@@ -186,6 +186,13 @@ class Training:
         return evaluate(env, teacher_actor(self.teacher, env))
 
 
+def prepare_torch() -> None:
+    """Choose how PyTorch computes in this process."""
+    torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
+    torch.backends.cudnn.benchmark = True
+    torch.set_float32_matmul_precision("high")
+
+
 def default_config(task: str, *, device: str = "auto", seed: int = 0) -> TrainConfig:
     """Return how a task is trained: with more worlds on a GPU, and for longer."""
     config = TrainConfig(task=task, device=device, seed=seed)
@@ -273,9 +280,7 @@ def train(
 
     need("tensorboard", "onnx")
     begin_s = time.monotonic()
-    torch.backends.cudnn.benchmark = True
-    torch.set_float32_matmul_precision("high")
-    torch.set_num_threads(1)  # two beside a simulator that uses all cores take five times as long
+    prepare_torch()
     training = Training(folder, None if resume else config, say=say)
     if resume:
         training.resume()
